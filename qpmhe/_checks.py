@@ -1,0 +1,81 @@
+"""Checks of user input, each with one error text that names value, expectation and remedy."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import InvalidInputError, OptionError, ShapeError, WeightError
+
+Array = NDArray[np.float64]
+
+
+def numbers(name: str, value: ArrayLike, *, finite: bool = True) -> Array:
+    """A float copy of value; real, and finite unless told otherwise."""
+    try:
+        array = np.array(value)
+        if np.iscomplexobj(array):
+            raise TypeError("complex numbers")
+        array = array.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(
+            f"{name} is {value!r}, which is not an array of real numbers ({error})."
+        ) from error
+    if finite and not np.isfinite(array).all():
+        raise InvalidInputError(f"{name} is {array.tolist()}; expected finite numbers only.")
+    return array
+
+
+def vector(name: str, value: ArrayLike, size: int, *, finite: bool = True) -> Array:
+    """A float copy of value of shape (size,); a scalar will do where size is 1."""
+    array = numbers(name, value, finite=finite)
+    if array.ndim == 0 and size == 1:
+        array = array.reshape(1)
+    if array.shape != (size,):
+        raise ShapeError(f"{name} has shape {array.shape}; expected ({size},).")
+    return array
+
+
+def positive_definite(name: str, value: ArrayLike, size: int | None = None) -> Array:
+    """A symmetric positive definite float copy of value; a scalar will do where size is 1."""
+    matrix = np.atleast_2d(numbers(name, value))
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise ShapeError(f"{name} has shape {matrix.shape}; expected a square matrix.")
+    if size is not None and matrix.shape != (size, size):
+        raise ShapeError(f"{name} has shape {matrix.shape}; expected ({size}, {size}).")
+    asymmetry = float(np.abs(matrix - matrix.T).max())
+    if asymmetry > 1e-10 * float(np.abs(matrix).max()):
+        raise WeightError(
+            f"{name} is not symmetric: it differs from its transpose by {asymmetry:.3g}. "
+            "Pass (M + M.T) / 2 if that is what is meant."
+        )
+    matrix = 0.5 * (matrix + matrix.T)
+    smallest = float(np.linalg.eigvalsh(matrix)[0])
+    if smallest <= 0.0:
+        raise WeightError(
+            f"{name} has the eigenvalue {smallest:.3g}; expected a positive definite matrix. "
+            "A direction without noise belongs into the sets, not into a singular matrix."
+        )
+    return matrix
+
+
+def count(name: str, value: Any, least: int, remedy: str = "") -> int:
+    """An integer no less than least."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise OptionError(f"{name} is {value!r}; expected an integer >= {least}.{remedy}")
+    return int(value)
+
+
+def positive(name: str, value: Any) -> float:
+    """A finite number above zero."""
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float, np.integer, np.floating))
+        or not math.isfinite(value)
+        or value <= 0
+    ):
+        raise OptionError(f"{name} is {value!r}; expected a finite number > 0.")
+    return float(value)

@@ -1,0 +1,138 @@
+"""Jacobians of model functions, the best that can be had: given, complex step, differences."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import ModelError
+from .functions import BatchedFunction, Probes
+
+__all__ = ["Jacobian"]
+
+Array = NDArray[Any]
+
+_COMPLEX_STEP = 1e-30  # no subtraction, hence no cancellation: any tiny step is exact
+_DIFFERENCE_STEP = float(np.finfo(np.float64).eps) ** (1 / 3)
+
+
+class Jacobian:
+    """The Jacobian with respect to x of a `BatchedFunction` with vector values.
+
+    Parameters
+    ----------
+    function : BatchedFunction
+        The function, of shape (d,).
+    given : callable or None
+        The user's Jacobian, g(x) or g(x, u) with values (d, n); compared with finite
+        differences at the probes.
+    inputs : int
+        Length m of u.
+    probes : list of (x, u)
+        Points at which the methods are tried against finite differences.
+
+    Attributes
+    ----------
+    method : str
+        ``given``, ``complex step`` or ``finite differences``.
+
+    Raises
+    ------
+    ModelError
+        If the given Jacobian is not the function's derivative at a probe.
+    """
+
+    def __init__(
+        self,
+        function: BatchedFunction,
+        given: Callable[..., Any] | None,
+        inputs: int,
+        probes: Probes,
+    ) -> None:
+        self._function = function
+        self.method = "finite differences"
+        self.batch: Callable[[Array, Array], Array] = self._differences
+        self._given: BatchedFunction | None = None
+        n = probes[0][0].size
+        if given is not None:
+            name = f"{function.name}_jacobian"
+            self._given = BatchedFunction(name, given, (*function.shape, n), inputs, probes)
+            self._compare(self._given, probes)
+            self.method, self.batch = "given", self._given.batch
+        elif self._complex_step_works(probes):
+            self.method, self.batch = "complex step", self._complex
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        """The Jacobian (d, n) at one state."""
+        if self._given is not None:
+            return self._given(x, u)
+        value: Array = self.batch(x[None], u[None])[0]
+        return value
+
+    def _complex(self, x: Array, u: Array) -> Array:
+        n = x.shape[-1]
+        moved = x[..., None, :] + (1j * _COMPLEX_STEP) * np.eye(n)
+        u_all = np.broadcast_to(u[..., None, :], (*moved.shape[:-1], u.shape[-1]))
+        values = np.asarray(self._function.batch(moved, u_all))
+        return np.swapaxes(values.imag, -1, -2) / _COMPLEX_STEP
+
+    def _differences(self, x: Array, u: Array) -> Array:
+        n = x.shape[-1]
+        step = _DIFFERENCE_STEP * np.maximum(1.0, np.abs(x))
+        moves = step[..., None, :] * np.eye(n)
+        u_all = np.broadcast_to(u[..., None, :], (*moves.shape[:-1], u.shape[-1]))
+        ahead = np.asarray(self._function.batch(x[..., None, :] + moves, u_all))
+        behind = np.asarray(self._function.batch(x[..., None, :] - moves, u_all))
+        return np.swapaxes((ahead - behind) / (2 * step[..., :, None]), -1, -2)
+
+    def _at_probes(self, probes: Probes) -> list[tuple[Array, Array, Array]]:
+        """The probes with finite differences that can be trusted there."""
+        usable = []
+        for x, u in probes:
+            try:
+                with np.errstate(all="ignore"):
+                    value = self._differences(x[None], u[None])[0]
+            except Exception:  # outside the function's domain
+                continue
+            if np.isfinite(value).all():
+                usable.append((x, u, value))
+        return usable
+
+    def _complex_step_works(self, probes: Probes) -> bool:
+        usable = self._at_probes(probes)
+        for x, u, expected in usable:
+            try:
+                # A function that throws the imaginary part away only warns; its derivative
+                # comes out as zero and gives it away below.
+                with np.errstate(all="ignore"), warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    found = self._complex(x[None], u[None])[0]
+            except Exception:  # comparisons, math.sin and the like do not take complex numbers
+                return False
+            if not _close(found, expected):
+                return False
+        return bool(usable)
+
+    def _compare(self, given: BatchedFunction, probes: Probes) -> None:
+        for x, u, expected in self._at_probes(probes):
+            try:
+                with np.errstate(all="ignore"):
+                    found = np.asarray(given(x, u), dtype=np.float64)
+            except Exception:  # outside its domain
+                continue
+            if np.isfinite(found).all() and not _close(found, expected):
+                i, j = np.unravel_index(np.argmax(np.abs(found - expected)), expected.shape)
+                raise ModelError(
+                    f"{given.name}[{i}, {j}] is {found[i, j]:.6g} at x = {x.tolist()}, but the "
+                    f"derivative of the function there is {expected[i, j]:.6g}. Correct it, or "
+                    "leave it out to have it computed."
+                )
+
+
+def _close(found: Array, expected: Array) -> bool:
+    scale = 1.0 + float(np.abs(expected).max())
+    return found.shape == expected.shape and float(np.abs(found - expected).max()) < 1e-4 * scale

@@ -1,0 +1,103 @@
+"""Discretisation of an ordinary differential equation by one fixed step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ._checks import positive
+from .errors import OptionError
+
+__all__ = ["METHODS", "Method", "discretize"]
+
+Array = NDArray[Any]
+Function = Callable[..., Any]
+Method = Literal["euler", "rk4"]
+_Steps = tuple[Function, Function | None]
+METHODS: tuple[str, ...] = get_args(Method)
+
+
+def discretize(
+    rate: Function, jacobian: Function | None, dt: float, method: str
+) -> tuple[Function, Function | None]:
+    r"""Turn :math:`\dot x = f_c(x, u)` into :math:`x^+ = f(x, u)` with u held over the step.
+
+    Parameters
+    ----------
+    rate : callable
+        f_c(x) or f_c(x, u), vectorised over leading dimensions, (..., n).
+    jacobian : callable or None
+        Its derivative with respect to x, (..., n, n), same arguments.
+    dt : float
+        Step, in the time unit of the rate, > 0.
+    method : {"euler", "rk4"}
+        ``euler``: x + dt f_c(x, u). ``rk4``: the classical Runge-Kutta method of order 4.
+
+    Returns
+    -------
+    step : callable
+        f(x, *u).
+    step_jacobian : callable or None
+        Its exact derivative with respect to x, where that of the rate is given.
+
+    Raises
+    ------
+    OptionError
+        If the method is unknown or dt is not positive.
+    """
+    dt = positive("dt", dt)
+    if method not in METHODS:
+        raise OptionError(f"method is {method!r}; expected one of {', '.join(METHODS)}.")
+    if method == "euler":
+        return _euler(rate, jacobian, dt)
+    return _rk4(rate, jacobian, dt)
+
+
+def _euler(rate: Function, jacobian: Function | None, dt: float) -> _Steps:
+    def step(x: Array, *u: Array) -> Array:
+        value: Array = x + dt * rate(x, *u)
+        return value
+
+    if jacobian is None:
+        return step, None
+    rate_jacobian = jacobian
+
+    def step_jacobian(x: Array, *u: Array) -> Array:
+        value: Array = dt * rate_jacobian(x, *u)
+        value += np.eye(x.shape[-1])
+        return value
+
+    return step, step_jacobian
+
+
+def _rk4(rate: Function, jacobian: Function | None, dt: float) -> _Steps:
+    def step(x: Array, *u: Array) -> Array:
+        k1 = rate(x, *u)
+        k2 = rate(x + 0.5 * dt * k1, *u)
+        k3 = rate(x + 0.5 * dt * k2, *u)
+        k4 = rate(x + dt * k3, *u)
+        value: Array = x + (dt / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
+        return value
+
+    if jacobian is None:
+        return step, None
+    rate_jacobian = jacobian
+
+    def step_jacobian(x: Array, *u: Array) -> Array:
+        eye = np.eye(x.shape[-1])
+        k1 = rate(x, *u)
+        j1 = rate_jacobian(x, *u)
+        x2 = x + 0.5 * dt * k1
+        k2 = rate(x2, *u)
+        j2 = rate_jacobian(x2, *u) @ (eye + 0.5 * dt * j1)
+        x3 = x + 0.5 * dt * k2
+        k3 = rate(x3, *u)
+        j3 = rate_jacobian(x3, *u) @ (eye + 0.5 * dt * j2)
+        j4 = rate_jacobian(x + dt * k3, *u) @ (eye + dt * j3)
+        value: Array = eye + (dt / 6.0) * (j1 + 2.0 * (j2 + j3) + j4)
+        return value
+
+    return step, step_jacobian

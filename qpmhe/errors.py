@@ -1,0 +1,34 @@
+"""Exceptions: those of the QP layer, and what else can be wrong with an estimation problem."""
+
+from __future__ import annotations
+
+from qpmhe_solvers.errors import (
+    BackendError,
+    InvalidInputError,
+    OptionError,
+    QpmheError,
+    ShapeError,
+)
+
+__all__ = [
+    "BackendError",
+    "InvalidInputError",
+    "ModelError",
+    "OptionError",
+    "QpmheError",
+    "SetError",
+    "ShapeError",
+    "WeightError",
+]
+
+
+class ModelError(InvalidInputError):
+    """A model function that returns what it must not, or breaks where it must work."""
+
+
+class WeightError(InvalidInputError):
+    """A weight or covariance that is not symmetric positive definite."""
+
+
+class SetError(InvalidInputError):
+    """A set that is empty, inverted or of the wrong dimension."""

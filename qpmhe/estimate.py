@@ -1,0 +1,176 @@
+"""What one step of the estimator tells."""
+
+from __future__ import annotations
+
+import enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Estimate", "Status"]
+
+Array = NDArray[np.float64]
+
+
+class Status(enum.Flag):
+    """Outcome of a step, and everything that happened on the way.
+
+    Exactly one of IMPROVED and CANDIDATE is always set; the others are added where they
+    apply, so that ``Status.IMPROVED in estimate.status`` asks for the outcome.
+    `explain` puts it into words.
+    """
+
+    #: The estimate's true cost is below the candidate's.
+    IMPROVED = enum.auto()
+    #: The observer's candidate is the estimate.
+    CANDIDATE = enum.auto()
+    #: No QP was asked for: max_qps is 0.
+    NO_QPS = enum.auto()
+    #: The sequence of QPs stopped because it had converged.
+    CONVERGED = enum.auto()
+    #: The sequence stopped at an iterate that no step length turned into a lower true cost.
+    NO_DECREASE = enum.auto()
+    #: A QP solver brought back no usable iterate.
+    SOLVER_FAILED = enum.auto()
+    #: A model function raised or was not finite.
+    MODEL_FAILED = enum.auto()
+    #: Components of the newest measurement are missing or not finite; they were left out.
+    MISSING = enum.auto()
+    #: The candidate is outside of sets; these were left out in this step.
+    SETS_DROPPED = enum.auto()
+
+    def explain(self) -> str:
+        """What happened, and what can be done about it, in sentences."""
+        return " ".join(text for flag, text in _TEXTS.items() if flag in self)
+
+
+_TEXTS = {
+    Status.IMPROVED: "The estimate's true cost is below the candidate's.",
+    Status.CANDIDATE: "The observer's candidate is the estimate.",
+    Status.NO_QPS: "No QP was asked for; raise max_qps to improve on the observer.",
+    Status.CONVERGED: "The sequence of QPs converged.",
+    Status.NO_DECREASE: (
+        "The last trial did not lower the true cost at any step length and was dropped; "
+        "raise max_solver_iterations or take another backend if this is frequent."
+    ),
+    Status.SOLVER_FAILED: (
+        "The QP solver brought back no usable iterate; see the estimate's message."
+    ),
+    Status.MODEL_FAILED: (
+        "A model function raised or was not finite; bound the states, or make the model "
+        "defined on all of them."
+    ),
+    Status.MISSING: (
+        "The measurement is missing in part or whole (not finite); its noise term was left "
+        "out and the observer predicted without it."
+    ),
+    Status.SETS_DROPPED: (
+        "The observer's candidate is outside of the sets, which were left out in this step; "
+        "widen them or take another observer."
+    ),
+}
+
+
+class Estimate:
+    """The result of one `MovingHorizonEstimator.update`, after the measurement y(t).
+
+    With N_t = min(t + 1, N) stages in the window, the trajectory holds the estimates of
+    x(t+1-N_t), ..., x(t+1), made from the measurements y(t+1-N_t), ..., y(t).
+
+    Attributes
+    ----------
+    time : int
+        t, the index of the newest measurement; the first is 0.
+    state : (n,) array
+        Estimate of x(t+1), the paper's estimate: a prediction one step ahead of the newest
+        measurement.
+    filtered : (n,) array
+        Estimate of x(t), the last measured time.
+    trajectory : (N_t + 1, n) array
+        Estimates of all states in the window.
+    disturbances : (N_t, n) array
+        w(i) = x(i+1) - f(x(i)) along the trajectory.
+    noises : (N_t, p) array
+        v(i) = y(i) - h(x(i)) along the trajectory; NaN where y is missing.
+    cost, candidate_cost : float
+        True cost J of the estimate and of the observer's candidate; cost <= candidate_cost.
+    candidate : (N_t + 1, n) array
+        The observer's trajectory.
+    status : Status
+        Outcome and events.
+    message : str
+        Words of the QP solver where it failed.
+    qps : int
+        QPs solved.
+    solver_iterations : int or None
+        Sum of the solver's own iterations; None where it does not tell.
+    step_time, solve_time : float
+        Seconds for the whole update, and for the QP solver in it.
+    """
+
+    __slots__ = (
+        "_residuals",
+        "candidate",
+        "candidate_cost",
+        "cost",
+        "message",
+        "qps",
+        "solve_time",
+        "solver_iterations",
+        "state",
+        "status",
+        "step_time",
+        "time",
+        "trajectory",
+    )
+
+    def __init__(
+        self,
+        time: int,
+        trajectory: Array,
+        residuals: Array,
+        cost: float,
+        candidate: Array,
+        candidate_cost: float,
+        status: Status,
+        message: str,
+        qps: int,
+        solver_iterations: int | None,
+        solve_time: float,
+    ) -> None:
+        self.time = time
+        self.trajectory = trajectory
+        self.state: Array = trajectory[-1]
+        self._residuals = residuals
+        self.cost, self.candidate_cost = cost, candidate_cost
+        self.candidate = candidate
+        self.status, self.message = status, message
+        self.qps, self.solver_iterations = qps, solver_iterations
+        self.solve_time, self.step_time = solve_time, float("nan")
+
+    @property
+    def filtered(self) -> Array:
+        """Estimate of x(t), the last measured time."""
+        value: Array = self.trajectory[-2]
+        return value
+
+    @property
+    def disturbances(self) -> Array:
+        """w(i) along the trajectory."""
+        return self._residuals[:, : self.trajectory.shape[1]]
+
+    @property
+    def noises(self) -> Array:
+        """v(i) along the trajectory, NaN where y is missing."""
+        return self._residuals[:, self.trajectory.shape[1] :]
+
+    @property
+    def improved(self) -> bool:
+        """Whether the estimate is better than the candidate."""
+        return Status.IMPROVED in self.status
+
+    def __repr__(self) -> str:
+        return (
+            f"Estimate(time={self.time}, state={self.state.tolist()}, cost={self.cost:.6g}, "
+            f"candidate_cost={self.candidate_cost:.6g}, status={self.status!s})"
+        )

@@ -1,0 +1,73 @@
+"""What an auxiliary observer in output-injection form must offer (eq:observer)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..system import System
+
+__all__ = ["Observer"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class Observer(ABC):
+    r"""An observer :math:`z(t+1) = f(z, u) + L(z, y - h(z, u))` with :math:`L(\cdot, 0) = 0`.
+
+    An observer is a rule without memory: what it must remember from sample to sample, a
+    covariance, travels through `correct` and is kept in the estimator's window.
+    """
+
+    #: Whether `correct` reads the Jacobians of f and h at z.
+    needs_jacobians: bool = False
+
+    @abstractmethod
+    def check(self, system: System, initial_state: Array) -> None:
+        """Insist that the observer fits the system.
+
+        Parameters
+        ----------
+        system : System
+            The system that is to be observed.
+        initial_state : (n,) array
+            z(0).
+
+        Raises
+        ------
+        InvalidInputError
+            If it does not fit.
+        """
+
+    def initial_covariance(self) -> Array | None:
+        """The covariance (n, n) of the initial estimate; None for observers without one."""
+        return None
+
+    @abstractmethod
+    def correct(
+        self,
+        z: Array,
+        v: Array,
+        f_jacobian: Array | None,
+        h_jacobian: Array | None,
+        observed: Mask | None,
+        covariance: Array | None,
+    ) -> tuple[Array, Array | None]:
+        """The correction L(z, v) and the covariance of the next step.
+
+        Parameters
+        ----------
+        z : (n,) array
+            Observer state z(t).
+        v : (p,) array
+            Fitting error y(t) - h(z(t)), with zeros where y is missing.
+        f_jacobian, h_jacobian : (n, n) and (p, n) array or None
+            Jacobians at z, if `needs_jacobians`.
+        observed : (p,) bool array or None
+            Which components of y are there; None if all are.
+        covariance : (n, n) array or None
+            Covariance of x(t) - z(t), if the observer has one.
+        """

@@ -1,0 +1,96 @@
+"""The extended Kalman filter as an observer in output-injection form."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import positive_definite
+from ..errors import ShapeError
+from ..system import System
+from .base import Mask, Observer
+
+__all__ = ["ExtendedKalman"]
+
+Array = NDArray[np.float64]
+
+
+class ExtendedKalman(Observer):
+    r"""The one-step predictor of the extended Kalman filter.
+
+    With A and C the Jacobians of f and h at z(t):
+
+    .. math::
+        S = C P C^\top + R, \quad K = A P C^\top S^{-1}, \quad L(z, v) = K v, \quad
+        P^+ = A P A^\top + Q - K S K^\top
+
+    linear in v, so that (eq:kappa) holds with the largest :math:`|K(t)|` met. On a linear
+    system it is the Kalman filter; its covariance can weigh the prior, see
+    `qpmhe.ObserverPrior`. It is robustly stable only where the Kalman filter of the
+    linearisation is; the estimator inherits what this observer has.
+
+    Parameters
+    ----------
+    prior : (n, n) array_like
+        Covariance P(0) of the initial error x(0) - z(0).
+    disturbance : (n, n) array_like
+        Covariance Q of w.
+    noise : (p, p) array_like
+        Covariance R of v.
+
+    Raises
+    ------
+    WeightError, ShapeError
+        If a covariance is not square, symmetric and positive definite.
+
+    References
+    ----------
+    Anderson and Moore, Optimal Filtering, 1979, sections 3.1 and 8.2.
+    """
+
+    needs_jacobians = True
+
+    def __init__(self, *, prior: ArrayLike, disturbance: ArrayLike, noise: ArrayLike) -> None:
+        self._prior = positive_definite("prior covariance", prior)
+        self._disturbance = positive_definite("disturbance covariance", disturbance)
+        self._noise = positive_definite("noise covariance", noise)
+
+    def check(self, system: System, initial_state: Array) -> None:
+        """Insist on covariances of the system's dimensions; see `Observer.check`."""
+        for name, matrix, size in (
+            ("prior", self._prior, system.n),
+            ("disturbance", self._disturbance, system.n),
+            ("noise", self._noise, system.p),
+        ):
+            if matrix.shape[0] != size:
+                raise ShapeError(
+                    f"{name} covariance has shape {matrix.shape}; expected ({size}, {size})."
+                )
+
+    def initial_covariance(self) -> Array:
+        """P(0)."""
+        return self._prior
+
+    def correct(
+        self,
+        z: Array,
+        v: Array,
+        f_jacobian: Array | None,
+        h_jacobian: Array | None,
+        observed: Mask | None,
+        covariance: Array | None,
+    ) -> tuple[Array, Array]:
+        """K v and the next covariance; see `Observer.correct`."""
+        if f_jacobian is None or h_jacobian is None or covariance is None:
+            raise ValueError("the extended Kalman observer needs Jacobians and a covariance")
+        c, r = h_jacobian, self._noise
+        if observed is not None:
+            c, r, v = c[observed], r[np.ix_(observed, observed)], v[observed]
+        predicted = f_jacobian @ covariance @ f_jacobian.T + self._disturbance
+        if v.size == 0:
+            return np.zeros_like(z), predicted
+        ap = f_jacobian @ covariance
+        cross = ap @ c.T
+        gain = np.linalg.solve(c @ covariance @ c.T + r, cross.T).T
+        following = predicted - gain @ cross.T
+        return gain @ v, 0.5 * (following + following.T)

@@ -1,0 +1,76 @@
+"""An observer with a correction of the user's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ModelError
+from ..system import System
+from .base import Mask, Observer
+
+__all__ = ["OutputInjection"]
+
+Array = NDArray[np.float64]
+
+
+class OutputInjection(Observer):
+    r"""Any correction :math:`L(z, v)` with :math:`L(\cdot, 0) = 0` (ass:observer_0).
+
+    Parameters
+    ----------
+    correction : callable
+        correction(z, v): z (n,) and the fitting error v (p,) to (n,).
+
+    Raises
+    ------
+    ModelError
+        Where it meets the system: if its value has the wrong shape or is not finite, or if
+        it does not vanish for v = 0.
+    """
+
+    def __init__(self, correction: Callable[[Array, Array], Any]) -> None:
+        if not callable(correction):
+            raise ModelError(f"correction is {correction!r}; expected a function of z and v.")
+        self._correction = correction
+
+    def check(self, system: System, initial_state: Array) -> None:
+        """Insist on values of shape (n,), and on L(z, 0) = 0; see `Observer.check`."""
+        self._check_at(initial_state, system.p)
+        generator = np.random.default_rng(20210829)
+        for _ in range(3):
+            near = initial_state * generator.uniform(0.5, 1.5, system.n)
+            self._check_at(near + generator.uniform(-0.1, 0.1, system.n), system.p)
+
+    def _check_at(self, z: Array, outputs: int) -> None:
+        try:
+            with np.errstate(all="ignore"):
+                value = np.asarray(self._correction(z.copy(), np.zeros(outputs)), np.float64)
+        except Exception as error:
+            raise ModelError(
+                f"correction raised {type(error).__name__}: {error} at z = {z.tolist()}, v = 0."
+            ) from error
+        if value.shape != z.shape:
+            raise ModelError(
+                f"correction returned shape {value.shape}; expected (n,) = {z.shape}."
+            )
+        if not np.all(value == 0.0):
+            raise ModelError(
+                f"correction is {value.tolist()} at z = {z.tolist()} and v = 0; an observer in "
+                "output-injection form must not correct where the output fits: L(z, 0) = 0."
+            )
+
+    def correct(
+        self,
+        z: Array,
+        v: Array,
+        f_jacobian: Array | None,
+        h_jacobian: Array | None,
+        observed: Mask | None,
+        covariance: Array | None,
+    ) -> tuple[Array, None]:
+        """L(z, v); see `Observer.correct`."""
+        return np.asarray(self._correction(z, v), dtype=np.float64), None

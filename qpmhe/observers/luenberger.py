@@ -1,0 +1,63 @@
+"""The observer with a constant gain."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import numbers
+from ..errors import ShapeError
+from ..system import System
+from .base import Mask, Observer
+
+__all__ = ["Luenberger"]
+
+Array = NDArray[np.float64]
+
+
+class Luenberger(Observer):
+    r"""Constant gain: :math:`L(z, v) = K v`.
+
+    (eq:kappa) holds with :math:`\kappa` the spectral norm of K. For an observer designed
+    in continuous time and discretised by one Euler step, K is the step times its gain.
+
+    Parameters
+    ----------
+    gain : (n, p) array_like
+        K, of the discrete-time observer; a vector (n,) will do where p is 1.
+
+    Raises
+    ------
+    InvalidInputError
+        If the gain is not finite; its shape is checked where it meets the system.
+    """
+
+    def __init__(self, gain: ArrayLike) -> None:
+        given = numbers("gain", gain)
+        self.gain: Array = given.reshape(-1, 1) if given.ndim < 2 else given
+
+    def check(self, system: System, initial_state: Array) -> None:
+        """Insist on a gain of shape (n, p); see `Observer.check`."""
+        shape = (system.n, system.p)
+        if self.gain.shape != shape:
+            raise ShapeError(
+                f"gain has shape {self.gain.shape}; expected (n, p) = {shape}: a row for each "
+                "state, a column for each output."
+            )
+
+    @property
+    def kappa(self) -> float:
+        """The constant of (eq:kappa)."""
+        return float(np.linalg.norm(self.gain, 2))
+
+    def correct(
+        self,
+        z: Array,
+        v: Array,
+        f_jacobian: Array | None,
+        h_jacobian: Array | None,
+        observed: Mask | None,
+        covariance: Array | None,
+    ) -> tuple[Array, None]:
+        """K v; see `Observer.correct`."""
+        return self.gain @ v, None

@@ -1,0 +1,71 @@
+"""The record of an estimator's run."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .estimate import Estimate, Status
+
+__all__ = ["Run"]
+
+Array = NDArray[np.float64]
+
+
+class Run:
+    """Results of T consecutive updates, as arrays.
+
+    Parameters
+    ----------
+    start : (n,) array
+        The estimate before the first update.
+    estimates : sequence of Estimate
+        What the updates returned.
+
+    Attributes
+    ----------
+    states : (T + 1, n) array
+        Estimates of x(0), ..., x(T), each made before y of its own time: row 0 is the start.
+    filtered : (T, n) array
+        Estimates of x(0), ..., x(T-1), each made with y of its own time.
+    costs, candidate_costs : (T,) array
+        True cost J of estimate and candidate.
+    times, solve_times : (T,) array
+        Seconds for each update, and for the QP solver in it.
+    qps : (T,) array
+        QPs solved.
+    solver_iterations : (T,) array
+        The solver's own iterations, -1 where it does not tell.
+    statuses : list of Status
+        Outcome and events of each step.
+    """
+
+    def __init__(self, start: Array, estimates: Sequence[Estimate]) -> None:
+        n = start.size
+        self.states: Array = np.array([start, *(e.state for e in estimates)])
+        self.filtered: Array = np.array([e.filtered for e in estimates]).reshape(-1, n)
+        self.costs: Array = np.array([e.cost for e in estimates])
+        self.candidate_costs: Array = np.array([e.candidate_cost for e in estimates])
+        self.times: Array = np.array([e.step_time for e in estimates])
+        self.solve_times: Array = np.array([e.solve_time for e in estimates])
+        self.qps = np.array([e.qps for e in estimates], dtype=np.intp)
+        self.solver_iterations = np.array(
+            [-1 if e.solver_iterations is None else e.solver_iterations for e in estimates],
+            dtype=np.intp,
+        )
+        self.statuses: list[Status] = [e.status for e in estimates]
+
+    def __len__(self) -> int:
+        return len(self.statuses)
+
+    def share(self, flag: Status) -> float:
+        """The share of steps whose status has this flag."""
+        return sum(flag in status for status in self.statuses) / max(1, len(self.statuses))
+
+    def reasons(self) -> dict[str, int]:
+        """How often each combination of flags occurred, the most frequent first."""
+        counts = Counter(str(status).removeprefix("Status.") for status in self.statuses)
+        return dict(counts.most_common())

@@ -1,0 +1,203 @@
+"""The system whose state is estimated (eq:system)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ._checks import count
+from .derivatives import Jacobian
+from .discretize import discretize
+from .errors import SetError
+from .functions import BatchedFunction, Probes
+from .sets import Box
+
+__all__ = ["System"]
+
+Array = NDArray[np.float64]
+Function = Callable[..., Any]
+
+
+class System:
+    r"""A nonlinear discrete-time system with additive disturbance and noise.
+
+    .. math::
+        x(t+1) = f(x(t), u(t)) + w(t), \qquad y(t) = h(x(t), u(t)) + v(t),
+        \qquad x \in \mathbb X,\ w \in \mathbb W,\ v \in \mathbb V
+
+    as in (eq:system) of the paper, with known inputs u beside.
+
+    Parameters
+    ----------
+    f : callable
+        f(x) or f(x, u): x of shape (n,) to (n,). A function that takes (..., n), as NumPy's
+        own functions do, is called once for a whole window; one that does not is looped over.
+    h : callable
+        h(x) or h(x, u): x of shape (n,) to (p,). A scalar will do where p is 1.
+    n, p : int
+        Number of states and of outputs, at least 1.
+    m : int
+        Number of known inputs; 0 for none.
+    f_jacobian, h_jacobian : callable, optional
+        Derivatives with respect to x, of shapes (n, n) and (p, n), same arguments. Left out,
+        they are computed: by the complex step where the function allows it, else by central
+        differences; see ``derivatives``.
+    states, disturbances, noises : Box, optional
+        The sets X, W and V; the whole space if left out.
+
+    Raises
+    ------
+    ModelError
+        If a function returns the wrong shape, changes its argument, or a given Jacobian is
+        not the derivative.
+    SetError
+        If a set has the wrong dimension.
+
+    Examples
+    --------
+    >>> import numpy as np, qpmhe
+    >>> A = np.array([[1.0, 0.1], [0.0, 1.0]])
+    >>> system = qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1)
+    >>> system.derivatives
+    {'f': 'complex step', 'h': 'complex step'}
+    """
+
+    def __init__(
+        self,
+        f: Function,
+        h: Function,
+        *,
+        n: int,
+        p: int,
+        m: int = 0,
+        f_jacobian: Function | None = None,
+        h_jacobian: Function | None = None,
+        states: Box | None = None,
+        disturbances: Box | None = None,
+        noises: Box | None = None,
+    ) -> None:
+        self.n, self.p, self.m = count("n", n, 1), count("p", p, 1), count("m", m, 0)
+        self.states = _set("states", states, self.n)
+        self.disturbances = _set("disturbances", disturbances, self.n)
+        self.noises = _set("noises", noises, self.p)
+        probes = _probes(self.states, self.n, self.m)
+        self.f = BatchedFunction("f", f, (self.n,), self.m, probes)
+        self.h = BatchedFunction("h", h, (self.p,), self.m, probes)
+        self.f_jacobian = Jacobian(self.f, f_jacobian, self.m, probes)
+        self.h_jacobian = Jacobian(self.h, h_jacobian, self.m, probes)
+
+    @classmethod
+    def from_ode(
+        cls,
+        rate: Function,
+        h: Function,
+        *,
+        dt: float,
+        n: int,
+        p: int,
+        m: int = 0,
+        method: str = "rk4",
+        rate_jacobian: Function | None = None,
+        h_jacobian: Function | None = None,
+        states: Box | None = None,
+        disturbances: Box | None = None,
+        noises: Box | None = None,
+    ) -> System:
+        r"""Discretise :math:`\dot x = f_c(x, u)` with a fixed step; u is held over the step.
+
+        The disturbance w stays that of the discrete-time system: it is added once a step.
+
+        Parameters
+        ----------
+        rate : callable
+            f_c(x) or f_c(x, u), in units of x per unit of time.
+        h, n, p, m, h_jacobian, states, disturbances, noises
+            As for `System`.
+        dt : float
+            Sampling time, in the time unit of the rate.
+        method : {"rk4", "euler"}
+            Runge-Kutta of order 4, or one explicit Euler step.
+        rate_jacobian : callable, optional
+            Derivative of the rate with respect to x, (n, n).
+
+        Raises
+        ------
+        OptionError
+            If dt is not positive or the method unknown.
+        ModelError, SetError
+            As for `System`.
+        """
+        n, m = count("n", n, 1), count("m", m, 0)
+        probes = _probes(_set("states", states, n), n, m)
+        batched = BatchedFunction("rate", rate, (n,), m, probes)
+        given = None
+        if rate_jacobian is not None:
+            Jacobian(batched, rate_jacobian, m, probes)  # compared with differences here
+            given = BatchedFunction("rate_jacobian", rate_jacobian, (n, n), m, probes)
+        f, f_jacobian = discretize(
+            _over_leading(batched, rate), given and _over_leading(given, rate_jacobian), dt, method
+        )
+        return cls(
+            f, h, n=n, p=p, m=m, f_jacobian=f_jacobian, h_jacobian=h_jacobian,
+            states=states, disturbances=disturbances, noises=noises,
+        )
+
+    @property
+    def derivatives(self) -> dict[str, str]:
+        """How the Jacobians of f and h are found."""
+        return {"f": self.f_jacobian.method, "h": self.h_jacobian.method}
+
+    def check(self, x: Array, u: Array) -> None:
+        """Insist that f and h are finite, of the right shapes, at the state x (n,).
+
+        Raises
+        ------
+        ModelError
+            If they are not.
+        """
+        self.f.check(x, u)
+        self.h.check(x, u)
+
+    def __repr__(self) -> str:
+        return f"System(n={self.n}, p={self.p}, m={self.m}, states={self.states})"
+
+
+def _over_leading(function: BatchedFunction, written: Any) -> Function:
+    """A function of (..., n), whatever way the user's was written."""
+    if function.plain:
+        return written  # type: ignore[no-any-return]
+
+    def evaluate(x: Array, *inputs: Array) -> Any:
+        u = inputs[0] if inputs else np.empty((*x.shape[:-1], 0))
+        return function.batch(x, u) if x.ndim > 1 else function(x, u)
+
+    return evaluate
+
+
+def _set(name: str, value: Box | None, dimension: int) -> Box | None:
+    if value is None:
+        return None
+    if not isinstance(value, Box):
+        raise SetError(f"{name} is {value!r}; expected a qpmhe.Box or None.")
+    if value.dimension != dimension:
+        raise SetError(f"{name} has dimension {value.dimension}; expected {dimension}.")
+    return value
+
+
+def _probes(states: Box | None, n: int, m: int) -> Probes:
+    """A few irregular points inside the state bounds, to try functions on."""
+    generator = np.random.default_rng(20210829)
+    probes: Probes = []
+    for scale in (1.0, 0.3, 3.0, 1.0):
+        x = scale * generator.uniform(0.2, 1.0, n)
+        if states is not None:
+            low, high = states.lower, states.upper
+            both = np.isfinite(low) & np.isfinite(high)
+            share = generator.uniform(0.2, 0.8, n)
+            with np.errstate(invalid="ignore"):
+                x = np.where(both, low + share * (high - low), np.clip(x, low, high))
+        probes.append((x, generator.uniform(0.2, 1.0, m)))
+    return probes

@@ -1,0 +1,69 @@
+"""The default: a banded factorisation where that is exact, a QP solver where it is not."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .banded import BandedSolver
+from .options import SolverOptions
+from .qp import QP
+from .solution import RawSolution, Solution, SolveStatus
+from .solver import Solver
+
+__all__ = ["AutoSolver"]
+
+Array = NDArray[np.float64]
+
+# daqp is the fastest up to about this many unknowns; sparse interior points win beyond.
+_SMALL = 60
+_SMALL_ORDER = ("daqp", "piqp", "clarabel", "proxqp", "osqp")
+_LARGE_ORDER = ("piqp", "clarabel", "osqp", "proxqp")
+
+
+class AutoSolver(Solver):
+    """Solve by `BandedSolver`; where its result violates an inequality, by a QP solver.
+
+    Parameters
+    ----------
+    options : SolverOptions
+        Handed to the QP solver. With an iteration cap, solvers that return nothing at the
+        cap are passed over.
+    """
+
+    def __init__(self, options: SolverOptions) -> None:
+        super().__init__(options)
+        self._banded = BandedSolver(options)
+        self._others: dict[bool, Solver] = {}
+
+    def _solve(self, qp: QP, start: Array | None) -> RawSolution:
+        solution = self.solve(qp, start)
+        return RawSolution(solution.d, solution.status is SolveStatus.SOLVED)
+
+    def solve(self, qp: QP, start: Array | None = None) -> Solution:
+        """Solve the QP with the cheapest exact method; see `Solver.solve`.
+
+        Parameters
+        ----------
+        qp : QP
+            The problem.
+        start : (K, n) array, optional
+            Handed to the QP solver, where one is needed.
+        """
+        solution = self._banded.solve(qp, start)
+        if solution.status is SolveStatus.SOLVED:
+            return solution
+        small = qp.size <= _SMALL
+        if small not in self._others:
+            self._others[small] = self._choose(small)
+        return self._others[small].solve(qp, start)
+
+    def _choose(self, small: bool) -> Solver:
+        from .registry import available, backend, create
+
+        usable = available()
+        for name in _SMALL_ORDER if small else _LARGE_ORDER:
+            capped = self.options.max_iterations is not None
+            if name in usable and not (capped and not backend(name).iterate_at_cap):
+                return create(name, self.options)
+        return self._banded

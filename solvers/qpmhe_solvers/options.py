@@ -1,0 +1,68 @@
+"""What a caller may ask of any QP solver, in one vocabulary."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from .errors import OptionError
+
+__all__ = ["SolverOptions"]
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """Limits and accuracy of one QP solve.
+
+    Parameters
+    ----------
+    max_iterations : int or None
+        Cap on the solver's own iterations, at least 1. None leaves the solver's default.
+        A backend without a cap (see its capabilities) solves fully.
+    absolute_tolerance : float
+        Absolute tolerance on the primal and dual residuals (units of the QP's data), > 0.
+    relative_tolerance : float
+        Tolerance relative to the size of the residuals' terms, >= 0. Backends that know
+        only one tolerance use the absolute one.
+    time_limit : float or None
+        Seconds for one solve, > 0. Backends without a clock ignore it.
+    warm_start : bool
+        Whether the start that ``Solver.solve`` is given is handed to backends that use one.
+
+    Raises
+    ------
+    OptionError
+        If a value is outside its range.
+    """
+
+    max_iterations: int | None = None
+    absolute_tolerance: float = 1e-7
+    relative_tolerance: float = 0.0
+    time_limit: float | None = None
+    warm_start: bool = True
+
+    def __post_init__(self) -> None:
+        cap = self.max_iterations
+        if cap is not None and (isinstance(cap, bool) or not isinstance(cap, int) or cap < 1):
+            raise OptionError(
+                f"max_iterations is {cap!r}; expected an integer >= 1 or None. "
+                "To skip the QP altogether, ask the estimator for max_qps=0."
+            )
+        _positive("absolute_tolerance", self.absolute_tolerance, zero=False)
+        _positive("relative_tolerance", self.relative_tolerance, zero=True)
+        if self.time_limit is not None:
+            _positive("time_limit", self.time_limit, zero=False)
+        if not isinstance(self.warm_start, bool):
+            raise OptionError(f"warm_start is {self.warm_start!r}; expected True or False.")
+
+
+def _positive(name: str, value: object, *, zero: bool) -> None:
+    bound = ">= 0" if zero else "> 0"
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float))
+        or not math.isfinite(value)
+        or value < 0
+        or (value == 0 and not zero)
+    ):
+        raise OptionError(f"{name} is {value!r}; expected a finite number {bound}.")

@@ -1,0 +1,242 @@
+"""The convex QP over a trajectory of stages, stored once and read in three shapes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import ShapeError
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
+
+__all__ = ["QP", "band_index"]
+
+Array = NDArray[np.float64]
+
+
+@lru_cache(maxsize=256)
+def band_index(n: int) -> NDArray[np.intp]:
+    """Where each entry of a stage's band panel stands in its stacked column blocks.
+
+    The Hessian's columns of stage k hold, on and below the diagonal, the block
+    ``[D; E]`` of shape (2n, n) (its own block and the one that couples to stage k+1).
+    ``panel[c, o] = [D; E][c + o, c]`` for ``c + o < 2n`` and 0 beyond. The index points
+    into the flat block followed by one zero, so that one ``take`` fills a panel.
+    """
+    column, offset = np.meshgrid(np.arange(n), np.arange(2 * n), indexing="ij")
+    row = column + offset
+    index: NDArray[np.intp] = np.where(row < 2 * n, row * n + column, 2 * n * n).ravel()
+    return index
+
+
+@dataclass(frozen=True)
+class _Pattern:
+    """Where the entries of a sparse matrix come from: found once, numbers flow through it."""
+
+    source: NDArray[np.intp]  # entry of the stored numbers, in CSC order
+    rows: NDArray[np.int32]
+    columns: NDArray[np.intp]
+    indptr: NDArray[np.int32]
+
+
+def _sorted_pattern(
+    source: NDArray[np.intp],
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    valid: NDArray[np.bool_],
+    width: int,
+) -> _Pattern:
+    """Drop the invalid entries of arrays that already run by column, then by row."""
+    counts = np.bincount(columns[valid], minlength=width)
+    return _Pattern(
+        source=source[valid],
+        rows=rows[valid].astype(np.int32),
+        columns=columns[valid],
+        indptr=np.concatenate(([0], np.cumsum(counts))).astype(np.int32),
+    )
+
+
+@lru_cache(maxsize=256)
+def _hessian_pattern(stages: int, n: int) -> _Pattern:
+    k, c, b, r = np.ix_(np.arange(stages), np.arange(n), np.arange(-1, 2), np.arange(n))
+    row, column = (k + b) * n + r, k * n + c + 0 * (b + r)
+    valid = (k + b >= 0) & (k + b < stages) & (c + r >= 0)
+    low, high = np.minimum(row, column), np.maximum(row, column)
+    return _sorted_pattern(low * 2 * n + (high - low), row + 0 * c, column, valid, stages * n)
+
+
+@lru_cache(maxsize=256)
+def _rows_pattern(stages: int, n: int, m: int) -> _Pattern:
+    """Source index: into the flat own rows, followed by the flat next rows."""
+    k, c, b, r = np.ix_(np.arange(stages), np.arange(n), np.arange(-1, 1), np.arange(m))
+    row, column = (k + b) * m + r + 0 * c, k * n + c + 0 * (b + r)
+    valid = (k + b >= 0) & (c + r >= 0)
+    source = row * n + c + np.where(b < 0, stages * m * n, 0)
+    return _sorted_pattern(source, row, column, valid, stages * n)
+
+
+def _csc(pattern: _Pattern, numbers: Array, height: int, width: int) -> csc_matrix:
+    # The solvers may sort or scale in place: every view gets indices of its own.
+    from scipy.sparse import csc_matrix
+
+    return csc_matrix(
+        (numbers[pattern.source], pattern.rows.copy(), pattern.indptr.copy()),
+        shape=(height, width),
+    )
+
+
+class QP:
+    r"""A convex QP in the increments :math:`d_0, \dots, d_{K-1}` of a trajectory.
+
+    .. math::
+        \min_d \tfrac12 d^\top H d + g^\top d \quad \text{s.t.} \quad
+        \ell_k \le d_k \le u_k, \quad
+        a_k \le F_k d_k + G_k d_{k+1} \le b_k
+
+    H is symmetric, block-tridiagonal and positive definite. The lower triangle is held in
+    stage-wise band panels (see `band_index`), which LAPACK reads in place; the CSC and
+    dense views are made from these same numbers.
+
+    Parameters
+    ----------
+    stages : int
+        Number K of stages, at least 1.
+    n : int
+        Unknowns per stage, at least 1.
+    rows : int
+        General rows per stage; 0 for none. Unused rows keep infinite bounds.
+
+    Attributes
+    ----------
+    band : (K, n, 2n) array
+        Lower band of H: ``band[k, c, o] = H[k n + c + o, k n + c]``.
+    gradient : (K, n) array
+        g.
+    lower, upper : (K, n) array
+        Bounds on d, infinite where there are none.
+    row_own, row_next : (K, rows, n) array
+        F and G; the last stage's G is never read.
+    row_lower, row_upper : (K, rows) array
+        a and b; equal entries make an equality row.
+    bounded : bool
+        False promises that no entry of ``lower`` and ``upper`` is finite.
+
+    Raises
+    ------
+    ShapeError
+        If a size is not a positive integer.
+    """
+
+    __slots__ = (
+        "band",
+        "bounded",
+        "gradient",
+        "lower",
+        "n",
+        "row_lower",
+        "row_next",
+        "row_own",
+        "row_upper",
+        "rows",
+        "size",
+        "stages",
+        "upper",
+    )
+
+    def __init__(self, stages: int, n: int, rows: int = 0) -> None:
+        for name, value, least in (("stages", stages, 1), ("n", n, 1), ("rows", rows, 0)):
+            if value < least:
+                raise ShapeError(f"{name} is {value}; a QP needs {name} >= {least}.")
+        self.stages, self.n, self.rows, self.size = stages, n, rows, stages * n
+        self.band: Array = np.zeros((stages, n, 2 * n))
+        self.gradient: Array = np.zeros((stages, n))
+        self.lower: Array = np.full((stages, n), -np.inf)
+        self.upper: Array = np.full((stages, n), np.inf)
+        self.row_own: Array = np.zeros((stages, rows, n))
+        self.row_next: Array = np.zeros((stages, rows, n))
+        self.row_lower: Array = np.full((stages, rows), -np.inf)
+        self.row_upper: Array = np.full((stages, rows), np.inf)
+        self.bounded = False
+
+    @property
+    def lapack_band(self) -> Array:
+        """The (2n, K n) lower band in LAPACK's layout, a view without a copy."""
+        return self.band.reshape(self.size, 2 * self.n).T
+
+    def dense(self) -> Array:
+        """H as a full symmetric (K n, K n) array."""
+        pattern = _hessian_pattern(self.stages, self.n)
+        full = np.zeros((self.size, self.size))
+        full[pattern.rows, pattern.columns] = self.band.ravel()[pattern.source]
+        return full
+
+    def csc(self) -> csc_matrix:
+        """H as a full symmetric CSC matrix with sorted indices of its own."""
+        pattern = _hessian_pattern(self.stages, self.n)
+        return _csc(pattern, self.band.ravel(), self.size, self.size)
+
+    def dense_rows(self) -> Array:
+        """The general rows [F, G] as a (K rows, K n) array."""
+        full: Array = self.csc_rows().toarray()
+        return full
+
+    def csc_rows(self) -> csc_matrix:
+        """The general rows [F, G] as a (K rows, K n) CSC matrix with sorted indices."""
+        pattern = _rows_pattern(self.stages, self.n, self.rows)
+        numbers = np.concatenate((self.row_own.ravel(), self.row_next.ravel()))
+        return _csc(pattern, numbers, self.stages * self.rows, self.size)
+
+    def hessian_times(self, d: Array) -> Array:
+        """H d for d of shape (K, n)."""
+        from scipy.linalg.blas import dsbmv
+
+        product: Array = dsbmv(
+            2 * self.n - 1, 1.0, self.lapack_band, np.ravel(d), lower=1
+        )
+        return product.reshape(self.stages, self.n)
+
+    def rows_times(self, d: Array) -> Array:
+        """F_k d_k + G_k d_{k+1} for d of shape (K, n); shape (K, rows)."""
+        value: Array = np.matmul(self.row_own, d[:, :, None])[:, :, 0]
+        value[:-1] += np.matmul(self.row_next[:-1], d[1:, :, None])[:, :, 0]
+        return value
+
+    def rows_transposed_times(self, y: Array) -> Array:
+        """The adjoint of `rows_times`: (K, rows) to (K, n)."""
+        value: Array = np.matmul(y[:, None, :], self.row_own)[:, 0]
+        value[1:] += np.matmul(y[:-1, None, :], self.row_next[:-1])[:, 0]
+        return value
+
+    def objective(self, d: Array) -> float:
+        """The value of the objective at d, of shape (K, n)."""
+        return float(np.vdot(d, 0.5 * self.hessian_times(d) + self.gradient))
+
+    def violation(self, d: Array) -> float:
+        """The largest amount by which d, of shape (K, n), misses a bound or a row."""
+        worst = 0.0
+        if self.bounded:
+            worst = max(worst, float((self.lower - d).max()), float((d - self.upper).max()))
+        if self.rows:
+            value = self.rows_times(d)
+            worst = max(
+                worst, float((self.row_lower - value).max()), float((value - self.row_upper).max())
+            )
+        return worst
+
+    def finite(self) -> bool:
+        """Whether H, g and the rows are free of NaN and infinities, and no bound is NaN."""
+        return bool(
+            np.isfinite(self.gradient).all()
+            and np.isfinite(self.band).all()
+            and np.isfinite(self.row_own).all()
+            and np.isfinite(self.row_next).all()
+            and not np.isnan(self.lower).any()
+            and not np.isnan(self.upper).any()
+            and not np.isnan(self.row_lower).any()
+            and not np.isnan(self.row_upper).any()
+        )

@@ -1,0 +1,213 @@
+"""The backends that there are, what they can do, and the door through which users add theirs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib import metadata
+from importlib.util import find_spec
+
+from .errors import BackendError
+from .options import SolverOptions
+from .solver import Solver
+
+__all__ = ["Backend", "available", "backend", "backends", "create", "register", "unregister"]
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One QP backend and its capabilities.
+
+    Parameters
+    ----------
+    name : str
+        The name that users write.
+    factory : callable
+        ``factory(options)`` makes a `Solver`. Called only if the backend is available.
+    method : str
+        The kind of algorithm, in a word or two.
+    module : str or None
+        The module whose presence makes it available; None if nothing more is needed.
+    distribution : str or None
+        What ``pip install`` calls that module.
+    matrices : str
+        The view of the QP that it reads: ``banded``, ``csc`` or ``dense``.
+    inequalities : bool
+        Whether it handles bounds and rows.
+    iteration_cap : bool
+        Whether ``SolverOptions.max_iterations`` is honoured.
+    iterate_at_cap : bool
+        Whether there is an iterate to judge when the cap stops it.
+    warm_start : bool
+        Whether the start given to ``solve`` is used.
+    time_limit : bool
+        Whether ``SolverOptions.time_limit`` is honoured.
+    """
+
+    name: str
+    factory: Callable[[SolverOptions], Solver]
+    method: str
+    module: str | None = None
+    distribution: str | None = None
+    matrices: str = "dense"
+    inequalities: bool = True
+    iteration_cap: bool = False
+    iterate_at_cap: bool = False
+    warm_start: bool = False
+    time_limit: bool = False
+
+    @property
+    def available(self) -> bool:
+        """Whether its module can be found; nothing is imported to find out."""
+        return self.module is None or find_spec(self.module) is not None
+
+    @property
+    def version(self) -> str:
+        """The installed version, or an empty string."""
+        try:
+            return metadata.version(self.distribution) if self.distribution else ""
+        except metadata.PackageNotFoundError:
+            return ""
+
+
+_REGISTRY: dict[str, Backend] = {}
+
+
+def register(entry: Backend) -> None:
+    """Add a backend, so that its name can be used wherever a backend is named.
+
+    Parameters
+    ----------
+    entry : Backend
+        Its name must be new.
+
+    Raises
+    ------
+    BackendError
+        If the name is taken.
+    """
+    if entry.name in _REGISTRY:
+        raise BackendError(
+            f"backend {entry.name!r} is registered already; choose another name or "
+            "unregister it first."
+        )
+    _REGISTRY[entry.name] = entry
+
+
+def unregister(name: str) -> None:
+    """Take a backend off the list.
+
+    Parameters
+    ----------
+    name : str
+        A registered name.
+
+    Raises
+    ------
+    BackendError
+        If there is none of that name.
+    """
+    backend(name)
+    del _REGISTRY[name]
+
+
+def backends() -> tuple[Backend, ...]:
+    """All registered backends, installed or not, in order of registration."""
+    return tuple(_REGISTRY.values())
+
+
+def available() -> tuple[str, ...]:
+    """Names of the backends that can be used here."""
+    return tuple(name for name, entry in _REGISTRY.items() if entry.available)
+
+
+def backend(name: str) -> Backend:
+    """Look up a registered backend.
+
+    Parameters
+    ----------
+    name : str
+        A registered name.
+
+    Raises
+    ------
+    BackendError
+        If there is none of that name; the text lists the names there are.
+    """
+    entry = _REGISTRY.get(name) if isinstance(name, str) else None
+    if entry is None:
+        raise BackendError(
+            f"backend {name!r} is not known; expected one of {', '.join(_REGISTRY)}."
+        )
+    return entry
+
+
+def create(name: str, options: SolverOptions | None = None) -> Solver:
+    """Make a solver.
+
+    Parameters
+    ----------
+    name : str
+        A registered name.
+    options : SolverOptions, optional
+        Limits and accuracy; the defaults if left out.
+
+    Raises
+    ------
+    BackendError
+        If the name is unknown, or its package is not installed.
+    """
+    entry = backend(name)
+    if not entry.available:
+        raise BackendError(
+            f"backend {name!r} needs the package {entry.distribution}, which is not installed; "
+            f"pip install {entry.distribution}, or use one of {', '.join(available())}."
+        )
+    return entry.factory(options if options is not None else SolverOptions())
+
+
+def _register_own() -> None:
+    from .auto import AutoSolver
+    from .banded import BandedSolver
+    from .dispatch import TRANSLATIONS, DispatchSolver
+
+    register(
+        Backend(
+            "auto", AutoSolver, "banded, then a QP solver", matrices="banded",
+            iteration_cap=True, iterate_at_cap=True, warm_start=True, time_limit=True,
+        )
+    )
+    register(
+        Backend(
+            "banded", BandedSolver, "banded Cholesky", matrices="banded", inequalities=False
+        )
+    )
+    methods = {
+        "clarabel": ("interior point", "clarabel", "clarabel"),
+        "cvxopt": ("interior point", "cvxopt", "cvxopt"),
+        "daqp": ("dual active set", "daqp", "daqp"),
+        "ecos": ("interior point", "ecos", "ecos"),
+        "highs": ("active set", "highspy", "highspy"),
+        "osqp": ("ADMM", "osqp", "osqp"),
+        "piqp": ("interior point", "piqp", "piqp"),
+        "proxqp": ("augmented Lagrangian", "proxsuite", "proxsuite"),
+        "qpalm": ("augmented Lagrangian", "qpalm", "qpalm"),
+        "quadprog": ("dual active set", "quadprog", "quadprog"),
+        "scs": ("ADMM", "scs", "scs"),
+    }
+    for name, (method, module, distribution) in methods.items():
+        how = TRANSLATIONS[name]
+        register(
+            Backend(
+                name, partial(DispatchSolver, name), method, module, distribution,
+                matrices=how.matrices,
+                iteration_cap=how.cap is not None,
+                iterate_at_cap=how.cap is not None and name != "daqp",
+                warm_start=how.start,
+                time_limit=how.time_limit is not None,
+            )
+        )
+
+
+_register_own()
