@@ -32,6 +32,8 @@ class Status(enum.Flag):
     NO_DECREASE = enum.auto()
     #: A QP solver brought back no usable iterate.
     SOLVER_FAILED = enum.auto()
+    #: A QP solver stopped at its cap, or its claim was not confirmed; its iterate was judged.
+    SOLVER_STOPPED = enum.auto()
     #: A model function raised or was not finite.
     MODEL_FAILED = enum.auto()
     #: Components of the newest measurement are missing or not finite; they were left out.
@@ -55,6 +57,10 @@ _TEXTS = {
     ),
     Status.SOLVER_FAILED: (
         "The QP solver brought back no usable iterate; see the estimate's message."
+    ),
+    Status.SOLVER_STOPPED: (
+        "A QP was not solved to tolerance, and its iterate was judged all the same; raise "
+        "max_solver_iterations if the cost is too far from the converged one."
     ),
     Status.MODEL_FAILED: (
         "A model function raised or was not finite; bound the states, or make the model "

@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 # that is worth taking.
 _LENGTHS = (0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)
 
+# A decrease of J by less than this share is rounding, and no improvement.
+_ROUNDING = 1e-12
+
 _NONE = Status(0)
 
 
@@ -118,14 +121,17 @@ class Optimizer:
         trial = self._trial(problem, best, step)
         enough = self._tolerance * (best.cost + self._tolerance)
         solved = solution.status is SolveStatus.SOLVED
-        if not trial.cost < best.cost:
+        if not solved:
+            outcome.events |= Status.SOLVER_STOPPED
+        target = best.cost - _ROUNDING * best.cost if best.cost < np.inf else np.inf
+        if not trial.cost < target:
             # Near a minimum J cannot be lowered beyond its rounding: not a failure.
             if solved and abs(float(np.vdot(qp.gradient, step))) <= enough:
                 outcome.events |= Status.CONVERGED
                 return False
             for length in _LENGTHS:
                 trial = self._trial(problem, best, length * step)
-                if trial.cost < best.cost:
+                if trial.cost < target:
                     break
             else:
                 outcome.events |= Status.NO_DECREASE

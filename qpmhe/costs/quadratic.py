@@ -98,7 +98,9 @@ class QuadraticCost:
             If a covariance is not square, symmetric and positive definite.
         """
         return cls(
-            prior=prior if isinstance(prior, ObserverPrior) else _inverse("prior covariance", prior),
+            prior=(
+                prior if isinstance(prior, ObserverPrior) else _inverse("prior covariance", prior)
+            ),
             disturbance=_inverse("disturbance covariance", disturbance),
             noise=_inverse("noise covariance", noise),
         )

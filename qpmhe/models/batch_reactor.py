@@ -12,7 +12,7 @@ from ..observers import Luenberger
 from ..system import System
 from .scenario import Scenario
 
-__all__ = ["BatchReactor", "batch_reactor"]
+__all__ = ["BatchReactor", "batch_reactor", "casadi_output", "casadi_rate"]
 
 Array = NDArray[Any]
 
@@ -54,6 +54,19 @@ def _output(x: Array) -> Array:
 
 def _output_jacobian(x: Array) -> Array:
     return np.ones((*x.shape[:-1], 1, 2))
+
+
+def casadi_rate(x: Any) -> Any:
+    """The same right-hand side of (ex:eq:sys) for a CasADi column."""
+    import casadi
+
+    reaction = _K1 * x[0] ** 2 - _K2 * x[1]
+    return casadi.vertcat(-2.0 * reaction, reaction)
+
+
+def casadi_output(x: Any) -> Any:
+    """The same output for a CasADi column."""
+    return x[0] + x[1]
 
 
 def batch_reactor(method: str = "euler") -> BatchReactor:

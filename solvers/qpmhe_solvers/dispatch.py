@@ -36,7 +36,7 @@ class Translation:
     start : bool
         Whether a primal start is used by the solver and does it good.
     needs_row : bool
-        Whether a QP without any constraint goes wrong, so that a void row is added.
+        Whether a QP without any inequality row goes wrong, so that a void row is added.
     """
 
     matrices: Literal["csc", "dense"]
@@ -52,7 +52,7 @@ class Translation:
 # Caps, tolerances and traps as measured (qpsolvers 4.13). cvxopt is harmed by its start; the
 # IPMs and quadprog ignore it; clarabel and scs hand a QP without rows to a least-squares
 # routine that calls it unbounded; ecos and cvxopt choke on infinite bounds, and ecos on a
-# relative tolerance of 0.
+# relative tolerance of 0. highs without rows claims to be optimal far from the optimum.
 TRANSLATIONS: Mapping[str, Translation] = {
     "clarabel": Translation(
         "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"), ("tol_gap_rel",), "time_limit",
@@ -69,6 +69,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
     "highs": Translation(
         "csc", "box", "qp_iteration_limit",
         ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), time_limit="time_limit",
+        needs_row=True,
     ),
     "osqp": Translation(
         "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", start=True
@@ -151,7 +152,7 @@ class _Constraints:
             blocks += [_unit_rows(self._up, qp.size), -_unit_rows(self._low, qp.size)]
             sides += [upper[self._up], -lower[self._low]]
         side = np.concatenate([*sides, np.empty(0)])
-        if how.needs_row and side.size == 0 and self.box[0] is None:
+        if how.needs_row and side.size == 0:
             blocks, side = [_void_row(qp.size)], np.ones(1)
         self.inequalities: tuple[Any, Array | None] = (None, None)
         if side.size:

@@ -174,7 +174,7 @@ def _register_own() -> None:
 
     register(
         Backend(
-            "auto", AutoSolver, "banded, then a QP solver", matrices="banded",
+            "auto", AutoSolver, "banded, then a QP", matrices="banded",
             iteration_cap=True, iterate_at_cap=True, warm_start=True, time_limit=True,
         )
     )

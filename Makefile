@@ -1,0 +1,41 @@
+# Every target sets up what it needs: git, python3 with pip and venv, and make are enough.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+ARGS ?=
+
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: reproduce test lint types examples wheel clean
+
+# One stamp for each set of extras, renewed when the project's requirements change.
+$(VENV)/.%: pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable ".[$*]"
+	touch $@
+
+reproduce: $(VENV)/.solvers
+	$(BIN)/qpmhe reproduce $(ARGS)
+
+test: $(VENV)/.test
+	$(BIN)/python -m pytest --numprocesses auto $(ARGS)
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+
+types: $(VENV)/.dev
+	$(BIN)/mypy
+
+examples: $(VENV)/.test
+	$(BIN)/python examples/quickstart.py
+	$(BIN)/python examples/paper_figure.py --out results
+	$(BIN)/python examples/benchmarks/step_time.py --steps 60
+	if [ -d "$(DATA)" ]; then $(BIN)/python examples/battery_soc.py --data "$(DATA)" --out results; \
+	else echo "no battery data at '$(DATA)': battery example left out"; fi
+
+wheel: $(VENV)/.dev
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+
+clean:
+	rm -rf $(VENV) dist results .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,155 @@
+"""The paper's own tool beside ours: CasADi with Ipopt, terminated after i iterations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..costs import ObserverPrior, QuadraticCost
+from ..errors import InvalidInputError
+from ..estimate import Estimate, Status
+from ..observers import Observer
+from ..problem import Problem
+from ..system import System
+from ..window import Window
+
+__all__ = ["IpoptEstimator"]
+
+Array = NDArray[np.float64]
+
+
+class IpoptEstimator:
+    r"""The estimator of Definition def:estimator with Ipopt on the nonlinear program.
+
+    The program is (eq:optiMHE) in multiple shooting: states and disturbances are variables,
+    the dynamics are equality constraints. It is built once for each window length and
+    started at the candidate. An iterate is judged as everywhere else in this package: by
+    its state trajectory, the true cost and the true constraints, against the candidate.
+
+    Parameters
+    ----------
+    system, observer, cost, horizon, initial_state
+        As for `qpmhe.MovingHorizonEstimator`; the system without inputs, the prior weight
+        constant.
+    f, h : callable
+        The same model for CasADi: a symbolic column (n) to (n) and (p).
+    max_iterations : int or None
+        Ipopt's iterations per sample; None goes to convergence.
+    tolerance : float
+        Ipopt's ``tol``.
+
+    Raises
+    ------
+    InvalidInputError
+        If CasADi is not installed, or the problem is not of the stated kind.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        observer: Observer,
+        cost: QuadraticCost,
+        *,
+        f: Callable[[Any], Any],
+        h: Callable[[Any], Any],
+        horizon: int,
+        initial_state: Array,
+        max_iterations: int | None = None,
+        tolerance: float = 1e-8,
+    ) -> None:
+        try:
+            import casadi
+        except ImportError as error:
+            raise InvalidInputError(
+                "Ipopt comes with CasADi, which is not installed; pip install 'qpmhe[casadi]'."
+            ) from error
+        if system.m or isinstance(cost.prior, ObserverPrior):
+            raise InvalidInputError(
+                "the comparison with Ipopt takes systems without inputs and constant prior weights."
+            )
+        self._casadi = casadi
+        self._system, self._cost, self._f, self._h = system, cost, f, h
+        self._prior = cost.prior
+        self._window = Window(system, observer, cost, horizon, initial_state, False)
+        self._problem = Problem(system, cost)
+        self._options: dict[str, Any] = {
+            "print_time": False,
+            "ipopt.print_level": 0,
+            "ipopt.sb": "yes",
+            "ipopt.tol": tolerance,
+        }
+        if max_iterations is not None:
+            self._options["ipopt.max_iter"] = max_iterations
+        self._programs: dict[int, tuple[Any, Array, Array]] = {}
+
+    def update(self, y: Array) -> Estimate:
+        """Take y(t) in and estimate x(t+1); as `qpmhe.MovingHorizonEstimator.update`."""
+        began = perf_counter()
+        window, problem, n = self._window, self._problem, self._system.n
+        window.push(y, np.zeros(0))
+        problem.bind(window)
+        count = window.length
+        solve, lower, upper = self._programs.get(count) or self._build(count)
+        candidate = problem.candidate(window)
+        start = np.concatenate(
+            (candidate.trajectory.ravel(), candidate.residuals[:, :n].ravel())
+        )
+        parameters = np.concatenate((problem.prior, problem.measurements.ravel()))
+        solving = perf_counter()
+        answer = solve(x0=start, p=parameters, lbg=0.0, ubg=0.0, lbx=lower, ubx=upper)
+        solve_time = perf_counter() - solving
+        states = np.array(answer["x"]).ravel()[: (count + 1) * n].reshape(count + 1, n)
+        trial = problem.evaluate(states)
+        improved = math.isfinite(trial.cost) and trial.cost < candidate.cost * (1 - 1e-12)
+        best = trial if improved else candidate
+        estimate = Estimate(
+            window.time - 1,
+            best.trajectory.copy(),
+            best.residuals.copy(),
+            best.cost,
+            window.candidate.copy(),
+            candidate.cost,
+            Status.IMPROVED if improved else Status.CANDIDATE,
+            str(solve.stats()["return_status"]),
+            0,
+            int(solve.stats()["iter_count"]),
+            solve_time,
+        )
+        estimate.step_time = perf_counter() - began
+        return estimate
+
+    def _build(self, count: int) -> tuple[Any, Array, Array]:
+        ca, n, p = self._casadi, self._system.n, self._system.p
+        states = ca.SX.sym("x", n, count + 1)
+        disturbances = ca.SX.sym("w", n, count)
+        prior, measured = ca.SX.sym("prior", n), ca.SX.sym("y", p, count)
+        offset = states[:, 0] - prior
+        objective = offset.T @ self._prior @ offset
+        defects = []
+        for i in range(count):
+            w, v = disturbances[:, i], measured[:, i] - self._h(states[:, i])
+            objective += w.T @ self._cost.disturbance @ w + v.T @ self._cost.noise @ v
+            defects.append(states[:, i + 1] - self._f(states[:, i]) - w)
+        program = {
+            "x": ca.veccat(states, disturbances),
+            "p": ca.veccat(prior, measured),
+            "f": objective,
+            "g": ca.vertcat(*defects),
+        }
+        solve = ca.nlpsol("mhe", "ipopt", program, self._options)
+        boxes = (self._system.states, self._system.disturbances)
+        lower = np.concatenate([
+            np.tile(box.lower if box else np.full(n, -np.inf), length)
+            for box, length in zip(boxes, (count + 1, count), strict=True)
+        ])
+        upper = np.concatenate([
+            np.tile(box.upper if box else np.full(n, np.inf), length)
+            for box, length in zip(boxes, (count + 1, count), strict=True)
+        ])
+        self._programs[count] = solve, lower, upper
+        return self._programs[count]
