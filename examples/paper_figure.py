@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+
 import qpmhe
 from qpmhe.plots import save, trajectories
 

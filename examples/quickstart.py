@@ -1,6 +1,7 @@
 """Estimate the angle and speed of a damped pendulum from noisy angles."""
 
 import numpy as np
+
 import qpmhe
 
 DT = 0.05

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -56,6 +57,11 @@ def discretize(
     return _rk4(rate, jacobian, dt)
 
 
+@lru_cache(maxsize=64)
+def _identity(n: int) -> Array:
+    return np.eye(n)
+
+
 def _euler(rate: Function, jacobian: Function | None, dt: float) -> _Steps:
     def step(x: Array, *u: Array) -> Array:
         value: Array = x + dt * rate(x, *u)
@@ -67,7 +73,7 @@ def _euler(rate: Function, jacobian: Function | None, dt: float) -> _Steps:
 
     def step_jacobian(x: Array, *u: Array) -> Array:
         value: Array = dt * rate_jacobian(x, *u)
-        value += np.eye(x.shape[-1])
+        value += _identity(x.shape[-1])
         return value
 
     return step, step_jacobian
@@ -87,7 +93,7 @@ def _rk4(rate: Function, jacobian: Function | None, dt: float) -> _Steps:
     rate_jacobian = jacobian
 
     def step_jacobian(x: Array, *u: Array) -> Array:
-        eye = np.eye(x.shape[-1])
+        eye = _identity(x.shape[-1])
         k1 = rate(x, *u)
         j1 = rate_jacobian(x, *u)
         x2 = x + 0.5 * dt * k1

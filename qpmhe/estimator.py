@@ -134,7 +134,7 @@ class MovingHorizonEstimator:
             ),
         )
         self._linearized = qps > 0
-        self._subproblem = Subproblem(system, self.horizon)
+        self._subproblem = Subproblem(system, cost, self.horizon)
         self._problem = Problem(system, cost)
         self._optimizer = Optimizer(
             self._subproblem, solver, qps, positive("tolerance", tolerance)

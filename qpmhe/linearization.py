@@ -33,7 +33,10 @@ class StageTerms:
         Numbers of states and outputs.
     """
 
-    __slots__ = ("_flat", "_index", "_n", "_weighted", "following", "jacobian", "own", "panel")
+    __slots__ = (
+        "_below", "_flat", "_index", "_n", "_square", "_weighted",
+        "following", "jacobian", "own", "panel",
+    )
 
     def __init__(self, stages: int, n: int, p: int) -> None:
         self._n = n
@@ -44,17 +47,18 @@ class StageTerms:
         self._index = band_index(n)
         self._weighted = np.empty((n + p, n))
         self._flat = np.zeros(2 * n * n + 1)
+        self._square = self._flat[: n * n].reshape(n, n)
+        self._below = self._flat[n * n : -1].reshape(n, n)
 
     def set_stage(self, k: int, weight: Array, residual: Array, weighted_residual: Array) -> None:
         """Compute the terms of stage k from its Jacobian, which is in place already."""
-        n, weighted, flat = self._n, self._weighted, self._flat
+        n, weighted = self._n, self._weighted
         jacobian = self.jacobian[k]
         np.dot(weight, jacobian, out=weighted)
-        square = n * n
-        np.dot(jacobian.T, weighted, out=flat[:square].reshape(n, n))
-        np.negative(weighted[:n], out=flat[square:-1].reshape(n, n))
-        flat.take(self._index, out=self.panel[k].reshape(-1), mode="clip")
-        np.negative(residual @ weighted, out=self.own[k])
+        np.dot(jacobian.T, weighted, out=self._square)
+        np.negative(weighted[:n], out=self._below)
+        self._flat.take(self._index, out=self.panel[k], mode="clip")
+        np.negative(residual.dot(weighted), out=self.own[k])
         self.following[k] = weighted_residual[:n]
 
     def set_all(self, weight: Array, residuals: Array, weighted_residuals: Array) -> None:
@@ -69,7 +73,7 @@ class StageTerms:
         flat[:, : n * n] = np.matmul(jacobian.transpose(0, 2, 1), weighted).reshape(count, -1)
         np.negative(weighted[:, :n].reshape(count, -1), out=flat[:, n * n : -1])
         panel = self.panel[:count].reshape(count, -1)
-        flat.take(self._index, axis=1, out=panel, mode="clip")
+        flat.take(self._index.ravel(), axis=1, out=panel, mode="clip")
         np.negative(np.matmul(residuals[:, None, :], weighted)[:, 0], out=self.own[:count])
         self.following[:count] = weighted_residuals[:, :n]
 

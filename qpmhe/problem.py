@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from qpmhe_solvers.qp import band_of
+
 from .costs import ObserverPrior, QuadraticCost
 from .sets import Box
 from .system import System
@@ -69,6 +71,7 @@ class Problem:
         self.prior_weight: Array = (
             np.eye(system.n) if isinstance(cost.prior, ObserverPrior) else cost.prior
         )
+        self.prior_band: Array = band_of(self.prior_weight)
         self.prior: Array = np.zeros(system.n)
         self.inputs: Array = np.zeros((0, system.m))
         self.measurements: Array = np.zeros((0, system.p))
@@ -93,6 +96,7 @@ class Problem:
         covariance = window.prior_covariance
         if self._prior_rule is not None and covariance is not None:
             self.prior_weight = self._prior_rule.weight(covariance)
+            self.prior_band = band_of(self.prior_weight)
         return bool(self._sets) and self._drop_violated(window)
 
     def _drop_violated(self, window: Window) -> bool:

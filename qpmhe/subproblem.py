@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers import QP
+from qpmhe_solvers.qp import band_of
 
+from .costs import QuadraticCost
 from .linearization import StageTerms
 from .problem import Problem, Trial
 from .sets import Box
@@ -33,14 +35,17 @@ class Subproblem:
     ----------
     system : System
         Dimensions, Jacobians and sets.
+    cost : QuadraticCost
+        The weights.
     horizon : int
         The longest window, N.
     """
 
-    def __init__(self, system: System, horizon: int) -> None:
+    def __init__(self, system: System, cost: QuadraticCost, horizon: int) -> None:
         self._system = system
         self._n = n = system.n
         self._terms = StageTerms(horizon, n, system.p)
+        self._disturbance_band = band_of(cost.disturbance)
         self._bounded_w = _bounded(system.disturbances)
         self._bounded_v = _bounded(system.noises)
         self._rows = self._bounded_w.size + self._bounded_v.size
@@ -74,14 +79,14 @@ class Subproblem:
         last, band, gradient = first + count, qp.band, qp.gradient
         weight = problem.stage_weights
         if weight.ndim == 2:
-            disturbance_band: Array = _band(weight[:n, :n])
+            disturbance_band = self._disturbance_band
             band[count] = disturbance_band
         else:
-            disturbance_band = np.array([_band(w[:n, :n]) for w in weight])
+            disturbance_band = np.array([band_of(w[:n, :n]) for w in weight])
             band[count] = disturbance_band[-1]
             disturbance_band = disturbance_band[:-1]
         np.add(terms.panel[first + 1 : last], disturbance_band, out=band[1:count])
-        np.add(terms.panel[first], _band(problem.prior_weight), out=band[0])
+        np.add(terms.panel[first], problem.prior_band, out=band[0])
         np.add(terms.own[first + 1 : last], terms.following[first : last - 1],
                out=gradient[1:count])
         offset = trial.trajectory[0] - problem.prior
@@ -123,12 +128,3 @@ def _bounded(box: Box | None) -> NDArray[np.intp]:
     if box is None:
         return np.empty(0, dtype=np.intp)
     return np.flatnonzero(np.isfinite(box.lower) | np.isfinite(box.upper))
-
-
-def _band(weight: Array) -> Array:
-    """The band panel (n, 2n) of a symmetric block without a coupling block."""
-    n = weight.shape[0]
-    panel = np.zeros((n, 2 * n))
-    for column in range(n):
-        panel[column, : n - column] = weight[column:, column]
-    return panel

@@ -151,7 +151,14 @@ class System:
         return {"f": self.f_jacobian.method, "h": self.h_jacobian.method}
 
     def check(self, x: Array, u: Array) -> None:
-        """Insist that f and h are finite, of the right shapes, at the state x (n,).
+        """Insist that f and h are finite, of the right shapes, at a state.
+
+        Parameters
+        ----------
+        x : (n,) array
+            The state.
+        u : (m,) array
+            The input.
 
         Raises
         ------

@@ -145,17 +145,18 @@ class Window:
             if posterior is None or not np.isfinite(posterior).all():
                 return math.inf
             self._covariance[k + 1] = posterior
-        if not math.isfinite(following @ following):
+        if not math.isfinite(following.dot(following)):
             return math.inf
-        cost = float(residual @ weight @ residual)
+        cost = float(residual.dot(weight).dot(residual))
         return cost if math.isfinite(cost) else math.inf
 
     def _linearize(self, k: int, weight: Array) -> bool:
         residual = self._residuals[k]
-        linear = math.isfinite(float(self._terms.jacobian[k].sum()))
+        flat = self._terms.jacobian[k].reshape(-1)
+        linear = math.isfinite(flat.dot(flat))
         if not linear:
             self._terms.jacobian[k] = np.eye(*self._terms.jacobian[k].shape)
-        self._terms.set_stage(k, weight, residual, weight @ residual)
+        self._terms.set_stage(k, weight, residual, weight.dot(residual))
         return linear
 
     def _hold(self, k: int) -> None:

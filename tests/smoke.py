@@ -4,6 +4,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+
 import qpmhe
 import qpmhe_solvers
 

@@ -10,10 +10,11 @@ import platform
 from importlib.metadata import version
 
 import numpy as np
-import qpmhe
-from qpmhe.studies import IpoptComparison, PaperStudy
 from rich.console import Console
 from rich.table import Table
+
+import qpmhe
+from qpmhe.studies import IpoptComparison, PaperStudy
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--steps", type=int, default=150, help="samples of each record")

@@ -115,7 +115,13 @@ class QuadraticCost:
         return CostConstants(2.0, prior, _extremes(self.disturbance), _extremes(self.noise))
 
     def partial_weight(self, observed: NDArray[np.bool_]) -> Array:
-        """The stage weight where only some components of y are there; zero on the others."""
+        """The stage weight where only some components of y are there; zero on the others.
+
+        Parameters
+        ----------
+        observed : (p,) bool array
+            Which components are there.
+        """
         key = observed.tobytes()
         if key not in self._partial:
             weight = self.stage_weight.copy()

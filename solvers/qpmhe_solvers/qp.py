@@ -14,7 +14,7 @@ from .errors import ShapeError
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
-__all__ = ["QP", "band_index"]
+__all__ = ["QP", "band_index", "band_of"]
 
 Array = NDArray[np.float64]
 
@@ -26,12 +26,21 @@ def band_index(n: int) -> NDArray[np.intp]:
     The Hessian's columns of stage k hold, on and below the diagonal, the block
     ``[D; E]`` of shape (2n, n) (its own block and the one that couples to stage k+1).
     ``panel[c, o] = [D; E][c + o, c]`` for ``c + o < 2n`` and 0 beyond. The index points
-    into the flat block followed by one zero, so that one ``take`` fills a panel.
+    into the flat block followed by one zero, so that one ``take`` fills a panel (n, 2n).
     """
     column, offset = np.meshgrid(np.arange(n), np.arange(2 * n), indexing="ij")
     row = column + offset
-    index: NDArray[np.intp] = np.where(row < 2 * n, row * n + column, 2 * n * n).ravel()
+    index: NDArray[np.intp] = np.where(row < 2 * n, row * n + column, 2 * n * n)
     return index
+
+
+def band_of(block: Array) -> Array:
+    """The band panel (n, 2n) of a symmetric diagonal block that couples to nothing."""
+    n = block.shape[0]
+    panel = np.zeros((n, 2 * n))
+    for column in range(n):
+        panel[column, : n - column] = block[column:, column]
+    return panel
 
 
 @dataclass(frozen=True)
@@ -192,7 +201,13 @@ class QP:
         return _csc(pattern, numbers, self.stages * self.rows, self.size)
 
     def hessian_times(self, d: Array) -> Array:
-        """H d for d of shape (K, n)."""
+        """H d.
+
+        Parameters
+        ----------
+        d : (K, n) array
+            Increments.
+        """
         from scipy.linalg.blas import dsbmv
 
         product: Array = dsbmv(
@@ -201,23 +216,47 @@ class QP:
         return product.reshape(self.stages, self.n)
 
     def rows_times(self, d: Array) -> Array:
-        """F_k d_k + G_k d_{k+1} for d of shape (K, n); shape (K, rows)."""
+        """F_k d_k + G_k d_{k+1}, of shape (K, rows).
+
+        Parameters
+        ----------
+        d : (K, n) array
+            Increments.
+        """
         value: Array = np.matmul(self.row_own, d[:, :, None])[:, :, 0]
         value[:-1] += np.matmul(self.row_next[:-1], d[1:, :, None])[:, :, 0]
         return value
 
     def rows_transposed_times(self, y: Array) -> Array:
-        """The adjoint of `rows_times`: (K, rows) to (K, n)."""
+        """The adjoint of `rows_times`, of shape (K, n).
+
+        Parameters
+        ----------
+        y : (K, rows) array
+            Multipliers of the rows.
+        """
         value: Array = np.matmul(y[:, None, :], self.row_own)[:, 0]
         value[1:] += np.matmul(y[:-1, None, :], self.row_next[:-1])[:, 0]
         return value
 
     def objective(self, d: Array) -> float:
-        """The value of the objective at d, of shape (K, n)."""
+        """The value of the objective.
+
+        Parameters
+        ----------
+        d : (K, n) array
+            Increments.
+        """
         return float(np.vdot(d, 0.5 * self.hessian_times(d) + self.gradient))
 
     def violation(self, d: Array) -> float:
-        """The largest amount by which d, of shape (K, n), misses a bound or a row."""
+        """The largest amount by which a bound or a row is missed.
+
+        Parameters
+        ----------
+        d : (K, n) array
+            Increments.
+        """
         worst = 0.0
         if self.bounded:
             worst = max(worst, float((self.lower - d).max()), float((d - self.upper).max()))

@@ -86,7 +86,17 @@ class Residuals:
 
     @staticmethod
     def of(qp: QP, d: Array, bound_duals: Array | None, row_duals: Array | None) -> Residuals:
-        """Recompute the residuals of d, of shape (K, n), and its multipliers."""
+        """Recompute the residuals of an iterate.
+
+        Parameters
+        ----------
+        qp : QP
+            The problem.
+        d : (K, n) array
+            The iterate.
+        bound_duals, row_duals : array or None
+            Its multipliers, as in `RawSolution`.
+        """
         primal = qp.violation(d)
         if bound_duals is None or row_duals is None:
             return Residuals(primal, float("nan"), float("nan"))

@@ -1,0 +1,51 @@
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+import qpmhe
+import qpmhe_solvers
+
+HEAVY = (
+    "casadi", "clarabel", "cvxpy", "matplotlib", "osqp", "proxsuite", "qpsolvers", "rich", "typer"
+)
+
+
+def test_import_loads_no_solver_and_no_plotting():
+    code = f"import sys, qpmhe; print([m for m in {HEAVY!r} if m in sys.modules])"
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert answer.stdout.strip() == "[]"
+
+
+def public_classes_and_functions():
+    for module in (qpmhe, qpmhe_solvers, qpmhe.models, qpmhe.errors):
+        for name in module.__all__:
+            thing = getattr(module, name)
+            if inspect.isclass(thing) or inspect.isfunction(thing):
+                yield pytest.param(thing, id=f"{module.__name__}.{name}")
+
+
+@pytest.mark.parametrize("thing", list(public_classes_and_functions()))
+def test_every_public_parameter_is_documented(thing):
+    text = inspect.getdoc(thing) or ""
+    assert text
+    if inspect.isclass(thing) and (issubclass(thing, Exception) or hasattr(thing, "__members__")):
+        return
+    callables = [(text, thing)]
+    if inspect.isclass(thing):
+        for name, member in vars(thing).items():
+            wrapped = isinstance(member, (classmethod, staticmethod))
+            function = member.__func__ if wrapped else member
+            if not name.startswith("_") and inspect.isfunction(function):
+                callables.append((inspect.getdoc(function) or "", function))
+    for documentation, function in callables:
+        if function in (qpmhe.Estimate, qpmhe_solvers.Solution):
+            continue  # made by the library; their attributes are documented instead
+        if " `qpmhe." in documentation or "see `" in documentation or "See `" in documentation:
+            continue  # refers to the contract that documents them
+        for parameter in list(inspect.signature(function).parameters):
+            if parameter not in ("self", "cls"):
+                assert parameter in documentation, f"{function.__qualname__}: {parameter}"
