@@ -1,30 +1,49 @@
 """Suboptimal moving horizon estimation by sequences of convex QPs, with a stability promise."""
 
 from . import errors, models, solvers
-from .costs import CostConstants, ObserverPrior, QuadraticCost
+from .costs import (
+    Cost,
+    CostConstants,
+    Huber,
+    Loss,
+    ObserverPrior,
+    Power,
+    Quadratic,
+    QuadraticCost,
+    RobustCost,
+)
 from .errors import QpmheError
 from .estimate import Estimate, Status
 from .estimator import MovingHorizonEstimator
-from .observers import ExtendedKalman, Luenberger, Observer, OutputInjection
+from .observers import ExtendedKalman, Luenberger, Observer, OutputInjection, Sample
 from .run import Run
-from .sets import Box
+from .sets import Box, ConvexSet, Polytope
 from .system import System
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Box",
+    "ConvexSet",
+    "Cost",
     "CostConstants",
     "Estimate",
     "ExtendedKalman",
+    "Huber",
+    "Loss",
     "Luenberger",
     "MovingHorizonEstimator",
     "Observer",
     "ObserverPrior",
     "OutputInjection",
+    "Polytope",
+    "Power",
     "QpmheError",
+    "Quadratic",
     "QuadraticCost",
+    "RobustCost",
     "Run",
+    "Sample",
     "Status",
     "System",
     "__version__",

@@ -39,6 +39,16 @@ def vector(name: str, value: ArrayLike, size: int, *, finite: bool = True) -> Ar
     return array
 
 
+def record(name: str, values: ArrayLike, width: int) -> Array:
+    """A float copy of a record (T, width); (T,) will do where width is 1."""
+    array = numbers(name, values, finite=False)
+    if array.ndim == 1 and width == 1:
+        array = array[:, None]
+    if array.ndim != 2 or array.shape[1] != width:
+        raise ShapeError(f"{name} has shape {array.shape}; expected (T, {width}), a row a sample.")
+    return array
+
+
 def positive_definite(name: str, value: ArrayLike, size: int | None = None) -> Array:
     """A symmetric positive definite float copy of value; a scalar will do where size is 1."""
     matrix = np.atleast_2d(numbers(name, value))

@@ -1,4 +1,4 @@
-"""Discretisation of an ordinary differential equation by one fixed step."""
+"""Discretisation of an ordinary differential equation by one step of given length."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from ._checks import positive
 from .errors import OptionError
 
 __all__ = ["METHODS", "Method", "discretize"]
@@ -17,12 +16,11 @@ __all__ = ["METHODS", "Method", "discretize"]
 Array = NDArray[Any]
 Function = Callable[..., Any]
 Method = Literal["euler", "rk4"]
-_Steps = tuple[Function, Function | None]
 METHODS: tuple[str, ...] = get_args(Method)
 
 
 def discretize(
-    rate: Function, jacobian: Function | None, dt: float, method: str
+    rate: Function, jacobian: Function | None, method: str
 ) -> tuple[Function, Function | None]:
     r"""Turn :math:`\dot x = f_c(x, u)` into :math:`x^+ = f(x, u)` with u held over the step.
 
@@ -32,29 +30,26 @@ def discretize(
         f_c(x) or f_c(x, u), vectorised over leading dimensions, (..., n).
     jacobian : callable or None
         Its derivative with respect to x, (..., n, n), same arguments.
-    dt : float
-        Step, in the time unit of the rate, > 0.
     method : {"euler", "rk4"}
         ``euler``: x + dt f_c(x, u). ``rk4``: the classical Runge-Kutta method of order 4.
 
     Returns
     -------
     step : callable
-        f(x, *u).
+        f(dt, x, *u), where dt is a number or an array (..., 1), in the time unit of the rate.
     step_jacobian : callable or None
         Its exact derivative with respect to x, where that of the rate is given.
 
     Raises
     ------
     OptionError
-        If the method is unknown or dt is not positive.
+        If the method is unknown.
     """
-    dt = positive("dt", dt)
     if method not in METHODS:
         raise OptionError(f"method is {method!r}; expected one of {', '.join(METHODS)}.")
     if method == "euler":
-        return _euler(rate, jacobian, dt)
-    return _rk4(rate, jacobian, dt)
+        return _euler(rate), jacobian and _euler_jacobian(jacobian)
+    return _rk4(rate), jacobian and _rk4_jacobian(rate, jacobian)
 
 
 @lru_cache(maxsize=64)
@@ -62,25 +57,30 @@ def _identity(n: int) -> Array:
     return np.eye(n)
 
 
-def _euler(rate: Function, jacobian: Function | None, dt: float) -> _Steps:
-    def step(x: Array, *u: Array) -> Array:
+def _of_matrices(dt: Any) -> Any:
+    """A step length that multiplies (..., n) made to multiply (..., n, n)."""
+    return dt[..., None] if isinstance(dt, np.ndarray) else dt
+
+
+def _euler(rate: Function) -> Function:
+    def step(dt: Any, x: Array, *u: Array) -> Array:
         value: Array = x + dt * rate(x, *u)
         return value
 
-    if jacobian is None:
-        return step, None
-    rate_jacobian = jacobian
+    return step
 
-    def step_jacobian(x: Array, *u: Array) -> Array:
-        value: Array = dt * rate_jacobian(x, *u)
+
+def _euler_jacobian(rate_jacobian: Function) -> Function:
+    def step_jacobian(dt: Any, x: Array, *u: Array) -> Array:
+        value: Array = _of_matrices(dt) * rate_jacobian(x, *u)
         value += _identity(x.shape[-1])
         return value
 
-    return step, step_jacobian
+    return step_jacobian
 
 
-def _rk4(rate: Function, jacobian: Function | None, dt: float) -> _Steps:
-    def step(x: Array, *u: Array) -> Array:
+def _rk4(rate: Function) -> Function:
+    def step(dt: Any, x: Array, *u: Array) -> Array:
         k1 = rate(x, *u)
         k2 = rate(x + 0.5 * dt * k1, *u)
         k3 = rate(x + 0.5 * dt * k2, *u)
@@ -88,22 +88,22 @@ def _rk4(rate: Function, jacobian: Function | None, dt: float) -> _Steps:
         value: Array = x + (dt / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
         return value
 
-    if jacobian is None:
-        return step, None
-    rate_jacobian = jacobian
+    return step
 
-    def step_jacobian(x: Array, *u: Array) -> Array:
-        eye = _identity(x.shape[-1])
+
+def _rk4_jacobian(rate: Function, rate_jacobian: Function) -> Function:
+    def step_jacobian(dt: Any, x: Array, *u: Array) -> Array:
+        eye, h = _identity(x.shape[-1]), _of_matrices(dt)
         k1 = rate(x, *u)
         j1 = rate_jacobian(x, *u)
         x2 = x + 0.5 * dt * k1
         k2 = rate(x2, *u)
-        j2 = rate_jacobian(x2, *u) @ (eye + 0.5 * dt * j1)
+        j2 = rate_jacobian(x2, *u) @ (eye + 0.5 * h * j1)
         x3 = x + 0.5 * dt * k2
         k3 = rate(x3, *u)
-        j3 = rate_jacobian(x3, *u) @ (eye + 0.5 * dt * j2)
-        j4 = rate_jacobian(x + dt * k3, *u) @ (eye + dt * j3)
-        value: Array = eye + (dt / 6.0) * (j1 + 2.0 * (j2 + j3) + j4)
+        j3 = rate_jacobian(x3, *u) @ (eye + 0.5 * h * j2)
+        j4 = rate_jacobian(x + dt * k3, *u) @ (eye + h * j3)
+        value: Array = eye + (h / 6.0) * (j1 + 2.0 * (j2 + j3) + j4)
         return value
 
-    return step, step_jacobian
+    return step_jacobian

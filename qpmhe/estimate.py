@@ -40,6 +40,12 @@ class Status(enum.Flag):
     MISSING = enum.auto()
     #: The candidate is outside of sets; these were left out in this step.
     SETS_DROPPED = enum.auto()
+    #: The candidate is outside of sets; the nearest trajectory inside took its place.
+    PROJECTED = enum.auto()
+    #: The candidate is outside of sets, and is the estimate as the policy "keep" demands.
+    CANDIDATE_OUTSIDE = enum.auto()
+    #: The time budget was spent; the best so far is the estimate.
+    TIME_UP = enum.auto()
 
     def explain(self) -> str:
         """What happened, and what can be done about it, in sentences."""
@@ -72,8 +78,17 @@ _TEXTS = {
     ),
     Status.SETS_DROPPED: (
         "The observer's candidate is outside of the sets, which were left out in this step; "
-        "widen them or take another observer."
+        "widen them, take another observer, or try outside='project'."
     ),
+    Status.PROJECTED: (
+        "The observer's candidate is outside of the sets; the nearest trajectory inside took "
+        "its place as the candidate, which the theorem does not cover."
+    ),
+    Status.CANDIDATE_OUTSIDE: (
+        "The observer's candidate is outside of the sets and was kept all the same; choose "
+        "outside='drop' or 'project' to improve on it."
+    ),
+    Status.TIME_UP: "The time budget was spent; the best trajectory so far is the estimate.",
 }
 
 
@@ -101,13 +116,17 @@ class Estimate:
     cost, candidate_cost : float
         True cost J of the estimate and of the observer's candidate; cost <= candidate_cost.
     candidate : (N_t + 1, n) array
-        The observer's trajectory.
+        The observer's trajectory, or its projection onto the sets.
+    delayed : (n,) array or None
+        Estimate of x(t+1-k) for the estimator's delay k; None until the window reaches it.
+    dropped : tuple of str
+        Names of the sets that were left out: "states", "disturbances", "noises".
     status : Status
         Outcome and events.
     message : str
         Words of the QP solver where it failed.
-    qps : int
-        QPs solved.
+    qps, corrections : int
+        QPs solved, and second-order corrections solved beside them.
     solver_iterations : int or None
         Sum of the solver's own iterations; None where it does not tell.
     step_time, solve_time : float
@@ -118,7 +137,10 @@ class Estimate:
         "_residuals",
         "candidate",
         "candidate_cost",
+        "corrections",
         "cost",
+        "delayed",
+        "dropped",
         "message",
         "qps",
         "solve_time",
@@ -143,6 +165,9 @@ class Estimate:
         qps: int,
         solver_iterations: int | None,
         solve_time: float,
+        corrections: int = 0,
+        dropped: tuple[str, ...] = (),
+        delay: int = 0,
     ) -> None:
         self.time = time
         self.trajectory = trajectory
@@ -152,6 +177,10 @@ class Estimate:
         self.candidate = candidate
         self.status, self.message = status, message
         self.qps, self.solver_iterations = qps, solver_iterations
+        self.corrections, self.dropped = corrections, dropped
+        self.delayed: Array | None = None
+        if delay < trajectory.shape[0]:
+            self.delayed = trajectory[trajectory.shape[0] - 1 - delay]
         self.solve_time, self.step_time = solve_time, float("nan")
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from time import perf_counter
 from typing import Any
 
@@ -10,14 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers import SolverOptions, create
 
-from ._checks import count, positive, vector
-from .costs import ObserverPrior, QuadraticCost
-from .errors import InvalidInputError, OptionError, ShapeError
+from ._checks import positive, positive_definite, record, vector
+from .costs import Cost, ObserverPrior
+from .covariance import window_covariances
+from .errors import InvalidInputError, ShapeError
 from .estimate import Estimate, Status
 from .observers import Observer
 from .optimizer import Optimizer
 from .problem import Problem
 from .run import Run
+from .settings import Settings
 from .subproblem import Subproblem
 from .system import System
 from .window import Window
@@ -25,9 +29,6 @@ from .window import Window
 __all__ = ["MovingHorizonEstimator"]
 
 Array = NDArray[np.float64]
-
-# With max_qps=None the sequence ends by convergence; this bounds it where that fails.
-_SAFETY_LIMIT = 100
 
 
 class MovingHorizonEstimator:
@@ -46,12 +47,12 @@ class MovingHorizonEstimator:
         The model and its sets.
     observer : Observer
         The auxiliary observer, such as `Luenberger`.
-    cost : QuadraticCost
-        Weights of prior, disturbances and noises.
+    cost : Cost
+        `QuadraticCost` or `RobustCost`.
     horizon : int
         N >= 1. Until N samples are there, all of them are used (Remark rem:emtpyN).
     initial_state : (n,) array_like
-        Initial estimate, at the time of the first measurement.
+        Initial estimate, at the time of the first measurement; within the state set.
     backend : str
         QP solver, one of ``qpmhe.solvers.available()``. ``auto`` uses a banded Cholesky
         factorisation and another solver only where inequalities bind; a named backend is
@@ -68,6 +69,23 @@ class MovingHorizonEstimator:
         this share of it.
     engine : {"python"}
         How the step is carried out.
+    outside : {"drop", "project", "keep"}
+        What to do where the candidate is outside of the sets: ``drop`` leaves the violated
+        sets out in this step, the paper's remedy after Assumption ass:observer; ``project``
+        takes the nearest trajectory inside as candidate, if one QP finds a truly feasible
+        one, and drops otherwise; ``keep`` returns the candidate.
+    start : {"candidate", "best"}
+        Where the sequence starts: at the candidate, or at the shifted previous estimate if
+        its true J is lower. Accepted is what beats the candidate, in both cases.
+    candidate : {"observer", "reinitialized"}
+        The paper's candidate, or that of an observer which at each sample starts again
+        from the estimate of x(t-N) made at that time; the paper's outlook, outside of the
+        theorem as proved there.
+    time_budget : float or None
+        Seconds for one update: no QP is begun later, and backends with a clock stop.
+    delay : int
+        ``estimate.delayed`` is the estimate of the state this many steps before
+        ``estimate.state``; at most N.
 
     Raises
     ------
@@ -90,7 +108,7 @@ class MovingHorizonEstimator:
         self,
         system: System,
         observer: Observer,
-        cost: QuadraticCost,
+        cost: Cost,
         *,
         horizon: int,
         initial_state: ArrayLike,
@@ -100,47 +118,69 @@ class MovingHorizonEstimator:
         solver_tolerance: float = 1e-7,
         tolerance: float = 1e-9,
         engine: str = "python",
+        outside: str = "drop",
+        start: str = "candidate",
+        candidate: str = "observer",
+        time_budget: float | None = None,
+        delay: int = 0,
     ) -> None:
+        self.settings = Settings(
+            horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
+            engine, outside, start, candidate, time_budget, delay,
+        )
+        self.system, self.observer, self.cost = system, observer, cost
         _is(system, System, "system", "qpmhe.System")
         _is(observer, Observer, "observer", "qpmhe.Luenberger or another observer")
-        _is(cost, QuadraticCost, "cost", "qpmhe.QuadraticCost")
-        if engine != "python":
-            raise OptionError(f"engine is {engine!r}; expected 'python', the only one there is.")
-        self.horizon = count("horizon", horizon, 1)
-        self.max_qps = max_qps
-        qps = _SAFETY_LIMIT
-        if max_qps is not None:
-            qps = count("max_qps", max_qps, 0, " None stands for convergence.")
-        self.system, self.observer, self.cost = system, observer, cost
+        _is(cost, Cost, "cost", "qpmhe.QuadraticCost or qpmhe.RobustCost")
         if (cost.n, cost.p) != (system.n, system.p):
             raise ShapeError(
                 f"the cost is for {cost.n} states and {cost.p} outputs; expected {system.n} "
                 f"and {system.p}, the system's."
             )
-        self.initial_state: Array = vector("initial_state", initial_state, system.n)
-        system.check(self.initial_state, np.zeros(system.m))
-        observer.check(system, self.initial_state)
         if isinstance(cost.prior, ObserverPrior) and observer.initial_covariance() is None:
             raise InvalidInputError(
                 f"the prior weight is to come from the observer, but {type(observer).__name__} "
                 "has no covariance; take qpmhe.ExtendedKalman, or give a constant weight."
             )
-        self.backend = backend
+        self.initial_state: Array = self._checked_start(initial_state)
         solver = create(
             backend,
             SolverOptions(
                 max_iterations=max_solver_iterations,
-                absolute_tolerance=positive("solver_tolerance", solver_tolerance),
+                absolute_tolerance=float(solver_tolerance),
+                time_limit=time_budget,
             ),
         )
-        self._linearized = qps > 0
-        self._subproblem = Subproblem(system, cost, self.horizon)
         self._problem = Problem(system, cost)
-        self._optimizer = Optimizer(
-            self._subproblem, solver, qps, positive("tolerance", tolerance)
-        )
+        if self._problem.constrained:
+            solver.prepare((horizon + 1) * system.n)
+        self._subproblem = Subproblem(system, cost, horizon)
+        self._optimizer = Optimizer(self._subproblem, solver, self.settings)
         self._no_input = np.zeros(system.m)
-        self.reset()
+        self._forget()
+
+    def _checked_start(self, initial_state: ArrayLike) -> Array:
+        state = vector("initial_state", initial_state, self.system.n)
+        self.system.check(state, np.zeros(self.system.m))
+        self.observer.check(self.system, state)
+        states = self.system.states
+        if states is not None and states.violation(state) > 0.0:
+            raise InvalidInputError(
+                f"initial_state is {state.tolist()}, which is outside of the state set "
+                f"{states!r}; start within it."
+            )
+        return state
+
+    def _forget(self) -> None:
+        self._window = Window(
+            self.system, self.observer, self.cost, self.settings.horizon, self.initial_state,
+            self.settings.qp_limit > 0,
+        )
+        self._last: Estimate | None = None
+        # Estimates of x(t-N), ..., x(t), each made at its own time.
+        self._history: deque[Array] = deque(
+            [self.initial_state.copy()], maxlen=self.settings.horizon + 1
+        )
 
     def reset(self, initial_state: ArrayLike | None = None) -> None:
         """Forget all measurements and start again.
@@ -152,30 +192,36 @@ class MovingHorizonEstimator:
 
         Raises
         ------
-        ShapeError, InvalidInputError, ModelError
-            If the state has the wrong shape or is not finite, or the model is not defined there.
+        InvalidInputError
+            If the state does not fit; the estimator is left as it was.
         """
         if initial_state is not None:
-            state = vector("initial_state", initial_state, self.system.n)
-            self.system.check(state, np.zeros(self.system.m))
-            self.initial_state = state
-        self._window = Window(
-            self.system, self.observer, self.cost, self.horizon, self.initial_state,
-            self._linearized,
-        )
-        self._state = self.initial_state.copy()
+            self.initial_state = self._checked_start(initial_state)
+        self._forget()
 
     @property
     def state(self) -> Array:
         """The current estimate of x(t+1), or the initial one before the first measurement."""
-        return self._state
+        return self._history[-1]
 
     @property
     def time(self) -> int:
         """Number of measurements taken so far."""
         return self._window.time
 
-    def update(self, y: ArrayLike, u: ArrayLike | None = None) -> Estimate:
+    @property
+    def horizon(self) -> int:
+        """N."""
+        return self.settings.horizon
+
+    def update(
+        self,
+        y: ArrayLike,
+        u: ArrayLike | None = None,
+        *,
+        dt: float | None = None,
+        noise_weight: ArrayLike | None = None,
+    ) -> Estimate:
         """Take the measurement y(t) and the input u(t) in, and estimate x(t+1).
 
         Solver failures, a model that cannot be evaluated and missing measurements do not
@@ -184,10 +230,16 @@ class MovingHorizonEstimator:
         Parameters
         ----------
         y : (p,) array_like
-            y(t); components that are not finite are missing. A scalar will do where p is 1.
+            y(t); components that are not finite, or None, are missing. A scalar will do
+            where p is 1.
         u : (m,) array_like, optional
-            u(t), the input that acts from t to t+1 (and on y(t), if h depends on it).
-            Needed exactly if the system has inputs.
+            u(t), the input that acts from t to t+1 (and on y(t), if h depends on it), and
+            whatever else is known of this time. Needed exactly if the system has inputs.
+        dt : float, optional
+            Length of the step from t to t+1, for a system made by `System.from_ode`, where
+            it is not the usual one.
+        noise_weight : (p, p) array_like, optional
+            Weight of this sample's noise, where it is not that of the cost.
 
         Returns
         -------
@@ -196,55 +248,150 @@ class MovingHorizonEstimator:
 
         Raises
         ------
-        ShapeError, InvalidInputError
-            If y or u has the wrong shape; the estimator is left as it was.
+        ShapeError, WeightError, InvalidInputError
+            If an argument does not fit; the estimator is left as it was.
         """
         began = perf_counter()
-        system, window = self.system, self._window
+        system = self.system
         y_array = np.asarray(y)
         if y_array.shape != (system.p,) or y_array.dtype != np.float64:
             y_array = vector("y", _without_none(y), system.p, finite=False)
+        u_array = self._no_input if u is None and system.m == 0 else self._input(u)
+        if dt is not None:
+            dt = positive("dt", dt)
+            _ = system.timed  # raises here, before the sample is taken, if there is none
+        if noise_weight is not None:
+            noise_weight = positive_definite("noise_weight", noise_weight, system.p)
         with np.errstate(all="ignore"):
-            missing, failed = window.push(y_array, self._input(u))
-            dropped = self._problem.bind(window)
-            outcome = self._optimizer.improve(self._problem, window)
+            missing, failed = self._window.push(y_array, u_array, dt, noise_weight)
+            if self.settings.candidate == "reinitialized":
+                # The oldest of the history is the estimate of x(t+1-N), or x(0).
+                self._window.replay(self._window.length, self._reinitial_state())
+            estimate = self._estimate(missing, failed, began)
+        self._history.append(estimate.state)
+        return estimate
+
+    def _reinitial_state(self) -> Array:
+        return self._history[len(self._history) - self._window.length]
+
+    def _estimate(self, missing: bool, failed: bool, began: float) -> Estimate:
+        """Solve the window's problem as it stands."""
+        window, problem, settings = self._window, self._problem, self.settings
+        problem.bind(window)
+        start = self._shifted() if settings.start == "best" else None
+        deadline = math.inf if settings.time_budget is None else began + settings.time_budget
+        outcome = self._optimizer.improve(problem, window, start, deadline)
         status = outcome.events | (Status.IMPROVED if outcome.improved else Status.CANDIDATE)
         if missing:
             status |= Status.MISSING
         if failed:
             status |= Status.MODEL_FAILED
-        if dropped:
-            status |= Status.SETS_DROPPED
-        candidate = window.candidate.copy()
-        trial = outcome.trial
-        residuals = trial.residuals
-        if window.has_missing or not outcome.improved:
+        trial, reference = outcome.trial, outcome.reference
+        trajectory, residuals = trial.trajectory, trial.residuals
+        if not outcome.improved:
+            trajectory = trajectory.copy()  # of the window, which moves on
+        if window.has_special_weights or not outcome.improved:
             residuals = residuals.copy()
-            residuals[:, system.n :][~window.observed] = np.nan
+            residuals[:, self.system.n :][~window.observed] = np.nan
         estimate = Estimate(
             window.time - 1,
-            trial.trajectory if outcome.improved else candidate.copy(),
+            trajectory,
             residuals,
             trial.cost,
-            candidate,
-            window.candidate_cost,
+            reference.trajectory.copy(),
+            reference.cost,
             status,
             outcome.message,
             outcome.qps,
             outcome.solver_iterations,
             outcome.solve_time,
+            outcome.corrections,
+            outcome.dropped,
+            settings.delay,
         )
         if failed and outcome.improved:
             window.restart(estimate.state)
-        self._state = estimate.state
+        self._last = estimate
         estimate.step_time = perf_counter() - began
         return estimate
+
+    def _shifted(self) -> Array | None:
+        """The previous estimate, moved on by one step of the model to the present window."""
+        if self._last is None:
+            return None
+        window, before = self._window, self._last.trajectory
+        try:
+            ahead = np.asarray(window.model.f(before[-1], window.inputs[-1]))
+        except Exception:  # the model is not defined there: no start, then
+            return None
+        shifted = np.vstack((before, ahead))
+        return shifted[shifted.shape[0] - 1 - window.length :]
+
+    def amend(self, time: int, y: ArrayLike) -> Estimate:
+        """Put a late measurement in its place, redo the observer from there, and estimate.
+
+        Parameters
+        ----------
+        time : int
+            Index of the sample that it belongs to, at most N samples old.
+        y : (p,) array_like
+            The measurement; components that are not finite leave those of the sample alone.
+
+        Returns
+        -------
+        Estimate
+            The estimate of the same state as before, with what is known now.
+
+        Raises
+        ------
+        ShapeError, InvalidInputError
+            If the time is not within the window, or y does not fit; the estimator is left
+            as it was.
+        """
+        oldest, newest = self.time - self._window.length, self.time - 1
+        if isinstance(time, bool) or not isinstance(time, (int, np.integer)) or not (
+            oldest <= time <= newest
+        ):
+            raise InvalidInputError(
+                f"time is {time!r}; expected an integer from {oldest} to {newest}, the samples "
+                "in the window. Take a longer horizon for later measurements."
+            )
+        late = vector("y", _without_none(y), self.system.p, finite=False)
+        began = perf_counter()
+        with np.errstate(all="ignore"):
+            self._window.amend(int(time), late)
+            self._last = None  # it does not belong to the window before this one
+            estimate = self._estimate(False, not math.isfinite(self._window.candidate_cost), began)
+        self._history[-1] = estimate.state
+        return estimate
+
+    def covariances(self) -> Array:
+        """Covariances of the last estimate's trajectory, by linearisation along it.
+
+        The inverse of the Gauss-Newton Hessian's diagonal blocks, computed in O(N n^3):
+        with inverse covariances as weights, the covariance of the error of each state given
+        the window's measurements and the prior. Inequalities do not enter; noise-free
+        components do.
+
+        Returns
+        -------
+        (N_t + 1, n, n) array
+            The last one is that of ``estimate.state``, the one before that of
+            ``estimate.filtered``.
+
+        Raises
+        ------
+        InvalidInputError
+            Before the first measurement, or if the model cannot be linearised there.
+        """
+        if self._last is None:
+            raise InvalidInputError("there is no estimate yet; update first.")
+        with np.errstate(all="ignore"):
+            return window_covariances(self._problem, self._last.trajectory)
 
     def _input(self, u: ArrayLike | None) -> Array:
         m = self.system.m
         if u is None:
-            if m == 0:
-                return self._no_input
             raise InvalidInputError(f"u is missing; the system has {m} inputs: update(y, u).")
         if m == 0:
             raise InvalidInputError("u was given, but the system has no inputs; leave it out.")
@@ -270,30 +417,18 @@ class MovingHorizonEstimator:
         ShapeError, InvalidInputError
             If a shape is wrong; no sample has been taken then.
         """
-        ys = _record("measurements", measurements, self.system.p)
-        us: Any = None
+        ys = record("measurements", measurements, self.system.p)
+        us: Any = [None] * len(ys)
         if inputs is not None:
-            us = _record("inputs", inputs, self.system.m)
-            if us.shape[0] != ys.shape[0]:
-                raise ShapeError(
-                    f"inputs has {us.shape[0]} samples; expected {ys.shape[0]}, one for each "
-                    "measurement."
-                )
-        start = self._state.copy()
-        if us is None:
-            estimates = [self.update(y) for y in ys]
-        else:
-            estimates = [self.update(y, u) for y, u in zip(ys, us, strict=True)]
-        return Run(start, estimates)
-
-
-def _record(name: str, values: ArrayLike, width: int) -> Array:
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim == 1 and width == 1:
-        array = array[:, None]
-    if array.ndim != 2 or array.shape[1] != width:
-        raise ShapeError(f"{name} has shape {array.shape}; expected (T, {width}), a row a sample.")
-    return array
+            us = record("inputs", inputs, self.system.m)
+        elif self.system.m:
+            self._input(None)
+        if len(us) != len(ys):
+            raise ShapeError(
+                f"inputs has {len(us)} samples; expected {len(ys)}, one for each measurement."
+            )
+        start = self.state.copy()
+        return Run(start, [self.update(y, u) for y, u in zip(ys, us, strict=True)])
 
 
 def _without_none(y: Any) -> Any:

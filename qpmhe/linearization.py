@@ -77,6 +77,15 @@ class StageTerms:
         np.negative(np.matmul(residuals[:, None, :], weighted)[:, 0], out=self.own[:count])
         self.following[:count] = weighted_residuals[:, :n]
 
+    def copy_scaled(self, terms: StageTerms, first: int, factors: Array) -> None:
+        """Take over the stages of other terms from ``first`` on, each times its factor."""
+        count = factors.size
+        stages = slice(first, first + count)
+        self.jacobian[:count] = terms.jacobian[stages]
+        np.multiply(terms.panel[stages], factors[:, None, None], out=self.panel[:count])
+        np.multiply(terms.own[stages], factors[:, None], out=self.own[:count])
+        np.multiply(terms.following[stages], factors[:, None], out=self.following[:count])
+
     def keep_last(self, end: int, keep: int) -> None:
         """Move the stages end-keep, ..., end-1 to the front."""
         for array in (self.jacobian, self.panel, self.own, self.following):

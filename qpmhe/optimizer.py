@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from time import perf_counter
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qpmhe_solvers import QP, Solver, SolveStatus
+from qpmhe_solvers import QP, Solution, Solver, SolveStatus
 
 from .estimate import Status
 from .problem import Problem, Trial
@@ -26,7 +28,21 @@ _LENGTHS = (0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)
 # A decrease of J by less than this share is rounding, and no improvement.
 _ROUNDING = 1e-12
 
+# Second-order corrections of a trial that misses a curved set.
+_CORRECTIONS = 2
+
 _NONE = Status(0)
+
+
+class Choices(Protocol):
+    """The settings that the optimizer reads."""
+
+    @property
+    def tolerance(self) -> float: ...
+    @property
+    def outside(self) -> str: ...
+    @property
+    def qp_limit(self) -> int: ...
 
 
 @dataclass(slots=True)
@@ -35,29 +51,36 @@ class Outcome:
 
     Parameters
     ----------
+    reference : Trial
+        The candidate, or its projection onto the sets.
     trial : Trial
-        The best trajectory, the candidate itself if nothing was better.
+        The best trajectory, the reference itself if nothing was better.
     improved : bool
-        Whether it is not the candidate.
+        Whether it is not the reference.
     events : Status
         Why the sequence stopped, and what happened.
     message : str
         Words of a solver that failed.
-    qps : int
-        QPs solved.
+    qps, corrections : int
+        QPs solved, and second-order corrections among the solves beside them.
     solver_iterations : int or None
         Sum of the solver's own counts, None where it does not tell.
     solve_time : float
         Seconds in the solver.
+    dropped : tuple of str
+        Names of the sets that were left out.
     """
 
+    reference: Trial
     trial: Trial
     improved: bool = False
     events: Status = _NONE
     message: str = ""
     qps: int = 0
+    corrections: int = 0
     solver_iterations: int | None = 0
     solve_time: float = 0.0
+    dropped: tuple[str, ...] = ()
 
 
 class Optimizer:
@@ -73,27 +96,54 @@ class Optimizer:
         Where the QPs come from.
     solver : Solver
         Where they go.
-    max_qps : int
-        Cap on the QPs of one window.
-    tolerance : float
-        The sequence has converged when a solved QP lowers J by less than this share of it.
+    settings : Settings
+        Cap on the QPs, tolerance, and what to do with a candidate outside of the sets.
     """
 
-    def __init__(
-        self, subproblem: Subproblem, solver: Solver, max_qps: int, tolerance: float
-    ) -> None:
+    def __init__(self, subproblem: Subproblem, solver: Solver, settings: Choices) -> None:
         self._subproblem, self._solver = subproblem, solver
-        self._max_qps, self._tolerance = max_qps, tolerance
+        self._limit, self._tolerance = settings.qp_limit, settings.tolerance
+        self._outside = settings.outside
 
-    def improve(self, problem: Problem, window: Window) -> Outcome:
-        """Run the sequence on a bound problem; never raises on account of solver or model."""
-        outcome = Outcome(problem.candidate(window))
-        if self._max_qps == 0:
-            outcome.events = Status.NO_QPS
+    def improve(
+        self,
+        problem: Problem,
+        window: Window,
+        start: Array | None = None,
+        deadline: float = math.inf,
+    ) -> Outcome:
+        """Run the sequence on a bound problem; never raises on account of solver or model.
+
+        Parameters
+        ----------
+        problem : Problem
+            The problem, bound to the window.
+        window : Window
+            The window.
+        start : (K + 1, n) array, optional
+            A trajectory to start from where it is better than the candidate.
+        deadline : float
+            Reading of ``time.perf_counter`` after which no QP is begun.
+        """
+        candidate = problem.candidate(window)
+        outcome = Outcome(candidate, candidate)
+        if problem.constrained and not self._reconcile(problem, window, outcome):
             return outcome
-        qp: QP | None = self._subproblem.at_candidate(problem, window)
-        for count in range(self._max_qps):
-            if count > 0:
+        if self._limit == 0:
+            outcome.events |= Status.NO_QPS
+            return outcome
+        qp: QP | None = None
+        if start is not None:
+            trial = problem.evaluate(_clipped(problem, start.copy()))
+            if trial.cost < _target(outcome.trial):
+                outcome.trial, outcome.improved = trial, True
+        for _ in range(self._limit):
+            if perf_counter() > deadline:
+                outcome.events |= Status.TIME_UP
+                break
+            if outcome.trial is candidate:
+                qp = self._subproblem.at_candidate(problem, window)
+            else:
                 qp = self._subproblem.at(problem, outcome.trial)
             if qp is None:
                 outcome.events |= Status.MODEL_FAILED
@@ -102,31 +152,74 @@ class Optimizer:
                 break
         return outcome
 
-    def _step(self, problem: Problem, qp: QP, outcome: Outcome) -> bool:
-        """Solve one QP and judge its iterate; whether another QP is worth while."""
+    def _reconcile(self, problem: Problem, window: Window, outcome: Outcome) -> bool:
+        """Deal with a candidate outside of the sets; whether to go on to the QPs."""
+        violated = problem.violated_sets(outcome.trial)
+        if not violated:
+            return True
+        if self._outside == "keep":
+            outcome.events |= Status.CANDIDATE_OUTSIDE
+            return False
+        if self._outside == "project" and self._limit > 0:
+            projected = self._projected(problem, window, outcome)
+            if projected.cost < math.inf:
+                outcome.reference = outcome.trial = projected
+                outcome.events |= Status.PROJECTED
+                return True
+        problem.leave_out(violated)
+        outcome.dropped = violated
+        outcome.events |= Status.SETS_DROPPED
+        return True
+
+    def _projected(self, problem: Problem, window: Window, outcome: Outcome) -> Trial:
+        """The nearest trajectory that satisfies the linearised sets, if it does the true ones."""
+        candidate = outcome.trial
+        qp = self._subproblem.nearest(problem, window)
+        trial = candidate
+        for attempt in range(1 + _CORRECTIONS):
+            step = self._solve(qp, outcome).d
+            if step is None:
+                return Trial(*_parts(candidate), math.inf, math.inf)
+            trial = self._trial(problem, candidate, step)
+            if trial.cost < math.inf or not math.isfinite(trial.violation):
+                return trial
+            if attempt < _CORRECTIONS:
+                self._subproblem.corrected(qp, problem, candidate, trial)
+                outcome.corrections += 1
+        return trial
+
+    def _solve(self, qp: QP, outcome: Outcome) -> Solution:
         began = perf_counter()
         solution = self._solver.solve(qp)
         outcome.solve_time += perf_counter() - began
-        outcome.qps += 1
         if solution.iterations is None or outcome.solver_iterations is None:
             outcome.solver_iterations = None
         else:
             outcome.solver_iterations += solution.iterations
+        return solution
+
+    def _step(self, problem: Problem, qp: QP, outcome: Outcome) -> bool:
+        """Solve one QP and judge its iterate; whether another QP is worth while."""
+        solution = self._solve(qp, outcome)
+        outcome.qps += 1
         step = solution.d
         if step is None:
             outcome.events |= Status.SOLVER_FAILED
             outcome.message = solution.message
             return False
         best = outcome.trial
-        trial = self._trial(problem, best, step)
-        enough = self._tolerance * (best.cost + self._tolerance)
+        target, enough = _target(best), self._tolerance * (best.cost + self._tolerance)
         solved = solution.status is SolveStatus.SOLVED
         if not solved:
             outcome.events |= Status.SOLVER_STOPPED
-        target = best.cost - _ROUNDING * best.cost if best.cost < np.inf else np.inf
+        slope = abs(float(np.vdot(qp.gradient, step)))
+        trial = self._trial(problem, best, step)
+        if not trial.cost < target and 0.0 < trial.violation < math.inf and qp.rows:
+            step = step.copy()  # a correction's solve reuses the solver's workspace
+            trial = self._corrected(problem, qp, outcome, trial)
         if not trial.cost < target:
             # Near a minimum J cannot be lowered beyond its rounding: not a failure.
-            if solved and abs(float(np.vdot(qp.gradient, step))) <= enough:
+            if solved and slope <= enough:
                 outcome.events |= Status.CONVERGED
                 return False
             for length in _LENGTHS:
@@ -142,9 +235,35 @@ class Optimizer:
             return False
         return True
 
+    def _corrected(self, problem: Problem, qp: QP, outcome: Outcome, trial: Trial) -> Trial:
+        """Second-order corrections of a trial that misses a set by its curvature."""
+        best = outcome.trial
+        for _ in range(_CORRECTIONS):
+            self._subproblem.corrected(qp, problem, best, trial)
+            step = self._solve(qp, outcome).d
+            outcome.corrections += 1
+            if step is None:
+                break
+            trial = self._trial(problem, best, step)
+            if trial.cost < math.inf or not math.isfinite(trial.violation):
+                break
+        return trial
+
     @staticmethod
     def _trial(problem: Problem, best: Trial, step: Array) -> Trial:
-        trajectory = best.trajectory + step
-        if problem.states is not None:
-            np.clip(trajectory, problem.states.lower, problem.states.upper, out=trajectory)
-        return problem.evaluate(trajectory)
+        return problem.evaluate(_clipped(problem, best.trajectory + step))
+
+
+def _clipped(problem: Problem, trajectory: Array) -> Array:
+    if problem.states is not None:
+        np.clip(trajectory, problem.states.lower, problem.states.upper, out=trajectory)
+    return trajectory
+
+
+def _target(best: Trial) -> float:
+    """What a trial's cost must be below to count as better."""
+    return best.cost - _ROUNDING * best.cost if best.cost < math.inf else math.inf
+
+
+def _parts(trial: Trial) -> tuple[Array, Array, Array, Array]:
+    return trial.trajectory, trial.residuals, trial.weights, trial.weighted

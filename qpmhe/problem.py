@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.qp import band_of
 
-from .costs import ObserverPrior, QuadraticCost
-from .sets import Box
+from .costs import Cost, ObserverPrior
+from .sets import ConvexSet
 from .system import System
 from .window import Window
 
@@ -19,8 +19,9 @@ __all__ = ["Problem", "Trial"]
 
 Array = NDArray[np.float64]
 
-# The paper's sets are closed and a trial lies on their boundary up to rounding.
-_FEASIBLE = 1e-9
+# A trial lies on the boundary of its sets up to rounding, which grows with the states, and
+# up to what QP solvers leave.
+_FEASIBLE = 5e-9
 
 
 @dataclass(slots=True)
@@ -33,16 +34,22 @@ class Trial:
         The states.
     residuals : (K, n + p) array
         w and v along them.
+    weights : (n + p, n + p) or (K, n + p, n + p) array
+        Weights of the quadratic forms that majorise the stage costs here.
     weighted : (K, n + p) array
-        The residuals times their weights.
+        The residuals times these weights.
     cost : float
         J; infinite where the model cannot be evaluated or a constraint is violated.
+    violation : float
+        The largest amount by which a set is missed; infinite where the model fails.
     """
 
     trajectory: Array
     residuals: Array
+    weights: Array
     weighted: Array
     cost: float
+    violation: float = 0.0
 
 
 class Problem:
@@ -53,59 +60,111 @@ class Problem:
     and the paper's (eq:optiMHE), (eq:constraints) become
 
     .. math::
-        \min_x\; |x_0 - \bar x|_P^2 + \sum_{i<K} |(w_i, v_i)|_{W_i}^2
+        \min_x\; \gamma^K \Gamma(x_0 - \bar x) + \sum_{i<K} \gamma^{K-1-i} l(w_i, v_i)
         \quad \text{s.t.} \quad x_i \in \mathbb X,\ w_i \in \mathbb W,\ v_i \in \mathbb V.
 
     Parameters
     ----------
     system : System
         f, h and the sets.
-    cost : QuadraticCost
-        The weights.
+    cost : Cost
+        The cost.
     """
 
-    def __init__(self, system: System, cost: QuadraticCost) -> None:
+    def __init__(self, system: System, cost: Cost) -> None:
         self._system, self._cost = system, cost
-        self._n = system.n
+        self._n, self._q = system.n, system.n + system.p
         self._prior_rule = cost.prior if isinstance(cost.prior, ObserverPrior) else None
-        self.prior_weight: Array = (
+        self._prior_weight: Array = (
             np.eye(system.n) if isinstance(cost.prior, ObserverPrior) else cost.prior
         )
-        self.prior_band: Array = band_of(self.prior_weight)
+        self._prior_band = band_of(self._prior_weight)
+        self._discounted = cost.discount < 1.0
+        self.model = system
         self.prior: Array = np.zeros(system.n)
         self.inputs: Array = np.zeros((0, system.m))
         self.measurements: Array = np.zeros((0, system.p))
         self.stage_weights: Array = cost.stage_weight
-        self._sets = [s for s in (system.states, system.disturbances, system.noises) if s]
-        self.states: Box | None = None
-        self.disturbances: Box | None = None
-        self.noises: Box | None = None
+        self.discounts: Array | None = None
+        self.constrained = any((system.states, system.disturbances, system.noises))
+        fixed = system.disturbances.fixed_components if system.disturbances else np.empty(0, int)
+        #: Components of w of zero width, whose states follow the model without noise.
+        self.noise_free: NDArray[np.intp] = fixed
+        self.use_sets(system.states, system.disturbances, system.noises)
 
-    def bind(self, window: Window) -> bool:
-        """Take over the window's data; prior z(t-N) as in (eq:prior).
+    def use_sets(
+        self,
+        states: ConvexSet | None,
+        disturbances: ConvexSet | None,
+        noises: ConvexSet | None,
+    ) -> None:
+        """Judge by these sets from now on; None leaves one out."""
+        self.states, self.disturbances, self.noises = states, disturbances, noises
+        self._rolls_out = bool(self.noise_free.size) and disturbances is not None
 
-        Returns
-        -------
-        dropped : bool
-            Whether the candidate is outside of sets, which are left out in this problem:
-            the paper's remedy after Assumption ass:observer.
-        """
+    def bind(self, window: Window) -> None:
+        """Take over the window's data, all sets, and the prior z(t-N) as in (eq:prior)."""
         self.prior = window.candidate[0]
         self.inputs, self.measurements = window.inputs, window.measurements
         self.stage_weights = window.stage_weights
-        covariance = window.prior_covariance
-        if self._prior_rule is not None and covariance is not None:
-            self.prior_weight = self._prior_rule.weight(covariance)
-            self.prior_band = band_of(self.prior_weight)
-        return bool(self._sets) and self._drop_violated(window)
+        self.model = window.model
+        if self._discounted:
+            self.discounts = window.discounts
+        if self._prior_rule is not None and window.prior_covariance is not None:
+            self._prior_weight = self._prior_rule.weight(window.prior_covariance)
+            self._prior_band = band_of(self._prior_weight)
+        if self.constrained:
+            system = self._system
+            self.use_sets(system.states, system.disturbances, system.noises)
 
-    def _drop_violated(self, window: Window) -> bool:
-        n, system, residuals = self._n, self._system, window.residuals
-        self.states = _kept(system.states, window.candidate)
-        self.disturbances = _kept(system.disturbances, residuals[:, :n])
-        self.noises = _kept(system.noises, residuals[:, n:])
-        kept = (self.states, self.disturbances, self.noises)
-        return kept != (system.states, system.disturbances, system.noises)
+    def violated_sets(self, trial: Trial) -> tuple[str, ...]:
+        """Names of the sets that a trajectory is outside of."""
+        n, limit = self._n, self._limit(trial.trajectory)
+        points = (trial.trajectory, trial.residuals[:, :n], trial.residuals[:, n:])
+        sets = {
+            "states": self.states, "disturbances": self.disturbances, "noises": self.noises
+        }
+        return tuple(
+            name
+            for (name, one), where in zip(sets.items(), points, strict=True)
+            if one is not None and one.violation(where) > limit
+        )
+
+    def leave_out(self, names: tuple[str, ...]) -> None:
+        """Judge without the sets of these names."""
+        self.use_sets(
+            None if "states" in names else self.states,
+            None if "disturbances" in names else self.disturbances,
+            None if "noises" in names else self.noises,
+        )
+
+    def prior_weight_at(self, offset: Array) -> Array:
+        """The weight (n, n) of the form that majorises the prior's cost at this offset."""
+        weight = self._prior_weight
+        if not self._cost.quadratic:
+            weight = self._cost.majorise_prior(offset, weight)
+        return weight if self.discounts is None else self.discounts[0] * weight
+
+    def prior_band_at(self, offset: Array) -> Array:
+        """The same weight as a band panel."""
+        if self._cost.quadratic and self.discounts is None:
+            return self._prior_band
+        return band_of(self.prior_weight_at(offset))
+
+    def restored(self, trajectory: Array) -> Array:
+        """The trajectory with its noise-free components rolled out from its first state.
+
+        Component j with W_j = {c} is set to f_j(x_i) + c, stage by stage; the other
+        components keep their states. May raise what the model raises.
+        """
+        free, system = self.noise_free, self.model
+        assert self.disturbances is not None
+        shift = self.disturbances.lower[free]
+        restored = trajectory.copy()
+        for i in range(trajectory.shape[0] - 1):
+            moved = np.asarray(system.f(restored[i], self.inputs[i]))
+            restored[i + 1, free] = moved[free] + shift
+        return restored
 
     def evaluate(self, trajectory: Array) -> Trial:
         """Judge a trajectory (K + 1, n) by the true model.
@@ -113,40 +172,62 @@ class Problem:
         Never raises on account of the model: where f or h raise or are not finite, or a
         constraint is violated, the cost is infinite.
         """
-        n, states = self._n, trajectory[:-1]
-        residuals = np.empty((states.shape[0], n + self._system.p))
+        n = self._n
+        residuals = np.empty((trajectory.shape[0] - 1, self._q))
         try:
-            np.subtract(trajectory[1:], self._system.f.batch(states, self.inputs),
+            if self._rolls_out:
+                trajectory = self.restored(trajectory)
+            states = trajectory[:-1]
+            np.subtract(trajectory[1:], self.model.f.batch(states, self.inputs),
                         out=residuals[:, :n])
-            np.subtract(self.measurements, self._system.h.batch(states, self.inputs),
+            np.subtract(self.measurements, self.model.h.batch(states, self.inputs),
                         out=residuals[:, n:])
         except Exception:  # a model function outside its domain: such a trial is worthless
-            return Trial(trajectory, residuals, residuals, math.inf)
-        weighted = self._weigh(residuals)
+            return Trial(trajectory, residuals, self.stage_weights, residuals, math.inf, math.inf)
+        weights, weighted, cost = self._cost_of(residuals)
         offset = trajectory[0] - self.prior
-        cost = float(np.vdot(weighted, residuals) + offset @ self.prior_weight @ offset)
-        if not math.isfinite(cost) or (self._sets and not self.feasible(trajectory, residuals)):
-            cost = math.inf
-        return Trial(trajectory, residuals, weighted, cost)
+        if self._cost.quadratic:
+            prior_cost = float(offset.dot(self._prior_weight).dot(offset))
+        else:
+            prior_cost = self._cost.prior_cost(offset, self._prior_weight)
+        cost += prior_cost if self.discounts is None else float(self.discounts[0]) * prior_cost
+        if not math.isfinite(cost):
+            return Trial(trajectory, residuals, weights, weighted, math.inf, math.inf)
+        violation = 0.0
+        if self.constrained:
+            violation = self.violation(trajectory, residuals)
+            if violation > self._limit(trajectory):
+                cost = math.inf
+        return Trial(trajectory, residuals, weights, weighted, cost, violation)
 
-    def _weigh(self, residuals: Array) -> Array:
-        weight = self.stage_weights
-        if weight.ndim == 2:
-            return residuals @ weight
-        value: Array = np.matmul(residuals[:, None, :], weight)[:, 0]
-        return value
+    def _cost_of(self, residuals: Array) -> tuple[Array, Array, float]:
+        """Majorising weights, weighted residuals, and the stages' cost."""
+        weights = self.stage_weights
+        if self._cost.quadratic:
+            if self.discounts is not None:
+                weights = weights * self.discounts[1:, None, None]
+            if weights.ndim == 2:
+                weighted = residuals.dot(weights)
+            else:
+                weighted = np.matmul(residuals[:, None, :], weights)[:, 0]
+            return weights, weighted, float(np.vdot(weighted, residuals))
+        costs = self._cost.stage_costs(residuals, weights)
+        weights = self._cost.majorise(residuals, weights)
+        if self.discounts is not None:
+            weights = weights * self.discounts[1:, None, None]
+            costs = costs * self.discounts[1:]
+        weighted = np.matmul(residuals[:, None, :], weights)[:, 0]
+        return weights, weighted, float(costs.sum())
 
     def candidate(self, window: Window) -> Trial:
         """The candidate of the bound window as a trial: its cost is known already."""
-        residuals = window.residuals
-        return Trial(window.candidate, residuals, residuals, window.candidate_cost)
-
-    def feasible(self, trajectory: Array, residuals: Array) -> bool:
-        """Whether states, disturbances and noises lie in their sets (those not dropped)."""
-        return self.violation(trajectory, residuals) <= _FEASIBLE
+        residuals, weights = window.residuals, window.majorising_weights
+        if self.discounts is not None:
+            weights = weights * self.discounts[1:, None, None]
+        return Trial(window.candidate, residuals, weights, residuals, window.candidate_cost)
 
     def violation(self, trajectory: Array, residuals: Array) -> float:
-        """The largest distance by which a component leaves its set."""
+        """The largest amount by which a point leaves its set, of those not left out."""
         n, worst = self._n, 0.0
         if self.states is not None:
             worst = self.states.violation(trajectory)
@@ -156,6 +237,6 @@ class Problem:
             worst = max(worst, self.noises.violation(residuals[:, n:]))
         return worst
 
-
-def _kept(box: Box | None, points: Array) -> Box | None:
-    return box if box is not None and box.violation(points) <= _FEASIBLE else None
+    @staticmethod
+    def _limit(trajectory: Array) -> float:
+        return _FEASIBLE * max(1.0, float(np.abs(trajectory).max()))

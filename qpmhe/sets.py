@@ -8,19 +8,113 @@ from numpy.typing import ArrayLike, NDArray
 from ._checks import numbers
 from .errors import SetError
 
-__all__ = ["Box"]
+__all__ = ["Box", "ConvexSet", "Polytope"]
 
 Array = NDArray[np.float64]
 
 
-class Box:
+class ConvexSet:
+    r"""A closed polyhedron :math:`\{s : \ell \le s \le u,\ a \le M s \le b\}`.
+
+    What `Box` and `Polytope` have in common; make one of these. Two sets are intersected
+    with ``&``.
+
+    Attributes
+    ----------
+    dimension : int
+        Length of s.
+    lower, upper : (d,) array
+        Bounds on the components, infinite where there are none.
+    matrix : (r, d) array
+        M, one row for each general inequality.
+    row_lower, row_upper : (r,) array
+        a and b.
+    """
+
+    __slots__ = ("dimension", "lower", "matrix", "row_lower", "row_upper", "upper")
+
+    def __init__(
+        self, lower: Array, upper: Array, matrix: Array, row_lower: Array, row_upper: Array
+    ) -> None:
+        self.lower, self.upper, self.dimension = lower, upper, lower.size
+        self.matrix, self.row_lower, self.row_upper = matrix, row_lower, row_upper
+
+    @property
+    def bounded_components(self) -> NDArray[np.intp]:
+        """Components with a finite bound."""
+        return np.flatnonzero(np.isfinite(self.lower) | np.isfinite(self.upper))
+
+    @property
+    def fixed_components(self) -> NDArray[np.intp]:
+        """Components of zero width: equal lower and upper bounds."""
+        return np.flatnonzero(self.lower == self.upper)
+
+    def violation(self, points: Array) -> float:
+        """The largest amount by which points miss a bound or a general inequality.
+
+        Parameters
+        ----------
+        points : (..., d) array
+            The points.
+        """
+        worst = float(np.maximum(self.lower - points, points - self.upper).max())
+        if self.matrix.shape[0]:
+            rows = points @ self.matrix.T
+            worst = max(worst, float(np.maximum(self.row_lower - rows, rows - self.row_upper).max()))
+        return max(0.0, worst)
+
+    def __and__(self, other: ConvexSet) -> ConvexSet:
+        if not isinstance(other, ConvexSet):
+            return NotImplemented
+        if other.dimension != self.dimension:
+            raise SetError(
+                f"sets of dimensions {self.dimension} and {other.dimension} cannot be "
+                "intersected; expected equal dimensions."
+            )
+        both = ConvexSet(
+            np.maximum(self.lower, other.lower),
+            np.minimum(self.upper, other.upper),
+            np.vstack((self.matrix, other.matrix)),
+            np.append(self.row_lower, other.row_lower),
+            np.append(self.row_upper, other.row_upper),
+        )
+        both._insist_not_empty()
+        return both
+
+    def _insist_not_empty(self) -> None:
+        from scipy.optimize import LinearConstraint, milp
+
+        # A linear program without objective: milp takes two-sided rows as they are.
+        answer = milp(
+            np.zeros(self.dimension),
+            bounds=(self.lower, self.upper),
+            constraints=(
+                LinearConstraint(self.matrix, self.row_lower, self.row_upper)
+                if self.matrix.shape[0]
+                else ()
+            ),
+            integrality=np.zeros(self.dimension),
+        )
+        if answer.status == 2:
+            raise SetError(
+                f"the set is empty: no point satisfies all of its inequalities ({self!r})."
+            )
+
+    def __repr__(self) -> str:
+        box = f"lower={self.lower.tolist()}, upper={self.upper.tolist()}"
+        rows = f", {self.matrix.shape[0]} rows" if self.matrix.shape[0] else ""
+        return f"{type(self).__name__}({box}{rows})"
+
+
+class Box(ConvexSet):
     r"""A box :math:`\{s : \ell \le s \le u\}`, open-ended where a bound is infinite.
 
     Parameters
     ----------
     lower, upper : array_like
         Bounds of equal shape (d,), in the units of the vector that they bound; ``-inf`` and
-        ``inf`` where a component is unbounded.
+        ``inf`` where a component is unbounded. Equal bounds fix a component: a disturbance
+        that is {0} makes its state free of process noise.
 
     Raises
     ------
@@ -28,7 +122,7 @@ class Box:
         If the shapes differ, a bound is NaN, or the box is empty.
     """
 
-    __slots__ = ("dimension", "lower", "upper")
+    __slots__ = ()
 
     def __init__(self, lower: ArrayLike, upper: ArrayLike) -> None:
         low = np.atleast_1d(numbers("lower", lower, finite=False))
@@ -50,14 +144,40 @@ class Box:
                 f"the box is empty: component {j} has lower {low[j]} and upper {high[j]}; "
                 "expected lower <= upper."
             )
-        self.lower: Array = low
-        self.upper: Array = high
-        self.dimension: int = low.size
+        nothing = np.empty(0)
+        super().__init__(low, high, np.empty((0, low.size)), nothing, nothing)
 
-    def violation(self, points: Array) -> float:
-        """The largest distance by which a component of points, (..., d), leaves the box."""
-        outside = np.maximum(self.lower - points, points - self.upper)
-        return max(0.0, float(outside.max()))
 
-    def __repr__(self) -> str:
-        return f"Box({self.lower.tolist()}, {self.upper.tolist()})"
+class Polytope(ConvexSet):
+    r"""A polyhedron :math:`\{s : M s \le b\}`, bounded or not.
+
+    Parameters
+    ----------
+    matrix : (r, d) array_like
+        M, a row for each inequality.
+    bound : (r,) array_like
+        b, in the units of the rows.
+
+    Raises
+    ------
+    SetError
+        If the shapes do not fit, a number is not finite, a row is zero, or the set is empty.
+    """
+
+    __slots__ = ()
+
+    def __init__(self, matrix: ArrayLike, bound: ArrayLike) -> None:
+        rows = np.atleast_2d(numbers("matrix", matrix))
+        side = np.atleast_1d(numbers("bound", bound))
+        if rows.ndim != 2 or side.shape != (rows.shape[0],) or rows.shape[1] == 0:
+            raise SetError(
+                f"matrix has shape {rows.shape} and bound {side.shape}; expected (r, d) and (r,)."
+            )
+        zero = ~rows.any(axis=1)
+        if zero.any():
+            raise SetError(
+                f"row {int(np.argmax(zero))} of matrix is zero; leave out rows that bound nothing."
+            )
+        free = np.full(rows.shape[1], np.inf)
+        super().__init__(-free, free, rows, np.full(side.size, -np.inf), side)
+        self._insist_not_empty()

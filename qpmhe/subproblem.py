@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from qpmhe_solvers import QP
 from qpmhe_solvers.qp import band_of
 
-from .costs import QuadraticCost
+from .costs import Cost
 from .linearization import StageTerms
 from .problem import Problem, Trial
-from .sets import Box
+from .sets import ConvexSet
 from .system import System
 from .window import Window
 
@@ -26,8 +26,9 @@ class Subproblem:
     The objective is half of J with linearised residuals (see `StageTerms`): its gradient
     at d = 0 is that of J/2, its Hessian the Gauss-Newton one. Sets become
 
-    - bounds on d from X,
-    - rows ``w_i + d_{i+1} - A_i d_i`` in W and ``v_i - C_i d_i`` in V, linearised.
+    - bounds on d, and rows on ``x_i + d_i``, from X;
+    - rows on ``w_i + d_{i+1} - A_i d_i`` from W and on ``v_i - C_i d_i`` from V; a component
+      of W of zero width gives an equality row.
 
     One QP is kept for each window length and overwritten at each use.
 
@@ -35,96 +36,155 @@ class Subproblem:
     ----------
     system : System
         Dimensions, Jacobians and sets.
-    cost : QuadraticCost
+    cost : Cost
         The weights.
     horizon : int
         The longest window, N.
     """
 
-    def __init__(self, system: System, cost: QuadraticCost, horizon: int) -> None:
-        self._system = system
-        self._n = n = system.n
-        self._terms = StageTerms(horizon, n, system.p)
+    def __init__(self, system: System, cost: Cost, horizon: int) -> None:
+        n, p = system.n, system.p
+        self._n, self._p = n, p
+        self._terms = StageTerms(horizon, n, p)
+        self._scaled = StageTerms(horizon, n, p) if cost.discount < 1.0 else None
         self._disturbance_band = band_of(cost.disturbance)
-        self._bounded_w = _bounded(system.disturbances)
-        self._bounded_v = _bounded(system.noises)
-        self._rows = self._bounded_w.size + self._bounded_v.size
+        self._x_rows = system.states.matrix if system.states else np.empty((0, n))
+        self._w_rows = _as_rows(system.disturbances, n)
+        self._v_rows = _as_rows(system.noises, p)
+        self._rows = sum(rows.shape[0] for rows in (self._w_rows, self._v_rows, self._x_rows))
+        ends = np.cumsum([0, *(len(rows) for rows in (self._w_rows, self._v_rows, self._x_rows))])
+        self._w, self._v, self._x = (slice(a, b) for a, b in zip(ends, ends[1:], strict=False))
         self._qps: dict[int, QP] = {}
 
     def at_candidate(self, problem: Problem, window: Window) -> QP:
         """The QP around the candidate, from what the window has kept."""
-        first = window.first
-        return self._assemble(problem, problem.candidate(window), window.terms, first)
+        first, count, terms = window.start, window.length, window.terms
+        if self._scaled is not None:
+            self._scaled.copy_scaled(terms, first, window.discounts[1:])
+            terms, first = self._scaled, 0
+        return self._assemble(problem, problem.candidate(window), terms, first, count)
 
     def at(self, problem: Problem, trial: Trial) -> QP | None:
         """The QP around any trajectory; None where the model has no Jacobians there."""
         states, terms, n = trial.trajectory[:-1], self._terms, self._n
         count = states.shape[0]
+        model, jacobian = problem.model, terms.jacobian[:count]
         try:
-            terms.jacobian[:count, :n] = self._system.f_jacobian.batch(states, problem.inputs)
-            terms.jacobian[:count, n:] = self._system.h_jacobian.batch(states, problem.inputs)
+            jacobian[:, :n] = model.f_jacobian.batch(states, problem.inputs)
+            jacobian[:, n:] = model.h_jacobian.batch(states, problem.inputs)
         except Exception:  # a user's Jacobian outside its domain
             return None
-        if not np.isfinite(terms.jacobian[:count]).all():
+        if not np.isfinite(jacobian).all():
             return None
-        terms.set_all(problem.stage_weights, trial.residuals, trial.weighted)
-        return self._assemble(problem, trial, terms, 0)
+        terms.set_all(trial.weights, trial.residuals, trial.weighted)
+        return self._assemble(problem, trial, terms, 0, count)
 
-    def _assemble(self, problem: Problem, trial: Trial, terms: StageTerms, first: int) -> QP:
-        n, count = self._n, trial.residuals.shape[0]
+    def nearest(self, problem: Problem, window: Window) -> QP:
+        """The QP of the point nearest to the candidate among those that satisfy the rows."""
+        qp = self.at_candidate(problem, window)
+        qp.band[...] = band_of(np.eye(self._n))
+        qp.gradient[...] = 0.0
+        return qp
+
+    def corrected(self, qp: QP, problem: Problem, around: Trial, trial: Trial) -> None:
+        """Shift the rows of a QP by what its linearisation missed at a trial.
+
+        With the same matrices, W and V then hold for the true residuals of a point near the
+        trial up to third order: a second-order correction. Rows that the solver itself
+        left violated are moved inwards by twice that.
+
+        Parameters
+        ----------
+        qp : QP
+            The QP around a trajectory, whose iterate was tried; overwritten.
+        problem : Problem
+            The sets.
+        around, trial : Trial
+            That trajectory, and what became of it.
+        """
+        n, step = self._n, trial.trajectory - around.trajectory
+        linear = around.residuals - np.matmul(self._jacobian, step[:-1, :, None])[:, :, 0]
+        linear[:, :n] += step[1:]
+        margin = 2.0 * qp.violation(step)
+        self._set_rows(qp, problem, around.residuals + (trial.residuals - linear),
+                       around.trajectory)
+        room = qp.row_upper - qp.row_lower
+        inwards = np.where(room > 4.0 * margin, margin, 0.0)
+        qp.row_lower += inwards
+        qp.row_upper -= inwards
+
+    def _assemble(
+        self, problem: Problem, trial: Trial, terms: StageTerms, first: int, count: int
+    ) -> QP:
+        n = self._n
         qp = self._qps.get(count)
         if qp is None:
             qp = self._qps[count] = QP(count + 1, n, self._rows)
-            qp.row_next[:-1, : self._bounded_w.size] = np.eye(n)[self._bounded_w]
+            qp.row_next[:-1, self._w] = self._w_rows
+            qp.row_own[:, self._x] = self._x_rows
         last, band, gradient = first + count, qp.band, qp.gradient
-        weight = problem.stage_weights
-        if weight.ndim == 2:
+        weights = trial.weights
+        if weights.ndim == 2:
             disturbance_band = self._disturbance_band
             band[count] = disturbance_band
         else:
-            disturbance_band = np.array([band_of(w[:n, :n]) for w in weight])
+            disturbance_band = np.array([band_of(w[:n, :n]) for w in weights])
             band[count] = disturbance_band[-1]
             disturbance_band = disturbance_band[:-1]
+        offset = trial.trajectory[0] - problem.prior
         np.add(terms.panel[first + 1 : last], disturbance_band, out=band[1:count])
-        np.add(terms.panel[first], problem.prior_band, out=band[0])
+        np.add(terms.panel[first], problem.prior_band_at(offset), out=band[0])
         np.add(terms.own[first + 1 : last], terms.following[first : last - 1],
                out=gradient[1:count])
-        offset = trial.trajectory[0] - problem.prior
-        np.add(terms.own[first], problem.prior_weight @ offset, out=gradient[0])
+        prior_weight = problem.prior_weight_at(offset)
+        np.add(terms.own[first], prior_weight.dot(offset), out=gradient[0])
         gradient[count] = terms.following[last - 1]
-        if self._rows or problem.states is not None or qp.bounded:
-            self._bound(qp, problem, trial, terms.jacobian[first:last])
+        if problem.constrained:
+            self._jacobian = terms.jacobian[first:last]
+            self._bound(qp, problem, trial)
         return qp
 
-    def _bound(self, qp: QP, problem: Problem, trial: Trial, jacobian: Array) -> None:
-        n = self._n
-        qp.bounded = problem.states is not None
-        if problem.states is not None:
-            np.subtract(problem.states.lower, trial.trajectory, out=qp.lower)
-            np.subtract(problem.states.upper, trial.trajectory, out=qp.upper)
+    def _bound(self, qp: QP, problem: Problem, trial: Trial) -> None:
+        n, states = self._n, problem.states
+        qp.bounded = states is not None and bool(states.bounded_components.size)
+        if qp.bounded and states is not None:
+            np.subtract(states.lower, trial.trajectory, out=qp.lower)
+            np.subtract(states.upper, trial.trajectory, out=qp.upper)
         else:
             qp.lower[...], qp.upper[...] = -np.inf, np.inf
         if self._rows:
-            split = self._bounded_w.size
-            w, v = slice(0, split), slice(split, None)
-            qp.row_own[:-1, w] = -jacobian[:, self._bounded_w]
-            qp.row_own[:-1, v] = -jacobian[:, n + self._bounded_v]
-            _set_rows(qp, w, problem.disturbances, self._bounded_w, trial.residuals[:, :n])
-            _set_rows(qp, v, problem.noises, self._bounded_v, trial.residuals[:, n:])
+            np.negative(np.matmul(self._w_rows, self._jacobian[:, :n]), out=qp.row_own[:-1, self._w])
+            np.negative(np.matmul(self._v_rows, self._jacobian[:, n:]), out=qp.row_own[:-1, self._v])
+            self._set_rows(qp, problem, trial.residuals, trial.trajectory)
+
+    def _set_rows(self, qp: QP, problem: Problem, residuals: Array, trajectory: Array) -> None:
+        n = self._n
+        for rows, matrix, one, points in (
+            (self._w, self._w_rows, problem.disturbances, residuals[:, :n]),
+            (self._v, self._v_rows, problem.noises, residuals[:, n:]),
+            (self._x, self._x_rows, problem.states, trajectory),
+        ):
+            stages = slice(0, points.shape[0])
+            if one is None:
+                qp.row_lower[stages, rows], qp.row_upper[stages, rows] = -np.inf, np.inf
+                continue
+            low, high = (one.row_lower, one.row_upper) if rows is self._x else _sides(one)
+            value = points @ matrix.T
+            qp.row_lower[stages, rows] = low - value
+            qp.row_upper[stages, rows] = high - value
 
 
-def _set_rows(
-    qp: QP, rows: slice, box: Box | None, components: NDArray[np.intp], values: Array
-) -> None:
-    if box is None:
-        qp.row_lower[:-1, rows], qp.row_upper[:-1, rows] = -np.inf, np.inf
-    else:
-        qp.row_lower[:-1, rows] = box.lower[components] - values[:, components]
-        qp.row_upper[:-1, rows] = box.upper[components] - values[:, components]
+def _as_rows(one: ConvexSet | None, dimension: int) -> Array:
+    """All inequalities of a set as rows: unit rows of its bounded components first."""
+    if one is None:
+        return np.empty((0, dimension))
+    return np.vstack((np.eye(dimension)[one.bounded_components], one.matrix))
 
 
-def _bounded(box: Box | None) -> NDArray[np.intp]:
-    """Components with a finite bound: the others need no row."""
-    if box is None:
-        return np.empty(0, dtype=np.intp)
-    return np.flatnonzero(np.isfinite(box.lower) | np.isfinite(box.upper))
+def _sides(one: ConvexSet) -> tuple[Array, Array]:
+    """Lower and upper sides of the rows of `_as_rows`."""
+    bounded = one.bounded_components
+    return (
+        np.append(one.lower[bounded], one.row_lower),
+        np.append(one.upper[bounded], one.row_upper),
+    )

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ._checks import count
+from ._checks import count, positive
 from .derivatives import Jacobian
 from .discretize import discretize
-from .errors import SetError
+from .errors import InvalidInputError, SetError
 from .functions import BatchedFunction, Probes
-from .sets import Box
+from .sets import ConvexSet
 
 __all__ = ["System"]
 
@@ -45,7 +46,7 @@ class System:
         Derivatives with respect to x, of shapes (n, n) and (p, n), same arguments. Left out,
         they are computed: by the complex step where the function allows it, else by central
         differences; see ``derivatives``.
-    states, disturbances, noises : Box, optional
+    states, disturbances, noises : Box or Polytope, optional
         The sets X, W and V; the whole space if left out.
 
     Raises
@@ -75,9 +76,9 @@ class System:
         m: int = 0,
         f_jacobian: Function | None = None,
         h_jacobian: Function | None = None,
-        states: Box | None = None,
-        disturbances: Box | None = None,
-        noises: Box | None = None,
+        states: ConvexSet | None = None,
+        disturbances: ConvexSet | None = None,
+        noises: ConvexSet | None = None,
     ) -> None:
         self.n, self.p, self.m = count("n", n, 1), count("p", p, 1), count("m", m, 0)
         self.states = _set("states", states, self.n)
@@ -88,6 +89,9 @@ class System:
         self.h = BatchedFunction("h", h, (self.p,), self.m, probes)
         self.f_jacobian = Jacobian(self.f, f_jacobian, self.m, probes)
         self.h_jacobian = Jacobian(self.h, h_jacobian, self.m, probes)
+        #: The sampling time of a system made by `from_ode`, None otherwise.
+        self.dt: float | None = None
+        self._timed: Callable[[], System] | None = None
 
     @classmethod
     def from_ode(
@@ -102,9 +106,9 @@ class System:
         method: str = "rk4",
         rate_jacobian: Function | None = None,
         h_jacobian: Function | None = None,
-        states: Box | None = None,
-        disturbances: Box | None = None,
-        noises: Box | None = None,
+        states: ConvexSet | None = None,
+        disturbances: ConvexSet | None = None,
+        noises: ConvexSet | None = None,
     ) -> System:
         r"""Discretise :math:`\dot x = f_c(x, u)` with a fixed step; u is held over the step.
 
@@ -137,13 +141,45 @@ class System:
         if rate_jacobian is not None:
             Jacobian(batched, rate_jacobian, m, probes)  # compared with differences here
             given = BatchedFunction("rate_jacobian", rate_jacobian, (n, n), m, probes)
-        f, f_jacobian = discretize(
-            _over_leading(batched, rate), given and _over_leading(given, rate_jacobian), dt, method
+        step, step_jacobian = discretize(
+            _over_leading(batched, rate), given and _over_leading(given, rate_jacobian), method
         )
-        return cls(
-            f, h, n=n, p=p, m=m, f_jacobian=f_jacobian, h_jacobian=h_jacobian,
-            states=states, disturbances=disturbances, noises=noises,
+        length = positive("dt", dt)
+        sets: dict[str, Any] = {
+            "states": states, "disturbances": disturbances, "noises": noises
+        }
+        system = cls(
+            partial(step, length), h, n=n, p=p, m=m,
+            f_jacobian=step_jacobian and partial(step_jacobian, length),
+            h_jacobian=h_jacobian, **sets,
         )
+        system.dt = length
+
+        def timed() -> System:
+            return cls(
+                _timed_by_input(step, m), _without_last(system.h.batch, m), n=n, p=p, m=m + 1,
+                f_jacobian=step_jacobian and _timed_by_input(step_jacobian, m),
+                h_jacobian=_without_last(system.h_jacobian.batch, m), **sets,
+            )
+
+        system._timed = timed
+        return system
+
+    @cached_property
+    def timed(self) -> System:
+        """The same system with the step's length as one more input, behind the others.
+
+        Raises
+        ------
+        InvalidInputError
+            If the system is not made by `from_ode`.
+        """
+        if self._timed is None:
+            raise InvalidInputError(
+                "the system is discrete: steps of another length need a model in continuous "
+                "time, made by System.from_ode."
+            )
+        return self._timed()
 
     @property
     def derivatives(self) -> dict[str, str]:
@@ -184,17 +220,31 @@ def _over_leading(function: BatchedFunction, written: Any) -> Function:
     return evaluate
 
 
-def _set(name: str, value: Box | None, dimension: int) -> Box | None:
+def _timed_by_input(step: Function, m: int) -> Function:
+    def evaluate(x: Array, u: Array) -> Any:
+        return step(u[..., m:], x, u[..., :m]) if m else step(u, x)
+
+    return evaluate
+
+
+def _without_last(function: Function, m: int) -> Function:
+    def evaluate(x: Array, u: Array) -> Any:
+        return function(x, u[..., :m]) if x.ndim > 1 else function(x[None], u[None, :m])[0]
+
+    return evaluate
+
+
+def _set(name: str, value: ConvexSet | None, dimension: int) -> ConvexSet | None:
     if value is None:
         return None
-    if not isinstance(value, Box):
-        raise SetError(f"{name} is {value!r}; expected a qpmhe.Box or None.")
+    if not isinstance(value, ConvexSet):
+        raise SetError(f"{name} is {value!r}; expected a qpmhe.Box, a qpmhe.Polytope or None.")
     if value.dimension != dimension:
         raise SetError(f"{name} has dimension {value.dimension}; expected {dimension}.")
     return value
 
 
-def _probes(states: Box | None, n: int, m: int) -> Probes:
+def _probes(states: ConvexSet | None, n: int, m: int) -> Probes:
     """A few irregular points inside the state bounds, to try functions on."""
     generator = np.random.default_rng(20210829)
     probes: Probes = []

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .costs import QuadraticCost
+from .costs import Cost
 from .linearization import StageTerms
-from .observers import Observer
+from .observers import Observer, Sample
 from .system import System
 
 __all__ = ["Window"]
@@ -20,9 +21,9 @@ Array = NDArray[np.float64]
 class Window:
     r"""Samples y(t-N), ..., y(t-1) with the observer's states z(t-N), ..., z(t).
 
-    The observer's trajectory never changes once computed, so what depends on it alone is
-    computed when a stage enters and kept while it stays: the residuals
-    :math:`(L(i), v_z(i))`, their cost, the Jacobians and the Gauss-Newton terms.
+    The observer's trajectory changes only where a late measurement or a restart makes it,
+    so what depends on it alone is computed when a stage enters and kept while it stays: the
+    residuals :math:`(L(i), v_z(i))`, their cost, the Jacobians and the Gauss-Newton terms.
 
     The arrays are longer than the window, which slides along them; at the end its stages
     move back to the front. Thus every window is a plain slice.
@@ -43,26 +44,32 @@ class Window:
         self,
         system: System,
         observer: Observer,
-        cost: QuadraticCost,
+        cost: Cost,
         horizon: int,
         initial_state: Array,
         linearized: bool,
     ) -> None:
         n, p, m = system.n, system.p, system.m
         self._system, self._observer, self._cost = system, observer, cost
-        self._f, self._h = system.f, system.h
-        self._n, self._linearized = n, linearized
+        self._n, self._m, self._linearized = n, m, linearized
         self._jacobians = linearized or observer.needs_jacobians
         self.horizon = horizon
         room = horizon + max(horizon, 64)
         self._room = room
         self._z = np.zeros((room + 1, n))
-        self._y, self._u = np.zeros((room, p)), np.zeros((room, m))
+        # The input of each stage, and behind it the length of its step where that is unusual.
+        self._y, self._u = np.zeros((room, p)), np.zeros((room, m + 1))
+        self._irregular = np.zeros(room, dtype=np.bool_)
         self._observed = np.ones((room, p), dtype=np.bool_)
+        # Stages whose weight is not the cost's own, because y is missing or has its own noise.
+        self._special = np.zeros(room, dtype=np.bool_)
+        self._own_noise: dict[int, Array] = {}  # by time
         self._residuals = np.zeros((room, n + p))
         self._weight = np.zeros((room, n + p, n + p))
+        # With a cost that is not quadratic: the weights that majorise it at the candidate.
+        self._majorising = self._weight if cost.quadratic else np.zeros((room, n + p, n + p))
         self._stage_cost = np.zeros(room)
-        self._terms = StageTerms(room, n, p)
+        self.terms = StageTerms(room, n, p)
         covariance = observer.initial_covariance()
         self._covariance = None if covariance is None else np.zeros((room + 1, n, n))
         self._z[0] = initial_state
@@ -70,7 +77,10 @@ class Window:
             self._covariance[0] = covariance
         self.time = 0  # samples ever pushed: the window ends at x(time)
         self.start = self.end = 0
-        self._last_partial = self._last_failure = -horizon - 1
+        self._last_special = self._last_irregular = -horizon - 1
+        self._sample = Sample(system, np.zeros(m))
+        # gamma^0, gamma^1, ... from the newest stage backwards, and the prior's behind.
+        self._ages = cost.discount ** np.arange(horizon, -1, -1.0) if cost.discount < 1 else None
 
     @property
     def length(self) -> int:
@@ -78,11 +88,18 @@ class Window:
         return self.end - self.start
 
     @property
-    def has_missing(self) -> bool:
-        """Whether any component of y is missing in the window."""
-        return self.time - self._last_partial <= self.length
+    def has_special_weights(self) -> bool:
+        """Whether some stage of the window has a weight of its own."""
+        return self.time - self._last_special <= self.length
 
-    def push(self, y: Array, u: Array) -> tuple[bool, bool]:
+    @property
+    def has_irregular_steps(self) -> bool:
+        """Whether some stage of the window has a step of unusual length."""
+        return self.time - self._last_irregular <= self.length
+
+    def push(
+        self, y: Array, u: Array, dt: float | None = None, noise_weight: Array | None = None
+    ) -> tuple[bool, bool]:
         """Take the sample y(t), u(t) in, and advance the observer to z(t+1).
 
         Returns
@@ -94,50 +111,116 @@ class Window:
         """
         if self.end == self._room:
             self._move_to_front()
-        k = self.end
-        self._y[k], self._u[k] = y, u
+        k, m = self.end, self._m
+        self._y[k] = y
         self._observed[k] = True
-        self._weight[k] = weight = self._cost.stage_weight
-        cost, missing = self._advance(k, weight, None), False
-        if not math.isfinite(cost):
-            observed = np.isfinite(y)
-            missing = not observed.all()
-            if missing:
-                self._observed[k] = observed
-                self._y[k, ~observed] = 0.0  # any number: its weight is zero
-                self._weight[k] = weight = self._cost.partial_weight(observed)
-                self._last_partial = self.time
-                cost = self._advance(k, weight, observed)
-        failed = not math.isfinite(cost)
-        if failed:
-            self._hold(k)
-        self._stage_cost[k] = cost
-        linear = not (self._linearized and not failed) or self._linearize(k, weight)
+        self._u[k, :m] = u
+        self._irregular[k] = dt is not None
+        if dt is not None:
+            self._u[k, m] = dt
+            self._last_irregular = self.time
+        if noise_weight is not None:
+            self._own_noise[self.time] = noise_weight
+        self._set_weight(k, self.time)
+        missing, failed = self._enter(k, self.time)
         self.end = k + 1
         self.time += 1
         if self.end - self.start > self.horizon:
             self.start += 1
-        return missing, failed or not linear
+            if self._own_noise:
+                self._own_noise.pop(self.time - self.horizon - 1, None)
+        return missing, failed
 
-    def _advance(self, k: int, weight: Array, observed: NDArray[np.bool_] | None) -> float:
+    def amend(self, time: int, y: Array) -> None:
+        """Put the finite components of y into a sample of the window, and redo the rest.
+
+        Parameters
+        ----------
+        time : int
+            The sample's time, within the window.
+        y : (p,) array
+            The late measurement.
+        """
+        k = self.end - (self.time - time)
+        new = np.isfinite(y)
+        self._y[k, new] = y[new]
+        self._observed[k] |= new
+        self._set_weight(k, time)
+        self.replay(self.time - time)
+
+    def replay(self, steps: int, state: Array | None = None) -> None:
+        """Redo the last stages, from another state of the observer if one is given.
+
+        Parameters
+        ----------
+        steps : int
+            How many stages, at most the window's length.
+        state : (n,) array, optional
+            The observer's state where they begin.
+        """
+        first = self.end - steps
+        if state is not None:
+            self._z[first] = state
+        for k in range(first, self.end):
+            self._enter(k, self.time - (self.end - k))
+
+    def _enter(self, k: int, time: int) -> tuple[bool, bool]:
+        """Compute stage k from z(k) and its sample; whether y is in part missing, or it failed."""
+        observed: NDArray[np.bool_] | None = None
+        if self._special[k] and not self._observed[k].all():
+            observed = self._observed[k]
+        cost = self._advance(k, time, observed)
+        if not math.isfinite(cost) and observed is None:
+            there = np.isfinite(self._y[k])
+            if not there.all():
+                self._observed[k] = observed = there
+                self._set_weight(k, time)
+                cost = self._advance(k, time, observed)
+        failed = not math.isfinite(cost)
+        if failed:
+            self._hold(k)
+        self._stage_cost[k] = cost
+        linear = failed or not self._linearized or self._linearize(k)
+        return observed is not None, failed or not linear
+
+    def _set_weight(self, k: int, time: int) -> None:
+        """The weight of stage k, at this time, from what is observed of it and its noise."""
+        own, observed = self._own_noise.get(time), self._observed[k]
+        complete = observed.all()
+        self._special[k] = own is not None or not complete
+        if not self._special[k]:
+            self._weight[k] = self._cost.stage_weight
+            return
+        self._last_special = max(self._last_special, time)
+        self._y[k, ~observed] = 0.0  # any number: its weight is zero
+        if complete:
+            self._weight[k] = self._cost.joint_weight(own)
+        else:
+            self._weight[k] = self._cost.partial_weight(observed, own)
+
+    def _advance(self, k: int, time: int, observed: NDArray[np.bool_] | None) -> float:
         """Evaluate stage k at z and step the observer; the stage's cost, or infinity."""
-        n, z, u, following = self._n, self._z[k], self._u[k], self._z[k + 1]
-        residual = self._residuals[k]
+        n, z, following = self._n, self._z[k], self._z[k + 1]
+        model, u = self._system, self._u[k, : self._m]
+        residual, weight, sample = self._residuals[k], self._weight[k], self._sample
         correction, error = residual[:n], residual[n:]
         try:
-            drift = self._f(z, u)
-            np.subtract(self._y[k], self._h(z, u), out=error)
+            if self._irregular[k]:
+                model, u = self._system.timed, self._u[k]
+            drift = model.f(z, u)
+            np.subtract(self._y[k], model.h(z, u), out=error)
             if observed is not None:
                 error[~observed] = 0.0
+            sample.system, sample.u, sample.observed = model, u, observed
             if self._jacobians:
-                jacobian = self._terms.jacobian[k]
-                jacobian[:n] = self._system.f_jacobian(z, u)
-                jacobian[n:] = self._system.h_jacobian(z, u)
-                a, c = jacobian[:n], jacobian[n:]
-            else:
-                a = c = None
-            prior = None if self._covariance is None else self._covariance[k]
-            correction[:], posterior = self._observer.correct(z, error, a, c, observed, prior)
+                jacobian = self.terms.jacobian[k]
+                jacobian[:n] = model.f_jacobian(z, u)
+                jacobian[n:] = model.h_jacobian(z, u)
+                sample.f_jacobian, sample.h_jacobian = jacobian[:n], jacobian[n:]
+            if self._covariance is not None:
+                sample.covariance = self._covariance[k]
+                sample.noise_weight = self._own_noise.get(time)
+            correction[:], posterior = self._observer.correct(z, error, sample)
             np.add(drift, correction, out=following)
         except Exception:  # a model function outside its domain: bad luck, not bad input
             return math.inf
@@ -147,41 +230,52 @@ class Window:
             self._covariance[k + 1] = posterior
         if not math.isfinite(following.dot(following)):
             return math.inf
-        cost = float(residual.dot(weight).dot(residual))
+        if self._cost.quadratic:
+            cost = float(residual.dot(weight).dot(residual))
+        else:
+            cost = float(self._cost.stage_costs(residual[None], weight)[0])
         return cost if math.isfinite(cost) else math.inf
 
-    def _linearize(self, k: int, weight: Array) -> bool:
+    def _linearize(self, k: int) -> bool:
         residual = self._residuals[k]
-        flat = self._terms.jacobian[k].reshape(-1)
+        flat = self.terms.jacobian[k].reshape(-1)
         linear = math.isfinite(flat.dot(flat))
         if not linear:
-            self._terms.jacobian[k] = np.eye(*self._terms.jacobian[k].shape)
-        self._terms.set_stage(k, weight, residual, weight.dot(residual))
+            self.terms.jacobian[k] = np.eye(*self.terms.jacobian[k].shape)
+        if not self._cost.quadratic:
+            self._majorising[k] = self._cost.majorise(residual[None], self._weight[k])[0]
+        weight = self._majorising[k]
+        self.terms.set_stage(k, weight, residual, weight.dot(residual))
         return linear
 
     def _hold(self, k: int) -> None:
         """Fill a stage at which the model cannot be evaluated: x(t+1) about x(t)."""
-        self._last_failure = self.time
         self._z[k + 1] = self._z[k]
         if self._covariance is not None:
             self._covariance[k + 1] = self._covariance[k]
         self._residuals[k] = 0.0
-        self._terms.jacobian[k] = np.eye(*self._terms.jacobian[k].shape)
+        self.terms.jacobian[k] = np.eye(*self.terms.jacobian[k].shape)
+        self._majorising[k] = self._weight[k]
         if self._linearized:
             nothing = np.zeros_like(self._residuals[k])
-            self._terms.set_stage(k, self._weight[k], nothing, nothing)
+            self.terms.set_stage(k, self._weight[k], nothing, nothing)
 
     def restart(self, state: Array) -> None:
         """Go on from another state after a failed stage, whose correction is void anyway."""
         self._z[self.end] = state
 
+    def _per_stage(self) -> tuple[Array, ...]:
+        arrays: tuple[Array | Any, ...] = (
+            self._y, self._u, self._irregular, self._observed, self._special,
+            self._residuals, self._weight, self._stage_cost,
+        )
+        return arrays if self._cost.quadratic else (*arrays, self._majorising)
+
     def _move_to_front(self) -> None:
-        keep, end = min(self.horizon, self.end - self.start), self.end
-        for array in (
-            self._y, self._u, self._observed, self._residuals, self._weight, self._stage_cost
-        ):
+        keep, end = self.end - self.start, self.end
+        for array in self._per_stage():
             array[:keep] = array[end - keep : end]
-        self._terms.keep_last(end, keep)
+        self.terms.keep_last(end, keep)
         for states in (self._z, self._covariance):
             if states is not None:
                 states[: keep + 1] = states[end - keep : end + 1]
@@ -200,7 +294,18 @@ class Window:
     @property
     def candidate_cost(self) -> float:
         """J of the candidate; its prior term is 0 exactly."""
-        return float(np.add.reduce(self._stage_cost[self.start : self.end]))
+        costs = self._stage_cost[self.start : self.end]
+        if self._ages is None:
+            return float(np.add.reduce(costs))
+        return float(costs.dot(self.discounts[1:]))
+
+    @property
+    def discounts(self) -> Array:
+        """Factors of the prior, in front, and of the stages' costs; ones without discount."""
+        if self._ages is None:
+            return np.ones(self.length + 1)
+        # gamma^K for the prior, gamma^(K-1), ..., gamma^0 for the stages.
+        return self._ages[self.horizon - self.length :]
 
     @property
     def measurements(self) -> Array:
@@ -214,27 +319,35 @@ class Window:
 
     @property
     def inputs(self) -> Array:
-        """The inputs u: a view."""
-        return self._u[self.start : self.end]
+        """The inputs u, with the steps' lengths behind them if some are irregular."""
+        u = self._u[self.start : self.end]
+        if not self.has_irregular_steps:
+            return u[:, : self._m]
+        lengths = self._u[:, self._m]
+        usual = ~self._irregular[self.start : self.end]
+        lengths[self.start : self.end][usual] = self._system.dt
+        return u
+
+    @property
+    def model(self) -> System:
+        """The system that takes these `inputs`."""
+        return self._system.timed if self.has_irregular_steps else self._system
 
     @property
     def stage_weights(self) -> Array:
-        """One weight for all stages (q, q), or one for each where y is missing in part."""
-        if self.has_missing:
+        """One weight for all stages (q, q), or one for each where some is special."""
+        if self.has_special_weights:
             return self._weight[self.start : self.end]
         return self._cost.stage_weight
+
+    @property
+    def majorising_weights(self) -> Array:
+        """Weights that majorise the cost at the candidate, of all stages or of each."""
+        if self._cost.quadratic:
+            return self.stage_weights
+        return self._majorising[self.start : self.end]
 
     @property
     def prior_covariance(self) -> Array | None:
         """The observer's covariance at z(t-N), if it has one."""
         return None if self._covariance is None else self._covariance[self.start]
-
-    @property
-    def first(self) -> int:
-        """Where the window's stages begin in `terms`."""
-        return self.start
-
-    @property
-    def terms(self) -> StageTerms:
-        """Gauss-Newton terms of the candidate, at `first` and on."""
-        return self._terms

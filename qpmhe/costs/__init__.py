@@ -1,6 +1,19 @@
 """Costs: what the prior, the disturbances and the noises weigh."""
 
+from .base import Cost, CostConstants
+from .losses import Huber, Loss, Power, Quadratic
 from .prior import ObserverPrior
-from .quadratic import CostConstants, QuadraticCost
+from .quadratic import QuadraticCost
+from .robust import RobustCost
 
-__all__ = ["CostConstants", "ObserverPrior", "QuadraticCost"]
+__all__ = [
+    "Cost",
+    "CostConstants",
+    "Huber",
+    "Loss",
+    "ObserverPrior",
+    "Power",
+    "Quadratic",
+    "QuadraticCost",
+    "RobustCost",
+]

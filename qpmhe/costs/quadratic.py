@@ -2,38 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .._checks import positive_definite
+from .base import Cost, CostConstants, quadratic_form
 from .prior import ObserverPrior
 
-__all__ = ["CostConstants", "QuadraticCost"]
+__all__ = ["QuadraticCost"]
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class CostConstants:
-    """The constants of Assumption ass:stagecosts, (eq:exp_bounds).
-
-    Parameters
-    ----------
-    exponent : float
-        a.
-    prior, disturbance, noise : (float, float)
-        Lower and upper constant c of each term: lower |s|^a <= cost(s) <= upper |s|^a.
-    """
-
-    exponent: float
-    prior: tuple[float, float]
-    disturbance: tuple[float, float]
-    noise: tuple[float, float]
-
-
-class QuadraticCost:
+class QuadraticCost(Cost):
     r"""Quadratic prior weighting and stage cost.
 
     .. math::
@@ -52,11 +33,16 @@ class QuadraticCost:
         Weight Q of the disturbance w, symmetric positive definite.
     noise : (p, p) array_like
         Weight R of the measurement noise v, symmetric positive definite.
+    discount : float
+        Factor in (0, 1] by which a stage's cost shrinks with each step of age, the prior's
+        with the window's length; 1 is the paper's cost.
 
     Raises
     ------
     WeightError, ShapeError
         If a weight is not square, symmetric and positive definite.
+    OptionError
+        If the discount is outside of (0, 1].
 
     Notes
     -----
@@ -64,26 +50,32 @@ class QuadraticCost:
     that are there: the inverse of their block of the covariance R^{-1}.
     """
 
+    quadratic = True
+
     def __init__(
-        self, *, prior: ArrayLike | ObserverPrior, disturbance: ArrayLike, noise: ArrayLike
+        self,
+        *,
+        prior: ArrayLike | ObserverPrior,
+        disturbance: ArrayLike,
+        noise: ArrayLike,
+        discount: float = 1.0,
     ) -> None:
-        self.disturbance: Array = positive_definite("disturbance", disturbance)
-        self.noise: Array = positive_definite("noise", noise)
-        self.n, self.p = self.disturbance.shape[0], self.noise.shape[0]
-        self.prior: Array | ObserverPrior
+        w = positive_definite("disturbance", disturbance)
+        first: Array | ObserverPrior
         if isinstance(prior, ObserverPrior):
-            self.prior = prior
+            first = prior
         else:
-            self.prior = positive_definite("prior", prior, self.n)
-        # Of the joint residual (w, v), so that a stage costs one product.
-        self.stage_weight: Array = np.zeros((self.n + self.p, self.n + self.p))
-        self.stage_weight[: self.n, : self.n] = self.disturbance
-        self.stage_weight[self.n :, self.n :] = self.noise
-        self._partial: dict[bytes, Array] = {}
+            first = positive_definite("prior", prior, w.shape[0])
+        super().__init__(first, w, positive_definite("noise", noise), discount)
 
     @classmethod
     def from_covariances(
-        cls, *, prior: ArrayLike | ObserverPrior, disturbance: ArrayLike, noise: ArrayLike
+        cls,
+        *,
+        prior: ArrayLike | ObserverPrior,
+        disturbance: ArrayLike,
+        noise: ArrayLike,
+        discount: float = 1.0,
     ) -> QuadraticCost:
         """The same cost, given covariances instead of weights.
 
@@ -91,6 +83,8 @@ class QuadraticCost:
         ----------
         prior, disturbance, noise : array_like
             Covariances of the initial error, of w and of v, symmetric positive definite.
+        discount : float
+            As for `QuadraticCost`.
 
         Raises
         ------
@@ -103,6 +97,7 @@ class QuadraticCost:
             ),
             disturbance=_inverse("disturbance covariance", disturbance),
             noise=_inverse("noise covariance", noise),
+            discount=discount,
         )
 
     @property
@@ -114,25 +109,21 @@ class QuadraticCost:
             prior = _extremes(self.prior)
         return CostConstants(2.0, prior, _extremes(self.disturbance), _extremes(self.noise))
 
-    def partial_weight(self, observed: NDArray[np.bool_]) -> Array:
-        """The stage weight where only some components of y are there; zero on the others.
+    def stage_costs(self, residuals: Array, weights: Array) -> Array:
+        """The quadratic forms; see `Cost.stage_costs`."""
+        return quadratic_form(residuals, weights)
 
-        Parameters
-        ----------
-        observed : (p,) bool array
-            Which components are there.
-        """
-        key = observed.tobytes()
-        if key not in self._partial:
-            weight = self.stage_weight.copy()
-            weight[self.n :, self.n :] = 0.0
-            there = np.flatnonzero(observed)
-            if there.size:
-                block = np.linalg.inv(self.noise)[np.ix_(there, there)]
-                place = self.n + there
-                weight[np.ix_(place, place)] = np.linalg.inv(block)
-            self._partial[key] = weight
-        return self._partial[key]
+    def majorise(self, residuals: Array, weights: Array) -> Array:
+        """The weights themselves; see `Cost.majorise`."""
+        return weights
+
+    def prior_cost(self, offset: Array, weight: Array) -> float:
+        """The quadratic form; see `Cost.prior_cost`."""
+        return float(offset.dot(weight).dot(offset))
+
+    def majorise_prior(self, offset: Array, weight: Array) -> Array:
+        """The weight itself; see `Cost.majorise_prior`."""
+        return weight
 
 
 def _inverse(name: str, covariance: ArrayLike) -> Array:

@@ -3,16 +3,45 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..system import System
 
-__all__ = ["Observer"]
+__all__ = ["Observer", "Sample"]
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+
+
+@dataclass(slots=True)
+class Sample:
+    """What an observer may know of the stage at which it corrects.
+
+    Parameters
+    ----------
+    system : System
+        The model that holds at this stage.
+    u : (m,) array
+        The input.
+    f_jacobian, h_jacobian : (n, n) and (p, n) array or None
+        Jacobians at z, if `Observer.needs_jacobians`.
+    observed : (p,) bool array or None
+        Which components of y are there; None if all are.
+    noise_weight : (p, p) array or None
+        Weight of this sample's noise, if it is not the usual one.
+    covariance : (n, n) array or None
+        Covariance of x(t) - z(t), if the observer has one.
+    """
+
+    system: System
+    u: Array
+    f_jacobian: Array | None = None
+    h_jacobian: Array | None = None
+    observed: NDArray[np.bool_] | None = None
+    noise_weight: Array | None = None
+    covariance: Array | None = None
 
 
 class Observer(ABC):
@@ -47,15 +76,7 @@ class Observer(ABC):
         return None
 
     @abstractmethod
-    def correct(
-        self,
-        z: Array,
-        v: Array,
-        f_jacobian: Array | None,
-        h_jacobian: Array | None,
-        observed: Mask | None,
-        covariance: Array | None,
-    ) -> tuple[Array, Array | None]:
+    def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array | None]:
         """The correction L(z, v) and the covariance of the next step.
 
         Parameters
@@ -64,10 +85,6 @@ class Observer(ABC):
             Observer state z(t).
         v : (p,) array
             Fitting error y(t) - h(z(t)), with zeros where y is missing.
-        f_jacobian, h_jacobian : (n, n) and (p, n) array or None
-            Jacobians at z, if `needs_jacobians`.
-        observed : (p,) bool array or None
-            Which components of y are there; None if all are.
-        covariance : (n, n) array or None
-            Covariance of x(t) - z(t), if the observer has one.
+        sample : Sample
+            What else is known of the stage; overwritten at the next one.
         """

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import positive_definite
 from ..errors import ShapeError
 from ..system import System
-from .base import Mask, Observer
+from .base import Observer, Sample
 
 __all__ = ["ExtendedKalman"]
 
@@ -71,26 +71,20 @@ class ExtendedKalman(Observer):
         """P(0)."""
         return self._prior
 
-    def correct(
-        self,
-        z: Array,
-        v: Array,
-        f_jacobian: Array | None,
-        h_jacobian: Array | None,
-        observed: Mask | None,
-        covariance: Array | None,
-    ) -> tuple[Array, Array]:
+    def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""
-        if f_jacobian is None or h_jacobian is None or covariance is None:
+        a, c, covariance = sample.f_jacobian, sample.h_jacobian, sample.covariance
+        if a is None or c is None or covariance is None:
             raise ValueError("the extended Kalman observer needs Jacobians and a covariance")
-        c, r = h_jacobian, self._noise
-        if observed is not None:
-            c, r, v = c[observed], r[np.ix_(observed, observed)], v[observed]
-        predicted = f_jacobian @ covariance @ f_jacobian.T + self._disturbance
+        r = self._noise if sample.noise_weight is None else np.linalg.inv(sample.noise_weight)
+        if sample.observed is not None:
+            there = sample.observed
+            c, r, v = c[there], r[np.ix_(there, there)], v[there]
+        moved = a @ covariance
+        predicted = moved @ a.T + self._disturbance
         if v.size == 0:
             return np.zeros_like(z), predicted
-        ap = f_jacobian @ covariance
-        cross = ap @ c.T
+        cross = moved @ c.T
         gain = np.linalg.solve(c @ covariance @ c.T + r, cross.T).T
         following = predicted - gain @ cross.T
         return gain @ v, 0.5 * (following + following.T)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError
 from ..system import System
-from .base import Mask, Observer
+from .base import Observer, Sample
 
 __all__ = ["OutputInjection"]
 
@@ -63,14 +63,6 @@ class OutputInjection(Observer):
                 "output-injection form must not correct where the output fits: L(z, 0) = 0."
             )
 
-    def correct(
-        self,
-        z: Array,
-        v: Array,
-        f_jacobian: Array | None,
-        h_jacobian: Array | None,
-        observed: Mask | None,
-        covariance: Array | None,
-    ) -> tuple[Array, None]:
+    def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, None]:
         """L(z, v); see `Observer.correct`."""
         return np.asarray(self._correction(z, v), dtype=np.float64), None

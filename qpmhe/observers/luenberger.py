@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import numbers
 from ..errors import ShapeError
 from ..system import System
-from .base import Mask, Observer
+from .base import Observer, Sample
 
 __all__ = ["Luenberger"]
 
@@ -50,14 +50,6 @@ class Luenberger(Observer):
         """The constant of (eq:kappa)."""
         return float(np.linalg.norm(self.gain, 2))
 
-    def correct(
-        self,
-        z: Array,
-        v: Array,
-        f_jacobian: Array | None,
-        h_jacobian: Array | None,
-        observed: Mask | None,
-        covariance: Array | None,
-    ) -> tuple[Array, None]:
+    def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, None]:
         """K v; see `Observer.correct`."""
         return self.gain @ v, None

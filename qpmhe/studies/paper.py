@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -186,9 +187,9 @@ class IpoptComparison:
     def estimator(self, iterations: int | None) -> IpoptEstimator:
         """Ipopt, terminated after this many iterations."""
         system, observer, cost, scenario = self.study.model
-        f, _ = discretize(casadi_rate, None, scenario.dt, self.study.method)
+        step, _ = discretize(casadi_rate, None, self.study.method)
         return IpoptEstimator(
-            system, observer, cost, f=f, h=casadi_output, horizon=scenario.horizon,
+            system, observer, cost, f=partial(step, scenario.dt), h=casadi_output, horizon=scenario.horizon,
             initial_state=scenario.initial_estimate, max_iterations=iterations,
         )
 

@@ -58,6 +58,17 @@ class AutoSolver(Solver):
             self._others[small] = self._choose(small)
         return self._others[small].solve(qp, start)
 
+    def prepare(self, size: int) -> None:
+        """Make the QP solvers: theirs is a long import.
+
+        Parameters
+        ----------
+        size : int
+            Unknowns of the largest QP to come.
+        """
+        for small in {True, size <= _SMALL}:
+            self._others[small] = self._choose(small)
+
     def _choose(self, small: bool) -> Solver:
         from .registry import available, backend, create
 

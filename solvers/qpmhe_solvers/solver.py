@@ -37,6 +37,15 @@ class Solver(ABC):
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
         """Solve qp. May raise, hang on to nothing, and lie: `solve` contains all of it."""
 
+    def prepare(self, size: int) -> None:
+        """Do beforehand what the first QPs with inequalities would otherwise wait for.
+
+        Parameters
+        ----------
+        size : int
+            Unknowns K n of the largest QP to come.
+        """
+
     def solve(self, qp: QP, start: Array | None = None) -> Solution:
         """Solve a QP; never raises an `Exception`, and never believes the solver.
 

@@ -1,0 +1,177 @@
+"""What every cost offers: weights for the QP, values for the verdict."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import OptionError
+from .prior import ObserverPrior
+
+__all__ = ["Cost", "CostConstants"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class CostConstants:
+    """The constants of Assumption ass:stagecosts, (eq:exp_bounds).
+
+    Parameters
+    ----------
+    exponent : float
+        a.
+    prior, disturbance, noise : (float, float)
+        Lower and upper constant c of each term: lower |s|^a <= cost(s) <= upper |s|^a.
+    """
+
+    exponent: float
+    prior: tuple[float, float]
+    disturbance: tuple[float, float]
+    noise: tuple[float, float]
+
+
+class Cost(ABC):
+    r"""A cost :math:`\gamma^K \Gamma(x_0 - \bar x) + \sum_{i<K} \gamma^{K-1-i} l(w_i, v_i)`.
+
+    Make a `QuadraticCost` or a `RobustCost`. The terms are functions of quadratic forms, so
+    that a stage is described by one joint weight of the residual (w, v), of shape
+    (n + p, n + p), and the QP by the weights that majorise the terms where it is built.
+
+    Attributes
+    ----------
+    n, p : int
+        Numbers of states and outputs.
+    disturbance, noise : (n, n) and (p, p) array
+        Weights of w and v.
+    discount : float
+        gamma, 1 for none.
+    stage_weight : (n + p, n + p) array
+        Both weights as one.
+    """
+
+    #: Whether the terms are the quadratic forms themselves, which makes weights constant.
+    quadratic: bool = False
+
+    def __init__(
+        self,
+        prior: Array | ObserverPrior,
+        disturbance: Array,
+        noise: Array,
+        discount: float,
+    ) -> None:
+        if isinstance(discount, bool) or not isinstance(discount, (int, float)) or not (
+            0.0 < discount <= 1.0
+        ):
+            raise OptionError(f"discount is {discount!r}; expected a number in (0, 1].")
+        self.discount = float(discount)
+        self.prior, self.disturbance, self.noise = prior, disturbance, noise
+        self.n, self.p = disturbance.shape[0], noise.shape[0]
+        self.stage_weight = self.joint_weight(noise)
+        self._partial: dict[bytes, Array] = {}
+
+    @property
+    @abstractmethod
+    def constants(self) -> CostConstants | None:
+        """The constants of (eq:exp_bounds), or None if the cost has none."""
+
+    @abstractmethod
+    def stage_costs(self, residuals: Array, weights: Array) -> Array:
+        """l(w, v) of each stage.
+
+        Parameters
+        ----------
+        residuals : (K, n + p) array
+            w and v.
+        weights : (n + p, n + p) or (K, n + p, n + p) array
+            Joint weight of all stages, or of each.
+        """
+
+    @abstractmethod
+    def majorise(self, residuals: Array, weights: Array) -> Array:
+        """Weights W of quadratic forms that touch the stage costs at the residuals r.
+
+        ``r^T W s`` is half the derivative of l at r in direction s; for exponents up to 2
+        the form also lies above l, up to a constant.
+
+        Parameters
+        ----------
+        residuals, weights
+            As for `stage_costs`.
+
+        Returns
+        -------
+        (n + p, n + p) or (K, n + p, n + p) array
+        """
+
+    @abstractmethod
+    def prior_cost(self, offset: Array, weight: Array) -> float:
+        """Gamma.
+
+        Parameters
+        ----------
+        offset : (n,) array
+            x_0 minus the prior.
+        weight : (n, n) array
+            The prior's weight.
+        """
+
+    @abstractmethod
+    def majorise_prior(self, offset: Array, weight: Array) -> Array:
+        """The prior's counterpart of `majorise`.
+
+        Parameters
+        ----------
+        offset, weight
+            As for `prior_cost`.
+        """
+
+    def joint_weight(self, noise: Array | None) -> Array:
+        """The weight of (w, v) with this weight of v.
+
+        Parameters
+        ----------
+        noise : (p, p) array or None
+            Weight of the measurement noise; None for the usual one.
+        """
+        joint = np.zeros((self.n + self.p, self.n + self.p))
+        joint[: self.n, : self.n] = self.disturbance
+        joint[self.n :, self.n :] = self.noise if noise is None else noise
+        return joint
+
+    def partial_weight(self, observed: Mask, noise: Array | None = None) -> Array:
+        """The stage weight where only some components of y are there; zero on the others.
+
+        Those there weigh the inverse of their block of the noise covariance.
+
+        Parameters
+        ----------
+        observed : (p,) bool array
+            Which components are there.
+        noise : (p, p) array, optional
+            A weight of this sample's noise, instead of the usual one.
+        """
+        key = observed.tobytes()
+        if noise is None and key in self._partial:
+            return self._partial[key]
+        weight = self.noise if noise is None else noise
+        reduced = np.zeros_like(weight)
+        there = np.flatnonzero(observed)
+        if there.size:
+            block = np.linalg.inv(weight)[np.ix_(there, there)]
+            reduced[np.ix_(there, there)] = np.linalg.inv(block)
+        joint = self.joint_weight(reduced)
+        if noise is None:
+            self._partial[key] = joint
+        return joint
+
+
+def quadratic_form(residuals: Array, weights: Array) -> Array:
+    """r^T W r of each row of residuals, for one weight or one a row."""
+    if weights.ndim == 2:
+        return np.einsum("ki,ki->k", residuals @ weights, residuals)
+    return np.einsum("ki,kij,kj->k", residuals, weights, residuals)

@@ -1,0 +1,113 @@
+"""A cost with losses of the user's choice."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import positive_definite
+from ..errors import InvalidInputError
+from .base import Cost, CostConstants
+from .losses import Loss, Quadratic
+from .prior import ObserverPrior
+
+__all__ = ["RobustCost"]
+
+Array = NDArray[np.float64]
+
+
+class RobustCost(Cost):
+    r"""A cost with a loss for each of prior, disturbance and noise.
+
+    .. math::
+        \Gamma(\chi, \bar x) = \rho_p(\chi - \bar x), \qquad
+        l(\omega, \nu) = \rho_w(\omega) + \rho_v(\nu)
+
+    Parameters
+    ----------
+    prior : Loss, (n, n) array_like or ObserverPrior
+        Loss of the initial error; a matrix stands for `Quadratic`.
+    disturbance : Loss or (n, n) array_like
+        Loss of w, such as `Huber` or `Power`; a matrix stands for `Quadratic`.
+    noise : Loss or (p, p) array_like
+        Loss of v.
+    discount : float
+        As for `QuadraticCost`.
+
+    Raises
+    ------
+    WeightError, ShapeError, OptionError
+        If a weight is not symmetric positive definite, dimensions differ, or the discount
+        is outside of (0, 1].
+
+    Notes
+    -----
+    Assumption ass:stagecosts asks for one exponent a in all three terms. `constants` is
+    None where the losses do not have that; the theorem does not apply then.
+    """
+
+    def __init__(
+        self,
+        *,
+        prior: Loss | ArrayLike | ObserverPrior,
+        disturbance: Loss | ArrayLike,
+        noise: Loss | ArrayLike,
+        discount: float = 1.0,
+    ) -> None:
+        self.disturbance_loss = _loss("disturbance", disturbance)
+        self.noise_loss = _loss("noise", noise)
+        n = self.disturbance_loss.dimension
+        weight: Array | ObserverPrior
+        if isinstance(prior, ObserverPrior):
+            weight = prior
+            self.prior_loss: Loss = Quadratic(np.eye(n))
+        else:
+            self.prior_loss = _loss("prior", prior)
+            weight = positive_definite("prior", self.prior_loss.weight, n)
+        super().__init__(
+            weight, self.disturbance_loss.weight, self.noise_loss.weight, discount
+        )
+
+    @property
+    def constants(self) -> CostConstants | None:
+        """The constants of (eq:exp_bounds), if all losses have the same exponent."""
+        losses = (self.prior_loss, self.disturbance_loss, self.noise_loss)
+        exponent = self.noise_loss.exponent
+        if exponent is None or any(loss.exponent != exponent for loss in losses):
+            return None
+        prior, disturbance, noise = (loss.constants() for loss in losses)
+        if isinstance(self.prior, ObserverPrior):
+            prior = (self.prior.minimum, self.prior.maximum)
+        if prior is None or disturbance is None or noise is None:
+            return None
+        return CostConstants(exponent, prior, disturbance, noise)
+
+    def stage_costs(self, residuals: Array, weights: Array) -> Array:
+        """The losses of w and v added; see `Cost.stage_costs`."""
+        n = self.n
+        value: Array = self.disturbance_loss.cost(residuals[:, :n], weights[..., :n, :n])
+        return value + self.noise_loss.cost(residuals[:, n:], weights[..., n:, n:])
+
+    def majorise(self, residuals: Array, weights: Array) -> Array:
+        """Reweighted forms; see `Cost.majorise`."""
+        n, q = self.n, self.n + self.p
+        joint = np.zeros((residuals.shape[0], q, q))
+        joint[:, :n, :n] = self.disturbance_loss.majorise(residuals[:, :n], weights[..., :n, :n])
+        joint[:, n:, n:] = self.noise_loss.majorise(residuals[:, n:], weights[..., n:, n:])
+        return joint
+
+    def prior_cost(self, offset: Array, weight: Array) -> float:
+        """The loss of the initial error; see `Cost.prior_cost`."""
+        return float(self.prior_loss.cost(offset[None], weight)[0])
+
+    def majorise_prior(self, offset: Array, weight: Array) -> Array:
+        """A reweighted form; see `Cost.majorise_prior`."""
+        return self.prior_loss.majorise(offset[None], weight)[0]
+
+
+def _loss(name: str, given: Loss | ArrayLike) -> Loss:
+    if isinstance(given, Loss):
+        return given
+    if isinstance(given, ObserverPrior):
+        raise InvalidInputError(f"{name} is {given!r}; expected a loss or a weight matrix.")
+    return Quadratic(positive_definite(name, given))

@@ -1,0 +1,78 @@
+"""Options of the estimator, validated in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from ._checks import count, positive
+from .errors import OptionError
+
+__all__ = ["Candidate", "Policy", "Settings", "Start"]
+
+Policy = Literal["drop", "project", "keep"]
+Start = Literal["candidate", "best"]
+Candidate = Literal["observer", "reinitialized"]
+
+# With max_qps=None the sequence ends by convergence; this bounds it where that fails.
+_SAFETY_LIMIT = 100
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Options of `MovingHorizonEstimator`, where each is explained.
+
+    Parameters
+    ----------
+    horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance, engine,
+    outside, start, candidate, time_budget, delay
+        As there.
+
+    Raises
+    ------
+    OptionError
+        If a value is outside its range; the text names it and what was expected.
+    """
+
+    horizon: int
+    backend: str = "auto"
+    max_qps: int | None = 1
+    max_solver_iterations: int | None = None
+    solver_tolerance: float = 1e-7
+    tolerance: float = 1e-9
+    engine: str = "python"
+    outside: str = "drop"
+    start: str = "candidate"
+    candidate: str = "observer"
+    time_budget: float | None = None
+    delay: int = 0
+
+    def __post_init__(self) -> None:
+        count("horizon", self.horizon, 1)
+        if self.max_qps is not None:
+            count("max_qps", self.max_qps, 0, " None stands for convergence.")
+        positive("solver_tolerance", self.solver_tolerance)
+        positive("tolerance", self.tolerance)
+        if self.time_budget is not None:
+            positive("time_budget", self.time_budget)
+        count("delay", self.delay, 0)
+        if self.delay > self.horizon:
+            raise OptionError(
+                f"delay is {self.delay!r}; expected at most the horizon, {self.horizon}: older "
+                "states are not in the window."
+            )
+        for name, choices in (
+            ("engine", ("python",)),
+            ("outside", get_args(Policy)),
+            ("start", get_args(Start)),
+            ("candidate", get_args(Candidate)),
+        ):
+            value = getattr(self, name)
+            if value not in choices:
+                known = ", ".join(repr(choice) for choice in choices)
+                raise OptionError(f"{name} is {value!r}; expected one of {known}.")
+
+    @property
+    def qp_limit(self) -> int:
+        """Most QPs of one window."""
+        return _SAFETY_LIMIT if self.max_qps is None else self.max_qps
