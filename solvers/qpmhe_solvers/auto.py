@@ -29,12 +29,17 @@ class AutoSolver(Solver):
     options : SolverOptions
         Handed to the QP solver. With an iteration cap, solvers that return nothing at the
         cap are passed over.
+
+    Notes
+    -----
+    Where no QP solver brings an iterate, the unconstrained minimiser does as a trial. An
+    iterate of the banded solver lives in its workspace until the next solve.
     """
 
     def __init__(self, options: SolverOptions) -> None:
         super().__init__(options)
         self._banded = BandedSolver(options)
-        self._others: dict[bool, Solver] = {}
+        self._others: dict[bool, list[Solver]] = {}
 
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
         solution = self.solve(qp, start)
@@ -56,7 +61,11 @@ class AutoSolver(Solver):
         small = qp.size <= _SMALL
         if small not in self._others:
             self._others[small] = self._choose(small)
-        return self._others[small].solve(qp, start)
+        for other in self._others[small]:
+            answer = other.solve(qp, start)
+            if answer.status.usable:
+                return answer
+        return solution
 
     def prepare(self, size: int) -> None:
         """Make the QP solvers: theirs is a long import.
@@ -69,12 +78,19 @@ class AutoSolver(Solver):
         for small in {True, size <= _SMALL}:
             self._others[small] = self._choose(small)
 
-    def _choose(self, small: bool) -> Solver:
+    def _choose(self, small: bool) -> list[Solver]:
+        """The two best solvers that can be made: the second where the first brings nothing."""
         from .registry import available, backend, create
 
-        usable = available()
+        capped, chosen = self.options.max_iterations is not None, []
+        usable = set(available())
         for name in _SMALL_ORDER if small else _LARGE_ORDER:
-            capped = self.options.max_iterations is not None
-            if name in usable and not (capped and not backend(name).iterate_at_cap):
-                return create(name, self.options)
-        return self._banded
+            if name not in usable or (capped and not backend(name).iterate_at_cap):
+                continue
+            try:
+                chosen.append(create(name, self.options))
+            except Exception:  # an installed package that does not work: the next will do
+                continue
+            if len(chosen) == 2:
+                break
+        return chosen

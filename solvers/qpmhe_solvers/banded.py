@@ -1,6 +1,9 @@
-"""The unconstrained minimiser by one banded Cholesky factorisation (LAPACK ``pbsv``)."""
+"""Direct solution without inequalities, by one factorisation of a banded matrix."""
 
 from __future__ import annotations
+
+import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +16,16 @@ from .solver import Solver
 __all__ = ["BandedSolver"]
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 
 
 class BandedSolver(Solver):
     """Solve ``H d = -g``, exact wherever the result meets every inequality.
 
     Where it does not, the minimiser without inequalities comes back with the status
-    UNCONSTRAINED: a legal trial, not the QP's solution. The factorisation takes
-    O(K n^3) time, no iterations, and needs no options.
+    UNCONSTRAINED: a legal trial, not the QP's solution. LAPACK's banded Cholesky
+    factorisation (``pbsv``) takes O(K n^3) time and no iterations. Equality rows are kept:
+    the optimality conditions, ordered by stages, are banded too, and solved by ``gbsv``.
 
     Parameters
     ----------
@@ -29,10 +34,10 @@ class BandedSolver(Solver):
     """
 
     def __init__(self, options: SolverOptions) -> None:
-        from scipy.linalg.lapack import dpbsv  # late: twice the cost of importing NumPy
+        from scipy.linalg.lapack import dgbsv, dpbsv  # late: twice the cost of importing NumPy
 
         super().__init__(options)
-        self._dpbsv = dpbsv
+        self._dpbsv, self._dgbsv = dpbsv, dgbsv
         self._work: dict[tuple[int, int], tuple[Array, Array, Array]] = {}
 
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
@@ -55,6 +60,27 @@ class BandedSolver(Solver):
             SOLVED, UNCONSTRAINED, or FAILED where H is not positive definite or not finite.
             The iterate lives in this solver's workspace until its next solve.
         """
+        row_duals = np.zeros(qp.stages * qp.rows)
+        if qp.rows and (qp.row_lower == qp.row_upper).any():
+            step, multipliers = self._with_equalities(qp)
+            row_duals = multipliers.ravel()
+        else:
+            step = self._cholesky(qp)
+        if step is None:
+            message = "the factorisation failed: H is not positive definite, or not finite"
+            return Solution(None, SolveStatus.FAILED, 0, message=message)
+        if not qp.bounded and not qp.rows:
+            return Solution(step, SolveStatus.SOLVED, 0)
+        no_bound = np.zeros(qp.size)
+        # Equality rows hold up to the rounding of the solve.
+        rounding = 1e-10 * (1.0 + float(np.abs(step).max())) if row_duals.any() else 0.0
+        violation = qp.violation(step)
+        if violation <= rounding:
+            return Solution(step, SolveStatus.SOLVED, 0, None, no_bound, row_duals)
+        residuals = Residuals.of(qp, step, no_bound, row_duals)
+        return Solution(step, SolveStatus.UNCONSTRAINED, 0, residuals, no_bound, row_duals)
+
+    def _cholesky(self, qp: QP) -> Array | None:
         key = (qp.stages, qp.n)
         work = self._work.get(key)
         if work is None:
@@ -65,17 +91,68 @@ class BandedSolver(Solver):
         band, lapack_band, step = work
         band[...] = qp.band
         np.negative(qp.gradient, out=step)
-        _, _, info = self._dpbsv(
-            lapack_band, step.reshape(qp.size), lower=1, overwrite_ab=1, overwrite_b=1
+        flat = step.reshape(qp.size)
+        _, _, info = self._dpbsv(lapack_band, flat, lower=1, overwrite_ab=1, overwrite_b=1)
+        # An infinite pivot turns its unknown into 0 and would pass: look at the factor, too.
+        finite = math.isfinite(flat.dot(flat)) and math.isfinite(
+            np.add.reduce(band[:, :, 0], axis=None)
         )
-        # A NaN anywhere reaches the last unknowns or the pivots; infinities become NaN.
-        if info != 0 or not np.isfinite(step).all():
-            message = f"Cholesky factorisation failed (info {info}): H is not positive definite"
-            return Solution(None, SolveStatus.FAILED, 0, message=message)
-        if not qp.bounded and not qp.rows:
-            return Solution(step, SolveStatus.SOLVED, 0)
-        no_bound, no_row = np.zeros(qp.size), np.zeros(qp.stages * qp.rows)
-        if qp.violation(step) <= 0.0:
-            return Solution(step, SolveStatus.SOLVED, 0, None, no_bound, no_row)
-        residuals = Residuals.of(qp, step, no_bound, no_row)
-        return Solution(step, SolveStatus.UNCONSTRAINED, 0, residuals, no_bound, no_row)
+        return step if info == 0 and finite else None
+
+    def _with_equalities(self, qp: QP) -> tuple[Array | None, Array]:
+        """Minimiser and multipliers (K, rows) subject to the equality rows alone."""
+        stages, n = qp.stages, qp.n
+        equal = qp.row_lower == qp.row_upper
+        slots = np.flatnonzero(equal.any(axis=0))
+        m, s = slots.size, n + slots.size
+        present = equal[:, slots]
+        own = np.where(present[:, :, None], qp.row_own[:, slots], 0.0)
+        following = np.where(present[:, :, None], qp.row_next[:, slots], 0.0)
+        lower, below = _unpacked(qp.band)
+        diagonal = np.zeros((stages, s, s))
+        diagonal[:, :n, :n] = lower
+        diagonal[:, n:, :n] = own
+        diagonal[:, :n, n:] = own.transpose(0, 2, 1)
+        # A slot without an equality at this stage gets the multiplier 0.
+        diagonal[:, n:, n:] = np.where(present, 0.0, 1.0)[:, :, None] * np.eye(m)
+        coupling = np.zeros((stages, s, s))  # rows of stage k+1, columns of stage k
+        coupling[:, :n, :n] = below
+        coupling[:, :n, n:] = following.transpose(0, 2, 1)
+        bandwidth = 2 * s - 1
+        band = np.zeros((3 * bandwidth + 1, stages * s))
+        for blocks, (rows, columns) in zip(
+            (diagonal, coupling[:-1], coupling[:-1].transpose(0, 2, 1)),
+            _places(stages, s), strict=True,
+        ):
+            band[2 * bandwidth + rows - columns, columns] = blocks.ravel()
+        side = np.zeros((stages, s))
+        side[:, :n] = -qp.gradient
+        side[:, n:] = np.where(present, qp.row_upper[:, slots], 0.0)
+        _, _, solution, info = self._dgbsv(bandwidth, bandwidth, band, side.ravel())
+        multipliers = np.zeros((stages, qp.rows))
+        if info != 0 or not np.isfinite(solution).all():
+            return None, multipliers
+        solution = solution.reshape(stages, s)
+        multipliers[:, slots] = solution[:, n:]
+        return np.ascontiguousarray(solution[:, :n]), multipliers
+
+
+def _unpacked(band: Array) -> tuple[Array, Array]:
+    """Diagonal blocks (K, n, n), full, and the blocks below them, from the band panels."""
+    n = band.shape[1]
+    row, column = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    low, high = np.minimum(row, column), np.maximum(row, column)
+    return band[:, low, high - low], band[:, column, n + row - column]
+
+
+@lru_cache(maxsize=64)
+def _places(stages: int, s: int) -> tuple[tuple[Index, Index], ...]:
+    """Rows and columns of the entries of diagonal blocks, blocks below, and blocks above."""
+    k, i, j = np.ix_(np.arange(stages), np.arange(s), np.arange(s))
+    row, column = np.broadcast_arrays(k * s + i, k * s + j)
+    inner = slice(0, stages - 1)
+    return (
+        (row.ravel(), column.ravel()),
+        ((row[inner] + s).ravel(), column[inner].ravel()),
+        (row[inner].ravel(), (column[inner] + s).ravel()),
+    )

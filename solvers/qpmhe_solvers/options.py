@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Integral
 
 from .errors import OptionError
 
@@ -43,7 +44,7 @@ class SolverOptions:
 
     def __post_init__(self) -> None:
         cap = self.max_iterations
-        if cap is not None and (isinstance(cap, bool) or not isinstance(cap, int) or cap < 1):
+        if cap is not None and (isinstance(cap, bool) or not isinstance(cap, Integral) or cap < 1):
             raise OptionError(
                 f"max_iterations is {cap!r}; expected an integer >= 1 or None. "
                 "To skip the QP altogether, ask the estimator for max_qps=0."
@@ -61,8 +62,7 @@ def _positive(name: str, value: object, *, zero: bool) -> None:
     if (
         isinstance(value, bool)
         or not isinstance(value, (int, float))
-        or not math.isfinite(value)
-        or value < 0
+        or not 0 <= value < math.inf
         or (value == 0 and not zero)
     ):
         raise OptionError(f"{name} is {value!r}; expected a finite number {bound}.")

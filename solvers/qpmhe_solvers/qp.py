@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -159,8 +160,8 @@ class QP:
 
     def __init__(self, stages: int, n: int, rows: int = 0) -> None:
         for name, value, least in (("stages", stages, 1), ("n", n, 1), ("rows", rows, 0)):
-            if value < least:
-                raise ShapeError(f"{name} is {value}; a QP needs {name} >= {least}.")
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+                raise ShapeError(f"{name} is {value!r}; a QP needs an integer {name} >= {least}.")
         self.stages, self.n, self.rows, self.size = stages, n, rows, stages * n
         self.band: Array = np.zeros((stages, n, 2 * n))
         self.gradient: Array = np.zeros((stages, n))
@@ -259,13 +260,13 @@ class QP:
         """
         worst = 0.0
         if self.bounded:
-            worst = max(worst, float((self.lower - d).max()), float((d - self.upper).max()))
+            worst = float(np.maximum(self.lower - d, d - self.upper).max())
         if self.rows:
             value = self.rows_times(d)
-            worst = max(
-                worst, float((self.row_lower - value).max()), float((value - self.row_upper).max())
-            )
-        return worst
+            missed = np.maximum(self.row_lower - value, value - self.row_upper)
+            worst = float(np.maximum(worst, missed.max()))
+        # Comparisons with NaN are false: a NaN among the numbers must not pass as feasible.
+        return math.inf if math.isnan(worst) else max(worst, 0.0)
 
     def finite(self) -> bool:
         """Whether H, g and the rows are free of NaN and infinities, and no bound is NaN."""

@@ -60,7 +60,12 @@ class Backend:
     @property
     def available(self) -> bool:
         """Whether its module can be found; nothing is imported to find out."""
-        return self.module is None or find_spec(self.module) is not None
+        if self.module is None:
+            return True
+        try:
+            return find_spec(self.module) is not None
+        except (ImportError, ValueError):  # a parent package that is missing or broken
+            return False
 
     @property
     def version(self) -> str:
@@ -160,9 +165,10 @@ def create(name: str, options: SolverOptions | None = None) -> Solver:
     """
     entry = backend(name)
     if not entry.available:
+        package = entry.distribution or entry.module
         raise BackendError(
-            f"backend {name!r} needs the package {entry.distribution}, which is not installed; "
-            f"pip install {entry.distribution}, or use one of {', '.join(available())}."
+            f"backend {name!r} needs the package {package}, which is not installed; "
+            f"pip install {package}, or use one of {', '.join(available())}."
         )
     return entry.factory(options if options is not None else SolverOptions())
 

@@ -103,21 +103,28 @@ class Residuals:
         curvature = qp.hessian_times(d)
         stationarity = curvature + qp.gradient
         gap = float(np.vdot(d, stationarity))
-        z = bound_duals.reshape(qp.stages, qp.n)
+        z = _present(bound_duals.reshape(qp.stages, qp.n), qp.lower, qp.upper)
         stationarity = stationarity + z
         gap += _support(z, qp.lower, qp.upper)
         if qp.rows:
             y = row_duals.reshape(qp.stages, qp.rows)
+            y = _present(y, qp.row_lower, qp.row_upper)
             stationarity = stationarity + qp.rows_transposed_times(y)
             gap += _support(y, qp.row_lower, qp.row_upper)
         return Residuals(primal, float(np.abs(stationarity).max()), abs(gap))
 
 
+def _present(multipliers: Array, lower: Array, upper: Array) -> Array:
+    """Multipliers without those of absent bounds, which then show as a dual residual."""
+    absent = np.where(multipliers > 0, upper, -lower) == np.inf
+    return np.where(absent, 0.0, multipliers)
+
+
 def _support(multipliers: Array, lower: Array, upper: Array) -> float:
-    """Sum of multiplier times bound; a multiplier of an absent bound counts as infinite gap."""
-    up, low = multipliers > 0, multipliers < 0
-    value = float(np.vdot(multipliers[up], np.minimum(upper[up], 1e20)))
-    return value + float(np.vdot(multipliers[low], np.maximum(lower[low], -1e20)))
+    """Sum of multiplier times the bound that it belongs to."""
+    active = multipliers != 0.0
+    side = np.where(multipliers > 0, upper, lower)
+    return float(np.vdot(multipliers[active], side[active]))
 
 
 class Solution:

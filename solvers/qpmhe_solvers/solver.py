@@ -17,8 +17,9 @@ __all__ = ["Solver"]
 Array = NDArray[np.float64]
 
 # A claim of success is believed while the recomputed residuals stay below this many times the
-# tolerance: solvers measure in scaled norms of their own.
+# tolerance, since solvers measure in scaled norms of their own, but not beyond the loosest.
 _SLACK = 1e3
+_LOOSEST = 1e-3
 
 
 class Solver(ABC):
@@ -62,25 +63,34 @@ class Solver(ABC):
             The iterate, if it is finite and of the right shape, with its recomputed
             residuals; otherwise FAILED with the reason in its message.
         """
-        if not qp.finite():
-            # NaN hangs proxqp and comes back as success from others: it must not reach them.
-            return Solution(None, SolveStatus.FAILED, message="the QP's data are not finite")
-        if not self.options.warm_start:
-            start = None
         try:
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                raw = self._solve(qp, start)
-                d, message = _as_iterate(raw, qp)
+                fault = _fault(qp)
+                if fault:
+                    return Solution(None, SolveStatus.FAILED, message=fault)
+                return self._judged(qp, self._solve(qp, self._usable(start, qp)))
         except Exception as error:  # the wall: whatever a third party's solver raises
             message = f"{type(error).__name__}: {error}"
             return Solution(None, SolveStatus.FAILED, message=message)
+
+    def _usable(self, start: Array | None, qp: QP) -> Array | None:
+        if start is None or not self.options.warm_start:
+            return None
+        fits = np.shape(start) == (qp.stages, qp.n) and bool(np.isfinite(start).all())
+        return start if fits else None
+
+    def _judged(self, qp: QP, raw: object) -> Solution:
+        if not isinstance(raw, RawSolution):
+            message = f"the backend returned {type(raw).__name__}, not a RawSolution"
+            return Solution(None, SolveStatus.FAILED, message=message)
+        d, message = _as_iterate(raw, qp)
         if d is None:
             return Solution(None, SolveStatus.FAILED, raw.iterations, message=message)
         bound_duals = _as_multipliers(raw.bound_duals, qp.size)
         row_duals = _as_multipliers(raw.row_duals, qp.stages * qp.rows)
         residuals = Residuals.of(qp, d, bound_duals, row_duals)
-        if not raw.claimed:
+        if not (isinstance(raw.claimed, (bool, np.bool_)) and raw.claimed):
             status = SolveStatus.STOPPED
         elif self._confirmed(qp, d, residuals):
             status = SolveStatus.SOLVED
@@ -89,18 +99,33 @@ class Solver(ABC):
         return Solution(d, status, raw.iterations, residuals, bound_duals, row_duals, message)
 
     def _confirmed(self, qp: QP, d: Array, residuals: Residuals) -> bool:
+        """Whether the residuals bear a claim out; without multipliers, feasibility has to do."""
         tolerance = self.options.absolute_tolerance + self.options.relative_tolerance
-        primal = _SLACK * tolerance * (1.0 + float(np.abs(d).max()))
-        dual = _SLACK * tolerance * (1.0 + float(np.abs(qp.gradient).max()))
-        return residuals.primal <= primal and not residuals.dual > dual
+        limit = max(tolerance, min(_SLACK * tolerance, _LOOSEST))
+        objective = abs(float(np.vdot(d, qp.gradient)))
+        return (
+            residuals.primal <= limit * (1.0 + float(np.abs(d).max()))
+            and not residuals.dual > limit * (1.0 + float(np.abs(qp.gradient).max()))
+            and not residuals.gap > limit * (1.0 + objective)
+        )
 
 
-def _as_iterate(raw: object, qp: QP) -> tuple[Array | None, str]:
-    if not isinstance(raw, RawSolution):
-        return None, f"the backend returned {type(raw).__name__}, not a RawSolution"
+def _fault(qp: QP) -> str:
+    """What no solver must be given: NaN hangs proxqp and comes back as success from others."""
+    if not qp.finite():
+        return "the QP's data are not finite"
+    if (qp.lower > qp.upper).any() or (qp.row_lower > qp.row_upper).any():
+        return "the QP is infeasible: a lower bound is above its upper bound"
+    return ""
+
+
+def _as_iterate(raw: RawSolution, qp: QP) -> tuple[Array | None, str]:
     if raw.d is None:
         return None, raw.message or "the solver returned no iterate"
-    d = np.array(raw.d, dtype=np.float64)  # a copy: solvers reuse their buffers
+    given = np.asarray(raw.d)
+    if np.iscomplexobj(given):
+        return None, "the solver returned complex numbers"
+    d = np.array(given, dtype=np.float64)  # a copy: solvers reuse their buffers
     if d.size != qp.size:
         return None, f"the solver returned {d.size} numbers for {qp.size} unknowns"
     if not np.isfinite(d).all():
@@ -108,10 +133,17 @@ def _as_iterate(raw: object, qp: QP) -> tuple[Array | None, str]:
     return d.reshape(qp.stages, qp.n), raw.message
 
 
-def _as_multipliers(values: Array | None, size: int) -> Array | None:
+def _as_multipliers(values: object, size: int) -> Array | None:
+    """Multipliers that can be used; None stands for all that cannot."""
     if values is None:
         return None
-    multipliers = np.array(values, dtype=np.float64).ravel()
+    try:
+        given = np.asarray(values)
+        if np.iscomplexobj(given):
+            return None
+        multipliers = np.array(given, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        return None
     if multipliers.size != size or not np.isfinite(multipliers).all():
         return None
     return multipliers

@@ -2,15 +2,43 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from qpmhe_solvers import QP, available, backend
+from qpmhe_solvers import QP, available, backend, register, unregister
 
 EVERY = available()
 WITH_INEQUALITIES = [name for name in EVERY if backend(name).inequalities]
+
+
+ARRAYS = (
+    "band", "gradient", "lower", "upper", "row_own", "row_next", "row_lower", "row_upper"
+)
+
+
+@contextmanager
+def registered(entry):
+    """Have a backend on the list for a while."""
+    register(entry)
+    try:
+        yield entry
+    finally:
+        unregister(entry.name)
+
+
+def overwrite(qp, other):
+    """Write the numbers of another QP of the same sizes into this one, in place."""
+    for name in ARRAYS:
+        getattr(qp, name)[...] = getattr(other, name)
+    qp.bounded = other.bounded
+
+
+def numbers(qp):
+    """Copies of all that a QP holds."""
+    return {name: getattr(qp, name).copy() for name in ARRAYS}
 
 
 @dataclass
@@ -41,13 +69,12 @@ class Dense:
         return np.abs(force).max()
 
     def complementarity(self, d, bound_duals, row_duals):
-        """Largest product of a multiplier and the distance to the side that it pushes from."""
+        """Largest product of a multiplier and the distance to its side; itself if there is none."""
         x, worst = np.ravel(d), 0.0
         multipliers = [*bound_duals, *row_duals]
         for (value, low, high), multiplier in zip(self._sides(x), multipliers, strict=True):
             distance = high - value if multiplier > 0 else value - low
-            if multiplier != 0:
-                worst = max(worst, abs(multiplier) * abs(distance))
+            worst = max(worst, abs(multiplier) * (abs(distance) if np.isfinite(distance) else 1.0))
         return worst
 
     def gap(self, d, bound_duals, row_duals):
@@ -109,6 +136,9 @@ def make(stages, n, rows=0, *, seed=0, bounds="none", sides="none", decades=0.0)
             for j in range(width):
                 curvature = sum(factor[r, i] * weights[r] * factor[r, j] for r in range(width))
                 hessian[k * n + i, k * n + j] += curvature + 0.5 * weights[i] * (i == j)
+    for i in range(qp.size):
+        for j in range(i):
+            hessian[j, i] = hessian[i, j]  # to the last bit, for exact comparisons
     for k in range(stages):
         for c in range(n):
             for o in range(2 * n - c):
