@@ -43,7 +43,9 @@ def window_covariances(problem: Problem, trajectory: Array) -> Array:
         a_all = np.asarray(problem.model.f_jacobian.batch(states, problem.inputs))
         c_all = np.asarray(problem.model.h_jacobian.batch(states, problem.inputs))
     except Exception as error:
-        raise InvalidInputError(f"the model has no Jacobians along the estimate: {error}") from error
+        raise InvalidInputError(
+            f"the model has no Jacobians along the estimate: {error}"
+        ) from error
     if not (np.isfinite(a_all).all() and np.isfinite(c_all).all()):
         raise InvalidInputError("the Jacobians are not finite along the estimate.")
     q = trial.weights.shape[-1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -60,8 +62,10 @@ class ConvexSet:
         worst = float(np.maximum(self.lower - points, points - self.upper).max())
         if self.matrix.shape[0]:
             rows = points @ self.matrix.T
-            worst = max(worst, float(np.maximum(self.row_lower - rows, rows - self.row_upper).max()))
-        return max(0.0, worst)
+            missed = np.maximum(self.row_lower - rows, rows - self.row_upper)
+            worst = float(np.maximum(worst, missed.max()))
+        # Comparisons with NaN are false: a NaN must not pass as a member.
+        return math.inf if math.isnan(worst) else max(0.0, worst)
 
     def __and__(self, other: ConvexSet) -> ConvexSet:
         if not isinstance(other, ConvexSet):
@@ -82,18 +86,17 @@ class ConvexSet:
         return both
 
     def _insist_not_empty(self) -> None:
-        from scipy.optimize import LinearConstraint, milp
+        from scipy.optimize import Bounds, LinearConstraint, milp
 
         # A linear program without objective: milp takes two-sided rows as they are.
         answer = milp(
             np.zeros(self.dimension),
-            bounds=(self.lower, self.upper),
+            bounds=Bounds(self.lower, self.upper),
             constraints=(
                 LinearConstraint(self.matrix, self.row_lower, self.row_upper)
                 if self.matrix.shape[0]
                 else ()
             ),
-            integrality=np.zeros(self.dimension),
         )
         if answer.status == 2:
             raise SetError(

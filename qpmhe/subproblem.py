@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,7 +55,7 @@ class Subproblem:
         self._v_rows = _as_rows(system.noises, p)
         self._rows = sum(rows.shape[0] for rows in (self._w_rows, self._v_rows, self._x_rows))
         ends = np.cumsum([0, *(len(rows) for rows in (self._w_rows, self._v_rows, self._x_rows))])
-        self._w, self._v, self._x = (slice(a, b) for a, b in zip(ends, ends[1:], strict=False))
+        self._w, self._v, self._x = (slice(a, b) for a, b in pairwise(ends))
         self._qps: dict[int, QP] = {}
 
     def at_candidate(self, problem: Problem, window: Window) -> QP:
@@ -153,8 +155,9 @@ class Subproblem:
         else:
             qp.lower[...], qp.upper[...] = -np.inf, np.inf
         if self._rows:
-            np.negative(np.matmul(self._w_rows, self._jacobian[:, :n]), out=qp.row_own[:-1, self._w])
-            np.negative(np.matmul(self._v_rows, self._jacobian[:, n:]), out=qp.row_own[:-1, self._v])
+            f_jacobian, h_jacobian = self._jacobian[:, :n], self._jacobian[:, n:]
+            np.negative(np.matmul(self._w_rows, f_jacobian), out=qp.row_own[:-1, self._w])
+            np.negative(np.matmul(self._v_rows, h_jacobian), out=qp.row_own[:-1, self._v])
             self._set_rows(qp, problem, trial.residuals, trial.trajectory)
 
     def _set_rows(self, qp: QP, problem: Problem, residuals: Array, trajectory: Array) -> None:

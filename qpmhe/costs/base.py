@@ -173,5 +173,7 @@ class Cost(ABC):
 def quadratic_form(residuals: Array, weights: Array) -> Array:
     """r^T W r of each row of residuals, for one weight or one a row."""
     if weights.ndim == 2:
-        return np.einsum("ki,ki->k", residuals @ weights, residuals)
-    return np.einsum("ki,kij,kj->k", residuals, weights, residuals)
+        form: Array = np.einsum("ki,ki->k", residuals @ weights, residuals)
+    else:
+        form = np.einsum("ki,kij,kj->k", residuals, weights, residuals)
+    return form

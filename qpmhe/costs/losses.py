@@ -68,7 +68,7 @@ class Loss(ABC):
         """
         if self.per_component:
             diagonal = np.diagonal(weight, axis1=-2, axis2=-1)
-            value: Array = self._value(diagonal * s * s).sum(axis=-1)
+            value: Array = np.sum(self._value(diagonal * s * s), axis=-1)
             return value
         return self._value(quadratic_form(s, weight))
 
@@ -83,10 +83,8 @@ class Loss(ABC):
         if self.per_component:
             diagonal = np.diagonal(weight, axis1=-2, axis2=-1)
             scaled = diagonal * self._slope(diagonal * s * s)
-            value: Array = scaled[:, :, None] * np.eye(s.shape[1])
-            return value
-        value = self._slope(quadratic_form(s, weight))[:, None, None] * weight
-        return value
+            return scaled[:, :, None] * np.eye(s.shape[1])
+        return self._slope(quadratic_form(s, weight))[:, None, None] * weight
 
     def constants(self) -> tuple[float, float] | None:
         """Constants c, C with c |s|^a <= loss(s) <= C |s|^a; None if there are none."""

@@ -85,8 +85,8 @@ class RobustCost(Cost):
     def stage_costs(self, residuals: Array, weights: Array) -> Array:
         """The losses of w and v added; see `Cost.stage_costs`."""
         n = self.n
-        value: Array = self.disturbance_loss.cost(residuals[:, :n], weights[..., :n, :n])
-        return value + self.noise_loss.cost(residuals[:, n:], weights[..., n:, n:])
+        w_cost = self.disturbance_loss.cost(residuals[:, :n], weights[..., :n, :n])
+        return np.add(w_cost, self.noise_loss.cost(residuals[:, n:], weights[..., n:, n:]))
 
     def majorise(self, residuals: Array, weights: Array) -> Array:
         """Reweighted forms; see `Cost.majorise`."""
@@ -102,7 +102,8 @@ class RobustCost(Cost):
 
     def majorise_prior(self, offset: Array, weight: Array) -> Array:
         """A reweighted form; see `Cost.majorise_prior`."""
-        return self.prior_loss.majorise(offset[None], weight)[0]
+        value: Array = self.prior_loss.majorise(offset[None], weight)[0]
+        return value
 
 
 def _loss(name: str, given: Loss | ArrayLike) -> Loss:

@@ -48,11 +48,12 @@ class BatchReactor(NamedTuple):
 def _rate(x: Array) -> Array:
     first = x[..., 0]
     reaction = _K1 * first * first - _K2 * x[..., 1]
-    return np.multiply.outer(reaction, _STOICHIOMETRY)
+    value: Array = np.multiply.outer(reaction, _STOICHIOMETRY)
+    return value
 
 
 def _rate_jacobian(x: Array) -> Array:
-    slope = np.multiply.outer(2.0 * _K1 * x[..., 0], _SLOPE)
+    slope: Array = np.multiply.outer(2.0 * _K1 * x[..., 0], _SLOPE)
     slope += _CONSTANT
     return slope
 

@@ -82,10 +82,11 @@ class IpoptEstimator:
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",
             "ipopt.tol": tolerance,
+            "ipopt.bound_relax_factor": 0.0,  # the verdict allows no relaxed bounds
         }
         if max_iterations is not None:
             self._options["ipopt.max_iter"] = max_iterations
-        self._programs: dict[int, tuple[Any, Array, Array]] = {}
+        self._programs: dict[int, tuple[Any, dict[str, Array]]] = {}
 
     def update(self, y: Array) -> Estimate:
         """Take y(t) in and estimate x(t+1); as `qpmhe.MovingHorizonEstimator.update`."""
@@ -94,14 +95,14 @@ class IpoptEstimator:
         window.push(y, np.zeros(0))
         problem.bind(window)
         count = window.length
-        solve, lower, upper = self._programs.get(count) or self._build(count)
+        solve, bounds = self._programs.get(count) or self._build(count)
         candidate = problem.candidate(window)
         start = np.concatenate(
             (candidate.trajectory.ravel(), candidate.residuals[:, :n].ravel())
         )
         parameters = np.concatenate((problem.prior, problem.measurements.ravel()))
         solving = perf_counter()
-        answer = solve(x0=start, p=parameters, lbg=0.0, ubg=0.0, lbx=lower, ubx=upper)
+        answer = solve(x0=start, p=parameters, **bounds)
         solve_time = perf_counter() - solving
         states = np.array(answer["x"]).ravel()[: (count + 1) * n].reshape(count + 1, n)
         trial = problem.evaluate(states)
@@ -123,33 +124,65 @@ class IpoptEstimator:
         estimate.step_time = perf_counter() - began
         return estimate
 
-    def _build(self, count: int) -> tuple[Any, Array, Array]:
+    def _build(self, count: int) -> tuple[Any, dict[str, Array]]:
         ca, n, p = self._casadi, self._system.n, self._system.p
         states = ca.SX.sym("x", n, count + 1)
         disturbances = ca.SX.sym("w", n, count)
         prior, measured = ca.SX.sym("prior", n), ca.SX.sym("y", p, count)
         offset = states[:, 0] - prior
         objective = offset.T @ self._prior @ offset
-        defects = []
+        defects, noises = [], []
         for i in range(count):
             w, v = disturbances[:, i], measured[:, i] - self._h(states[:, i])
             objective += w.T @ self._cost.disturbance @ w + v.T @ self._cost.noise @ v
             defects.append(states[:, i + 1] - self._f(states[:, i]) - w)
+            noises.append(v)
+        rows, bounds = self._rows(states, disturbances, noises)
         program = {
             "x": ca.veccat(states, disturbances),
             "p": ca.veccat(prior, measured),
             "f": objective,
-            "g": ca.vertcat(*defects),
+            "g": ca.vertcat(*defects, *rows),
         }
         solve = ca.nlpsol("mhe", "ipopt", program, self._options)
-        boxes = (self._system.states, self._system.disturbances)
-        lower = np.concatenate([
-            np.tile(box.lower if box else np.full(n, -np.inf), length)
-            for box, length in zip(boxes, (count + 1, count), strict=True)
-        ])
-        upper = np.concatenate([
-            np.tile(box.upper if box else np.full(n, np.inf), length)
-            for box, length in zip(boxes, (count + 1, count), strict=True)
-        ])
-        self._programs[count] = solve, lower, upper
+        zero = np.zeros(count * n)
+        limits = {
+            "lbx": self._bounds("lower", count),
+            "ubx": self._bounds("upper", count),
+            "lbg": np.concatenate((zero, *(low for low, _ in bounds))),
+            "ubg": np.concatenate((zero, *(high for _, high in bounds))),
+        }
+        self._programs[count] = solve, limits
         return self._programs[count]
+
+    def _bounds(self, side: str, count: int) -> Array:
+        """Bounds of the states, then of the disturbances."""
+        infinite = np.full(self._system.n, -np.inf if side == "lower" else np.inf)
+        boxes = ((self._system.states, count + 1), (self._system.disturbances, count))
+        return np.concatenate(
+            [np.tile(getattr(box, side) if box else infinite, length) for box, length in boxes]
+        )
+
+    def _rows(
+        self, states: Any, disturbances: Any, noises: list[Any]
+    ) -> tuple[list[Any], list[tuple[Array, Array]]]:
+        """V as rows, and the general inequalities of all sets."""
+        ca, system = self._casadi, self._system
+        rows: list[Any] = []
+        bounds: list[tuple[Array, Array]] = []
+        columns = {
+            "states": (system.states, ca.horzsplit(states)),
+            "disturbances": (system.disturbances, ca.horzsplit(disturbances)),
+            "noises": (system.noises, noises),
+        }
+        for name, (one, points) in columns.items():
+            if one is None:
+                continue
+            for point in points:
+                if name == "noises":
+                    rows.append(point)
+                    bounds.append((one.lower, one.upper))
+                if one.matrix.shape[0]:
+                    rows.append(ca.DM(one.matrix) @ point)
+                    bounds.append((one.row_lower, one.row_upper))
+        return rows, bounds

@@ -189,8 +189,9 @@ class IpoptComparison:
         system, observer, cost, scenario = self.study.model
         step, _ = discretize(casadi_rate, None, self.study.method)
         return IpoptEstimator(
-            system, observer, cost, f=partial(step, scenario.dt), h=casadi_output, horizon=scenario.horizon,
-            initial_state=scenario.initial_estimate, max_iterations=iterations,
+            system, observer, cost, f=partial(step, scenario.dt), h=casadi_output,
+            horizon=scenario.horizon, initial_state=scenario.initial_estimate,
+            max_iterations=iterations,
         )
 
     def run(self, iterations: int | None, tick: Tick | None = None) -> Run:

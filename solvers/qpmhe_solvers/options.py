@@ -43,7 +43,7 @@ class SolverOptions:
     warm_start: bool = True
 
     def __post_init__(self) -> None:
-        cap = self.max_iterations
+        cap: object = self.max_iterations
         if cap is not None and (isinstance(cap, bool) or not isinstance(cap, Integral) or cap < 1):
             raise OptionError(
                 f"max_iterations is {cap!r}; expected an integer >= 1 or None. "

@@ -38,7 +38,7 @@ class Solver(ABC):
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
         """Solve qp. May raise, hang on to nothing, and lie: `solve` contains all of it."""
 
-    def prepare(self, size: int) -> None:
+    def prepare(self, size: int) -> None:  # noqa: B027 - most have nothing to prepare
         """Do beforehand what the first QPs with inequalities would otherwise wait for.
 
         Parameters
