@@ -89,43 +89,64 @@ class Jacobian:
         behind = np.asarray(self._function.batch(x[..., None, :] - moves, u_all))
         return np.swapaxes((ahead - behind) / (2 * step[..., :, None]), -1, -2)
 
-    def _at_probes(self, probes: Probes) -> list[tuple[Array, Array, Array]]:
-        """The probes with finite differences that can be trusted there."""
+    def _at_probes(self, probes: Probes) -> list[tuple[Array, Array, Array, Array]]:
+        """The probes with the function's value and its finite differences there."""
         usable = []
         for x, u in probes:
             try:
                 with np.errstate(all="ignore"):
-                    value = self._differences(x[None], u[None])[0]
+                    value = np.asarray(self._function(x, u))
+                    slope = self._differences(x[None], u[None])[0]
             except Exception:  # outside the function's domain
                 continue
-            if np.isfinite(value).all():
-                usable.append((x, u, value))
+            if np.isfinite(slope).all():
+                usable.append((x, u, value, slope))
         return usable
 
     def _complex_step_works(self, probes: Probes) -> bool:
         usable = self._at_probes(probes)
-        for x, u, expected in usable:
+        for x, u, value, expected in usable:
             try:
-                # A function that throws the imaginary part away only warns; its derivative
-                # comes out as zero and gives it away below.
+                # A function that throws the imaginary part away warns, which raises here.
                 with np.errstate(all="ignore"), warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
+                    warnings.simplefilter("error")
                     found = self._complex(x[None], u[None])[0]
             except Exception:  # comparisons, math.sin and the like do not take complex numbers
                 return False
-            if not _close(found, expected):
+            if not _close(found, expected, value).all():
                 return False
         return bool(usable)
 
+    def check(self, x: Array, u: Array) -> None:
+        """Try the method once more at a state that is to be used.
+
+        Parameters
+        ----------
+        x : (n,) array
+            The state.
+        u : (m,) array
+            The input.
+
+        Raises
+        ------
+        ModelError
+            If a given Jacobian is not the derivative there.
+        """
+        if self._given is not None:
+            self._compare(self._given, [(x, u)])
+        elif self.method == "complex step" and not self._complex_step_works([(x, u)]):
+            self.method, self.batch = "finite differences", self._differences
+
     def _compare(self, given: BatchedFunction, probes: Probes) -> None:
-        for x, u, expected in self._at_probes(probes):
+        for x, u, value, expected in self._at_probes(probes):
             try:
                 with np.errstate(all="ignore"):
                     found = np.asarray(given(x, u), dtype=np.float64)
             except Exception:  # outside its domain
                 continue
-            if np.isfinite(found).all() and not _close(found, expected):
-                i, j = np.unravel_index(np.argmax(np.abs(found - expected)), expected.shape)
+            wrong = ~_close(found, expected, value)
+            if np.isfinite(found).all() and wrong.any():
+                i, j = np.argwhere(wrong)[0]
                 raise ModelError(
                     f"{given.name}[{i}, {j}] is {found[i, j]:.6g} at x = {x.tolist()}, but the "
                     f"derivative of the function there is {expected[i, j]:.6g}. Correct it, or "
@@ -133,6 +154,9 @@ class Jacobian:
                 )
 
 
-def _close(found: Array, expected: Array) -> bool:
-    scale = 1.0 + float(np.abs(expected).max())
-    return found.shape == expected.shape and float(np.abs(found - expected).max()) < 1e-4 * scale
+def _close(found: Array, expected: Array, value: Array) -> Array:
+    """Entry by entry, up to what differences of functions with these values can tell."""
+    row = np.abs(expected).max(axis=1, keepdims=True)
+    floor = 1e-6 * (1.0 + row) + 1e-9 * np.abs(value).reshape(-1, 1)
+    close: Array = np.abs(found - expected) <= 1e-4 * np.abs(expected) + floor
+    return close

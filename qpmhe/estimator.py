@@ -30,6 +30,9 @@ __all__ = ["MovingHorizonEstimator"]
 
 Array = NDArray[np.float64]
 
+# Every so many samples it is made sure that f and h may be called on many states at once.
+_CHECK_EVERY = 16
+
 
 class MovingHorizonEstimator:
     r"""Suboptimal moving horizon estimation with an observer-based candidate.
@@ -216,7 +219,7 @@ class MovingHorizonEstimator:
 
     def update(
         self,
-        y: ArrayLike,
+        y: ArrayLike | None,
         u: ArrayLike | None = None,
         *,
         dt: float | None = None,
@@ -253,9 +256,7 @@ class MovingHorizonEstimator:
         """
         began = perf_counter()
         system = self.system
-        y_array = np.asarray(y)
-        if y_array.shape != (system.p,) or y_array.dtype != np.float64:
-            y_array = vector("y", _without_none(y), system.p, finite=False)
+        y_array = self._measurement(y)
         u_array = self._no_input if u is None and system.m == 0 else self._input(u)
         if dt is not None:
             dt = positive("dt", dt)
@@ -263,20 +264,32 @@ class MovingHorizonEstimator:
         if noise_weight is not None:
             noise_weight = positive_definite("noise_weight", noise_weight, system.p)
         with np.errstate(all="ignore"):
-            missing, failed = self._window.push(y_array, u_array, dt, noise_weight)
+            missing, held, flat = self._window.push(y_array, u_array, dt, noise_weight)
             if self.settings.candidate == "reinitialized":
                 # The oldest of the history is the estimate of x(t+1-N), or x(0).
                 self._window.replay(self._window.length, self._reinitial_state())
-            estimate = self._estimate(missing, failed, began)
+            estimate = self._estimate(missing, held, flat, began)
         self._history.append(estimate.state)
         return estimate
 
     def _reinitial_state(self) -> Array:
         return self._history[len(self._history) - self._window.length]
 
-    def _estimate(self, missing: bool, failed: bool, began: float) -> Estimate:
+    def _measurement(self, y: ArrayLike | None) -> Array:
+        p = self.system.p
+        if isinstance(y, np.ndarray) and y.shape == (p,) and y.dtype == np.float64:
+            return y
+        if y is None:
+            return np.full(p, np.nan)
+        if isinstance(y, (list, tuple)):
+            y = [np.nan if item is None else item for item in y]
+        return vector("y", y, p, finite=False)
+
+    def _estimate(self, missing: bool, held: bool, flat: bool, began: float) -> Estimate:
         """Solve the window's problem as it stands."""
         window, problem, settings = self._window, self._problem, self.settings
+        if window.time <= settings.horizon or window.time % _CHECK_EVERY == 0:
+            window.check_batches()
         problem.bind(window)
         start = self._shifted() if settings.start == "best" else None
         deadline = math.inf if settings.time_budget is None else began + settings.time_budget
@@ -284,7 +297,7 @@ class MovingHorizonEstimator:
         status = outcome.events | (Status.IMPROVED if outcome.improved else Status.CANDIDATE)
         if missing:
             status |= Status.MISSING
-        if failed:
+        if held or flat:
             status |= Status.MODEL_FAILED
         trial, reference = outcome.trial, outcome.reference
         trajectory, residuals = trial.trajectory, trial.residuals
@@ -309,7 +322,7 @@ class MovingHorizonEstimator:
             outcome.dropped,
             settings.delay,
         )
-        if failed and outcome.improved:
+        if held and outcome.improved:
             window.restart(estimate.state)
         self._last = estimate
         estimate.step_time = perf_counter() - began
@@ -356,12 +369,13 @@ class MovingHorizonEstimator:
                 f"time is {time!r}; expected an integer from {oldest} to {newest}, the samples "
                 "in the window. Take a longer horizon for later measurements."
             )
-        late = vector("y", _without_none(y), self.system.p, finite=False)
+        late = self._measurement(y)
         began = perf_counter()
         with np.errstate(all="ignore"):
             self._window.amend(int(time), late)
             self._last = None  # it does not belong to the window before this one
-            estimate = self._estimate(False, not math.isfinite(self._window.candidate_cost), began)
+            held = not math.isfinite(self._window.candidate_cost)
+            estimate = self._estimate(False, held, False, began)
         self._history[-1] = estimate.state
         return estimate
 
@@ -429,15 +443,6 @@ class MovingHorizonEstimator:
             )
         start = self.state.copy()
         return Run(start, [self.update(y, u) for y, u in zip(ys, us, strict=True)])
-
-
-def _without_none(y: Any) -> Any:
-    """None stands for a missing number, alone or within a list."""
-    if y is None:
-        return np.nan
-    if isinstance(y, (list, tuple)):
-        return [np.nan if item is None else item for item in y]
-    return y
 
 
 def _is(value: object, kind: type, name: str, expected: str) -> None:

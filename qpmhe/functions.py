@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -64,6 +65,7 @@ class BatchedFunction:
             )
         # A scalar at one state is a value of shape (1,): p = 1 is written without brackets.
         self._short = False
+        self._returns_array = True
         self.mode = "unknown"
         self._detect(probes)
 
@@ -74,18 +76,26 @@ class BatchedFunction:
 
     def batch(self, x: Array, u: Array) -> Array:
         """The values at states x (..., n) and inputs u (..., m): shape (..., *shape)."""
-        if self.mode == "batched":
-            value = self._function(x, u) if self._takes_input else self._function(x)
-            return np.asarray(value).reshape(x.shape[:-1] + self.shape) if self._short else value
         lead = x.shape[:-1]
         if len(lead) != 1:
-            x, u = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])
-        if self.mode == "columns":
+            # Functions that pass for batched on (B, n) may still mix axes up beyond.
+            count = math.prod(lead)
+            x, u = x.reshape(count, x.shape[-1]), u.reshape(count, u.shape[-1])
+        if self.mode == "batched":
+            value = self._function(x, u) if self._takes_input else self._function(x)
+            value = np.asarray(value)
+            if len(lead) == 1 and not self._short:
+                return value
+        elif self.mode == "columns":
             value = self._function(x.T, u.T) if self._takes_input else self._function(x.T)
             value = np.moveaxis(np.asarray(value), -1, 0)
         else:
-            value = np.array([self(xi, ui) for xi, ui in zip(x, u, strict=True)])
-        return value.reshape(lead + self.shape)
+            # Copied row by row: a function may return one and the same array every time.
+            value = np.empty((x.shape[0], *self.shape), dtype=np.result_type(x, np.float64))
+            for i in range(x.shape[0]):
+                value[i] = self(x[i], u[i])
+        shaped: Array = value.reshape(lead + self.shape)
+        return shaped
 
     def _detect(self, probes: Probes) -> None:
         points, values = [], []
@@ -137,16 +147,45 @@ class BatchedFunction:
                 f"expected {self.shape}. Check n, p, m and the order of the arguments."
             )
         self._short = value.shape != self.shape
+        self._returns_array = self._returns_array and isinstance(raw, np.ndarray)
         return value.reshape(self.shape) if np.isfinite(value).all() else None
+
+    def agrees(self, x: Array, u: Array, expected: Array, tolerance: float) -> bool:
+        """Whether a batch gives what single states gave; if not, states are looped over.
+
+        A function with a branch on its state (``if x[0] > 1``) can pass for one of many
+        states until states on both sides of the branch meet in one batch.
+
+        Parameters
+        ----------
+        x, u : (B, n) and (B, m) array
+            States and inputs.
+        expected : (B, ...) array
+            Values at these, computed one by one.
+        tolerance : float
+            How far rounding may lead, absolute.
+        """
+        if self.mode == "looped":
+            return True
+        try:
+            close = np.abs(self.batch(x, u) - expected) <= tolerance
+            if close.all():
+                return True
+        except Exception:  # a function of one state may do anything on many
+            pass
+        self.mode = "looped"
+        return False
 
     @property
     def plain(self) -> bool:
         """Whether the user's function can be called as it is, on (..., n) and all inputs."""
         takes_all = self._takes_input or self._inputs == 0
-        return self.mode == "batched" and takes_all and not self._short
+        return self.mode == "batched" and takes_all and self._returns_array and not self._short
 
     def check(self, x: Array, u: Array) -> None:
         """Insist on a finite value of the right shape at a state that is to be used."""
+        if self.mode == "unknown":
+            self._detect([(x, u), (x * (1 + 1e-6) + 1e-9, u + 1e-3)])
         try:
             with np.errstate(all="ignore"):
                 value = np.asarray(self(x, u), dtype=np.float64)
@@ -155,8 +194,6 @@ class BatchedFunction:
                 f"{self.name} raised {type(error).__name__}: {error} at the initial state "
                 f"{x.tolist()}; it must be defined where the estimation starts."
             ) from error
-        if self.mode == "unknown":
-            self._detect([(x, u), (x * (1 + 1e-6) + 1e-9, u)])
         if value.shape != self.shape:
             raise ModelError(
                 f"{self.name} returned shape {value.shape} at the initial state; "

@@ -19,9 +19,10 @@ __all__ = ["Problem", "Trial"]
 
 Array = NDArray[np.float64]
 
-# A trial lies on the boundary of its sets up to rounding, which grows with the states, and
-# up to what QP solvers leave.
+# A trial lies on the boundary of its sets up to what QP solvers leave. The disturbance is a
+# difference of states, whose rounding comes on top.
 _FEASIBLE = 5e-9
+_ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
 
 @dataclass(slots=True)
@@ -85,6 +86,8 @@ class Problem:
         self.inputs: Array = np.zeros((0, system.m))
         self.measurements: Array = np.zeros((0, system.p))
         self.stage_weights: Array = cost.stage_weight
+        #: Which components of y are there (K, p); None if all are.
+        self.observed: NDArray[np.bool_] | None = None
         self.discounts: Array | None = None
         self.constrained = any((system.states, system.disturbances, system.noises))
         fixed = system.disturbances.fixed_components if system.disturbances else np.empty(0, int)
@@ -107,6 +110,7 @@ class Problem:
         self.prior = window.candidate[0]
         self.inputs, self.measurements = window.inputs, window.measurements
         self.stage_weights = window.stage_weights
+        self.observed = window.observed if window.has_special_weights else None
         self.model = window.model
         if self._discounted:
             self.discounts = window.discounts
@@ -119,16 +123,15 @@ class Problem:
 
     def violated_sets(self, trial: Trial) -> tuple[str, ...]:
         """Names of the sets that a trajectory is outside of."""
-        n, limit = self._n, self._limit(trial.trajectory)
-        points = (trial.trajectory, trial.residuals[:, :n], trial.residuals[:, n:])
-        sets = {
-            "states": self.states, "disturbances": self.disturbances, "noises": self.noises
+        n = self._n
+        amounts = {
+            "states": self.states and self.states.violation(trial.trajectory),
+            "disturbances": self.disturbances
+            and self.disturbances.violation(trial.residuals[:, :n]),
+            "noises": self.noises
+            and self.noises.violation(trial.residuals[:, n:], self.observed),
         }
-        return tuple(
-            name
-            for (name, one), where in zip(sets.items(), points, strict=True)
-            if one is not None and one.violation(where) > limit
-        )
+        return tuple(name for name, amount in amounts.items() if amount and amount > _FEASIBLE)
 
     def leave_out(self, names: tuple[str, ...]) -> None:
         """Judge without the sets of these names."""
@@ -196,7 +199,7 @@ class Problem:
         violation = 0.0
         if self.constrained:
             violation = self.violation(trajectory, residuals)
-            if violation > self._limit(trajectory):
+            if violation > _FEASIBLE:
                 cost = math.inf
         return Trial(trajectory, residuals, weights, weighted, cost, violation)
 
@@ -232,11 +235,9 @@ class Problem:
         if self.states is not None:
             worst = self.states.violation(trajectory)
         if self.disturbances is not None:
-            worst = max(worst, self.disturbances.violation(residuals[:, :n]))
+            rounding = _ROUNDING * np.abs(trajectory[1:]).max(axis=1, keepdims=True)
+            amount = self.disturbances.violation(residuals[:, :n], rounding=rounding)
+            worst = max(worst, amount)
         if self.noises is not None:
-            worst = max(worst, self.noises.violation(residuals[:, n:]))
+            worst = max(worst, self.noises.violation(residuals[:, n:], self.observed))
         return worst
-
-    @staticmethod
-    def _limit(trajectory: Array) -> float:
-        return _FEASIBLE * max(1.0, float(np.abs(trajectory).max()))

@@ -51,21 +51,44 @@ class ConvexSet:
         """Components of zero width: equal lower and upper bounds."""
         return np.flatnonzero(self.lower == self.upper)
 
-    def violation(self, points: Array) -> float:
+    def violation(
+        self,
+        points: Array,
+        known: NDArray[np.bool_] | None = None,
+        rounding: Array | float = 0.0,
+    ) -> float:
         """The largest amount by which points miss a bound or a general inequality.
 
         Parameters
         ----------
         points : (..., d) array
             The points.
+        known : (..., d) bool array, optional
+            Components that there are; inequalities on others do not count.
+        rounding : float or (..., 1) array
+            How far the points are uncertain; that much does not count.
         """
-        worst = float(np.maximum(self.lower - points, points - self.upper).max())
+        missed = np.maximum(self.lower - points, points - self.upper) - rounding
+        worst = float((missed if known is None else np.where(known, missed, 0.0)).max())
         if self.matrix.shape[0]:
             rows = points @ self.matrix.T
-            missed = np.maximum(self.row_lower - rows, rows - self.row_upper)
+            missed = np.maximum(self.row_lower - rows, rows - self.row_upper) - rounding
+            if known is not None:
+                missed = np.where(self.touched(~known), 0.0, missed)
             worst = float(np.maximum(worst, missed.max()))
         # Comparisons with NaN are false: a NaN must not pass as a member.
         return math.inf if math.isnan(worst) else max(0.0, worst)
+
+    def touched(self, components: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which general inequalities have a nonzero coefficient on these components.
+
+        Parameters
+        ----------
+        components : (..., d) bool array
+            The components.
+        """
+        touched: NDArray[np.bool_] = (components @ (self.matrix != 0.0).T.astype(np.intp)) > 0
+        return touched
 
     def __and__(self, other: ConvexSet) -> ConvexSet:
         if not isinstance(other, ConvexSet):

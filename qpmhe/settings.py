@@ -51,6 +51,11 @@ class Settings:
         count("horizon", self.horizon, 1)
         if self.max_qps is not None:
             count("max_qps", self.max_qps, 0, " None stands for convergence.")
+        if self.max_solver_iterations is not None:
+            count(
+                "max_solver_iterations", self.max_solver_iterations, 1,
+                " None leaves the solver's default; max_qps=0 skips the QPs.",
+            )
         positive("solver_tolerance", self.solver_tolerance)
         positive("tolerance", self.tolerance)
         if self.time_budget is not None:

@@ -175,6 +175,11 @@ class Subproblem:
             value = points @ matrix.T
             qp.row_lower[stages, rows] = low - value
             qp.row_upper[stages, rows] = high - value
+        if problem.observed is not None and problem.noises is not None:
+            missing = ~problem.observed
+            void = (missing @ (self._v_rows != 0.0).T.astype(np.intp)) > 0
+            qp.row_lower[:-1, self._v][void] = -np.inf
+            qp.row_upper[:-1, self._v][void] = np.inf
 
 
 def _as_rows(one: ConvexSet | None, dimension: int) -> Array:

@@ -201,8 +201,8 @@ class System:
         ModelError
             If they are not.
         """
-        self.f.check(x, u)
-        self.h.check(x, u)
+        for function in (self.f, self.h, self.f_jacobian, self.h_jacobian):
+            function.check(x, u)
 
     def __repr__(self) -> str:
         return f"System(n={self.n}, p={self.p}, m={self.m}, states={self.states})"
@@ -215,7 +215,7 @@ def _over_leading(function: BatchedFunction, written: Any) -> Function:
 
     def evaluate(x: Array, *inputs: Array) -> Any:
         u = inputs[0] if inputs else np.empty((*x.shape[:-1], 0))
-        return function.batch(x, u) if x.ndim > 1 else function(x, u)
+        return function.batch(x, u) if x.ndim > 1 else np.asarray(function(x, u))
 
     return evaluate
 
@@ -248,8 +248,9 @@ def _probes(states: ConvexSet | None, n: int, m: int) -> Probes:
     """A few irregular points inside the state bounds, to try functions on."""
     generator = np.random.default_rng(20210829)
     probes: Probes = []
-    for scale in (1.0, 0.3, 3.0, 1.0):
-        x = scale * generator.uniform(0.2, 1.0, n)
+    for scale, least in ((1.0, 0.2), (0.3, 0.2), (3.0, 0.2), (1.0, -1.0), (10.0, -1.0), (3.0, -1.0)):
+        # Positive ones first, where most models are defined; then all signs, where branches part.
+        x = scale * generator.uniform(least, 1.0, n)
         if states is not None:
             low, high = states.lower, states.upper
             both = np.isfinite(low) & np.isfinite(high)

@@ -99,15 +99,16 @@ class Window:
 
     def push(
         self, y: Array, u: Array, dt: float | None = None, noise_weight: Array | None = None
-    ) -> tuple[bool, bool]:
+    ) -> tuple[bool, bool, bool]:
         """Take the sample y(t), u(t) in, and advance the observer to z(t+1).
 
         Returns
         -------
-        missing, failed : bool
-            Whether a component of y is not finite, and whether a model function raised or
-            was not finite at z(t). A failed stage keeps its measurement; the observer holds
-            its state, and the candidate's cost is infinite while the stage stays.
+        missing, held, flat : bool
+            Whether a component of y is not finite; whether f, h or the observer raised or
+            were not finite at z(t); whether only the Jacobians did. A held stage keeps its
+            measurement; the observer holds its state, and the candidate's cost is infinite
+            while the stage stays.
         """
         if self.end == self._room:
             self._move_to_front()
@@ -122,14 +123,14 @@ class Window:
         if noise_weight is not None:
             self._own_noise[self.time] = noise_weight
         self._set_weight(k, self.time)
-        missing, failed = self._enter(k, self.time)
+        outcome = self._enter(k, self.time)
         self.end = k + 1
         self.time += 1
         if self.end - self.start > self.horizon:
             self.start += 1
             if self._own_noise:
                 self._own_noise.pop(self.time - self.horizon - 1, None)
-        return missing, failed
+        return outcome
 
     def amend(self, time: int, y: Array) -> None:
         """Put the finite components of y into a sample of the window, and redo the rest.
@@ -164,8 +165,8 @@ class Window:
         for k in range(first, self.end):
             self._enter(k, self.time - (self.end - k))
 
-    def _enter(self, k: int, time: int) -> tuple[bool, bool]:
-        """Compute stage k from z(k) and its sample; whether y is in part missing, or it failed."""
+    def _enter(self, k: int, time: int) -> tuple[bool, bool, bool]:
+        """Compute stage k from z(k) and its sample; what `push` tells."""
         observed: NDArray[np.bool_] | None = None
         if self._special[k] and not self._observed[k].all():
             observed = self._observed[k]
@@ -176,12 +177,12 @@ class Window:
                 self._observed[k] = observed = there
                 self._set_weight(k, time)
                 cost = self._advance(k, time, observed)
-        failed = not math.isfinite(cost)
-        if failed:
+        held = not math.isfinite(cost)
+        if held:
             self._hold(k)
         self._stage_cost[k] = cost
-        linear = failed or not self._linearized or self._linearize(k)
-        return observed is not None, failed or not linear
+        linear = held or not self._linearized or self._linearize(k)
+        return observed is not None, held, not linear
 
     def _set_weight(self, k: int, time: int) -> None:
         """The weight of stage k, at this time, from what is observed of it and its noise."""
@@ -207,7 +208,9 @@ class Window:
         try:
             if self._irregular[k]:
                 model, u = self._system.timed, self._u[k]
-            drift = model.f(z, u)
+            # Copied at once: a function may return one array every time, and derivatives
+            # by differences call it again.
+            following[:] = model.f(z, u)
             np.subtract(self._y[k], model.h(z, u), out=error)
             if observed is not None:
                 error[~observed] = 0.0
@@ -221,7 +224,7 @@ class Window:
                 sample.covariance = self._covariance[k]
                 sample.noise_weight = self._own_noise.get(time)
             correction[:], posterior = self._observer.correct(z, error, sample)
-            np.add(drift, correction, out=following)
+            following += correction
         except Exception:  # a model function outside its domain: bad luck, not bad input
             return math.inf
         if self._covariance is not None:
@@ -263,6 +266,23 @@ class Window:
     def restart(self, state: Array) -> None:
         """Go on from another state after a failed stage, whose correction is void anyway."""
         self._z[self.end] = state
+
+    def check_batches(self) -> None:
+        """Insist that f and h give over the whole window what they gave state by state.
+
+        Where they do not, they are looped over from now on; see `BatchedFunction.agrees`.
+        """
+        if not math.isfinite(self.candidate_cost):
+            return
+        n, states, inputs = self._n, self.candidate[:-1], self.inputs
+        following, residuals = self.candidate[1:], self.residuals
+        rounding = 1e-9 * (1.0 + float(np.abs(self.candidate).max()))
+        self.model.f.agrees(states, inputs, following - residuals[:, :n], rounding)
+        fitted = np.where(self.observed, self.measurements - residuals[:, n:], np.nan)
+        rounding = 1e-9 * (1.0 + float(np.abs(self.measurements).max()))
+        there = self.observed.all(axis=1)
+        if there.any():
+            self.model.h.agrees(states[there], inputs[there], fitted[there], rounding)
 
     def _per_stage(self) -> tuple[Array, ...]:
         arrays: tuple[Array | Any, ...] = (

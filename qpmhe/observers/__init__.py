@@ -1,8 +1,22 @@
 """Auxiliary observers: stable, perhaps poor, and the source of every guarantee."""
 
 from .base import Observer, Sample
+from .design import design_luenberger
 from .extended_kalman import ExtendedKalman
+from .high_gain import HighGain
 from .injection import OutputInjection
 from .luenberger import Luenberger
+from .steady_kalman import SteadyStateKalman
+from .unscented import UnscentedKalman
 
-__all__ = ["ExtendedKalman", "Luenberger", "Observer", "OutputInjection", "Sample"]
+__all__ = [
+    "ExtendedKalman",
+    "HighGain",
+    "Luenberger",
+    "Observer",
+    "OutputInjection",
+    "Sample",
+    "SteadyStateKalman",
+    "UnscentedKalman",
+    "design_luenberger",
+]

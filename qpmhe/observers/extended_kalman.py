@@ -22,7 +22,7 @@ class ExtendedKalman(Observer):
 
     .. math::
         S = C P C^\top + R, \quad K = A P C^\top S^{-1}, \quad L(z, v) = K v, \quad
-        P^+ = A P A^\top + Q - K S K^\top
+        P^+ = (A - K C) P (A - K C)^\top + K R K^\top + Q
 
     linear in v, so that (eq:kappa) holds with the largest :math:`|K(t)|` met. On a linear
     system it is the Kalman filter; its covariance can weigh the prior, see
@@ -80,11 +80,9 @@ class ExtendedKalman(Observer):
         if sample.observed is not None:
             there = sample.observed
             c, r, v = c[there], r[np.ix_(there, there)], v[there]
-        moved = a @ covariance
-        predicted = moved @ a.T + self._disturbance
-        if v.size == 0:
-            return np.zeros_like(z), predicted
-        cross = moved @ c.T
-        gain = np.linalg.solve(c @ covariance @ c.T + r, cross.T).T
-        following = predicted - gain @ cross.T
+        cross = a @ covariance @ c.T
+        gain = np.linalg.solve(c @ covariance @ c.T + r, cross.T).T if v.size else cross
+        # Joseph's form: symmetric, and positive semidefinite by construction.
+        closed = a - gain @ c
+        following = closed @ covariance @ closed.T + gain @ r @ gain.T + self._disturbance
         return gain @ v, 0.5 * (following + following.T)

@@ -57,6 +57,16 @@ class OutputInjection(Observer):
             raise ModelError(
                 f"correction returned shape {value.shape}; expected (n,) = {z.shape}."
             )
+        state, misfit = z.copy(), np.full(outputs, 0.1)
+        try:
+            with np.errstate(all="ignore"):
+                self._correction(state, misfit)
+        except Exception:  # bad luck far from the data is for the run
+            pass
+        if not (np.array_equal(state, z) and np.all(misfit == 0.1)):
+            raise ModelError(
+                "correction changes z or v in place; copy them before writing to them."
+            )
         if not np.all(value == 0.0):
             raise ModelError(
                 f"correction is {value.tolist()} at z = {z.tolist()} and v = 0; an observer in "

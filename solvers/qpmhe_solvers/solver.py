@@ -48,7 +48,7 @@ class Solver(ABC):
         """
 
     def solve(self, qp: QP, start: Array | None = None) -> Solution:
-        """Solve a QP; never raises an `Exception`, and never believes the solver.
+        """Solve a QP; whatever the solver raises ends here, and it is never believed.
 
         Parameters
         ----------
@@ -70,7 +70,9 @@ class Solver(ABC):
                 if fault:
                     return Solution(None, SolveStatus.FAILED, message=fault)
                 return self._judged(qp, self._solve(qp, self._usable(start, qp)))
-        except Exception as error:  # the wall: whatever a third party's solver raises
+        except (KeyboardInterrupt, SystemExit, GeneratorExit):
+            raise
+        except BaseException as error:  # the wall; a panic of compiled code is no Exception
             message = f"{type(error).__name__}: {error}"
             return Solution(None, SolveStatus.FAILED, message=message)
 
@@ -84,11 +86,14 @@ class Solver(ABC):
         if not isinstance(raw, RawSolution):
             message = f"the backend returned {type(raw).__name__}, not a RawSolution"
             return Solution(None, SolveStatus.FAILED, message=message)
+        count = _as_count(raw.iterations)
         d, message = _as_iterate(raw, qp)
         if d is None:
-            return Solution(None, SolveStatus.FAILED, raw.iterations, message=message)
+            return Solution(None, SolveStatus.FAILED, count, message=message)
         bound_duals = _as_multipliers(raw.bound_duals, qp.size)
         row_duals = _as_multipliers(raw.row_duals, qp.stages * qp.rows)
+        if not qp.bounded and not qp.rows:
+            bound_duals, row_duals = np.zeros(qp.size), np.zeros(0)  # there is nothing to weigh
         residuals = Residuals.of(qp, d, bound_duals, row_duals)
         if not (isinstance(raw.claimed, (bool, np.bool_)) and raw.claimed):
             status = SolveStatus.STOPPED
@@ -96,17 +101,17 @@ class Solver(ABC):
             status = SolveStatus.SOLVED
         else:
             status = SolveStatus.INACCURATE
-        return Solution(d, status, raw.iterations, residuals, bound_duals, row_duals, message)
+        return Solution(d, status, count, residuals, bound_duals, row_duals, message)
 
     def _confirmed(self, qp: QP, d: Array, residuals: Residuals) -> bool:
-        """Whether the residuals bear a claim out; without multipliers, feasibility has to do."""
+        """Whether the residuals bear a claim out; a claim without multipliers cannot be checked."""
         tolerance = self.options.absolute_tolerance + self.options.relative_tolerance
         limit = max(tolerance, min(_SLACK * tolerance, _LOOSEST))
         objective = abs(float(np.vdot(d, qp.gradient)))
         return (
             residuals.primal <= limit * (1.0 + float(np.abs(d).max()))
-            and not residuals.dual > limit * (1.0 + float(np.abs(qp.gradient).max()))
-            and not residuals.gap > limit * (1.0 + objective)
+            and residuals.dual <= limit * (1.0 + float(np.abs(qp.gradient).max()))
+            and residuals.gap <= limit * (1.0 + objective)
         )
 
 
@@ -120,8 +125,10 @@ def _fault(qp: QP) -> str:
 
 
 def _as_iterate(raw: RawSolution, qp: QP) -> tuple[Array | None, str]:
+    told: object = raw.message
+    message = told if isinstance(told, str) else f"its message is a {type(told).__name__}"
     if raw.d is None:
-        return None, raw.message or "the solver returned no iterate"
+        return None, message or "the solver returned no iterate"
     given = np.asarray(raw.d)
     if np.iscomplexobj(given):
         return None, "the solver returned complex numbers"
@@ -130,7 +137,14 @@ def _as_iterate(raw: RawSolution, qp: QP) -> tuple[Array | None, str]:
         return None, f"the solver returned {d.size} numbers for {qp.size} unknowns"
     if not np.isfinite(d).all():
         return None, "the solver returned an iterate that is not finite"
-    return d.reshape(qp.stages, qp.n), raw.message
+    return d.reshape(qp.stages, qp.n), message
+
+
+def _as_count(value: object) -> int | None:
+    """A count of iterations; None where it is none."""
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0:
+        return int(value)
+    return None
 
 
 def _as_multipliers(values: object, size: int) -> Array | None:

@@ -1,0 +1,346 @@
+"""Constant gains from the linearisation of a system about a point."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import positive_definite, vector
+from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
+from ..system import System
+from .luenberger import Luenberger
+
+__all__ = ["design_luenberger"]
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+# Below this a direction counts as unseen. Matrices are scaled to norm one before, and the
+# Jacobians may be finite differences.
+_UNSEEN = float(np.sqrt(np.finfo(np.float64).eps))
+
+
+def design_luenberger(
+    system: System,
+    at: ArrayLike,
+    u: ArrayLike | None = None,
+    *,
+    poles: ArrayLike | None = None,
+    disturbance: ArrayLike | None = None,
+    noise: ArrayLike | None = None,
+) -> Luenberger:
+    r"""A Luenberger observer for the linearisation of a system about a point.
+
+    With A and C the Jacobians of f and h at the point, the error of the observer's state
+    obeys :math:`e(t+1) = (A - K C)\, e(t)` near it. The gain K either places the
+    eigenvalues of A - K C, or is that of the stationary Kalman predictor
+
+    .. math::
+        K = A P C^\top S^{-1}, \quad S = C P C^\top + R, \quad
+        P = A P A^\top + Q - K S K^\top
+
+    The observer is stable where the linearisation is a good one. How far that is, nothing
+    here tells: the point should be typical, most often a steady state.
+
+    Parameters
+    ----------
+    system : System
+        The discrete-time system.
+    at : (n,) array_like
+        The state about which to linearise.
+    u : (m,) array_like, optional
+        The input there; needed exactly if the system has inputs.
+    poles : (n,) array_like, optional
+        Eigenvalues of A - K C, inside the unit circle, complex ones in conjugate pairs.
+        With several outputs, none more often than the rank of C. For a continuous-time
+        pole s and a sampling time dt, give exp(s dt).
+    disturbance : (n, n) array_like, optional
+        Covariance Q of w (squared state units), symmetric positive definite. Instead of
+        poles, together with the noise.
+    noise : (p, p) array_like, optional
+        Covariance R of v (squared output units), symmetric positive definite.
+
+    Returns
+    -------
+    Luenberger
+        The observer with the gain K (n, p), in units of the state per unit of the output.
+
+    Raises
+    ------
+    OptionError
+        Unless either the poles or both covariances are given, or if a pole does not lie
+        inside the unit circle or comes without its conjugate.
+    ShapeError, WeightError
+        If an argument has the wrong shape, or a covariance is not positive definite.
+    ModelError
+        If the model cannot be linearised there; if a mode that the outputs do not show is
+        to be moved or, with covariances, is not stable; or if the numbers are too
+        ill-conditioned for a gain with the promised poles.
+
+    References
+    ----------
+    Kautsky, Nichols and van Dooren, Robust pole assignment in linear state feedback,
+    International Journal of Control 41 (1985), as in `scipy.signal.place_poles`; with one
+    output Ackermann's formula. Anderson and Moore, Optimal Filtering, 1979, chapter 4.
+
+    Examples
+    --------
+    >>> import numpy as np, qpmhe
+    >>> A = np.array([[1.0, 0.1], [0.0, 1.0]])
+    >>> system = qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1)
+    >>> observer = qpmhe.design_luenberger(system, [0.0, 0.0], poles=[0.5, 0.6])
+    >>> observer.gain.round(6).tolist()
+    [[0.9], [2.0]]
+    """
+    if poles is not None and disturbance is None and noise is None:
+        a, c, point = linearize(system, at, u)
+        return Luenberger(_placed(a, c, _checked_poles(poles, system.n), point))
+    if poles is None and disturbance is not None and noise is not None:
+        a, c, point = linearize(system, at, u)
+        q = positive_definite("disturbance covariance", disturbance, system.n)
+        r = positive_definite("noise covariance", noise, system.p)
+        return Luenberger(stationary(a, c, q, r, point)[0])
+    options = {"poles": poles, "disturbance": disturbance, "noise": noise}
+    given = [name for name, value in options.items() if value is not None]
+    raise OptionError(
+        f"given: {', '.join(given) or 'none of them'}; expected either the poles, or the "
+        "covariances of disturbance and noise."
+    )
+
+
+def linearize(system: System, at: ArrayLike, u: ArrayLike | None) -> tuple[Array, Array, Array]:
+    """The Jacobians A (n, n) and C (p, n) at a point, and the point (n,).
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    at : (n,) array_like
+        The state.
+    u : (m,) array_like or None
+        The input, if the system has any.
+
+    Raises
+    ------
+    InvalidInputError
+        If the point does not fit, or the Jacobians are not finite there.
+    """
+    point = vector("at", at, system.n)
+    if u is None and system.m:
+        raise InvalidInputError(
+            f"u is missing; the system has {system.m} inputs, whose values at the point matter."
+        )
+    inputs = np.zeros(0) if u is None else vector("u", u, system.m)
+    found = []
+    for name, jacobian in (("f", system.f_jacobian), ("h", system.h_jacobian)):
+        try:
+            with np.errstate(all="ignore"):
+                value = np.asarray(jacobian(point, inputs), dtype=np.float64)
+        except Exception as error:
+            raise ModelError(
+                f"{name} cannot be linearised at x = {point.tolist()}: it raised "
+                f"{type(error).__name__}: {error}. Choose a point where it is defined."
+            ) from error
+        if not np.isfinite(value).all():
+            raise ModelError(
+                f"the Jacobian of {name} at x = {point.tolist()} is {value.tolist()}; expected "
+                "finite numbers. Choose a point where it is differentiable."
+            )
+        found.append(value)
+    return found[0], found[1], point
+
+
+def stationary(a: Array, c: Array, q: Array, r: Array, point: Array) -> tuple[Array, Array]:
+    """Gain (n, p) and covariance (n, n) of the stationary Kalman predictor.
+
+    Parameters
+    ----------
+    a, c : (n, n) and (p, n) array
+        Jacobians at the point.
+    q, r : (n, n) and (p, p) array
+        Covariances of w and v, positive definite.
+    point : (n,) array
+        The point, for error texts.
+
+    Raises
+    ------
+    ModelError
+        If there is no stationary predictor, or it cannot be computed.
+    """
+    from scipy.linalg import solve_discrete_are
+
+    hidden = _unobservable_modes(a, c)
+    lasting = hidden[np.abs(hidden) > 1.0 - _UNSEEN]
+    if lasting.size:
+        raise ModelError(
+            f"the linearisation at x = {point.tolist()} is not detectable: the outputs do not "
+            f"show the mode with eigenvalue {_text(lasting)}, which does not decay by itself. "
+            "Choose another point, measure more, or take that part out of the state."
+        )
+    try:
+        covariance = np.asarray(solve_discrete_are(a.T, c.T, q, r), dtype=np.float64)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ModelError(
+            f"the Riccati equation about x = {point.tolist()} could not be solved: {error} "
+            "Scale states and outputs to similar sizes."
+        ) from error
+    covariance = 0.5 * (covariance + covariance.T)
+    cross = a @ covariance @ c.T
+    gain: Array = np.asarray(np.linalg.solve(c @ covariance @ c.T + r, cross.T).T, np.float64)
+    radius = spectral_radius(a - gain @ c)
+    if not radius < 1.0:
+        raise ModelError(
+            f"the solution of the Riccati equation about x = {point.tolist()} gives A - K C the "
+            f"spectral radius {radius:.6g}; expected less than 1. Scale states and outputs to "
+            "similar sizes."
+        )
+    return gain, covariance
+
+
+def ackermann(a: Array, c: Array, poles: ComplexArray) -> Array:
+    r"""The gain K (n, 1) that gives A - K C the poles, for a pair with one output.
+
+    .. math::
+        K = p(A)\, [C;\ C A;\ \dots;\ C A^{n-1}]^{-1} e_n
+
+    Parameters
+    ----------
+    a, c : (n, n) and (1, n) array
+        An observable pair.
+    poles : (n,) complex array
+        Roots of the polynomial p.
+    """
+    # A shift and a scaling of A move the poles along. They part the rows of the
+    # observability matrix, which short sampling times bring close to each other.
+    shift, scale = _shift_and_scale(a)
+    eye = np.eye(a.shape[0])
+    a = (a - shift * eye) / scale
+    rows, product = [c[0]], eye.astype(np.complex128)
+    for pole in (poles - shift) / scale:
+        rows.append(rows[-1] @ a)
+        product = product @ (a - pole * eye)
+    column = np.linalg.solve(np.array(rows[:-1]), eye[:, -1])
+    gain: Array = scale * (product.real @ column)
+    return gain[:, None]
+
+
+def spectral_radius(matrix: Array) -> float:
+    """The largest modulus of an eigenvalue."""
+    return float(np.abs(_eigenvalues(matrix)).max())
+
+
+def _eigenvalues(matrix: Array) -> ComplexArray:
+    return np.asarray(np.linalg.eigvals(matrix), dtype=np.complex128)
+
+
+def _placed(a: Array, c: Array, poles: ComplexArray, point: Array) -> Array:
+    hidden = _unobservable_modes(a, c)
+    if hidden.size:
+        raise ModelError(
+            f"the linearisation at x = {point.tolist()} is not observable: the outputs do not "
+            f"show the mode with eigenvalue {_text(hidden)}, and no gain moves it. If it is "
+            "stable, give covariances of disturbance and noise instead of poles."
+        )
+    # Outputs that say the same are one output: C is made one of full rank.
+    combinations, sizes, _ = np.linalg.svd(c, full_matrices=False)
+    combinations = combinations[:, sizes > sizes[0] * 1e-14].T
+    if combinations.shape[0] == 1:
+        reduced = ackermann(a, combinations @ c, poles)
+    else:
+        reduced = _place_poles(a, combinations @ c, poles)
+    gain: Array = reduced @ combinations
+    # Characteristic polynomials, as the eigenvalues of a multiple pole are all but random.
+    placed, asked = np.poly(a - gain @ c), np.poly(poles)
+    off = float(np.abs(placed - asked).max() / np.abs(asked).max())
+    if not (off < 1e-3 and spectral_radius(a - gain @ c) < 1.0):
+        raise ModelError(
+            f"the poles about x = {point.tolist()} come out as "
+            f"{_text(_eigenvalues(a - gain @ c))} instead of {_text(poles)}: the pair is too "
+            "ill-conditioned. Ask for slower poles, or give covariances instead."
+        )
+    return gain
+
+
+def _place_poles(a: Array, c: Array, poles: ComplexArray) -> Array:
+    from scipy.signal import place_poles
+
+    rank = c.shape[0]
+    values, times = np.unique(poles, return_counts=True)
+    if times.max() > rank:
+        raise OptionError(
+            f"the pole {_text(values[[times.argmax()]])} is given {times.max()} times; "
+            f"expected at most rank C = {rank} times. Move its copies a little apart."
+        )
+    with warnings.catch_warnings():
+        # It warns where it has not found the most robust of the gains with these poles.
+        warnings.simplefilter("ignore")
+        try:
+            gain = place_poles(a.T, c.T, poles).gain_matrix
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise ModelError(
+                f"no gain with the poles {_text(poles)} was found: {error}. Give covariances "
+                "instead of poles."
+            ) from error
+    return np.asarray(gain, dtype=np.float64).T
+
+
+def _checked_poles(poles: ArrayLike, n: int) -> ComplexArray:
+    try:
+        given = np.atleast_1d(np.array(poles, dtype=np.complex128))
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"poles is {poles!r}, not an array of numbers.") from error
+    if given.shape != (n,):
+        raise ShapeError(f"poles has shape {given.shape}; expected (n,) = ({n},).")
+    outside = given[~(np.abs(given) < 1.0)]
+    if outside.size:
+        raise OptionError(
+            f"the poles {_text(outside)} do not lie inside the unit circle; a continuous-time "
+            "pole s is exp(s dt) here."
+        )
+    upper, lower = given[given.imag > 0.0], given[given.imag < 0.0]
+    if upper.size != lower.size or not np.allclose(
+        np.sort_complex(upper), np.sort_complex(lower.conj()), rtol=0.0, atol=1e-9
+    ):
+        raise OptionError(
+            f"poles is {_text(given)}; expected complex poles in conjugate pairs, as a real "
+            "gain gives them."
+        )
+    return np.concatenate((given[given.imag == 0.0], upper, upper.conj()))
+
+
+def _unobservable_modes(a: Array, c: Array) -> ComplexArray:
+    """Eigenvalues of A on the largest invariant subspace that C does not see."""
+    shift, scale = _shift_and_scale(a)
+    shifted = (a - shift * np.eye(a.shape[0])) / scale
+    size = np.linalg.norm(c, axis=1, keepdims=True)
+    basis = _kernel(c / np.where(size > 0.0, size, 1.0))
+    while basis.shape[1]:
+        moved = shifted @ basis
+        staying = _kernel(moved - basis @ (basis.T @ moved))
+        if staying.shape[1] == basis.shape[1]:
+            return _eigenvalues(basis.T @ a @ basis)
+        basis = basis @ staying
+    return np.zeros(0, dtype=np.complex128)
+
+
+def _shift_and_scale(a: Array) -> tuple[float, float]:
+    """Numbers s and r for which (A - s I) / r is of norm one, unless A is a multiple of I."""
+    shift = float(np.trace(a)) / a.shape[0]
+    size = float(np.linalg.norm(a - shift * np.eye(a.shape[0])))
+    return shift, max(size, _UNSEEN * float(np.linalg.norm(a))) or 1.0
+
+
+def _kernel(matrix: Array) -> Array:
+    _, values, rows = np.linalg.svd(matrix)
+    kernel: Array = rows[int(np.count_nonzero(values > _UNSEEN)) :].T
+    return kernel
+
+
+def _text(values: ComplexArray) -> str:
+    return ", ".join(
+        f"{value.real:.6g}" if math.isclose(value.imag, 0.0, abs_tol=1e-12) else f"{value:.6g}"
+        for value in values
+    )

@@ -1,0 +1,136 @@
+"""The stationary Kalman predictor about a point."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import positive_definite
+from ..errors import ShapeError
+from ..system import System
+from .base import Observer, Sample
+from .design import linearize, stationary
+
+__all__ = ["SteadyStateKalman"]
+
+Array = NDArray[np.float64]
+
+
+class SteadyStateKalman(Observer):
+    r"""Constant gain of the stationary Kalman predictor, with the covariance that it has.
+
+    With A and C the Jacobians of f and h at a point, found once, at construction:
+
+    .. math::
+        S = C P C^\top + R, \quad K = A P C^\top S^{-1}, \quad L(z, v) = K v, \quad
+        P = A P A^\top + Q - K S K^\top
+
+    It costs what a `Luenberger` observer costs in stability and (eq:kappa), with
+    :math:`\kappa` the spectral norm of K, and offers a covariance besides, so that
+    `qpmhe.ObserverPrior` can weigh the prior. That covariance is the one of this observer's
+    own error on the linearisation,
+
+    .. math::
+        P(t+1) = (A - K C) P(t) (A - K C)^\top + Q + K R K^\top
+
+    which stays at P from P(0) = P on, and leaves it only where outputs are missing (their
+    columns of K are zero then) or a sample has a noise weight of its own. The gain itself
+    never changes. On a linear system with P(0) = P it is the Kalman predictor.
+
+    Parameters
+    ----------
+    system : System
+        The system for which the gain is; the estimator's, or one of the same dimensions.
+    at : (n,) array_like
+        The state about which to linearise; it should be typical of the operation.
+    u : (m,) array_like, optional
+        The input there; needed exactly if the system has inputs.
+    disturbance : (n, n) array_like
+        Covariance Q of w (squared state units), symmetric positive definite.
+    noise : (p, p) array_like
+        Covariance R of v (squared output units), symmetric positive definite.
+    prior : (n, n) array_like, optional
+        Covariance P(0) of the initial error x(0) - z(0); the stationary one if left out,
+        which suits an observer that has run for long and is too sure of itself otherwise.
+
+    Attributes
+    ----------
+    gain : (n, p) array
+        K, in units of the state per unit of the output.
+    covariance : (n, n) array
+        The stationary P.
+
+    Raises
+    ------
+    ShapeError, WeightError
+        If an argument has the wrong shape, or a covariance is not symmetric and positive
+        definite.
+    ModelError
+        If the model cannot be linearised at the point, or its linearisation is not
+        detectable there; the text names the mode that is not observed.
+
+    References
+    ----------
+    Anderson and Moore, Optimal Filtering, 1979, chapter 4.
+
+    Examples
+    --------
+    >>> import qpmhe
+    >>> system = qpmhe.System(lambda x: x, lambda x: x, n=1, p=1)
+    >>> observer = qpmhe.SteadyStateKalman(system, [0.0], disturbance=[[1.0]], noise=[[2.0]])
+    >>> float(observer.covariance.round(6)[0, 0]), float(observer.gain.round(6)[0, 0])
+    (2.0, 0.5)
+    """
+
+    def __init__(
+        self,
+        system: System,
+        at: ArrayLike,
+        u: ArrayLike | None = None,
+        *,
+        disturbance: ArrayLike,
+        noise: ArrayLike,
+        prior: ArrayLike | None = None,
+    ) -> None:
+        self._a, self._c, point = linearize(system, at, u)
+        self._disturbance = positive_definite("disturbance covariance", disturbance, system.n)
+        self._noise = positive_definite("noise covariance", noise, system.p)
+        self.gain, self.covariance = stationary(
+            self._a, self._c, self._disturbance, self._noise, point
+        )
+        self._prior = self.covariance
+        if prior is not None:
+            self._prior = positive_definite("prior covariance", prior, system.n)
+        self._closed = self._a - self.gain @ self._c
+        self._entering = self._disturbance + self.gain @ self._noise @ self.gain.T
+
+    def check(self, system: System, initial_state: Array) -> None:
+        """Insist on a system of the dimensions that the gain is for; see `Observer.check`."""
+        n, p = self.gain.shape
+        if (system.n, system.p) != (n, p):
+            raise ShapeError(
+                f"the observer is for {n} states and {p} outputs; expected {system.n} and "
+                f"{system.p}, the system's."
+            )
+
+    @property
+    def kappa(self) -> float:
+        """The constant of (eq:kappa)."""
+        return float(np.linalg.norm(self.gain, 2))
+
+    def initial_covariance(self) -> Array:
+        """P(0)."""
+        return self._prior
+
+    def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
+        """K v and the covariance of the next error; see `Observer.correct`."""
+        before = self.covariance if sample.covariance is None else sample.covariance
+        closed, entering = self._closed, self._entering
+        if sample.observed is not None or sample.noise_weight is not None:
+            r = self._noise if sample.noise_weight is None else np.linalg.inv(sample.noise_weight)
+            gain = self.gain
+            if sample.observed is not None:
+                gain = np.where(sample.observed, gain, 0.0)
+            closed, entering = self._a - gain @ self._c, self._disturbance + gain @ r @ gain.T
+        following = closed @ before @ closed.T + entering
+        return self.gain @ v, 0.5 * (following + following.T)

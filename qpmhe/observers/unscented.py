@@ -1,0 +1,141 @@
+"""The unscented Kalman filter as an observer in output-injection form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import positive, positive_definite
+from ..errors import ShapeError
+from ..system import System
+from .base import Observer, Sample
+
+__all__ = ["UnscentedKalman"]
+
+Array = NDArray[np.float64]
+
+# A sigma point is drawn back into the state set, but not closer to z than this share.
+_CLOSEST = 1e-3
+
+
+class UnscentedKalman(Observer):
+    r"""A one-step predictor whose gain comes from sigma points instead of Jacobians.
+
+    With S the Cholesky factor of P(t), c the spread and the deviations
+
+    .. math::
+        F_j = f(z + d_j) - f(z), \quad H_j = h(z + d_j) - h(z), \qquad
+        d_j = \pm c\, S e_1, \dots, \pm c\, S e_n
+
+    of 2n sigma points, each with the weight :math:`1 / 2c^2` in the sums,
+
+    .. math::
+        \begin{aligned}
+        K &= \textstyle\sum_j F_j H_j^\top \big(\sum_j H_j H_j^\top + R\big)^{-1}, \qquad
+        L(z, v) = K v \\
+        P^+ &= \textstyle\sum_j (F_j - K H_j)(F_j - K H_j)^\top + K R K^\top + Q
+        \end{aligned}
+
+    It differs from the textbook's filter, for a reason: an observer in output-injection
+    form (eq:observer) steps from z to f(z) where the output fits, L(z, 0) = 0, whereas the
+    textbook's steps to the mean of the f(z + d_j) and compares y with the mean of the
+    h(z + d_j). Deviations are therefore taken from f(z) and h(z). So K is the gain of least
+    mean square error among corrections of the form K v, and the bias that remains is part
+    of :math:`P^+`, which is positive definite whatever the spread. On a linear system both
+    are the Kalman filter; as the spread vanishes this one becomes `ExtendedKalman`.
+
+    Linear in v, so that (eq:kappa) holds with the largest :math:`|K(t)|` met. The model is
+    evaluated at 2n + 1 states in each step. Where X has bounds, the two sigma points of a
+    direction are drawn nearer to z, with a larger weight, so far that they satisfy the
+    bounds (but not nearer than a thousandth); where f or h cannot be evaluated at a sigma
+    point, the stage fails as it does where they cannot be evaluated at z. Steps of unusual
+    length and missing outputs are taken as they are.
+
+    Parameters
+    ----------
+    prior : (n, n) array_like
+        Covariance P(0) of the initial error x(0) - z(0), in squared state units.
+    disturbance : (n, n) array_like
+        Covariance Q of w, in squared state units.
+    noise : (p, p) array_like
+        Covariance R of v, in squared output units.
+    spread : float
+        c, the distance of the sigma points from z in standard deviations, above 0:
+        :math:`\sqrt{n + \lambda}` or :math:`\alpha \sqrt{n + \kappa}` of the textbooks.
+        :math:`\sqrt 3` matches the fourth moments of a Gaussian along each direction.
+
+    Raises
+    ------
+    WeightError, ShapeError
+        If a covariance is not square, symmetric and positive definite.
+    OptionError
+        If the spread is not positive.
+
+    References
+    ----------
+    Julier and Uhlmann, Unscented filtering and nonlinear estimation, Proceedings of the IEEE
+    92 (2004), doi 10.1109/JPROC.2003.823141.
+    """
+
+    def __init__(
+        self,
+        *,
+        prior: ArrayLike,
+        disturbance: ArrayLike,
+        noise: ArrayLike,
+        spread: float = math.sqrt(3.0),
+    ) -> None:
+        self._prior = positive_definite("prior covariance", prior)
+        self._disturbance = positive_definite("disturbance covariance", disturbance)
+        self._noise = positive_definite("noise covariance", noise)
+        self._spread = positive("spread", spread)
+
+    def check(self, system: System, initial_state: Array) -> None:
+        """Insist on covariances of the system's dimensions; see `Observer.check`."""
+        for name, matrix, size in (
+            ("prior", self._prior, system.n),
+            ("disturbance", self._disturbance, system.n),
+            ("noise", self._noise, system.p),
+        ):
+            if matrix.shape[0] != size:
+                raise ShapeError(
+                    f"{name} covariance has shape {matrix.shape}; expected ({size}, {size})."
+                )
+
+    def initial_covariance(self) -> Array:
+        """P(0)."""
+        return self._prior
+
+    def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
+        """K v and the next covariance; see `Observer.correct`."""
+        system, covariance = sample.system, sample.covariance
+        if covariance is None:
+            raise ValueError("the unscented Kalman observer needs a covariance")
+        r = self._noise if sample.noise_weight is None else np.linalg.inv(sample.noise_weight)
+        moves = self._spread * np.linalg.cholesky(covariance).T
+        share = np.ones(z.size)
+        if system.states is not None:
+            room = np.minimum(system.states.upper - z, z - system.states.lower)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                # No movement asks for no room; where z is on a bound this is 0 / 0.
+                steps = np.where(moves == 0.0, math.inf, room / np.abs(moves))
+            share = np.clip(steps.min(axis=1), _CLOSEST, 1.0)
+            moves *= share[:, None]
+        points = np.concatenate((z[None], z + moves, z - moves))
+        inputs = np.broadcast_to(sample.u, (points.shape[0], sample.u.size))
+        # Roots of the weights go into the deviations, so that sums become products.
+        roots = np.tile(1.0 / (math.sqrt(2.0) * self._spread * share), 2)[:, None]
+        f, h = system.f.batch(points, inputs), system.h.batch(points, inputs)
+        ahead: Array = (f[1:] - f[0]) * roots
+        if sample.observed is not None:
+            there = sample.observed
+            h, r, v = h[:, there], r[np.ix_(there, there)], v[there]
+        if v.size == 0:
+            return np.zeros_like(z), ahead.T @ ahead + self._disturbance
+        seen: Array = (h[1:] - h[0]) * roots
+        gain = np.linalg.solve(seen.T @ seen + r, seen.T @ ahead).T
+        left = ahead - seen @ gain.T
+        following = left.T @ left + gain @ r @ gain.T + self._disturbance
+        return gain @ v, 0.5 * (following + following.T)

@@ -1,0 +1,218 @@
+import itertools
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.errors import OptionError
+
+
+def spd(generator, n):
+    root = generator.standard_normal((n, n))
+    return root @ root.T + 0.1 * np.eye(n)
+
+
+def random_cost(n, p, seed=0):
+    generator = np.random.default_rng(seed)
+    return qpmhe.QuadraticCost(
+        prior=spd(generator, n), disturbance=spd(generator, n), noise=spd(generator, p)
+    )
+
+
+@pytest.mark.parametrize("term", ["prior", "disturbance", "noise"])
+@pytest.mark.parametrize(("n", "p"), [(1, 1), (2, 1), (3, 4)])
+def test_constants_bound_the_cost_and_are_attained(n, p, term):
+    cost = random_cost(n, p)
+    weight, (low, high) = getattr(cost, term), getattr(cost.constants, term)
+    exponent = cost.constants.exponent
+    generator = np.random.default_rng(1)
+    ratios = []
+    for _ in range(2000):
+        s = generator.standard_normal(len(weight)) * 10.0 ** generator.uniform(-3, 3)
+        value = sum(s[i] * weight[i, j] * s[j] for i in range(len(s)) for j in range(len(s)))
+        ratios.append(value / np.linalg.norm(s) ** exponent)
+    assert low * (1 - 1e-9) <= min(ratios)
+    assert max(ratios) <= high * (1 + 1e-9)
+    vectors = np.linalg.eigh(weight)[1]
+    assert vectors[:, 0] @ weight @ vectors[:, 0] == pytest.approx(low)
+    assert vectors[:, -1] @ weight @ vectors[:, -1] == pytest.approx(high)
+
+
+def test_the_constants_of_a_known_cost():
+    constants = qpmhe.QuadraticCost(
+        prior=np.diag([4.0, 1.0]), disturbance=np.diag([100.0, 25.0]), noise=[[25.0]]
+    ).constants
+    assert constants.exponent == 2.0
+    np.testing.assert_allclose(constants.prior, (1.0, 4.0))
+    np.testing.assert_allclose(constants.disturbance, (25.0, 100.0))
+    np.testing.assert_allclose(constants.noise, (25.0, 25.0))
+
+
+def test_weights_are_inverse_covariances():
+    generator = np.random.default_rng(2)
+    prior, disturbance, noise = spd(generator, 3), spd(generator, 3), spd(generator, 2)
+    by_covariance = qpmhe.QuadraticCost.from_covariances(
+        prior=prior, disturbance=disturbance, noise=noise
+    )
+    for weight, covariance in (
+        (by_covariance.prior, prior),
+        (by_covariance.disturbance, disturbance),
+        (by_covariance.noise, noise),
+    ):
+        np.testing.assert_allclose(weight @ covariance, np.eye(len(covariance)), atol=1e-12)
+        np.testing.assert_array_equal(weight, weight.T)
+    by_weight = qpmhe.QuadraticCost(prior=prior, disturbance=disturbance, noise=noise)
+    np.testing.assert_allclose(by_weight.prior, prior)
+    np.testing.assert_allclose(by_weight.disturbance, disturbance)
+    np.testing.assert_allclose(by_weight.noise, noise)
+
+
+def test_the_paper_weighs_a_small_noise_heavily():
+    cost = qpmhe.QuadraticCost.from_covariances(prior=1.0, disturbance=0.1**2, noise=0.2**2)
+    np.testing.assert_allclose([cost.disturbance[0, 0], cost.noise[0, 0]], [100.0, 25.0])
+
+
+@pytest.mark.parametrize(("n", "p"), [(1, 1), (2, 3)])
+def test_the_stage_weight_is_that_of_both_residuals(n, p):
+    cost = random_cost(n, p)
+    w, v = np.random.default_rng(3).standard_normal((2, n + p))[:, : max(n, p)]
+    w, v = w[:n], v[:p]
+    joint = np.concatenate([w, v])
+    assert joint @ cost.stage_weight @ joint == pytest.approx(
+        w @ cost.disturbance @ w + v @ cost.noise @ v
+    )
+    assert (cost.n, cost.p) == (n, p)
+
+
+def test_scalars_will_do_for_one_state_and_one_output():
+    cost = qpmhe.QuadraticCost(prior=1, disturbance=2.0, noise=np.float64(3.0))
+    np.testing.assert_array_equal(cost.prior, [[1.0]])
+    np.testing.assert_array_equal(cost.stage_weight, np.diag([2.0, 3.0]))
+
+
+def test_weights_are_copies():
+    given = np.eye(2)
+    cost = qpmhe.QuadraticCost(prior=given, disturbance=given, noise=given)
+    given[0, 0] = 9.0
+    for weight in (cost.prior, cost.disturbance, cost.noise, cost.stage_weight):
+        assert weight[0, 0] == 1.0
+
+
+def masks(p):
+    return [np.array(mask) for mask in itertools.product([True, False], repeat=p)]
+
+
+@pytest.mark.parametrize("mask", masks(3), ids=lambda mask: "".join("xo"[int(b)] for b in mask))
+def test_the_partial_weight_is_the_inverse_of_the_observed_covariance(mask):
+    n, p = 2, 3
+    cost = random_cost(n, p)
+    covariance = np.linalg.inv(cost.noise)
+    weight = cost.partial_weight(mask)
+    np.testing.assert_array_equal(weight[:n], cost.stage_weight[:n])
+    np.testing.assert_array_equal(weight[:, :n], cost.stage_weight[:, :n])
+    block = weight[n:, n:]
+    assert not block[~mask].any()
+    assert not block[:, ~mask].any()
+    observed = np.ix_(mask, mask)
+    np.testing.assert_allclose(
+        block[observed] @ covariance[observed], np.eye(mask.sum()), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("mask", masks(3)[1:-1], ids=str)
+def test_a_missing_output_is_one_that_may_take_its_best_value(mask):
+    # Minimising |v|_R^2 over the components that are not seen leaves the Schur complement.
+    cost = random_cost(2, 3, seed=4)
+    v = np.zeros(3)
+    v[mask] = np.random.default_rng(5).standard_normal(mask.sum())
+    r = cost.noise
+    v_best = v.copy()
+    v_best[~mask] = -np.linalg.solve(r[np.ix_(~mask, ~mask)], r[np.ix_(~mask, mask)] @ v[mask])
+    residual = np.concatenate([np.zeros(2), v])
+    assert residual @ cost.partial_weight(mask) @ residual == pytest.approx(v_best @ r @ v_best)
+
+
+def test_partial_weights_leave_the_full_one_alone():
+    cost = random_cost(2, 3)
+    before = cost.stage_weight.copy()
+    for mask in masks(3) + masks(3)[::-1]:
+        cost.partial_weight(mask)
+    np.testing.assert_array_equal(cost.stage_weight, before)
+    np.testing.assert_allclose(cost.partial_weight(masks(3)[0]), before, rtol=1e-12, atol=1e-13)
+    np.testing.assert_array_equal(
+        cost.partial_weight(masks(3)[2]), random_cost(2, 3).partial_weight(masks(3)[2])
+    )
+
+
+# The prior weight from an observer's covariance
+
+
+def rotated(eigenvalues, seed=6):
+    generator = np.random.default_rng(seed)
+    vectors = np.linalg.qr(generator.standard_normal((len(eigenvalues), len(eigenvalues))))[0]
+    return vectors, (vectors * np.array(eigenvalues)) @ vectors.T
+
+
+def test_the_observer_prior_is_the_inverse_covariance_within_its_bounds():
+    covariance = spd(np.random.default_rng(7), 4)
+    weight = qpmhe.ObserverPrior().weight(covariance)
+    np.testing.assert_allclose(weight @ covariance, np.eye(4), atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("eigenvalues", "clipped"),
+    [
+        ([0.5, 2.0, 1.0], [2.0, 0.5, 1.0]),
+        ([1e-9, 2.0, 1.0], [10.0, 0.5, 1.0]),
+        ([0.5, 2.0, 1e9], [2.0, 0.5, 0.1]),
+        ([1e-9, 1e9, 1.0], [10.0, 0.1, 1.0]),
+        ([0.0, 2.0, 1.0], [10.0, 0.5, 1.0]),
+        ([-1e-3, 2.0, 1.0], [10.0, 0.5, 1.0]),
+    ],
+    ids=str,
+)
+def test_the_observer_prior_clips_eigenvalues_and_keeps_directions(eigenvalues, clipped):
+    rule = qpmhe.ObserverPrior(minimum=0.1, maximum=10.0)
+    vectors, covariance = rotated(eigenvalues)
+    expected = (vectors * np.array(clipped)) @ vectors.T
+    np.testing.assert_allclose(rule.weight(covariance), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_the_bounds_of_the_observer_prior_are_its_constants():
+    rule = qpmhe.ObserverPrior(minimum=0.1, maximum=10.0)
+    cost = qpmhe.QuadraticCost(prior=rule, disturbance=np.eye(3), noise=np.eye(1))
+    low, high = cost.constants.prior
+    assert (low, high) == (0.1, 10.0)
+    generator = np.random.default_rng(8)
+    for _ in range(100):
+        _, covariance = rotated(10.0 ** generator.uniform(-4, 4, 3), seed=9)
+        eigenvalues = np.linalg.eigvalsh(rule.weight(covariance))
+        assert eigenvalues[0] >= low * (1 - 1e-9)
+        assert eigenvalues[-1] <= high * (1 + 1e-9)
+
+
+def test_from_covariances_hands_an_observer_prior_on():
+    rule = qpmhe.ObserverPrior()
+    cost = qpmhe.QuadraticCost.from_covariances(prior=rule, disturbance=2.0, noise=4.0)
+    assert cost.prior is rule
+    np.testing.assert_allclose(cost.stage_weight, np.diag([0.5, 0.25]))
+
+
+@pytest.mark.parametrize(
+    ("minimum", "maximum"),
+    [
+        (0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (1.0, 1.0), (np.nan, 1.0), (1.0, np.inf),
+        (1.0, np.nan), ("a", 1.0), (1.0, None),
+    ],
+)
+def test_bounds_of_the_observer_prior_out_of_range(minimum, maximum):
+    with pytest.raises(OptionError) as caught:
+        qpmhe.ObserverPrior(minimum=minimum, maximum=maximum)
+    assert f"minimum is {minimum!r} and maximum {maximum!r}" in str(caught.value)
+    assert "0 < minimum < maximum" in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", [int, np.int64, np.float32, np.float64])
+def test_bounds_of_the_observer_prior_may_be_any_number(kind):
+    rule = qpmhe.ObserverPrior(minimum=kind(1), maximum=kind(8))
+    assert (rule.minimum, rule.maximum) == (1.0, 8.0)
