@@ -135,7 +135,19 @@ class Jacobian:
         if self._given is not None:
             self._compare(self._given, [(x, u)])
         elif self.method == "complex step" and not self._complex_step_works([(x, u)]):
-            self.method, self.batch = "finite differences", self._differences
+            self.use("finite differences")
+
+    def use(self, method: str) -> None:
+        """Compute by a certain one of the two methods from now on, unless one was given.
+
+        Parameters
+        ----------
+        method : str
+            ``complex step`` or ``finite differences``.
+        """
+        if self._given is None:
+            self.method = method
+            self.batch = self._complex if method == "complex step" else self._differences
 
     def _compare(self, given: BatchedFunction, probes: Probes) -> None:
         for x, u, value, expected in self._at_probes(probes):

@@ -2,37 +2,25 @@
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qpmhe_solvers import SolverOptions, create
-
 from ._checks import positive, positive_definite, record, vector
 from .costs import Cost, ObserverPrior
-from .covariance import window_covariances
+from .engine import PythonEngine
 from .errors import InvalidInputError, ShapeError
-from .estimate import Estimate, Status
+from .estimate import Estimate
 from .observers import Observer
-from .optimizer import Optimizer
-from .problem import Problem
 from .run import Run
 from .settings import Settings
-from .subproblem import Subproblem
 from .system import System
-from .window import Window
 
 __all__ = ["MovingHorizonEstimator"]
 
 Array = NDArray[np.float64]
-
-# Every so many samples it is made sure that f and h may be called on many states at once.
-_CHECK_EVERY = 16
-
 
 class MovingHorizonEstimator:
     r"""Suboptimal moving horizon estimation with an observer-based candidate.
@@ -146,21 +134,8 @@ class MovingHorizonEstimator:
                 "has no covariance; take qpmhe.ExtendedKalman, or give a constant weight."
             )
         self.initial_state: Array = self._checked_start(initial_state)
-        solver = create(
-            backend,
-            SolverOptions(
-                max_iterations=max_solver_iterations,
-                absolute_tolerance=float(solver_tolerance),
-                time_limit=time_budget,
-            ),
-        )
-        self._problem = Problem(system, cost)
-        if self._problem.constrained:
-            solver.prepare((horizon + 1) * system.n)
-        self._subproblem = Subproblem(system, cost, horizon)
-        self._optimizer = Optimizer(self._subproblem, solver, self.settings)
         self._no_input = np.zeros(system.m)
-        self._forget()
+        self._engine = PythonEngine(system, observer, cost, self.settings, self.initial_state)
 
     def _checked_start(self, initial_state: ArrayLike) -> Array:
         state = vector("initial_state", initial_state, self.system.n)
@@ -173,17 +148,6 @@ class MovingHorizonEstimator:
                 f"{states!r}; start within it."
             )
         return state
-
-    def _forget(self) -> None:
-        self._window = Window(
-            self.system, self.observer, self.cost, self.settings.horizon, self.initial_state,
-            self.settings.qp_limit > 0,
-        )
-        self._last: Estimate | None = None
-        # Estimates of x(t-N), ..., x(t), each made at its own time.
-        self._history: deque[Array] = deque(
-            [self.initial_state.copy()], maxlen=self.settings.horizon + 1
-        )
 
     def reset(self, initial_state: ArrayLike | None = None) -> None:
         """Forget all measurements and start again.
@@ -200,17 +164,17 @@ class MovingHorizonEstimator:
         """
         if initial_state is not None:
             self.initial_state = self._checked_start(initial_state)
-        self._forget()
+        self._engine.reset(self.initial_state)
 
     @property
     def state(self) -> Array:
         """The current estimate of x(t+1), or the initial one before the first measurement."""
-        return self._history[-1]
+        return self._engine.state
 
     @property
     def time(self) -> int:
         """Number of measurements taken so far."""
-        return self._window.time
+        return self._engine.time
 
     @property
     def horizon(self) -> int:
@@ -263,17 +227,7 @@ class MovingHorizonEstimator:
             _ = system.timed  # raises here, before the sample is taken, if there is none
         if noise_weight is not None:
             noise_weight = positive_definite("noise_weight", noise_weight, system.p)
-        with np.errstate(all="ignore"):
-            missing, held, flat = self._window.push(y_array, u_array, dt, noise_weight)
-            if self.settings.candidate == "reinitialized":
-                # The oldest of the history is the estimate of x(t+1-N), or x(0).
-                self._window.replay(self._window.length, self._reinitial_state())
-            estimate = self._estimate(missing, held, flat, began)
-        self._history.append(estimate.state)
-        return estimate
-
-    def _reinitial_state(self) -> Array:
-        return self._history[len(self._history) - self._window.length]
+        return self._engine.step(y_array, u_array, dt, noise_weight, began)
 
     def _measurement(self, y: ArrayLike | None) -> Array:
         p = self.system.p
@@ -284,61 +238,6 @@ class MovingHorizonEstimator:
         if isinstance(y, (list, tuple)):
             y = [np.nan if item is None else item for item in y]
         return vector("y", y, p, finite=False)
-
-    def _estimate(self, missing: bool, held: bool, flat: bool, began: float) -> Estimate:
-        """Solve the window's problem as it stands."""
-        window, problem, settings = self._window, self._problem, self.settings
-        if window.time <= settings.horizon or window.time % _CHECK_EVERY == 0:
-            window.check_batches()
-        problem.bind(window)
-        start = self._shifted() if settings.start == "best" else None
-        deadline = math.inf if settings.time_budget is None else began + settings.time_budget
-        outcome = self._optimizer.improve(problem, window, start, deadline)
-        status = outcome.events | (Status.IMPROVED if outcome.improved else Status.CANDIDATE)
-        if missing:
-            status |= Status.MISSING
-        if held or flat:
-            status |= Status.MODEL_FAILED
-        trial, reference = outcome.trial, outcome.reference
-        trajectory, residuals = trial.trajectory, trial.residuals
-        if not outcome.improved:
-            trajectory = trajectory.copy()  # of the window, which moves on
-        if window.has_special_weights or not outcome.improved:
-            residuals = residuals.copy()
-            residuals[:, self.system.n :][~window.observed] = np.nan
-        estimate = Estimate(
-            window.time - 1,
-            trajectory,
-            residuals,
-            trial.cost,
-            reference.trajectory.copy(),
-            reference.cost,
-            status,
-            outcome.message,
-            outcome.qps,
-            outcome.solver_iterations,
-            outcome.solve_time,
-            outcome.corrections,
-            outcome.dropped,
-            settings.delay,
-        )
-        if held and outcome.improved:
-            window.restart(estimate.state)
-        self._last = estimate
-        estimate.step_time = perf_counter() - began
-        return estimate
-
-    def _shifted(self) -> Array | None:
-        """The previous estimate, moved on by one step of the model to the present window."""
-        if self._last is None:
-            return None
-        window, before = self._window, self._last.trajectory
-        try:
-            ahead = np.asarray(window.model.f(before[-1], window.inputs[-1]))
-        except Exception:  # the model is not defined there: no start, then
-            return None
-        shifted = np.vstack((before, ahead))
-        return shifted[shifted.shape[0] - 1 - window.length :]
 
     def amend(self, time: int, y: ArrayLike) -> Estimate:
         """Put a late measurement in its place, redo the observer from there, and estimate.
@@ -361,7 +260,7 @@ class MovingHorizonEstimator:
             If the time is not within the window, or y does not fit; the estimator is left
             as it was.
         """
-        oldest, newest = self.time - self._window.length, self.time - 1
+        oldest, newest = self.time - self._engine.length, self.time - 1
         if isinstance(time, bool) or not isinstance(time, (int, np.integer)) or not (
             oldest <= time <= newest
         ):
@@ -369,15 +268,7 @@ class MovingHorizonEstimator:
                 f"time is {time!r}; expected an integer from {oldest} to {newest}, the samples "
                 "in the window. Take a longer horizon for later measurements."
             )
-        late = self._measurement(y)
-        began = perf_counter()
-        with np.errstate(all="ignore"):
-            self._window.amend(int(time), late)
-            self._last = None  # it does not belong to the window before this one
-            held = not math.isfinite(self._window.candidate_cost)
-            estimate = self._estimate(False, held, False, began)
-        self._history[-1] = estimate.state
-        return estimate
+        return self._engine.amend(int(time), self._measurement(y))
 
     def covariances(self) -> Array:
         """Covariances of the last estimate's trajectory, by linearisation along it.
@@ -398,10 +289,49 @@ class MovingHorizonEstimator:
         InvalidInputError
             Before the first measurement, or if the model cannot be linearised there.
         """
-        if self._last is None:
-            raise InvalidInputError("there is no estimate yet; update first.")
-        with np.errstate(all="ignore"):
-            return window_covariances(self._problem, self._last.trajectory)
+        return self._engine.covariances()
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that was learnt from measurements so far, as plain arrays and numbers.
+
+        An estimator made with the same arguments goes on bit for bit after
+        `load_state_dict`, in the same process or another.
+
+        Returns
+        -------
+        dict
+            Copies; safe to keep, to pickle, or to write down.
+        """
+        return self._engine.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where another estimator stopped.
+
+        Parameters
+        ----------
+        state : dict
+            What `state_dict` gave of an estimator with the same arguments.
+
+        Raises
+        ------
+        InvalidInputError
+            If it is not such a state; the estimator is left as it was.
+        """
+        self._engine.load_state_dict(state)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {
+            "arguments": (self.system, self.observer, self.cost),
+            "settings": self.settings,
+            "initial_state": self.initial_state,
+            "state": self.state_dict(),
+        }
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        self.__init__(  # type: ignore[misc]
+            *saved["arguments"], initial_state=saved["initial_state"], **vars(saved["settings"])
+        )
+        self.load_state_dict(saved["state"])
 
     def _input(self, u: ArrayLike | None) -> Array:
         m = self.system.m
@@ -411,7 +341,13 @@ class MovingHorizonEstimator:
             raise InvalidInputError("u was given, but the system has no inputs; leave it out.")
         return vector("u", u, m, finite=False)
 
-    def run(self, measurements: ArrayLike, inputs: ArrayLike | None = None) -> Run:
+    def run(
+        self,
+        measurements: ArrayLike,
+        inputs: ArrayLike | None = None,
+        *,
+        covariances: bool = False,
+    ) -> Run:
         """Take a whole record, sample by sample, going on from the present state.
 
         Parameters
@@ -420,6 +356,8 @@ class MovingHorizonEstimator:
             y(t), ..., y(t+T-1); (T,) will do where p is 1.
         inputs : (T, m) array_like, optional
             The inputs of the same times.
+        covariances : bool
+            Whether to compute the covariance of each estimate.
 
         Returns
         -------
@@ -441,8 +379,12 @@ class MovingHorizonEstimator:
             raise ShapeError(
                 f"inputs has {len(us)} samples; expected {len(ys)}, one for each measurement."
             )
-        start = self.state.copy()
-        return Run(start, [self.update(y, u) for y, u in zip(ys, us, strict=True)])
+        start, estimates, collected = self.state.copy(), [], []
+        for y, u in zip(ys, us, strict=True):
+            estimates.append(self.update(y, u))
+            if covariances:
+                collected.append(self.covariances()[-1])
+        return Run(start, estimates, np.array(collected) if covariances else None)
 
 
 def _is(value: object, kind: type, name: str, expected: str) -> None:

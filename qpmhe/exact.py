@@ -185,8 +185,7 @@ class _Program:
 
     def set(self, problem: Problem, trial: Trial, jacobian: Array) -> None:
         """Put the numbers of a trial in."""
-        n, weights = self._n, problem.stage_weights
-        root = self._roots(weights)
+        n, root = self._n, self._roots(problem.stage_weights)
         self._residuals.value = np.matmul(trial.residuals[:, None, :], root)[:, 0]
         columns = np.matmul(jacobian.transpose(0, 2, 1), root)
         for j, parameter in enumerate(self._jacobian):
@@ -198,8 +197,9 @@ class _Program:
         self._disturbances.set(
             problem.disturbances, trial.residuals[:, :n], jacobian[:, :n], None
         )
-        seen = np.diagonal(weights, axis1=-2, axis2=-1)[..., n:] > 0.0
-        self._noises.set(problem.noises, trial.residuals[:, n:], jacobian[:, n:], seen)
+        self._noises.set(
+            problem.noises, trial.residuals[:, n:], jacobian[:, n:], problem.observed
+        )
 
     def _roots(self, weights: Array) -> Array:
         """Roots of the stage weights, of all stages or of each."""
@@ -280,17 +280,17 @@ class _Rows:
         one: ConvexSet | None,
         points: Array,
         jacobian: Array | None,
-        seen: NDArray[np.bool_] | None,
+        observed: NDArray[np.bool_] | None,
     ) -> None:
         """Put the numbers in; without the set if it is None.
 
-        Rows are off where they are about components that are not seen.
+        Rows are off where they are about components (K, d) that are not observed.
         """
         if not self.constraints:
             return
         on = np.full((points.shape[0], self._matrix.shape[0]), one is not None)
-        if seen is not None:
-            on &= ~((self._matrix != 0.0) & ~seen[..., None, :]).any(axis=-1)
+        if observed is not None:
+            on &= ~((self._matrix != 0.0) & ~observed[:, None, :]).any(axis=-1)
         if self._switch is not None:
             self._switch.value = on.astype(np.float64)
         if jacobian is not None:

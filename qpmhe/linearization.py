@@ -86,7 +86,11 @@ class StageTerms:
         np.multiply(terms.own[stages], factors[:, None], out=self.own[:count])
         np.multiply(terms.following[stages], factors[:, None], out=self.following[:count])
 
+    def arrays(self) -> tuple[Array, ...]:
+        """The arrays, each with one entry a stage."""
+        return self.jacobian, self.panel, self.own, self.following
+
     def keep_last(self, end: int, keep: int) -> None:
         """Move the stages end-keep, ..., end-1 to the front."""
-        for array in (self.jacobian, self.panel, self.own, self.following):
+        for array in self.arrays():
             array[:keep] = array[end - keep : end]

@@ -24,6 +24,8 @@ class Run:
         The estimate before the first update.
     estimates : sequence of Estimate
         What the updates returned.
+    covariances : (T, n, n) array, optional
+        Covariances of their states.
 
     Attributes
     ----------
@@ -41,9 +43,18 @@ class Run:
         The solver's own iterations, -1 where it does not tell.
     statuses : list of Status
         Outcome and events of each step.
+    delayed : (T, n) array
+        Estimates with the estimator's delay, NaN where the window did not reach that far.
+    covariances : (T, n, n) array or None
+        Covariances of the estimates of x(1), ..., x(T), if they were asked for.
     """
 
-    def __init__(self, start: Array, estimates: Sequence[Estimate]) -> None:
+    def __init__(
+        self,
+        start: Array,
+        estimates: Sequence[Estimate],
+        covariances: Array | None = None,
+    ) -> None:
         n = start.size
         self.states: Array = np.array([start, *(e.state for e in estimates)])
         self.filtered: Array = np.array([e.filtered for e in estimates]).reshape(-1, n)
@@ -56,6 +67,11 @@ class Run:
             [-1 if e.solver_iterations is None else e.solver_iterations for e in estimates],
             dtype=np.intp,
         )
+        nothing = np.full(n, np.nan)
+        self.delayed: Array = np.array(
+            [nothing if e.delayed is None else e.delayed for e in estimates]
+        ).reshape(-1, n)
+        self.covariances = covariances
         self.statuses: list[Status] = [e.status for e in estimates]
 
     def __len__(self) -> int:

@@ -92,6 +92,14 @@ class System:
         #: The sampling time of a system made by `from_ode`, None otherwise.
         self.dt: float | None = None
         self._timed: Callable[[], System] | None = None
+        self._recipe: tuple[Function, dict[str, Any]] = (
+            type(self),
+            {
+                "f": f, "h": h, "n": n, "p": p, "m": m,
+                "f_jacobian": f_jacobian, "h_jacobian": h_jacobian,
+                "states": states, "disturbances": disturbances, "noises": noises,
+            },
+        )
 
     @classmethod
     def from_ode(
@@ -154,6 +162,13 @@ class System:
             h_jacobian=h_jacobian, **sets,
         )
         system.dt = length
+        system._recipe = (
+            cls.from_ode,
+            {
+                "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": method,
+                "rate_jacobian": rate_jacobian, "h_jacobian": h_jacobian, **sets,
+            },
+        )
 
         def timed() -> System:
             return cls(
@@ -164,6 +179,10 @@ class System:
 
         system._timed = timed
         return system
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Made anew from the user's functions: the closures inside cannot be pickled.
+        return _made, self._recipe
 
     @cached_property
     def timed(self) -> System:
@@ -208,6 +227,10 @@ class System:
         return f"System(n={self.n}, p={self.p}, m={self.m}, states={self.states})"
 
 
+def _made(maker: Function, arguments: dict[str, Any]) -> Any:
+    return maker(**arguments)
+
+
 def _over_leading(function: BatchedFunction, written: Any) -> Function:
     """A function of (..., n), whatever way the user's was written."""
     if function.plain:
@@ -248,8 +271,8 @@ def _probes(states: ConvexSet | None, n: int, m: int) -> Probes:
     """A few irregular points inside the state bounds, to try functions on."""
     generator = np.random.default_rng(20210829)
     probes: Probes = []
-    for scale, least in ((1.0, 0.2), (0.3, 0.2), (3.0, 0.2), (1.0, -1.0), (10.0, -1.0), (3.0, -1.0)):
-        # Positive ones first, where most models are defined; then all signs, where branches part.
+    # Positive ones first, where most models are defined; then all signs, where branches part.
+    for scale, least in ((1.0, 0.2), (0.3, 0.2), (3.0, 0.2), (1.0, -1.0), (10.0, -1.0)):
         x = scale * generator.uniform(least, 1.0, n)
         if states is not None:
             low, high = states.lower, states.upper

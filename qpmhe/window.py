@@ -301,6 +301,42 @@ class Window:
                 states[: keep + 1] = states[end - keep : end + 1]
         self.start, self.end = 0, keep
 
+    def state_dict(self) -> dict[str, Any]:
+        """All that the window knows, as copies of arrays and numbers."""
+        stages = slice(self.start, self.end)
+        points = slice(self.start, self.end + 1)
+        return {
+            "time": self.time,
+            "z": self._z[points].copy(),
+            "covariance": None if self._covariance is None else self._covariance[points].copy(),
+            "stages": [array[stages].copy() for array in self._per_stage()],
+            "terms": [array[stages].copy() for array in self.terms.arrays()],
+            "own_noise": {time: weight.copy() for time, weight in self._own_noise.items()},
+            "last_special": self._last_special,
+            "last_irregular": self._last_irregular,
+        }
+
+    def fits(self, state: dict[str, Any]) -> bool:
+        """Whether a state is of a window like this one."""
+        return (state["covariance"] is None) == (self._covariance is None) and len(
+            state["stages"]
+        ) == len(self._per_stage())
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` of an equal window gave."""
+        length = len(state["z"]) - 1
+        self.start, self.end, self.time = 0, length, int(state["time"])
+        self._z[: length + 1] = state["z"]
+        if self._covariance is not None:
+            self._covariance[: length + 1] = state["covariance"]
+        for array, saved in zip(self._per_stage(), state["stages"], strict=True):
+            array[:length] = saved
+        for array, saved in zip(self.terms.arrays(), state["terms"], strict=True):
+            array[:length] = saved
+        self._own_noise = {time: weight.copy() for time, weight in state["own_noise"].items()}
+        self._last_special = int(state["last_special"])
+        self._last_irregular = int(state["last_irregular"])
+
     @property
     def candidate(self) -> Array:
         """Candidate trajectory z(t-N), ..., z(t) (eq:warmstart): a view."""

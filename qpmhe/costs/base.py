@@ -42,16 +42,21 @@ class Cost(ABC):
     that a stage is described by one joint weight of the residual (w, v), of shape
     (n + p, n + p), and the QP by the weights that majorise the terms where it is built.
 
-    Attributes
+    Parameters
     ----------
-    n, p : int
-        Numbers of states and outputs.
+    prior : (n, n) array or ObserverPrior
+        Weight of the initial error, or the rule for it.
     disturbance, noise : (n, n) and (p, p) array
         Weights of w and v.
     discount : float
         gamma, 1 for none.
+
+    Attributes
+    ----------
+    n, p : int
+        Numbers of states and outputs.
     stage_weight : (n + p, n + p) array
-        Both weights as one.
+        The weights of w and v as one.
     """
 
     #: Whether the terms are the quadratic forms themselves, which makes weights constant.

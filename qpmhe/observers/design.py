@@ -126,7 +126,7 @@ def linearize(system: System, at: ArrayLike, u: ArrayLike | None) -> tuple[Array
     Raises
     ------
     InvalidInputError
-        If the point does not fit, or the Jacobians are not finite there.
+        If the point does not fit, or the model or its Jacobians are not finite there.
     """
     point = vector("at", at, system.n)
     if u is None and system.m:
@@ -135,21 +135,23 @@ def linearize(system: System, at: ArrayLike, u: ArrayLike | None) -> tuple[Array
         )
     inputs = np.zeros(0) if u is None else vector("u", u, system.m)
     found = []
-    for name, jacobian in (("f", system.f_jacobian), ("h", system.h_jacobian)):
+    for function, jacobian in ((system.f, system.f_jacobian), (system.h, system.h_jacobian)):
         try:
             with np.errstate(all="ignore"):
-                value = np.asarray(jacobian(point, inputs), dtype=np.float64)
+                value = np.asarray(function(point, inputs), dtype=np.float64)
+                slope = np.asarray(jacobian(point, inputs), dtype=np.float64)
         except Exception as error:
             raise ModelError(
-                f"{name} cannot be linearised at x = {point.tolist()}: it raised "
+                f"{function.name} cannot be linearised at x = {point.tolist()}: it raised "
                 f"{type(error).__name__}: {error}. Choose a point where it is defined."
             ) from error
-        if not np.isfinite(value).all():
+        # The value too: outside of a function's domain a complex step may look like a slope.
+        if not (np.isfinite(value).all() and np.isfinite(slope).all()):
             raise ModelError(
-                f"the Jacobian of {name} at x = {point.tolist()} is {value.tolist()}; expected "
-                "finite numbers. Choose a point where it is differentiable."
+                f"{function.name} is {value.tolist()} at x = {point.tolist()}, its Jacobian "
+                f"{slope.tolist()}; expected finite numbers. Choose another point."
             )
-        found.append(value)
+        found.append(slope)
     return found[0], found[1], point
 
 

