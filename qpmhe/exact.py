@@ -171,28 +171,31 @@ class _Program:
         self._prior_root, self._offset = cp.Parameter((n, n)), cp.Parameter((1, n))
         prior = self._offset + d[:1] @ self._prior_root
         terms = [
-            _loss(cp, self._prior_loss, prior, factors[:1]),
-            _loss(cp, w_loss, white[:, :n], factors[1:]),
-            _loss(cp, v_loss, white[:, n:], factors[1:]),
+            _Term(cp, self._prior_loss, prior, factors[:1]),
+            _Term(cp, w_loss, white[:, :n], factors[1:]),
+            _Term(cp, v_loss, white[:, n:], factors[1:]),
         ]
+        self._terms = terms
         self._states = _Rows(cp, system.states, n, d, None)
         self._disturbances = _Rows(cp, system.disturbances, n, d[1:], d)
         self._noises = _Rows(cp, system.noises, system.p, None, d)
-        constraints = [constraint for _, needed in terms for constraint in needed]
-        for rows in (self._states, self._disturbances, self._noises):
-            constraints += rows.constraints
-        self.problem = cp.Problem(cp.Minimize(sum(term for term, _ in terms)), constraints)
+        constraints: list[Any] = []
+        for part in (*terms, self._states, self._disturbances, self._noises):
+            constraints += part.constraints
+        self.problem = cp.Problem(cp.Minimize(sum(term.value for term in terms)), constraints)
 
     def set(self, problem: Problem, trial: Trial, jacobian: Array) -> None:
         """Put the numbers of a trial in."""
         n, root = self._n, self._roots(problem.stage_weights)
-        self._residuals.value = np.matmul(trial.residuals[:, None, :], root)[:, 0]
+        self._residuals.value = white = np.matmul(trial.residuals[:, None, :], root)[:, 0]
         columns = np.matmul(jacobian.transpose(0, 2, 1), root)
         for j, parameter in enumerate(self._jacobian):
             parameter.value = columns[:, j]
         prior_root = _root(problem._prior_weight, self._prior_loss)
         self._prior_root.value = prior_root
-        self._offset.value = (trial.trajectory[:1] - problem.prior) @ prior_root
+        self._offset.value = offset = (trial.trajectory[:1] - problem.prior) @ prior_root
+        for term, now in zip(self._terms, (offset, white[:, :n], white[:, n:]), strict=True):
+            term.scale_to(now)
         self._states.set(problem.states, trial.trajectory, None, None)
         self._disturbances.set(
             problem.disturbances, trial.residuals[:, :n], jacobian[:, :n], None
@@ -215,6 +218,7 @@ class _Program:
     def solve(self) -> tuple[Array | None, SolveStatus, int | None, str]:
         """The increments, how far to trust them, the solver's count, and its words."""
         cp, problem, message = self._cp, self.problem, ""
+        best: tuple[Array, int | None] | None = None
         for tolerance in _TOLERANCES:
             try:
                 problem.solve(
@@ -231,8 +235,11 @@ class _Program:
                 continue
             if problem.status == cp.OPTIMAL:
                 return d, SolveStatus.SOLVED, iterations, ""
-            return d, SolveStatus.STOPPED, iterations, message
-        return None, SolveStatus.FAILED, None, message
+            if best is None:
+                best = d, iterations
+        if best is None:
+            return None, SolveStatus.FAILED, None, message
+        return best[0], SolveStatus.STOPPED, best[1], message
 
 
 class _Rows:
@@ -309,25 +316,42 @@ def _applied(cp: Any, matrices: list[Any], d: Any) -> Any:
     return sum(cp.multiply(column, d[:-1, j : j + 1] @ ones) for j, column in enumerate(matrices))
 
 
-def _loss(cp: Any, loss: Loss, white: Any, factors: Array) -> tuple[Any, list[Any]]:
-    """The losses of whitened residuals (K, d) times their factors, and constraints for that."""
-    if isinstance(loss, Quadratic):
-        roots = np.sqrt(factors)[:, None] * np.ones((1, white.shape[1]))
-        return cp.sum_squares(cp.multiply(roots, white)), []
-    if loss.per_component:
-        size = cp.vec(white, order="C")
-        factors = np.repeat(factors, white.shape[1])
-    else:
-        size = cp.norm(white, 2, axis=1)
-    if isinstance(loss, Huber):
-        return factors @ cp.huber(size, loss.threshold), []
-    assert isinstance(loss, Power)
-    if loss.exponent == 1.0:
-        return factors @ cp.abs(size), []
-    # value^(1/a) 1^(1 - 1/a) >= |bound|, the cone itself: exponents are not made rational.
-    value, bound = cp.Variable(factors.size), cp.Variable(factors.size)
-    cone = cp.PowCone3D(value, np.ones(factors.size), bound, 1.0 / loss.exponent)
-    return factors @ value, [cp.abs(size) <= bound, cone]
+class _Term:
+    """The losses of whitened residuals (K, d), times their factors, added."""
+
+    def __init__(self, cp: Any, loss: Loss, white: Any, factors: Array) -> None:
+        self.constraints: list[Any] = []
+        self._scale: Any = None
+        if isinstance(loss, Quadratic):
+            roots = np.sqrt(factors)[:, None] * np.ones((1, white.shape[1]))
+            self.value = cp.sum_squares(cp.multiply(roots, white))
+            return
+        if loss.per_component:
+            size = cp.vec(white, order="C")
+            factors = np.repeat(factors, white.shape[1])
+        else:
+            size = cp.norm(white, 2, axis=1)
+        if isinstance(loss, Huber):
+            self.value = factors @ cp.huber(size, loss.threshold)
+            return
+        assert isinstance(loss, Power)
+        self._exponent = loss.exponent
+        if loss.exponent == 1.0:
+            self.value = factors @ cp.abs(size)
+            return
+        # value^(1/a) 1^(1 - 1/a) >= |share|, the cone itself: exponents are not made rational.
+        # The scale keeps the cones near 1, without which Clarabel gives up on large powers.
+        value, share = cp.Variable(factors.size), cp.Variable(factors.size)
+        self._scale, self._power = cp.Parameter(nonneg=True), cp.Parameter(nonneg=True)
+        cone = cp.PowCone3D(value, np.ones(factors.size), share, 1.0 / loss.exponent)
+        self.constraints = [cp.abs(size) <= self._scale * share, cone]
+        self.value = self._power * (factors @ value)
+
+    def scale_to(self, white: Array) -> None:
+        """Take the size of whitened residuals as the unit."""
+        if self._scale is not None:
+            scale = max(1.0, float(np.abs(white).max()))
+            self._scale.value, self._power.value = scale, scale**self._exponent
 
 
 def _losses(cost: Cost) -> tuple[Loss, Loss, Loss]:

@@ -144,16 +144,19 @@ class _Constraints:
             self.box = (lower.copy(), upper.copy())
         dense = how.matrices == "dense"
         blocks, sides = [], []
-        rows = qp.csc_rows().tocsr() if qp.rows else None
-        if rows is not None:
+        rows: Any = None
+        if qp.rows:
+            rows = qp.dense_rows() if dense else qp.csc_rows().tocsr()
             blocks += [rows[self._row_up], -rows[self._row_low]]
             sides += [row_upper[self._row_up], -row_lower[self._row_low]]
         if self._as_rows:
-            blocks += [_unit_rows(self._up, qp.size), -_unit_rows(self._low, qp.size)]
+            blocks += [
+                _unit_rows(self._up, qp.size, dense), -_unit_rows(self._low, qp.size, dense)
+            ]
             sides += [upper[self._up], -lower[self._low]]
         side = np.concatenate([*sides, np.empty(0)])
         if how.needs_row and side.size == 0:
-            blocks, side = [_void_row(qp.size)], np.ones(1)
+            blocks, side = [_void_row(qp.size, dense)], np.ones(1)
         self.inequalities: tuple[Any, Array | None] = (None, None)
         if side.size:
             self.inequalities = (_stack(blocks, dense), side)
@@ -196,26 +199,31 @@ def _numbers(values: Any, size: int) -> Array | None:
     return numbers[:size] if numbers.size >= size else None
 
 
-def _unit_rows(columns: NDArray[np.intp], width: int) -> Any:
+def _unit_rows(columns: NDArray[np.intp], width: int, dense: bool) -> Any:
+    count = columns.size
+    if dense:
+        rows = np.zeros((count, width))
+        rows[np.arange(count), columns] = 1.0
+        return rows
     from scipy.sparse import csr_matrix
 
-    return csr_matrix(
-        (np.ones(columns.size), columns, np.arange(columns.size + 1)), shape=(columns.size, width)
-    )
+    return csr_matrix((np.ones(count), columns, np.arange(count + 1)), shape=(count, width))
 
 
-def _void_row(width: int) -> Any:
+def _void_row(width: int, dense: bool) -> Any:
     from scipy.sparse import csr_matrix
 
-    return csr_matrix((1, width))
+    return np.zeros((1, width)) if dense else csr_matrix((1, width))
 
 
 def _stack(blocks: list[Any], dense: bool) -> Any:
+    if dense:
+        return np.vstack(blocks)
     from scipy.sparse import csc_matrix, vstack
 
     stacked = csc_matrix(vstack(blocks, format="csc"))
     stacked.sort_indices()
-    return stacked.toarray() if dense else stacked
+    return stacked
 
 
 def _keywords(how: Translation, options: SolverOptions) -> dict[str, Any]:

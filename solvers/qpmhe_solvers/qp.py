@@ -192,7 +192,10 @@ class QP:
 
     def dense_rows(self) -> Array:
         """The general rows [F, G] as a (K rows, K n) array."""
-        full: Array = self.csc_rows().toarray()
+        pattern = _rows_pattern(self.stages, self.n, self.rows)
+        full = np.zeros((self.stages * self.rows, self.size))
+        numbers = np.concatenate((self.row_own.ravel(), self.row_next.ravel()))
+        full[pattern.rows, pattern.columns] = numbers[pattern.source]
         return full
 
     def csc_rows(self) -> csc_matrix:

@@ -5,9 +5,7 @@ import pytest
 
 import qpmhe
 from qpmhe.errors import (
-    BackendError,
     InvalidInputError,
-    OptionError,
     SetError,
     ShapeError,
     WeightError,
@@ -21,82 +19,6 @@ def test_the_estimator_that_the_cases_spoil_works():
     assert with_input().update([1.0], [0.0, 0.0]).state.shape == (2,)
 
 
-# Options
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "least"),
-    [
-        *(("horizon", value, 1) for value in (0, -1, 1.5, 3.0, True, "3", None)),
-        *(("max_qps", value, 0) for value in (-1, 1.5, True, "2")),
-    ],
-)
-def test_counts_out_of_range(name, value, least):
-    check(
-        OptionError, [f"{name} is {value!r}", f"expected an integer >= {least}"],
-        lambda: estimator(**{name: value}),
-    )
-
-
-@pytest.mark.parametrize("value", [0, -2, 1.5, True, "5"])
-def test_iteration_caps_out_of_range(value):
-    check(
-        OptionError, [f"iterations is {value!r}", "expected an integer >= 1", "max_qps=0"],
-        lambda: estimator(max_solver_iterations=value),
-    )
-
-
-def test_the_iteration_cap_is_named_as_the_user_writes_it():
-    check(
-        OptionError, ["max_solver_iterations is 0"], lambda: estimator(max_solver_iterations=0)
-    )
-
-
-@pytest.mark.parametrize("value", [0, 0.0, -1e-9, math.nan, math.inf, "tight", True, None, [1e-7]])
-@pytest.mark.parametrize("name", ["tolerance", "solver_tolerance"])
-def test_tolerances_out_of_range(name, value):
-    check(
-        OptionError, [f"{name} is {value!r}", "expected a finite number > 0"],
-        lambda: estimator(**{name: value}),
-    )
-
-
-@pytest.mark.parametrize(
-    "option",
-    [
-        {"horizon": np.int64(3)},
-        {"max_qps": np.int32(2)},
-        {"max_solver_iterations": np.int64(5)},
-        {"solver_tolerance": np.float32(1e-5)},
-        {"tolerance": np.float64(1e-5)},
-        {"max_qps": None},
-        {"max_solver_iterations": None},
-    ],
-    ids=str,
-)
-def test_numbers_of_numpy_are_numbers(option):
-    assert estimator(**option).update([1.0]).state.shape == (2,)
-
-
-@pytest.mark.parametrize("name", ["nosuch", "", "OSQP", None, 3, ["osqp"]])
-def test_an_unknown_backend_lists_the_known_ones(name):
-    known = [entry.name for entry in qpmhe.solvers.backends()]
-    assert "auto" in known
-    check(
-        BackendError, [f"backend {name!r} is not known", *known], lambda: estimator(backend=name)
-    )
-
-
-@pytest.mark.parametrize("backend", qpmhe.solvers.available())
-def test_available_backends_are_accepted(backend):
-    assert estimator(backend=backend).update([1.0]).cost >= 0.0
-
-
-@pytest.mark.parametrize("name", ["fast", "Python", None, 0])
-def test_an_unknown_engine(name):
-    check(OptionError, [f"engine is {name!r}", "'python'"], lambda: estimator(engine=name))
-
-
 # Parts
 
 
@@ -105,7 +27,7 @@ def test_an_unknown_engine(name):
     [
         ("system", "qpmhe.System"),
         ("observer", "qpmhe.Luenberger"),
-        ("cost", "qpmhe.QuadraticCost"),
+        ("cost", "qpmhe.QuadraticCost or qpmhe.RobustCost"),
     ],
 )
 @pytest.mark.parametrize("value", [0.5, "part", ("a", "b"), qpmhe.Box([0.0], [1.0])], ids=repr)
@@ -202,6 +124,36 @@ def test_initial_states(state, kind, fragments):
     np.testing.assert_array_equal(mhe.state, before)
 
 
+STATE_SETS = {
+    "box": qpmhe.Box([-5.0, -5.0], [5.0, 5.0]),
+    "polytope": qpmhe.Polytope([[1.0, 1.0], [-1.0, -1.0]], [5.0, 5.0]),
+    "both": qpmhe.Box([-5.0, -np.inf], [9.0, 9.0]) & qpmhe.Polytope([[1.0, 1.0]], [5.0]),
+}
+
+
+@pytest.mark.parametrize("kind", STATE_SETS)
+@pytest.mark.parametrize("outside", ["drop", "project", "keep"])
+def test_an_initial_state_outside_of_the_state_set(kind, outside):
+    system = system_of(states=STATE_SETS[kind])
+    fragments = ["initial_state is [2.0, 7.0]", "outside of the state set", repr(STATE_SETS[kind])]
+    check(
+        InvalidInputError, [*fragments, "start within it"],
+        lambda: estimator(system, initial_state=[2.0, 7.0], outside=outside),
+    )
+    mhe = estimator(system, outside=outside)
+    mhe.update([1.0])
+    before = mhe.state.copy()
+    check(InvalidInputError, fragments, lambda: mhe.reset([2.0, 7.0]))
+    assert mhe.time == 1
+    np.testing.assert_array_equal(mhe.state, before)
+    np.testing.assert_array_equal(mhe.initial_state, [1.0, 2.0])
+
+
+def test_an_initial_state_on_the_boundary_is_inside():
+    mhe = estimator(system_of(states=STATE_SETS["both"]), initial_state=[3.0, 2.0])
+    np.testing.assert_array_equal(mhe.state, [3.0, 2.0])
+
+
 # Weights and covariances
 
 
@@ -271,6 +223,64 @@ def test_boxes(lower, upper, kind, fragments):
 
 
 @pytest.mark.parametrize(
+    ("matrix", "bound", "kind", "fragments"),
+    [
+        (np.eye(2), [1.0], SetError, ["matrix has shape (2, 2)", "bound (1,)", "(r, d) and (r,)"]),
+        ([1.0, 2.0], [1.0, 2.0], SetError, ["matrix has shape (1, 2)", "bound (2,)"]),
+        (np.eye(2), [[1.0], [1.0]], SetError, ["bound (2, 1)", "(r, d) and (r,)"]),
+        (np.ones((2, 2, 2)), [1.0, 1.0], SetError, ["matrix has shape (2, 2, 2)", "(r, d)"]),
+        (np.ones((2, 0)), [1.0, 1.0], SetError, ["matrix has shape (2, 0)", "(r, d)"]),
+        ([[1.0, 0.0], [0.0, 0.0]], [1.0, 1.0], SetError, ["row 1 of matrix is zero", "leave out"]),
+        ([[1.0, math.nan]], [1.0], InvalidInputError, ["matrix is [[1.0, nan]]", "finite"]),
+        ([[1.0, 0.0]], [math.inf], InvalidInputError, ["bound is [inf]", "finite"]),
+        ([[1.0, 0.0]], [math.nan], InvalidInputError, ["bound is [nan]", "finite"]),
+        ("rows", [1.0], InvalidInputError, ["matrix is 'rows'", "real numbers"]),
+        ([[1.0, 0.0]], [1j], InvalidInputError, ["bound is [1j]", "real numbers"]),
+        ([[1.0, 2.0], [1.0]], [1.0, 1.0], InvalidInputError, ["matrix is [[1.0, 2.0], [1.0]]"]),
+        ([[1.0], [-1.0]], [0.0, -1.0], SetError, ["the set is empty", "Polytope(", "2 rows"]),
+        (
+            [[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]], [-1.0, 0.0, 0.0], SetError,
+            ["the set is empty", "no point satisfies all"],
+        ),
+    ],
+)
+def test_polytopes(matrix, bound, kind, fragments):
+    check(kind, fragments, lambda: qpmhe.Polytope(matrix, bound))
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (qpmhe.Box([0.0], [1.0]), qpmhe.Box([2.0], [3.0])),
+        (qpmhe.Box([0.0, 0.0], [1.0, 1.0]), qpmhe.Polytope([[-1.0, -1.0]], [-2.1])),
+        (qpmhe.Polytope([[1.0, 1.0]], [0.0]), qpmhe.Polytope([[-1.0, -1.0]], [-0.5])),
+        (
+            qpmhe.Polytope([[1.0, 0.0]], [0.0]) & qpmhe.Polytope([[0.0, -1.0]], [0.0]),
+            qpmhe.Polytope([[-1.0, 1.0]], [-1.0]),
+        ),
+    ],
+    ids=["boxes", "box and rows", "rows", "three"],
+)
+def test_empty_intersections(one, other):
+    for left, right in ((one, other), (other, one)):
+        fragments = ["the set is empty", "no point satisfies all"]
+        check(SetError, fragments, lambda a=left, b=right: a & b)
+
+
+def test_intersections_of_other_dimensions():
+    check(
+        SetError, ["dimensions 2 and 3", "expected equal dimensions"],
+        lambda: qpmhe.Box([0.0] * 2, [1.0] * 2) & qpmhe.Polytope([[1.0, 1.0, 1.0]], [1.0]),
+    )
+
+
+@pytest.mark.parametrize("other", [None, 1.0, ([0.0], [1.0])], ids=repr)
+def test_a_set_meets_sets_only(other):
+    with pytest.raises(TypeError, match="unsupported operand"):
+        qpmhe.Box([0.0], [1.0]) & other
+
+
+@pytest.mark.parametrize(
     ("name", "right"), [("states", 2), ("disturbances", 2), ("noises", 1)]
 )
 @pytest.mark.parametrize("build", ["system", "ode"])
@@ -287,4 +297,12 @@ def test_sets_of_the_wrong_dimension_or_type(build, name, right):
         SetError, [f"{name} has dimension 3", f"expected {right}"],
         lambda: make(qpmhe.Box([0.0] * 3, [1.0] * 3)),
     )
-    check(SetError, [f"{name} is (0.0, 1.0)", "qpmhe.Box"], lambda: make((0.0, 1.0)))
+    make(qpmhe.Polytope(np.eye(right), [9.0] * right))
+    check(
+        SetError, [f"{name} has dimension 4", f"expected {right}"],
+        lambda: make(qpmhe.Polytope(np.ones((1, 4)), [1.0])),
+    )
+    check(
+        SetError, [f"{name} is (0.0, 1.0)", "qpmhe.Box", "qpmhe.Polytope"],
+        lambda: make((0.0, 1.0)),
+    )

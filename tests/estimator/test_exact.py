@@ -145,7 +145,9 @@ def constraints(case):
             add(problem.noises, r[n:], -jacobian[n:] @ pick(i))
     if not rows:
         return None
-    return np.vstack(rows), np.concatenate(low), np.concatenate(high)
+    matrix, lower, upper = np.vstack(rows), np.concatenate(low), np.concatenate(high)
+    finite = np.isfinite(lower) | np.isfinite(upper)
+    return matrix[finite], lower[finite], upper[finite]
 
 
 def missed(case, d):
@@ -158,7 +160,7 @@ def missed(case, d):
 
 
 def brute_force(case, begin):
-    """SciPy's own minimum of the same objective, from its own derivatives."""
+    """SciPy's own minimum of the same objective, from its own differences."""
     shape = begin.shape
     found = constraints(case)
     rows = [] if found is None else [LinearConstraint(*found)]
@@ -243,7 +245,7 @@ def test_quadratic_cost_with_sets_gives_the_solution_of_the_qp(sets):
 @pytest.mark.parametrize("cost", ROBUST.values(), ids=ROBUST)
 @pytest.mark.parametrize("sets", SETS.values(), ids=SETS)
 def test_robust_cost_has_the_minimum_that_scipy_finds(cost, sets):
-    case = setup(cost, 4, **sets)
+    case = setup(cost, 3, **sets)
     found = solve(case)
     assert found.solved
     assert missed(case, found.d) <= 1e-7
@@ -431,10 +433,7 @@ def test_program_follows_the_rules_for_parameters(cost, sets):
 @pytest.mark.parametrize("loss", [Quadratic, Huber, Power])
 @pytest.mark.parametrize("per_component", [False, True])
 def test_missing_outputs_have_no_say(loss, per_component):
-    if loss is Quadratic:
-        noise = Quadratic(R2)
-    else:
-        noise = loss(R2, 1.5, per_component)
+    noise = Quadratic(R2) if loss is Quadratic else loss(R2, 1.5, per_component)
     cost = RobustCost(prior=P0, disturbance=Q2, noise=noise)
     missing = ((0, 1), (2, 0), (3, 0), (3, 1))
     case = setup(cost, 5, h=both, missing=missing)
@@ -599,12 +598,12 @@ class Mine(Huber):
 def test_losses_that_it_does_not_know_are_named():
     system = System(curved, first, n=2, p=1)
     cost = RobustCost(prior=P0, disturbance=Q2, noise=Mine(R1))
-    with pytest.raises(qpmhe.errors.OptionError, match="the loss Mine .*expected Quadratic"):
+    with pytest.raises(qpmhe.errors.OptionError, match=r"the loss Mine .*expected Quadratic"):
         ExactStep(system, cost)
 
 
 def test_costs_that_it_does_not_know_are_named():
-    with pytest.raises(qpmhe.errors.OptionError, match="cost is 3; .*QuadraticCost"):
+    with pytest.raises(qpmhe.errors.OptionError, match=r"cost is 3; .*QuadraticCost"):
         ExactStep(System(curved, first, n=2, p=1), 3)
 
 

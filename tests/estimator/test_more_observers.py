@@ -301,18 +301,21 @@ def test_an_unobservable_mode_that_decays_is_left_alone():
     assert np.abs(poles - 0.5).min() < 1e-12
 
 
-HIDDEN = np.array([[0.9, 0.0, 0.0], [0.2, 1.25, 0.0], [0.1, 0.0, 0.7]])
+# The first state shows the second, and neither shows the others.
+HIDDEN = np.array(
+    [[0.9, 0.3, 0.0, 0.0], [0.0, 0.8, 0.0, 0.0], [0.2, 0.4, 1.25, 0.0], [0.1, 0.0, 0.5, 0.7]]
+)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_hidden_mode_is_named_in_any_coordinates(seed):
-    T = np.random.default_rng(seed).standard_normal((3, 3))
-    A, C = T @ HIDDEN @ np.linalg.inv(T), np.eye(1, 3) @ np.linalg.inv(T)
+    T = np.random.default_rng(seed).standard_normal((4, 4))
+    A, C = T @ HIDDEN @ np.linalg.inv(T), np.eye(1, 4) @ np.linalg.inv(T)
     system = linear(A, C)
     with pytest.raises(ModelError, match=r"not detectable: .* eigenvalue 1\.25, which does not"):
-        design_luenberger(system, np.zeros(3), disturbance=np.eye(3), noise=[[1.0]])
+        design_luenberger(system, np.zeros(4), disturbance=np.eye(4), noise=[[1.0]])
     with pytest.raises(ModelError, match=r"not observable: .* (1\.25, 0\.7|0\.7, 1\.25), and"):
-        design_luenberger(system, np.zeros(3), poles=[0.1, 0.2, 0.3])
+        design_luenberger(system, np.zeros(4), poles=[0.1, 0.2, 0.3, 0.4])
 
 
 def test_what_is_hidden_at_one_point_is_seen_at_another():
