@@ -180,8 +180,10 @@ def observe(system: qpmhe.System, observer: qpmhe.Observer, ys: Array, us: Array
     states, covariance = [START], observer.initial_covariance()
     for y, u in zip(ys, us, strict=True):
         z = states[-1]
-        a, c, v = system.f_jacobian(z, u), system.h_jacobian(z, u), y - system.h(z, u)
-        correction, covariance = observer.correct(z, v, a, c, None, covariance)
+        sample = qpmhe.Sample(
+            system, u, system.f_jacobian(z, u), system.h_jacobian(z, u), covariance=covariance
+        )
+        correction, covariance = observer.correct(z, y - system.h(z, u), sample)
         states.append(system.f(z, u) + correction)
     return np.array(states)
 
