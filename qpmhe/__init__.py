@@ -15,7 +15,18 @@ from .costs import (
 from .errors import QpmheError
 from .estimate import Estimate, Status
 from .estimator import MovingHorizonEstimator
-from .observers import ExtendedKalman, Luenberger, Observer, OutputInjection, Sample
+from .observers import (
+    ExtendedKalman,
+    HighGain,
+    Luenberger,
+    Observer,
+    OutputInjection,
+    Sample,
+    SteadyStateKalman,
+    UnscentedKalman,
+    design_luenberger,
+)
+from .parameters import augment_parameters
 from .run import Run
 from .sets import Box, ConvexSet, Polytope
 from .system import System
@@ -29,6 +40,7 @@ __all__ = [
     "CostConstants",
     "Estimate",
     "ExtendedKalman",
+    "HighGain",
     "Huber",
     "Loss",
     "Luenberger",
@@ -45,8 +57,12 @@ __all__ = [
     "Run",
     "Sample",
     "Status",
+    "SteadyStateKalman",
     "System",
+    "UnscentedKalman",
     "__version__",
+    "augment_parameters",
+    "design_luenberger",
     "errors",
     "models",
     "solvers",

@@ -16,11 +16,13 @@ Array = NDArray[np.float64]
 def numbers(name: str, value: ArrayLike, *, finite: bool = True) -> Array:
     """A float copy of value; real, and finite unless told otherwise."""
     try:
-        array = np.array(value)
+        array = np.ma.filled(np.ma.asarray(value, np.float64), np.nan) if isinstance(
+            value, np.ma.MaskedArray
+        ) else np.array(value)
         if np.iscomplexobj(array):
             raise TypeError("complex numbers")
         array = array.astype(np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InvalidInputError(
             f"{name} is {value!r}, which is not an array of real numbers ({error})."
         ) from error

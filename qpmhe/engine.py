@@ -59,7 +59,7 @@ class PythonEngine:
             SolverOptions(
                 max_iterations=settings.max_solver_iterations,
                 absolute_tolerance=float(settings.solver_tolerance),
-                time_limit=settings.time_budget,
+                time_limit=None if settings.time_budget is None else float(settings.time_budget),
             ),
         )
         self._problem = Problem(system, cost)

@@ -131,7 +131,8 @@ class MovingHorizonEstimator:
         if isinstance(cost.prior, ObserverPrior) and observer.initial_covariance() is None:
             raise InvalidInputError(
                 f"the prior weight is to come from the observer, but {type(observer).__name__} "
-                "has no covariance; take qpmhe.ExtendedKalman, or give a constant weight."
+                "has no covariance; take a Kalman-type observer, such as qpmhe.ExtendedKalman, "
+                "or give a constant weight."
             )
         self.initial_state: Array = self._checked_start(initial_state)
         self._no_input = np.zeros(system.m)
@@ -197,8 +198,8 @@ class MovingHorizonEstimator:
         Parameters
         ----------
         y : (p,) array_like
-            y(t); components that are not finite, or None, are missing. A scalar will do
-            where p is 1.
+            y(t); components that are not finite (or so large that their square is not), None or
+            masked are missing. A scalar will do where p is 1.
         u : (m,) array_like, optional
             u(t), the input that acts from t to t+1 (and on y(t), if h depends on it), and
             whatever else is known of this time. Needed exactly if the system has inputs.
@@ -231,7 +232,7 @@ class MovingHorizonEstimator:
 
     def _measurement(self, y: ArrayLike | None) -> Array:
         p = self.system.p
-        if isinstance(y, np.ndarray) and y.shape == (p,) and y.dtype == np.float64:
+        if type(y) is np.ndarray and y.shape == (p,) and y.dtype == np.float64:
             return y
         if y is None:
             return np.full(p, np.nan)

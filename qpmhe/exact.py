@@ -170,18 +170,17 @@ class _Program:
         white = self._residuals + d[1:] @ self._root[:n] - _applied(cp, self._jacobian, d)
         self._prior_root, self._offset = cp.Parameter((n, n)), cp.Parameter((1, n))
         prior = self._offset + d[:1] @ self._prior_root
-        terms = [
+        self._terms = terms = [
             _Term(cp, self._prior_loss, prior, factors[:1]),
             _Term(cp, w_loss, white[:, :n], factors[1:]),
             _Term(cp, v_loss, white[:, n:], factors[1:]),
         ]
-        self._terms = terms
         self._states = _Rows(cp, system.states, n, d, None)
         self._disturbances = _Rows(cp, system.disturbances, n, d[1:], d)
         self._noises = _Rows(cp, system.noises, system.p, None, d)
-        constraints: list[Any] = []
-        for part in (*terms, self._states, self._disturbances, self._noises):
-            constraints += part.constraints
+        constraints = [one for term in terms for one in term.constraints]
+        for rows in (self._states, self._disturbances, self._noises):
+            constraints += rows.constraints
         self.problem = cp.Problem(cp.Minimize(sum(term.value for term in terms)), constraints)
 
     def set(self, problem: Problem, trial: Trial, jacobian: Array) -> None:

@@ -106,8 +106,8 @@ class BatchedFunction:
                 values.append(value)
         if not points:
             return
-        # As many points as can be told from every dimension of the value.
-        size = max(3, max(self.shape) + 1, points[0][0].size + 1, self._inputs + 1)
+        # All points, and more than any dimension of the value, so that axes cannot be mixed up.
+        size = max(len(points), 3, *(d + 1 for d in (*self.shape, points[0][0].size, self._inputs)))
         x = np.array([points[i % len(points)][0] for i in range(size)])
         u = np.array([points[i % len(points)][1] for i in range(size)])
         expected = np.array([values[i % len(points)] for i in range(size)])
@@ -133,7 +133,7 @@ class BatchedFunction:
                     if self._takes_input
                     else self._function(x_given)
                 )
-                value = np.asarray(raw, dtype=np.float64)
+                value = np.array(raw, dtype=np.float64)  # a copy: it may be one buffer
         except Exception:  # outside its domain; the estimator checks at the initial state
             return None
         if not (np.array_equal(x_given, x) and np.array_equal(u_given, u)):

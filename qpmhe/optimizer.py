@@ -21,12 +21,16 @@ __all__ = ["Optimizer", "Outcome"]
 
 Array = NDArray[np.float64]
 
-# Tried in turn where the full step fails; the last is short enough for any descent direction
+# Tried in turn where the full step fails: the first where it misses a set by the solver's
+# accuracy; the last is short enough for any descent direction
 # that is worth taking.
-_LENGTHS = (0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)
+_LENGTHS = (0.9999, 0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)
 
 # A decrease of J by less than this share is rounding, and no improvement.
 _ROUNDING = 1e-12
+
+# A set missed by less than this is for the first of these lengths, not for a correction.
+_NEARLY = 1e-6
 
 # Second-order corrections of a trial that misses a curved set.
 _CORRECTIONS = 2
@@ -190,7 +194,11 @@ class Optimizer:
 
     def _solve(self, qp: QP, outcome: Outcome) -> Solution:
         began = perf_counter()
-        solution = self._solver.solve(qp)
+        try:
+            solution = self._solver.solve(qp)
+        except Exception as error:  # a user's solver that overrides the contained `solve`
+            message = f"{type(error).__name__}: {error}"
+            solution = Solution(None, SolveStatus.FAILED, message=message)
         outcome.solve_time += perf_counter() - began
         if solution.iterations is None or outcome.solver_iterations is None:
             outcome.solver_iterations = None
@@ -209,12 +217,14 @@ class Optimizer:
             return False
         best = outcome.trial
         target, enough = _target(best), self._tolerance * (best.cost + self._tolerance)
+        if not math.isfinite(enough):
+            enough = -1.0  # a candidate that cannot be judged: nothing converges to it
         solved = solution.status is SolveStatus.SOLVED
         if not solved:
             outcome.events |= Status.SOLVER_STOPPED
         slope = abs(float(np.vdot(qp.gradient, step)))
         trial = self._trial(problem, best, step)
-        if not trial.cost < target and 0.0 < trial.violation < math.inf and qp.rows:
+        if not trial.cost < target and _NEARLY < trial.violation < math.inf and qp.rows:
             step = step.copy()  # a correction's solve reuses the solver's workspace
             trial = self._corrected(problem, qp, outcome, trial)
         if not trial.cost < target:

@@ -18,6 +18,10 @@ __all__ = ["Window"]
 Array = NDArray[np.float64]
 
 
+# A measurement beyond this has no finite square: it is as good as missing.
+_LARGEST = 1e150
+
+
 class Window:
     r"""Samples y(t-N), ..., y(t-1) with the observer's states z(t-N), ..., z(t).
 
@@ -72,6 +76,7 @@ class Window:
         self.terms = StageTerms(room, n, p)
         covariance = observer.initial_covariance()
         self._covariance = None if covariance is None else np.zeros((room + 1, n, n))
+        self._initial_state = initial_state
         self._z[0] = initial_state
         if self._covariance is not None:
             self._covariance[0] = covariance
@@ -172,7 +177,7 @@ class Window:
             observed = self._observed[k]
         cost = self._advance(k, time, observed)
         if not math.isfinite(cost) and observed is None:
-            there = np.isfinite(self._y[k])
+            there = np.abs(self._y[k]) < _LARGEST  # false for NaN, too
             if not there.all():
                 self._observed[k] = observed = there
                 self._set_weight(k, time)
@@ -216,10 +221,7 @@ class Window:
                 error[~observed] = 0.0
             sample.system, sample.u, sample.observed = model, u, observed
             if self._jacobians:
-                jacobian = self.terms.jacobian[k]
-                jacobian[:n] = model.f_jacobian(z, u)
-                jacobian[n:] = model.h_jacobian(z, u)
-                sample.f_jacobian, sample.h_jacobian = jacobian[:n], jacobian[n:]
+                self._differentiate(k, model, z, u)
             if self._covariance is not None:
                 sample.covariance = self._covariance[k]
                 sample.noise_weight = self._own_noise.get(time)
@@ -239,6 +241,16 @@ class Window:
             cost = float(self._cost.stage_costs(residual[None], weight)[0])
         return cost if math.isfinite(cost) else math.inf
 
+    def _differentiate(self, k: int, model: System, z: Array, u: Array) -> None:
+        jacobian, n = self.terms.jacobian[k], self._n
+        try:
+            jacobian[:n] = model.f_jacobian(z, u)
+            jacobian[n:] = model.h_jacobian(z, u)
+        except Exception:  # a user's Jacobian outside its domain
+            # An observer that never reads it goes on; `_linearize` sees the NaN.
+            jacobian[:] = np.nan
+        self._sample.f_jacobian, self._sample.h_jacobian = jacobian[:n], jacobian[n:]
+
     def _linearize(self, k: int) -> bool:
         residual = self._residuals[k]
         flat = self.terms.jacobian[k].reshape(-1)
@@ -252,10 +264,16 @@ class Window:
         return linear
 
     def _hold(self, k: int) -> None:
-        """Fill a stage at which the model cannot be evaluated: x(t+1) about x(t)."""
-        self._z[k + 1] = self._z[k]
+        """Fill a stage at which the model cannot be evaluated: x(t+1) about x(t).
+
+        The observer goes on where the model last worked: z(t) is where it does not.
+        """
+        good = k - 1
+        while good >= 0 and not math.isfinite(self._stage_cost[good]):
+            good -= 1
+        self._z[k + 1] = self._z[good] if good >= 0 else self._initial_state
         if self._covariance is not None:
-            self._covariance[k + 1] = self._covariance[k]
+            self._covariance[k + 1] = self._covariance[max(good, 0)]
         self._residuals[k] = 0.0
         self.terms.jacobian[k] = np.eye(*self.terms.jacobian[k].shape)
         self._majorising[k] = self._weight[k]

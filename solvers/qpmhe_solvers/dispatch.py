@@ -35,6 +35,8 @@ class Translation:
         Keywords of the tolerances.
     start : bool
         Whether a primal start is used by the solver and does it good.
+    default_cap : int or None
+        Cap where none is asked for and the solver's own would let it run for minutes.
     needs_row : bool
         Whether a QP without any inequality row goes wrong, so that a void row is added.
     """
@@ -47,6 +49,7 @@ class Translation:
     time_limit: str | None = None
     start: bool = False
     needs_row: bool = False
+    default_cap: int | None = None
 
 
 # Caps, tolerances and traps as measured (qpsolvers 4.13). cvxopt is harmed by its start; the
@@ -75,7 +78,9 @@ TRANSLATIONS: Mapping[str, Translation] = {
         "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", start=True
     ),
     "piqp": Translation("csc", "box", "max_iter", ("eps_abs",), ("eps_rel",)),
-    "proxqp": Translation("dense", "box", "max_iter", ("eps_abs",), ("eps_rel",)),
+    "proxqp": Translation(
+        "dense", "box", "max_iter", ("eps_abs",), ("eps_rel",), default_cap=200
+    ),
     "qpalm": Translation("csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit"),
     "quadprog": Translation("dense", "rows", None, ()),
     "scs": Translation(
@@ -229,8 +234,9 @@ def _stack(blocks: list[Any], dense: bool) -> Any:
 def _keywords(how: Translation, options: SolverOptions) -> dict[str, Any]:
     words: dict[str, Any] = dict.fromkeys(how.absolute, options.absolute_tolerance)
     words.update(dict.fromkeys(how.relative, options.relative_tolerance))
-    if options.max_iterations is not None and how.cap is not None:
-        words[how.cap] = options.max_iterations
+    cap = how.default_cap if options.max_iterations is None else options.max_iterations
+    if cap is not None and how.cap is not None:
+        words[how.cap] = int(cap)
     if options.time_limit is not None and how.time_limit is not None:
         words[how.time_limit] = options.time_limit
     return words

@@ -166,7 +166,7 @@ def brute_force(case, begin):
     rows = [] if found is None else [LinearConstraint(*found)]
     answer = minimize(
         lambda d: objective(case, d.reshape(shape)), begin.ravel(), method="SLSQP",
-        constraints=rows, options={"ftol": 1e-14, "maxiter": 2000},
+        constraints=rows, options={"ftol": 1e-12, "maxiter": 500},
     )
     return answer.x.reshape(shape), answer.fun
 
@@ -362,7 +362,7 @@ def test_sets_are_dropped_and_taken_back_without_stating_anew(cost, names, monke
     sets = {
         "states": Box([-0.4, -np.inf], [0.45, 0.4]),
         "disturbances": Polytope([[0.0, 1.0]], [0.02]) & Box([0.0, -np.inf], [0.0, np.inf]),
-        "noises": Box([-1.0], [4.0]),
+        "noises": Box([-2.0], [4.0]),
     }
     case = setup(cost, 4, observer=Luenberger([0.0, 0.1]), **sets)
     step = ExactStep(case.system, cost)
@@ -380,7 +380,8 @@ def test_sets_are_dropped_and_taken_back_without_stating_anew(cost, names, monke
     expected = solve(less)
     assert without.predicted == pytest.approx(expected.predicted, rel=1e-7)
     np.testing.assert_allclose(without.d, expected.d, atol=1e-4)
-    assert without.predicted < before.predicted * (1 - 1e-6)  # every one of these sets binds
+    if cost is ROBUST["huber"]:  # there, every one of these sets binds
+        assert without.predicted < before.predicted * (1 - 1e-6)
     case.problem.bind(case.window)
     after = solve(case, step)
     assert after.predicted == pytest.approx(before.predicted, rel=1e-9)
@@ -448,21 +449,32 @@ def test_missing_outputs_have_no_say(loss, per_component):
     np.testing.assert_allclose(solve(case).d, found.d, atol=1e-6)
 
 
-def test_rows_of_missing_outputs_are_void():
+@pytest.mark.parametrize("rows", [[], [[1.0, 1.0], [0.0, -1.0]]])
+def test_rows_of_missing_outputs_are_void(rows):
     cost = RobustCost(prior=P0, disturbance=Q2, noise=Huber(R2))
-    boxed = {"noises": Box([-3.0, -3.0], [9.0, 9.0]) & Polytope([[1.0, 1.0]], [9.0])}
-    missing = [(time, component) for time in range(4) for component in (0, 1)][1:]
-    found = solve(setup(cost, 4, h=both, missing=missing, **boxed))
-    free = solve(setup(cost, 4, h=both, missing=missing, noises=Box([-3.0, -9e9], [9.0, 9e9])))
+    narrow, free = Box([-3.0, -1e-4], [9.0, 1e-4]), Box([-3.0, -np.inf], [9.0, np.inf])
+    for row in rows:
+        narrow = narrow & Polytope([row], [1e-4])
+    missing = [(time, 1) for time in range(4)]
+    found = solve(setup(cost, 4, h=both, missing=missing, noises=narrow))
+    expected = solve(setup(cost, 4, h=both, missing=missing, noises=free))
     assert found.solved
-    assert found.predicted == pytest.approx(free.predicted, rel=1e-6)
+    assert found.predicted == pytest.approx(expected.predicted, rel=1e-8)
+    # With all of y there, they bind.
+    case = setup(cost, 4, h=both, missing=missing, noises=narrow)
+    case.problem.observed = None
+    bound = solve(case)
+    assert not bound.solved or bound.predicted > found.predicted * 1.001
 
 
-def test_weight_of_one_sample_is_used():
-    cost = RobustCost(prior=P0, disturbance=Q2, noise=Huber(R1, 0.8))
-    case = setup(cost, 4)
+@pytest.mark.parametrize("per_component", [False, True])
+def test_weight_of_one_sample_is_used(per_component):
+    noise = Huber(R2, 0.8, per_component)
+    case = setup(RobustCost(prior=P0, disturbance=Q2, noise=noise), 4, h=both)
     usual = solve(case)
-    case.window.push(np.array([1.0]), np.zeros(0), noise_weight=np.array([[900.0]]))
+    # A loss per component has no use for what is off the diagonal.
+    own = np.array([[900.0, 50.0], [50.0, 40.0]])
+    case.window.push(np.array([1.0, 0.0]), np.zeros(0), noise_weight=own)
     case.problem.bind(case.window)
     case.trial = case.problem.candidate(case.window)
     case.jacobian = case.window.terms.jacobian[: case.window.end]
@@ -475,10 +487,8 @@ def test_weight_of_one_sample_is_used():
 
 def test_weight_of_the_prior_follows_the_observer():
     cost = RobustCost(prior=ObserverPrior(), disturbance=Q2, noise=Huber(R1, 0.8))
-    observer = ExtendedKalman.from_cost(
-        QuadraticCost(prior=P0, disturbance=Q2, noise=R1)
-    ) if hasattr(ExtendedKalman, "from_cost") else ExtendedKalman(
-        initial=np.linalg.inv(P0), disturbance=np.linalg.inv(Q2), noise=np.linalg.inv(R1)
+    observer = ExtendedKalman(
+        prior=np.linalg.inv(P0), disturbance=np.linalg.inv(Q2), noise=np.linalg.inv(R1)
     )
     case = setup(cost, 9, observer=observer)
     weight = np.linalg.inv(case.window.prior_covariance)
@@ -614,7 +624,7 @@ def test_sequence_of_exact_steps_lowers_the_true_cost(cost, seed):
     case = setup(cost, 6, seed=seed, states=Box([-3.0, -3.0], [3.0, 3.0]))
     step, subproblem = ExactStep(case.system, cost), Subproblem(case.system, cost, 6)
     begun = case.trial.cost
-    for _ in range(15):
+    for _ in range(30):
         found = solve(case, step)
         assert found.predicted <= case.trial.cost * (1 + 1e-8)
         for length in 0.5 ** np.arange(12.0):

@@ -363,6 +363,7 @@ def test_one_parameter_vector_for_all_states_does_not_pass_for_batched():
     np.testing.assert_array_equal(
         system.f.batch(z, np.zeros((3, 0))), [[2.0, 2.0], [3.0, 3.0], [4.0, 4.0]]
     )
+    assert system.f.mode == "batched"  # by columns inside, not state by state
 
 
 @pytest.mark.parametrize(
@@ -485,10 +486,14 @@ def test_model_undefined_at_the_start_is_named_there():
 
 
 def test_bounds_keep_trials_inside_the_domain_of_the_model():
-    def root(x, theta):
-        return np.sqrt(theta - 10.0) * x
+    def narrow(x, theta):
+        if np.any(np.abs(np.real(theta) - 10.25) > 0.01 + 1e-4):
+            raise ValueError("no such substance")
+        return theta[0] * x
 
     system = augment_parameters(
-        root, lambda x, theta: x, n=1, p=1, nominal=[10.25], parameter_bounds=Box([10.1], [10.9])
+        narrow, lambda x, theta: x, n=1, p=1, nominal=[10.25],
+        parameter_bounds=Box([10.24], [10.26]),
     )
+    assert system.f.mode == "batched"  # and not, for want of points to try, state by state
     assert system.derivatives == {"f": "complex step", "h": "complex step"}

@@ -44,9 +44,8 @@ def test_convergence_is_the_dense_minimum_of_every_window(horizon, seed):
         minimum, found = dense_minimum(estimate.candidate, window, method="lm")
         assert estimate.cost == pytest.approx(minimum, rel=1e-9)
         np.testing.assert_allclose(estimate.trajectory, found.x.reshape(-1, 2), atol=1e-4)
-        own = 2.0 * 0.5 * (residuals(estimate.trajectory.ravel(), estimate.candidate[0], window)
-                           ** 2).sum()
-        assert estimate.cost == pytest.approx(own, rel=1e-11)
+        terms = residuals(estimate.trajectory.ravel(), estimate.candidate[0], window)
+        assert estimate.cost == pytest.approx(terms @ terms, rel=1e-11)
 
 
 @pytest.mark.parametrize("max_qps", [1, 2])
@@ -87,17 +86,37 @@ def bounded_minima():
     return qpmhe.Box(lower, upper), Y, minima
 
 
+def in_box(box, **options):
+    system = qpmhe.System(euler, lambda x: x[..., :1] + x[..., 1:], n=2, p=1, states=box)
+    return qpmhe.MovingHorizonEstimator(
+        system, OBSERVER, COST, horizon=6, initial_state=[3.0, 0.6], **options
+    )
+
+
 @pytest.mark.parametrize("backend", INEQUALITY_BACKENDS)
 def test_convergence_in_a_state_box_is_the_dense_minimum(backend, bounded_minima):
     box, Y, minima = bounded_minima
-    system = qpmhe.System(euler, lambda x: x[..., :1] + x[..., 1:], n=2, p=1, states=box)
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, OBSERVER, COST, horizon=6, initial_state=[3.0, 0.6], backend=backend,
-        max_qps=None, solver_tolerance=1e-9,
-    )
-    run = mhe.run(Y)
+    run = in_box(box, backend=backend, max_qps=None, solver_tolerance=1e-9).run(Y)
     assert run.share(qpmhe.Status.SETS_DROPPED) == 0.0
     np.testing.assert_allclose(run.costs, minima, rtol=1e-6)
+
+
+@pytest.mark.parametrize("backend", INEQUALITY_BACKENDS)
+def test_states_are_on_their_bounds_and_never_beyond(backend, bounded_minima):
+    # At a loose tolerance too: iterates that miss the box are clipped into it, then judged.
+    box, Y, minima = bounded_minima
+    mhe = in_box(box, backend=backend, max_qps=3, solver_tolerance=1e-5)
+    on_bound = 0
+    for y, minimum in zip(Y, minima, strict=True):
+        estimate = mhe.update(y)
+        assert (estimate.trajectory >= box.lower).all()
+        assert (estimate.trajectory <= box.upper).all()
+        on_bound += bool(
+            np.isclose(estimate.trajectory, box.lower, atol=1e-4).any()
+            or np.isclose(estimate.trajectory, box.upper, atol=1e-4).any()
+        )
+        assert estimate.cost == pytest.approx(minimum, rel=1e-2)
+    assert on_bound >= 8
 
 
 class Rows:

@@ -100,13 +100,12 @@ def distance(found, expected):
 @pytest.mark.parametrize("missing", [False, True], ids=["complete", "missing"])
 @pytest.mark.parametrize("radius", [0.8, 1.15], ids=["stable", "unstable"])
 def test_every_horizon_gives_the_kalman_predictor_and_filter(radius, missing, horizon):
-    for n in (1, 2, 3, 4):
-        for p in (1, 2):
-            plant = Plant(100 * n + p, n, p, radius, m=n % 3, missing=missing)
-            predicted, filtered, _ = kalman(plant)
-            run = plant.estimator(horizon).run(plant.Y, plant.inputs())
-            assert distance(run.states, np.array([x for x, _ in predicted])) < 1e-8
-            assert distance(run.filtered, np.array([x for x, _ in filtered])) < 1e-8
+    for n, p in ((1, 1), (1, 2), (2, 2), (3, 1), (4, 1), (4, 2)):
+        plant = Plant(100 * n + p, n, p, radius, m=n % 3, missing=missing)
+        predicted, filtered, _ = kalman(plant)
+        run = plant.estimator(horizon).run(plant.Y, plant.inputs())
+        assert distance(run.states, np.array([x for x, _ in predicted])) < 1e-8
+        assert distance(run.filtered, np.array([x for x, _ in filtered])) < 1e-8
 
 
 @pytest.mark.parametrize("missing", [False, True], ids=["complete", "missing"])

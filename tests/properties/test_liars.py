@@ -1,4 +1,4 @@
-"""Solvers that fail, lie or vandalise: none of them can make an estimate worse than its candidate."""
+"""Solvers that fail, lie or vandalise: none makes an estimate worse than its candidate."""
 
 import contextlib
 
@@ -130,7 +130,7 @@ ODD = {
     "claim is an array": lambda qp, rng: RawSolution(newton(qp), np.array([True, False])),
     "claim is text": lambda qp, rng: RawSolution(newton(qp), "no"),
     "message is None": lambda qp, rng: RawSolution(newton(qp), True, message=None),
-    "message is hostile": lambda qp, rng: RawSolution(None, True, message=Hostile()),
+    "count is of numpy": lambda qp, rng: RawSolution(newton(qp), True, np.int64(3)),
 }
 
 
@@ -213,7 +213,7 @@ def test_a_useless_iterate_leaves_the_candidate_and_says_so(lie, sets):
 
 
 @sets_or_not
-@pytest.mark.parametrize("max_qps", [1, 2, None])
+@pytest.mark.parametrize("max_qps", [1, None])
 @pytest.mark.parametrize("lie", ODD)
 def test_an_odd_answer_breaks_nothing(lie, max_qps, sets):
     with registered(ODD[lie]):
@@ -224,7 +224,8 @@ def test_an_odd_answer_breaks_nothing(lie, max_qps, sets):
     assert len(record) == len(estimates)
     for estimate in estimates:
         assert repr(estimate)
-        assert estimate.solver_iterations is None or isinstance(estimate.solver_iterations, int)
+        count = estimate.solver_iterations
+        assert count is None or isinstance(count, (int, np.integer))
         assert isinstance(estimate.message, str)
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import qpmhe
 from qpmhe import Status
 
-from .plain import observer_path, true_cost
+from .plain import observer_path, there, true_cost
 
 KINDS = ("linear", "smooth", "kinked", "cubic", "exponential", "raising", "branching")
 SPECIALS = (np.nan, np.inf, -np.inf, 1e3, -1e6, 1e30, 1e200)
@@ -40,7 +40,7 @@ class Case:
             qpmhe.Box(np.full(n, -sizes[1, 0]), np.full(n, sizes[1, 1])) if boxes[1] else None,
             qpmhe.Box(np.full(p, -3 * sizes[2, 0]), np.full(p, np.inf)) if boxes[2] else None,
         )
-        form = (lambda g: g) if as_it_is else _one_state
+        form = (lambda g: g) if as_it_is and kind != "branching" else _one_state
         self.system = qpmhe.System(
             form(self.f), form(self.h), n=n, p=p,
             states=self.sets[0], disturbances=self.sets[1], noises=self.sets[2],
@@ -117,7 +117,7 @@ def check_step(case, estimate, Y):
     assert np.isfinite(trajectory).all()
     assert np.isfinite(estimate.candidate).all()
     assert np.isfinite(estimate.disturbances).all()
-    seen = np.isfinite(Y)
+    seen = there(Y)
     assert np.isfinite(estimate.noises[seen]).all()
     assert np.isnan(estimate.noises[~seen]).all()
     assert (Status.MISSING in status) == (not seen[-1].all())
@@ -186,3 +186,59 @@ def test_promise(backend, case, horizon, max_qps, max_solver_iterations):
         case, horizon, backend=backend, max_qps=max_qps,
         max_solver_iterations=max_solver_iterations,
     )
+
+
+ROTATION = np.array([[0.9, 0.3], [-0.3, 0.9]])
+
+
+def clamped(x):
+    x[x < 0.0] = 0.0
+    return 0.9 * x
+
+
+# Functions of one state that a batch of states passes through without an exception, with
+# another value than state by state once the states lie on both sides of the condition.
+BRANCHING = {
+    "if on a single state": (1, lambda x: 0.9 * x if x[0] > -0.2 else 0.3 * x - 0.2),
+    "any": (2, lambda x: 0.5 * x if np.any(x < -0.3) else x @ ROTATION.T),
+    "all": (2, lambda x: x @ ROTATION.T if np.all(np.abs(x) < 5.0) else 0.5 * x),
+    "norm": (2, lambda x: x @ ROTATION.T if np.linalg.norm(x) < 6.0 else 0.5 * x),
+    "largest": (2, lambda x: (x @ ROTATION.T) / max(1.0, np.abs(x).max() / 5.0)),
+    "argument clamped in place": (2, clamped),
+}
+
+
+@pytest.mark.parametrize("name", BRANCHING)
+def test_models_that_branch_on_the_state_are_judged_state_by_state(name):
+    n, model = BRANCHING[name]
+    rng = np.random.default_rng(4)
+    try:
+        system = qpmhe.System(model, lambda x: x[..., :1], n=n, p=1)
+    except qpmhe.errors.ModelError:
+        assert "in place" in name  # refusing such a function is as good
+        return
+    weights = (np.eye(n), 4.0 * np.eye(n), np.eye(1))
+    cost = qpmhe.QuadraticCost(prior=weights[0], disturbance=weights[1], noise=weights[2])
+    gain, z0 = np.full((n, 1), 0.4), np.full(n, 0.5)
+    Y = 6.0 * rng.standard_normal((25, 1))
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(gain), cost, horizon=5, initial_state=z0, max_qps=2
+    )
+
+    def f(x):
+        return model(x.copy())
+
+    path = observer_path(f, lambda x: x[:1], gain, z0, Y)
+    for t, y in enumerate(Y):
+        estimate = mhe.update(y)
+        first = max(0, t - 4)
+        np.testing.assert_allclose(estimate.candidate, path[first : t + 2], rtol=1e-12)
+        for trajectory, reported in (
+            (estimate.trajectory, estimate.cost),
+            (estimate.candidate, estimate.candidate_cost),
+        ):
+            prior = estimate.candidate[0]
+            true, slack = true_cost(
+                f, lambda x: x[:1], trajectory, prior, Y[first : t + 1], weights
+            )
+            assert abs(reported - true) <= 1e-9 * true + slack

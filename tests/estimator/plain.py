@@ -1,0 +1,170 @@
+"""Window, candidate, J and its Gauss-Newton step by plain loops and dense algebra."""
+
+import math
+
+import numpy as np
+
+STEP = 1e-30  # of the complex differences, which are exact for any tiny step
+
+
+def spd(generator, n):
+    root = generator.standard_normal((n, n))
+    return root @ root.T + 0.5 * np.eye(n)
+
+
+def quadratic(s, weight):
+    return s @ weight @ s
+
+
+def huber(threshold):
+    def loss(s, weight):
+        q = s @ weight @ s
+        if q.real <= threshold**2:
+            return q
+        return 2.0 * threshold * np.sqrt(q) - threshold**2
+
+    return loss
+
+
+def power(exponent):
+    return lambda s, weight: (s @ weight @ s) ** (exponent / 2.0)
+
+
+def each(loss):
+    """The loss of every component by itself, added."""
+    return lambda s, weight: sum(
+        loss(s[j : j + 1], weight[j : j + 1, j : j + 1]) for j in range(len(s))
+    )
+
+
+def euler(rate):
+    return lambda x, u, dt: x + dt * rate(x, u)
+
+
+def rk4(rate):
+    def step(x, u, dt):
+        k1 = rate(x, u)
+        k2 = rate(x + dt / 2.0 * k1, u)
+        k3 = rate(x + dt / 2.0 * k2, u)
+        k4 = rate(x + dt * k3, u)
+        return x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+    return step
+
+
+def differences(function, trajectory):
+    """Complex differences of a function of the trajectory, the last axis one a component."""
+    columns = []
+    for k in np.ndindex(trajectory.shape):
+        moved = trajectory.astype(complex)
+        moved[k] += 1j * STEP
+        columns.append(np.imag(function(moved)) / STEP)
+    return np.stack(columns, axis=-1)
+
+
+class Record:
+    """All samples since the start, and the observer z+ = f(z) + gain (y - h(z)) along them.
+
+    Weights are (P, Q, R); losses those of the initial error, of w and of v.
+    """
+
+    def __init__(
+        self, h, gain, start, weights, horizon, *, discount=1.0, losses=(quadratic,) * 3
+    ):
+        self.h, self.gain, self.horizon = h, np.asarray(gain, dtype=float), horizon
+        self.P, self.Q, self.R = weights
+        self.discount, self.losses = discount, losses
+        self.z = [np.array(start, dtype=float)]
+        self.steps, self.ys, self.noise_weights = [], [], []
+
+    @property
+    def first(self):
+        """Time of the window's first state."""
+        return max(0, len(self.ys) - self.horizon)
+
+    @property
+    def count(self):
+        return len(self.ys) - self.first
+
+    @property
+    def candidate(self):
+        return np.array(self.z[self.first :])
+
+    def push(self, step, y, noise_weight=None):
+        """Take in a sample and the model x -> f(x) of its time."""
+        self.steps.append(step)
+        self.ys.append(np.array(y, dtype=float))
+        self.noise_weights.append(self.R if noise_weight is None else noise_weight)
+        self.z.append(None)
+        self.observe(len(self.ys) - 1, self.z[-2])
+
+    def observe(self, time, z):
+        """Run the observer again from a state at this time on."""
+        self.z[time] = z
+        for t in range(time, len(self.ys)):
+            v = np.nan_to_num(self.ys[t] - self.h(self.z[t]), nan=0.0)
+            self.z[t + 1] = self.steps[t](self.z[t]) + self.gain @ v
+
+    def amend(self, time, y):
+        new = np.isfinite(y)
+        self.ys[time][new] = np.asarray(y)[new]
+        self.observe(time, self.z[time])
+
+    def weight(self, t):
+        """Weight of v(t): the inverse of the covariance of the components that are there."""
+        seen, weight = np.isfinite(self.ys[t]), self.noise_weights[t]
+        if seen.all():
+            return weight
+        reduced = np.zeros_like(weight)
+        if seen.any():
+            block = np.linalg.inv(weight)[np.ix_(seen, seen)]
+            reduced[np.ix_(seen, seen)] = np.linalg.inv(block)
+        return reduced
+
+    def residuals(self, trajectory):
+        """(w, v) of the window's stages, with zeros where y is missing; complex will do."""
+        stages = []
+        for i, t in enumerate(range(self.first, len(self.ys))):
+            seen = np.isfinite(self.ys[t])
+            y = np.where(seen, self.ys[t], 0.0)
+            w = trajectory[i + 1] - self.steps[t](trajectory[i])
+            stages.append(np.concatenate([w, (y - self.h(trajectory[i])) * seen]))
+        return np.array(stages)
+
+    def cost(self, trajectory):
+        """J by its definition."""
+        n, count = len(self.Q), self.count
+        prior, of_w, of_v = self.losses
+        total = self.discount**count * prior(trajectory[0] - self.z[self.first], self.P)
+        for i, residual in enumerate(self.residuals(trajectory)):
+            stage = of_w(residual[:n], self.Q)
+            stage = stage + of_v(residual[n:], self.weight(self.first + i))
+            total = total + self.discount ** (count - 1 - i) * stage
+        return total
+
+    def gradient(self, trajectory):
+        return differences(self.cost, trajectory).reshape(trajectory.shape)
+
+    def hessian(self, trajectory):
+        """Of J/2 for quadratic losses: the residuals' Jacobians between their weights."""
+        n, count = len(self.Q), self.count
+        total = np.zeros((trajectory.size, trajectory.size))
+        total[:n, :n] = self.discount**count * self.P
+        for i, slope in enumerate(differences(self.residuals, trajectory)):
+            joint = np.zeros((len(slope), len(slope)))
+            joint[:n, :n], joint[n:, n:] = self.Q, self.weight(self.first + i)
+            total += self.discount ** (count - 1 - i) * slope.T @ joint @ slope
+        return total
+
+    def improved(self, trajectory):
+        """The trajectory after one full Gauss-Newton step, which must lower J to be of use."""
+        step = np.linalg.solve(self.hessian(trajectory), -0.5 * self.gradient(trajectory).ravel())
+        better = trajectory + step.reshape(trajectory.shape)
+        assert self.cost(better) < self.cost(trajectory)
+        return better
+
+
+def is_minimum(record, trajectory, tolerance=1e-6):
+    """Whether J is stationary at a trajectory, next to its slope at the candidate."""
+    scale = 1.0 + np.abs(record.gradient(record.candidate)).max()
+    return math.isfinite(scale) and np.abs(record.gradient(trajectory)).max() < tolerance * scale

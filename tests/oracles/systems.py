@@ -1,0 +1,229 @@
+"""Nonlinear systems with sets that bind, each written once for NumPy and for CasADi."""
+
+import numpy as np
+
+import qpmhe
+
+
+class Case:
+    """A model, sets, an observer that mostly keeps within them, and random records.
+
+    Parameters
+    ----------
+    step, output : callable
+        f and h: (components of x, a module with sin, exp, ...) to a list of components.
+    truth, start : sequence
+        x(0) of the simulation, and the estimator's.
+    gain : array_like
+        The observer's.
+    deviations : (sequence, sequence, sequence)
+        Standard deviations of prior, disturbance and noise, for the weights.
+    draws : (sequence, sequence)
+        Disturbances and noises are drawn evenly from plus and minus these.
+    sets : dict
+        For "box" and "polytope" each the sets X, W and V.
+    """
+
+    def __init__(self, step, output, truth, start, gain, deviations, draws, sets, horizon=6):
+        self.step, self.output = step, output
+        self.truth, self.start = np.array(truth, float), np.array(start, float)
+        self.gain, self.horizon = np.array(gain, float), horizon
+        self.draws = tuple(np.array(draw) for draw in draws)
+        self.n, self.p = len(truth), len(draws[1])
+        self.cost = qpmhe.QuadraticCost.from_covariances(
+            **{
+                name: np.diag(np.square(deviation))
+                for name, deviation in zip(
+                    ("prior", "disturbance", "noise"), deviations, strict=True
+                )
+            }
+        )
+        self.sets = sets
+
+    def f(self, x):
+        return np.stack(self.step([x[..., j] for j in range(self.n)], np), axis=-1)
+
+    def h(self, x):
+        return np.stack(self.output([x[..., j] for j in range(self.n)], np), axis=-1)
+
+    def symbolic(self):
+        """f and h for CasADi."""
+        import casadi
+
+        return {
+            name: lambda x, g=g: casadi.vertcat(*g(casadi.vertsplit(x), casadi))
+            for name, g in (("f", self.step), ("h", self.output))
+        }
+
+    def parts(self, kind):
+        """System, observer, cost, and what the estimators have in common."""
+        states, disturbances, noises = self.sets[kind]
+        system = qpmhe.System(
+            self.f, self.h, n=self.n, p=self.p,
+            states=states, disturbances=disturbances, noises=noises,
+        )
+        common = {"horizon": self.horizon, "initial_state": self.start}
+        return (system, qpmhe.Luenberger(self.gain), self.cost), common
+
+    def record(self, seed, steps):
+        rng = np.random.default_rng(seed)
+        x, Y = self.truth, []
+        for _ in range(steps):
+            Y.append(self.h(x) + rng.uniform(-self.draws[1], self.draws[1]))
+            x = self.f(x) + rng.uniform(-self.draws[0], self.draws[0])
+        return np.array(Y)
+
+
+def around(center, *half):
+    """The polytope sum_j |s_j - c_j| / half_j <= 1: a diamond in two dimensions."""
+    signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * len(half))).reshape(len(half), -1).T
+    rows = signs / np.array(half)
+    return qpmhe.Polytope(rows, 1.0 + rows @ np.array(center, float))
+
+
+def symmetric(*half):
+    return qpmhe.Box(-np.array(half), np.array(half))
+
+
+def reactor():
+    def step(x, m):
+        rate = 0.16 * x[0] ** 2 - 0.64 * x[1]
+        return [x[0] - 0.2 * rate, x[1] + 0.1 * rate]
+
+    return Case(
+        step, lambda x, m: [x[0] + x[1]],
+        truth=[2.8, 0.7], start=[3.2, 0.7], gain=[[0.05], [0.05]],
+        deviations=([1.0, 1.0], [0.1, 0.1], [0.2]), draws=([0.15, 0.15], [0.5]),
+        sets={
+            "box": (
+                qpmhe.Box([0.0, 0.65], [4.5, 3.5]), symmetric(0.06, 0.06), qpmhe.Box(-1.2, 0.35)
+            ),
+            "polytope": (
+                qpmhe.Polytope([[1.0, 1.0], [0.0, -1.0]], [4.2, -0.6]),
+                around([0, 0], 0.15, 0.1), qpmhe.Polytope([[1.0], [-1.0]], [0.4, 1.2]),
+            ),
+        },
+    )
+
+
+def van_der_pol():
+    def step(x, m):
+        return [x[0] + 0.1 * x[1], x[1] + 0.1 * ((1 - x[0] ** 2) * x[1] - x[0])]
+
+    return Case(
+        step, lambda x, m: [x[0] + 0.1 * x[1] ** 2],
+        truth=[1.2, 0.5], start=[1.5, 0.8], gain=[[0.05], [0.05]],
+        deviations=([0.5, 0.5], [0.1, 0.1], [0.2]), draws=([0.1, 0.1], [0.5]),
+        sets={
+            "box": (
+                symmetric(1.65, 0.9), symmetric(0.06, 0.06), qpmhe.Box(-1.2, 0.3)
+            ),
+            "polytope": (
+                qpmhe.Polytope([[1.0, 0.3], [-1.0, -0.3], [0.2, 1.0]], [1.75, 1.9, 1.2]),
+                around([0, 0], 0.09, 0.09), qpmhe.Polytope([[1.0], [-1.0]], [0.35, 1.2]),
+            ),
+        },
+    )
+
+
+def pendulum():
+    def step(x, m):
+        return [x[0] + 0.1 * x[1], x[1] - 0.1 * (4.0 * m.sin(x[0]) + 0.3 * x[1])]
+
+    return Case(
+        step, lambda x, m: [m.sin(x[0])],
+        truth=[0.8, 0.0], start=[1.1, 0.2], gain=[[0.05], [0.1]],
+        deviations=([0.5, 0.5], [0.05, 0.2], [0.2]), draws=([0.05, 0.2], [0.4]),
+        sets={
+            "box": (symmetric(1.25, 2.2), symmetric(0.06, 0.08), qpmhe.Box(-0.8, 0.3)),
+            "polytope": (
+                around([0, 0], 2.1, 4.0), around([0, 0], 0.1, 0.12),
+                qpmhe.Polytope([[1.0], [-1.0]], [0.32, 0.8]),
+            ),
+        },
+    )
+
+
+def tanks():
+    def step(x, m):
+        upper, lower = 0.4 * m.sqrt(x[0]), 0.4 * m.sqrt(x[1])
+        return [x[0] + 0.1 * (0.4 - upper), x[1] + 0.1 * (upper - lower)]
+
+    return Case(
+        step, lambda x, m: [m.sqrt(x[1])],
+        truth=[1.0, 0.5], start=[0.8, 0.7], gain=[[0.05], [0.08]],
+        deviations=([0.3, 0.3], [0.05, 0.05], [0.1]), draws=([0.05, 0.05], [0.25]),
+        sets={
+            "box": (
+                qpmhe.Box([0.05, 0.45], [1.05, 0.8]), symmetric(0.035, 0.035),
+                qpmhe.Box(-0.6, 0.2),
+            ),
+            "polytope": (
+                qpmhe.Box([0.05, 0.05], [3.0, 3.0]) & qpmhe.Polytope([[1.0, 1.0]], [1.55]),
+                around([0, 0], 0.06, 0.05), qpmhe.Polytope([[1.0], [-1.0]], [0.2, 0.6]),
+            ),
+        },
+    )
+
+
+def stirred_tank():
+    """Exothermic reaction: scaled concentration and temperature, two outputs."""
+
+    def step(x, m):
+        rate = x[0] * m.exp(8.0 * (1.0 - 1.0 / x[1]))
+        return [
+            x[0] + 0.1 * (1.0 - x[0] - rate), x[1] + 0.1 * (1.3 - 1.3 * x[1] + 0.3 * rate),
+        ]
+
+    return Case(
+        step, lambda x, m: [x[1], x[0] * x[1]],
+        truth=[0.5, 1.05], start=[0.6, 1.1], gain=[[0.0, 0.05], [0.05, 0.0]],
+        deviations=([0.2, 0.1], [0.03, 0.02], [0.05, 0.1]),
+        draws=([0.03, 0.02], [0.1, 0.2]),
+        sets={
+            "box": (
+                qpmhe.Box([0.42, 0.9], [0.7, 1.16]), symmetric(0.015, 0.012),
+                qpmhe.Box([-0.3, -0.6], [0.08, 0.15]),
+            ),
+            "polytope": (
+                qpmhe.Box([0.1, 0.8], [1.0, 1.5]) & qpmhe.Polytope([[1.0, 1.0]], [1.72]),
+                around([0, 0], 0.025, 0.02),
+                qpmhe.Polytope([[1.0, 0.2], [0.2, 1.0], [-1, -1]], [0.08, 0.15, 0.6]),
+            ),
+        },
+    )
+
+
+def tracking():
+    """Range and bearing of a vehicle."""
+
+    def step(x, m):
+        return [x[0] + 0.2 * x[2], x[1] + 0.2 * x[3], x[2], x[3]]
+
+    def output(x, m):
+        return [m.sqrt(x[0] ** 2 + x[1] ** 2), m.arctan2(x[1], x[0])]
+
+    return Case(
+        step, output,
+        truth=[2.8, 1.8, -0.3, 0.5], start=[2.8, 2.2, 0.0, 0.3],
+        gain=[[0.05, -0.05], [0.05, 0.1], [0.02, -0.02], [0.02, 0.05]],
+        deviations=([0.5, 0.5, 0.5, 0.5], [0.05, 0.05, 0.1, 0.1], [0.2, 0.1]),
+        draws=([0.02, 0.02, 0.1, 0.1], [0.4, 0.2]),
+        sets={
+            "box": (
+                qpmhe.Box([0.5, 0.5, -0.4, -0.4], [3.2, 6.0, 0.4, 0.6]),
+                symmetric(0.05, 0.05, 0.04, 0.04), qpmhe.Box([-1.0, -0.5], [0.25, 0.15]),
+            ),
+            "polytope": (
+                qpmhe.Polytope([[1, 1, 0, 0], [0, 0, 1, 1], [-1, 0, 0, 0]], [5.5, 0.6, -0.5]),
+                around([0, 0, 0, 0], 0.12, 0.12, 0.1, 0.1),
+                qpmhe.Polytope([[1, 0.5], [0, 1], [-1, -1]], [0.25, 0.15, 1.5]),
+            ),
+        },
+    )
+
+
+SYSTEMS = {
+    "reactor": reactor, "van_der_pol": van_der_pol, "pendulum": pendulum, "tanks": tanks,
+    "stirred_tank": stirred_tank, "tracking": tracking,
+}

@@ -1,0 +1,142 @@
+"""Every Python block of the documentation runs, and prints what the page says it prints."""
+
+import contextlib
+import importlib
+import io
+import re
+import sys
+import types
+import warnings
+from itertools import pairwise
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+import qpmhe
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md"))
+OUTPUT = 'text title="Output"'
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
+
+
+def fences(page):
+    """(first line, info string, text) of each fenced block."""
+    opened, info, found = 0, "", []
+    lines = (DOCS / page).read_text(encoding="utf-8").splitlines()
+    for number, line in enumerate(lines, start=1):
+        mark = re.match(r"\s*```(.*)", line)
+        if mark and opened:
+            found.append((opened + 1, info, "\n".join(lines[opened : number - 1])))
+            opened = 0
+        elif mark:
+            opened, info = number, mark[1].strip()
+    assert not opened, f"{page}: the block that line {opened} opens is never closed"
+    return found
+
+
+def same(found, expected):
+    """Equal words, and numbers equal up to 2 % and one unit of the last decimal told."""
+    if NUMBER.sub("#", found).split() != NUMBER.sub("#", expected).split():
+        return False
+    for one, other in zip(NUMBER.findall(found), NUMBER.findall(expected), strict=True):
+        decimals = len(re.sub(r"e.*", "", other).partition(".")[2])
+        unit = 10.0**-decimals if decimals else 0.0
+        if not abs(float(one) - float(other)) <= 0.02 * abs(float(other)) + unit:
+            return False
+    return True
+
+
+@pytest.fixture
+def registered_backends():
+    before = {entry.name for entry in qpmhe.solvers.backends()}
+    yield
+    for entry in qpmhe.solvers.backends():
+        if entry.name not in before:
+            qpmhe.solvers.unregister(entry.name)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_page_runs(page, tmp_path, monkeypatch, registered_backends):
+    monkeypatch.chdir(tmp_path)
+    blocks = fences(page)
+    # A module, so that functions of a page can be pickled as those of a script can.
+    module = types.ModuleType("page_" + re.sub(r"\W", "_", page))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    np.random.seed(0)  # noqa: NPY002 - for pages that use it in spite of this rule
+    for position, (line, info, text) in enumerate(blocks):
+        assert info, f"{page}:{line}: name the language of this block"
+        if info != "python":
+            assert not info.startswith("py"), f"{page}:{line}: {info!r} would not run"
+            continue
+        printed = io.StringIO()
+        code = compile("\n" * (line - 1) + text, str(DOCS / page), "exec")
+        with warnings.catch_warnings(), contextlib.redirect_stdout(printed):
+            warnings.simplefilter("error")
+            exec(code, vars(module))
+        told = ""
+        if position + 1 < len(blocks) and blocks[position + 1][1] == OUTPUT:
+            told = blocks[position + 1][2]
+        assert same(printed.getvalue(), told), (
+            f"{page}:{line} printed\n{printed.getvalue()}\nand the page says\n{told}"
+        )
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_output_stands_behind_its_block(page):
+    infos = ["", *(info for _, info, _ in fences(page))]
+    for before, info in pairwise(infos):
+        assert info != OUTPUT or before == "python"
+
+
+@pytest.mark.parametrize(
+    ("found", "expected", "verdict"),
+    [
+        ("a 1.00 b", "a 1.01  b\n", True),
+        ("a 1.00", "a 1.05", False),
+        ("a 1.00", "b 1.00", False),
+        ("7", "8", False),
+        ("0.3 0.4", "0.3", False),
+        ("x1 0.001", "x1 0.000", True),
+        ("1.00e-09", "1.01e-09", True),
+        ("-0.30", "0.30", False),
+    ],
+)
+def test_outputs_are_compared(found, expected, verdict):
+    assert same(found, expected) is verdict
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page):
+    text = re.sub(r"```.*?```", "", (DOCS / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        link = urlsplit(target)
+        if not link.scheme and link.path:
+            assert (DOCS / page).parent.joinpath(link.path).is_file(), target
+
+
+def test_every_page_is_in_the_navigation():
+    nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
+    assert sorted(re.findall(r"([\w/-]+\.md)", nav)) == PAGES
+
+
+def referenced():
+    return re.findall(r"^::: ([\w.]+)$", (DOCS / "reference.md").read_text(), flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", referenced())
+def test_the_reference_names_things_that_there_are(name):
+    module, _, attribute = name.rpartition(".")
+    assert hasattr(importlib.import_module(module), attribute)
+
+
+@pytest.mark.parametrize("module", [qpmhe, qpmhe.solvers, qpmhe.errors])
+def test_the_reference_holds_every_public_name(module):
+    names = {name.rpartition(".")[2] for name in referenced()}
+    modules = {
+        name for name in module.__all__ if isinstance(getattr(module, name), types.ModuleType)
+    }
+    assert set(module.__all__) - modules - {"__version__"} <= names
