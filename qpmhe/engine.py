@@ -16,6 +16,7 @@ from .costs import Cost
 from .covariance import window_covariances
 from .errors import InvalidInputError
 from .estimate import Estimate, Status
+from .exact import ExactStep
 from .observers import Observer
 from .optimizer import Optimizer
 from .problem import Problem
@@ -66,7 +67,11 @@ class PythonEngine:
         if self._problem.constrained:
             solver.prepare((settings.horizon + 1) * system.n)
         self._subproblem = Subproblem(system, cost, settings.horizon)
-        self._optimizer = Optimizer(self._subproblem, solver, settings)
+        exact = None
+        if settings.subproblem == "exact":
+            exact = ExactStep(system, cost)
+            exact.prepare(settings.horizon)
+        self._optimizer = Optimizer(self._subproblem, solver, settings, exact)
         self.reset(initial_state)
 
     def reset(self, initial_state: Array) -> None:

@@ -72,6 +72,10 @@ class MovingHorizonEstimator:
         The paper's candidate, or that of an observer which at each sample starts again
         from the estimate of x(t-N) made at that time; the paper's outlook, outside of the
         theorem as proved there.
+    subproblem : {"qp", "exact"}
+        What is solved around a trajectory: a QP in which quadratic forms majorise the
+        cost, by the backend; or the convex problem with the cost as it is, by cvxpy, which
+        needs fewer but much slower steps where the cost is a `RobustCost`.
     time_budget : float or None
         Seconds for one update: no QP is begun later, and backends with a clock stop.
     delay : int
@@ -112,12 +116,13 @@ class MovingHorizonEstimator:
         outside: str = "drop",
         start: str = "candidate",
         candidate: str = "observer",
+        subproblem: str = "qp",
         time_budget: float | None = None,
         delay: int = 0,
     ) -> None:
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
-            engine, outside, start, candidate, time_budget, delay,
+            engine, outside, start, candidate, subproblem, time_budget, delay,
         )
         self.system, self.observer, self.cost = system, observer, cost
         _is(system, System, "system", "qpmhe.System")

@@ -146,7 +146,7 @@ class ExactStep:
         linear[:, : self._system.n] += d[1:]
         costs = self._cost.stage_costs(linear, problem.stage_weights)
         offset = trial.trajectory[0] + d[0] - problem.prior
-        prior = self._cost.prior_cost(offset, problem._prior_weight)
+        prior = self._cost.prior_cost(offset, problem.prior_weight)
         factors = _discounts(self._cost, linear.shape[0])
         return float(factors[0]) * prior + float(factors[1:].dot(costs))
 
@@ -190,7 +190,7 @@ class _Program:
         columns = np.matmul(jacobian.transpose(0, 2, 1), root)
         for j, parameter in enumerate(self._jacobian):
             parameter.value = columns[:, j]
-        prior_root = _root(problem._prior_weight, self._prior_loss)
+        prior_root = _root(problem.prior_weight, self._prior_loss)
         self._prior_root.value = prior_root
         self._offset.value = offset = (trial.trajectory[:1] - problem.prior) @ prior_root
         for term, now in zip(self._terms, (offset, white[:, :n], white[:, n:]), strict=True):

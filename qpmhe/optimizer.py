@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from qpmhe_solvers import QP, Solution, Solver, SolveStatus
 
 from .estimate import Status
+from .exact import ExactSolution, ExactStep
 from .problem import Problem, Trial
 from .subproblem import Subproblem
 from .window import Window
@@ -86,6 +87,14 @@ class Outcome:
     solve_time: float = 0.0
     dropped: tuple[str, ...] = ()
 
+    def count(self, iterations: int | None, seconds: float) -> None:
+        """Add a solve's iterations and time."""
+        self.solve_time += seconds
+        if iterations is None or self.solver_iterations is None:
+            self.solver_iterations = None
+        else:
+            self.solver_iterations += iterations
+
 
 class Optimizer:
     r"""Gauss-Newton steps from the candidate, each judged by the true problem.
@@ -102,10 +111,18 @@ class Optimizer:
         Where they go.
     settings : Settings
         Cap on the QPs, tolerance, and what to do with a candidate outside of the sets.
+    exact : ExactStep, optional
+        Solves the convex problem with the cost as it is, in place of the QPs.
     """
 
-    def __init__(self, subproblem: Subproblem, solver: Solver, settings: Choices) -> None:
-        self._subproblem, self._solver = subproblem, solver
+    def __init__(
+        self,
+        subproblem: Subproblem,
+        solver: Solver,
+        settings: Choices,
+        exact: ExactStep | None = None,
+    ) -> None:
+        self._subproblem, self._solver, self._exact = subproblem, solver, exact
         self._limit, self._tolerance = settings.qp_limit, settings.tolerance
         self._outside = settings.outside
 
@@ -194,21 +211,29 @@ class Optimizer:
 
     def _solve(self, qp: QP, outcome: Outcome) -> Solution:
         began = perf_counter()
+        solution: Solution
         try:
             solution = self._solver.solve(qp)
         except Exception as error:  # a user's solver that overrides the contained `solve`
             message = f"{type(error).__name__}: {error}"
             solution = Solution(None, SolveStatus.FAILED, message=message)
-        outcome.solve_time += perf_counter() - began
-        if solution.iterations is None or outcome.solver_iterations is None:
-            outcome.solver_iterations = None
-        else:
-            outcome.solver_iterations += solution.iterations
+        outcome.count(solution.iterations, perf_counter() - began)
+        return solution
+
+    def _solve_exactly(self, problem: Problem, outcome: Outcome) -> ExactSolution:
+        began = perf_counter()
+        assert self._exact is not None
+        solution = self._exact.solve(problem, outcome.trial, self._subproblem.jacobian)
+        outcome.count(solution.iterations, perf_counter() - began)
         return solution
 
     def _step(self, problem: Problem, qp: QP, outcome: Outcome) -> bool:
         """Solve one QP and judge its iterate; whether another QP is worth while."""
-        solution = self._solve(qp, outcome)
+        solution: Solution | ExactSolution
+        if self._exact is None:
+            solution = self._solve(qp, outcome)
+        else:
+            solution = self._solve_exactly(problem, outcome)
         outcome.qps += 1
         step = solution.d
         if step is None:
@@ -222,14 +247,17 @@ class Optimizer:
         solved = solution.status is SolveStatus.SOLVED
         if not solved:
             outcome.events |= Status.SOLVER_STOPPED
-        slope = abs(float(np.vdot(qp.gradient, step)))
+        if isinstance(solution, ExactSolution):
+            promised = best.cost - solution.predicted
+        else:
+            promised = abs(float(np.vdot(qp.gradient, step)))
         trial = self._trial(problem, best, step)
         if not trial.cost < target and _NEARLY < trial.violation < math.inf and qp.rows:
             step = step.copy()  # a correction's solve reuses the solver's workspace
             trial = self._corrected(problem, qp, outcome, trial)
         if not trial.cost < target:
             # Near a minimum J cannot be lowered beyond its rounding: not a failure.
-            if solved and slope <= enough:
+            if solved and promised <= enough:
                 outcome.events |= Status.CONVERGED
                 return False
             for length in _LENGTHS:

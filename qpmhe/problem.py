@@ -76,10 +76,11 @@ class Problem:
         self._system, self._cost = system, cost
         self._n, self._q = system.n, system.n + system.p
         self._prior_rule = cost.prior if isinstance(cost.prior, ObserverPrior) else None
-        self._prior_weight: Array = (
+        #: Weight of the initial error, before discount and majorisation.
+        self.prior_weight: Array = (
             np.eye(system.n) if isinstance(cost.prior, ObserverPrior) else cost.prior
         )
-        self._prior_band = band_of(self._prior_weight)
+        self._prior_band = band_of(self.prior_weight)
         self._discounted = cost.discount < 1.0
         self.model = system
         self.prior: Array = np.zeros(system.n)
@@ -115,8 +116,8 @@ class Problem:
         if self._discounted:
             self.discounts = window.discounts
         if self._prior_rule is not None and window.prior_covariance is not None:
-            self._prior_weight = self._prior_rule.weight(window.prior_covariance)
-            self._prior_band = band_of(self._prior_weight)
+            self.prior_weight = self._prior_rule.weight(window.prior_covariance)
+            self._prior_band = band_of(self.prior_weight)
         if self.constrained:
             system = self._system
             self.use_sets(system.states, system.disturbances, system.noises)
@@ -143,7 +144,7 @@ class Problem:
 
     def prior_weight_at(self, offset: Array) -> Array:
         """The weight (n, n) of the form that majorises the prior's cost at this offset."""
-        weight = self._prior_weight
+        weight = self.prior_weight
         if not self._cost.quadratic:
             weight = self._cost.majorise_prior(offset, weight)
         return weight if self.discounts is None else self.discounts[0] * weight
@@ -190,9 +191,9 @@ class Problem:
         weights, weighted, cost = self._cost_of(residuals)
         offset = trajectory[0] - self.prior
         if self._cost.quadratic:
-            prior_cost = float(offset.dot(self._prior_weight).dot(offset))
+            prior_cost = float(offset.dot(self.prior_weight).dot(offset))
         else:
-            prior_cost = self._cost.prior_cost(offset, self._prior_weight)
+            prior_cost = self._cost.prior_cost(offset, self.prior_weight)
         cost += prior_cost if self.discounts is None else float(self.discounts[0]) * prior_cost
         if not math.isfinite(cost):
             return Trial(trajectory, residuals, weights, weighted, math.inf, math.inf)

@@ -8,11 +8,12 @@ from typing import Literal, get_args
 from ._checks import count, positive
 from .errors import OptionError
 
-__all__ = ["Candidate", "Policy", "Settings", "Start"]
+__all__ = ["Candidate", "Convex", "Policy", "Settings", "Start"]
 
 Policy = Literal["drop", "project", "keep"]
 Start = Literal["candidate", "best"]
 Candidate = Literal["observer", "reinitialized"]
+Convex = Literal["qp", "exact"]
 
 # With max_qps=None the sequence ends by convergence; this bounds it where that fails.
 _SAFETY_LIMIT = 100
@@ -25,7 +26,7 @@ class Settings:
     Parameters
     ----------
     horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance, engine,
-    outside, start, candidate, time_budget, delay
+    outside, start, candidate, subproblem, time_budget, delay
         As there.
 
     Raises
@@ -44,6 +45,7 @@ class Settings:
     outside: str = "drop"
     start: str = "candidate"
     candidate: str = "observer"
+    subproblem: str = "qp"
     time_budget: float | None = None
     delay: int = 0
 
@@ -71,6 +73,7 @@ class Settings:
             ("outside", get_args(Policy)),
             ("start", get_args(Start)),
             ("candidate", get_args(Candidate)),
+            ("subproblem", get_args(Convex)),
         ):
             value = getattr(self, name)
             if value not in choices:

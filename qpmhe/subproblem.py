@@ -105,7 +105,7 @@ class Subproblem:
             That trajectory, and what became of it.
         """
         n, step = self._n, trial.trajectory - around.trajectory
-        linear = around.residuals - np.matmul(self._jacobian, step[:-1, :, None])[:, :, 0]
+        linear = around.residuals - np.matmul(self.jacobian, step[:-1, :, None])[:, :, 0]
         linear[:, :n] += step[1:]
         margin = 2.0 * qp.violation(step)
         self._set_rows(qp, problem, around.residuals + (trial.residuals - linear),
@@ -141,8 +141,9 @@ class Subproblem:
         prior_weight = problem.prior_weight_at(offset)
         np.add(terms.own[first], prior_weight.dot(offset), out=gradient[0])
         gradient[count] = terms.following[last - 1]
+        #: Jacobians (K, n + p, n) of (f, h) along the trajectory of the last QP.
+        self.jacobian: Array = terms.jacobian[first:last]
         if problem.constrained:
-            self._jacobian = terms.jacobian[first:last]
             self._bound(qp, problem, trial)
         return qp
 
@@ -155,7 +156,7 @@ class Subproblem:
         else:
             qp.lower[...], qp.upper[...] = -np.inf, np.inf
         if self._rows:
-            f_jacobian, h_jacobian = self._jacobian[:, :n], self._jacobian[:, n:]
+            f_jacobian, h_jacobian = self.jacobian[:, :n], self.jacobian[:, n:]
             np.negative(np.matmul(self._w_rows, f_jacobian), out=qp.row_own[:-1, self._w])
             np.negative(np.matmul(self._v_rows, h_jacobian), out=qp.row_own[:-1, self._v])
             self._set_rows(qp, problem, trial.residuals, trial.trajectory)

@@ -26,9 +26,9 @@ Array = NDArray[np.float64]
 class IpoptEstimator:
     r"""The estimator of Definition def:estimator with Ipopt on the nonlinear program.
 
-    The program is (eq:optiMHE) in multiple shooting: states and disturbances are variables,
-    the dynamics are equality constraints. It is built once for each window length and
-    started at the candidate. An iterate is judged as everywhere else in this package: by
+    The program is (eq:optiMHE) in the state trajectory, as in `Problem`: with disturbances
+    as variables of their own and the dynamics as constraints, Ipopt took a quarter longer.
+    It is built once for each window length and started at the candidate. An iterate is judged as everywhere else in this package: by
     its state trajectory, the true cost and the true constraints, against the candidate.
 
     Parameters
@@ -97,14 +97,12 @@ class IpoptEstimator:
         count = window.length
         solve, bounds = self._programs.get(count) or self._build(count)
         candidate = problem.candidate(window)
-        start = np.concatenate(
-            (candidate.trajectory.ravel(), candidate.residuals[:, :n].ravel())
-        )
+        start = candidate.trajectory.ravel()
         parameters = np.concatenate((problem.prior, problem.measurements.ravel()))
         solving = perf_counter()
         answer = solve(x0=start, p=parameters, **bounds)
         solve_time = perf_counter() - solving
-        states = np.array(answer["x"]).ravel()[: (count + 1) * n].reshape(count + 1, n)
+        states = np.array(answer["x"]).reshape(count + 1, n)
         trial = problem.evaluate(states)
         improved = math.isfinite(trial.cost) and trial.cost < candidate.cost * (1 - 1e-12)
         best = trial if improved else candidate
@@ -127,62 +125,50 @@ class IpoptEstimator:
     def _build(self, count: int) -> tuple[Any, dict[str, Array]]:
         ca, n, p = self._casadi, self._system.n, self._system.p
         states = ca.SX.sym("x", n, count + 1)
-        disturbances = ca.SX.sym("w", n, count)
         prior, measured = ca.SX.sym("prior", n), ca.SX.sym("y", p, count)
         offset = states[:, 0] - prior
         objective = offset.T @ self._prior @ offset
-        defects, noises = [], []
+        disturbances, noises = [], []
         for i in range(count):
-            w, v = disturbances[:, i], measured[:, i] - self._h(states[:, i])
-            objective += w.T @ self._cost.disturbance @ w + v.T @ self._cost.noise @ v
-            defects.append(states[:, i + 1] - self._f(states[:, i]) - w)
-            noises.append(v)
-        rows, bounds = self._rows(states, disturbances, noises)
+            disturbances.append(states[:, i + 1] - self._f(states[:, i]))
+            noises.append(measured[:, i] - self._h(states[:, i]))
+            objective += disturbances[i].T @ self._cost.disturbance @ disturbances[i]
+            objective += noises[i].T @ self._cost.noise @ noises[i]
+        rows, bounds = self._rows(ca.horzsplit(states), disturbances, noises)
         program = {
-            "x": ca.veccat(states, disturbances),
+            "x": ca.vec(states),
             "p": ca.veccat(prior, measured),
             "f": objective,
-            "g": ca.vertcat(*defects, *rows),
+            "g": ca.vertcat(*rows),
         }
-        solve = ca.nlpsol("mhe", "ipopt", program, self._options)
-        zero = np.zeros(count * n)
+        box = self._system.states
+        nothing = np.full(n, np.inf)
         limits = {
-            "lbx": self._bounds("lower", count),
-            "ubx": self._bounds("upper", count),
-            "lbg": np.concatenate((zero, *(low for low, _ in bounds))),
-            "ubg": np.concatenate((zero, *(high for _, high in bounds))),
+            "lbx": np.tile(box.lower if box else -nothing, count + 1),
+            "ubx": np.tile(box.upper if box else nothing, count + 1),
+            "lbg": np.concatenate([low for low, _ in bounds] or [np.empty(0)]),
+            "ubg": np.concatenate([high for _, high in bounds] or [np.empty(0)]),
         }
-        self._programs[count] = solve, limits
+        self._programs[count] = ca.nlpsol("mhe", "ipopt", program, self._options), limits
         return self._programs[count]
 
-    def _bounds(self, side: str, count: int) -> Array:
-        """Bounds of the states, then of the disturbances."""
-        infinite = np.full(self._system.n, -np.inf if side == "lower" else np.inf)
-        boxes = ((self._system.states, count + 1), (self._system.disturbances, count))
-        return np.concatenate(
-            [np.tile(getattr(box, side) if box else infinite, length) for box, length in boxes]
-        )
-
     def _rows(
-        self, states: Any, disturbances: Any, noises: list[Any]
+        self, states: list[Any], disturbances: list[Any], noises: list[Any]
     ) -> tuple[list[Any], list[tuple[Array, Array]]]:
-        """V as rows, and the general inequalities of all sets."""
-        ca, system = self._casadi, self._system
+        """W and V as rows, and the general inequalities of all sets."""
+        system = self._system
         rows: list[Any] = []
         bounds: list[tuple[Array, Array]] = []
-        columns = {
-            "states": (system.states, ca.horzsplit(states)),
-            "disturbances": (system.disturbances, ca.horzsplit(disturbances)),
-            "noises": (system.noises, noises),
-        }
-        for name, (one, points) in columns.items():
+        for one, points in (
+            (system.states, states), (system.disturbances, disturbances), (system.noises, noises)
+        ):
             if one is None:
                 continue
             for point in points:
-                if name == "noises":
+                if points is not states:
                     rows.append(point)
                     bounds.append((one.lower, one.upper))
                 if one.matrix.shape[0]:
-                    rows.append(ca.DM(one.matrix) @ point)
+                    rows.append(self._casadi.DM(one.matrix) @ point)
                     bounds.append((one.row_lower, one.row_upper))
         return rows, bounds

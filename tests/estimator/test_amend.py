@@ -60,13 +60,13 @@ def estimator(observer="luenberger", cost="quadratic", sets=None, **options):
 
 
 def samples(count, missing=0.2, irregular=False, seed=2):
-    """Arguments of the updates, some outputs missing."""
+    """Arguments of the updates: some outputs missing, every other step of its own kind."""
     generator, result = np.random.default_rng(seed), []
-    for _ in range(count):
+    for t in range(count):
         y = generator.standard_normal(3)
         y[generator.random(3) < missing] = np.nan
         own = {}
-        if irregular and generator.random() < 0.5:
+        if irregular and t % 2:
             own = {"dt": generator.uniform(0.1, 0.4), "noise_weight": spd(generator, 3)}
         result.append((y, generator.standard_normal(1), own))
     return result
@@ -145,8 +145,7 @@ def test_late_measurements_around_the_slides_to_the_front(when, age):
 @pytest.mark.parametrize("cost", ["quadratic", "robust"])
 def test_samples_with_steps_and_weights_of_their_own(cost, order):
     late, prompt = estimator("kalman", cost), estimator("kalman", cost)
-    record = samples(12, irregular=True, seed=3)
-    assert record[5][2]
+    record = samples(12, irregular=True)
     for t, arguments in enumerate(record):
         first = feed(late, arguments, np.full(3, np.nan) if t in order else None)
         second = feed(prompt, arguments)
@@ -175,7 +174,7 @@ def test_late_measurements_with_sets(sets):
             np.testing.assert_allclose(first.trajectory, second.trajectory, rtol=1e-6, atol=1e-6)
             assert first.dropped == second.dropped
             dropped = dropped or bool(first.dropped)
-    assert dropped is (sets == "noises")
+    assert dropped
 
 
 @pytest.mark.parametrize("backend", qpmhe.solvers.available())
@@ -283,7 +282,7 @@ def failing():
         lambda x: 0.9 * np.sqrt(x), lambda x: x, n=1, p=1,
         f_jacobian=lambda x: 0.45 / np.sqrt(x)[..., None],
     )
-    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=3.0)
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=0.05)
     return qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger([0.8]), cost, horizon=4, initial_state=[1.0], max_qps=2
     )
@@ -295,13 +294,13 @@ def check_candidate(estimate, ys):
     total = 0.0
     with np.errstate(invalid="ignore"):
         for i, y in enumerate(ys[estimate.time + 1 - len(z[1:]) : estimate.time + 1]):
-            total += 2.0 * (z[i + 1] - 0.9 * np.sqrt(z[i])) ** 2 + 3.0 * (y - z[i]) ** 2
+            total += 2.0 * (z[i + 1] - 0.9 * np.sqrt(z[i])) ** 2 + 0.05 * (y - z[i]) ** 2
     if np.isfinite(estimate.candidate_cost):
         assert estimate.candidate_cost == pytest.approx(total, rel=1e-10)
     return np.isfinite(estimate.candidate_cost)
 
 
-@pytest.mark.parametrize("age", [0, 1, 2])
+@pytest.mark.parametrize("age", [0, 1])
 def test_the_candidate_is_true_where_a_stage_of_the_window_had_failed(age):
     mhe = failing()
     ys = [1.0, 0.9, -3.0, 0.8, 0.9, 0.8, 0.85, 0.9, 0.8, 0.9, 0.95, 0.9]
@@ -310,11 +309,11 @@ def test_the_candidate_is_true_where_a_stage_of_the_window_had_failed(age):
         estimate = mhe.update([y])
         finite.append(check_candidate(estimate, ys))
         failed.append(Status.MODEL_FAILED in estimate.status)
-        if t == 6:
+        if t == 5:
             # The stage that failed is in the window, and older than the newest.
-            assert 4 in range(t - 3, t)
+            assert failed == [False, False, False, True, False, False]
             ys[t - age] += 0.02
-            check_candidate(mhe.amend(t - age, [ys[t - age]]), ys)
-    assert any(failed[:6])
-    assert not all(finite)
-    assert finite[-1]
+            late = mhe.amend(t - age, [ys[t - age]])
+            assert late.improved
+            check_candidate(late, ys)
+    assert finite == [True] * 3 + [False] * 4 + [True] * 5
