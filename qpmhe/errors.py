@@ -8,6 +8,7 @@ from qpmhe_solvers.errors import (
     OptionError,
     QpmheError,
     ShapeError,
+    UnknownOptionError,
 )
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "QpmheError",
     "SetError",
     "ShapeError",
+    "UnknownOptionError",
     "WeightError",
 ]
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qpmhe_solvers.errors import tell_unknown_options
+
 from ._checks import count, positive
 from .derivatives import Jacobian
 from .discretize import discretize
@@ -22,6 +24,7 @@ Array = NDArray[np.float64]
 Function = Callable[..., Any]
 
 
+@tell_unknown_options
 class System:
     r"""A nonlinear discrete-time system with additive disturbance and noise.
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qpmhe_solvers.errors import tell_unknown_options
+
 from .._checks import positive_definite
 from .base import Cost, CostConstants, quadratic_form
 from .prior import ObserverPrior
@@ -14,6 +16,7 @@ __all__ = ["QuadraticCost"]
 Array = NDArray[np.float64]
 
 
+@tell_unknown_options
 class QuadraticCost(Cost):
     r"""Quadratic prior weighting and stage cost.
 

@@ -28,8 +28,9 @@ class IpoptEstimator:
 
     The program is (eq:optiMHE) in the state trajectory, as in `Problem`: with disturbances
     as variables of their own and the dynamics as constraints, Ipopt took a quarter longer.
-    It is built once for each window length and started at the candidate. An iterate is judged as everywhere else in this package: by
-    its state trajectory, the true cost and the true constraints, against the candidate.
+    It is built once for each window length and started at the candidate. An iterate is
+    judged as everywhere else in this package: by its state trajectory, the true cost and
+    the true constraints, against the candidate.
 
     Parameters
     ----------

@@ -2,7 +2,23 @@
 
 from __future__ import annotations
 
-__all__ = ["BackendError", "InvalidInputError", "OptionError", "QpmheError", "ShapeError"]
+import functools
+import inspect
+from difflib import get_close_matches
+from typing import Any, TypeVar
+
+__all__ = [
+    "BackendError",
+    "InvalidInputError",
+    "OptionError",
+    "QpmheError",
+    "ShapeError",
+    "UnknownOptionError",
+    "tell_unknown_options",
+]
+
+T = TypeVar("T")
+
 
 
 class QpmheError(Exception):
@@ -21,5 +37,36 @@ class OptionError(InvalidInputError):
     """An option outside its range, or one that does not exist."""
 
 
+class UnknownOptionError(OptionError, TypeError):
+    """A keyword that there is not; also the TypeError that Python would raise."""
+
+
 class BackendError(InvalidInputError):
     """A QP backend that is not known here, or whose package is not installed."""
+
+
+def tell_unknown_options(cls: type[T]) -> type[T]:
+    """Make a class answer an unknown keyword with the ones that it knows.
+
+    Parameters
+    ----------
+    cls : type
+        The class; its constructor is wrapped, its signature stays.
+    """
+    plain = cls.__init__
+    known = [name for name in inspect.signature(plain).parameters if name != "self"]
+
+    @functools.wraps(plain)
+    def init(self: T, *args: Any, **options: Any) -> None:
+        for name in options:
+            if name not in known:
+                near = get_close_matches(name, known, 1)
+                hint = f" Did you mean {near[0]}?" if near else ""
+                raise UnknownOptionError(
+                    f"{cls.__name__} has no option {name!r}; expected one of "
+                    f"{', '.join(known)}.{hint}"
+                )
+        plain(self, *args, **options)
+
+    type.__setattr__(cls, "__init__", init)
+    return cls

@@ -165,7 +165,7 @@ def test_a_start_that_the_model_does_not_reach(root):
     runs = [
         qpmhe.MovingHorizonEstimator(
             system, qpmhe.Luenberger([0.9]), cost, horizon=3, initial_state=[1.0], start=start
-        ).run([0.9, 0.5, 0.02, 0.5, 0.9, 0.9, 1.0, 1.0, 1.0])
+        ).run([0.9, 0.5, -0.3, 0.5, 0.9, 0.9, 1.0, 1.0, 1.0])
         for start in ("candidate", "best")
     ]
     for run in runs:

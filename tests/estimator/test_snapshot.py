@@ -1,0 +1,144 @@
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import qpmhe
+
+OPTIONS = {
+    "plain": {},
+    "converged": {"max_qps": None},
+    "best": {"start": "best", "max_qps": 2},
+    "reinitialized": {"candidate": "reinitialized"},
+    "observer alone": {"max_qps": 0},
+    "delayed": {"delay": 3},
+}
+
+
+def make(**options):
+    system, observer, cost, scenario = qpmhe.models.batch_reactor()
+    return qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=6, initial_state=scenario.initial_estimate, **options
+    )
+
+
+def record(steps=30):
+    measurements = qpmhe.models.batch_reactor().scenario.simulate(2, steps).measurements
+    measurements[7] = np.nan
+    return measurements
+
+
+def feed(mhe, measurements, first=0):
+    """A record with irregular steps, own noises and a late measurement at stated times."""
+    estimates = []
+    for t, y in enumerate(measurements, first):
+        weight = [[4.0]] if t == 10 else None
+        estimates.append(mhe.update(y, dt=0.15 if t == 9 else None, noise_weight=weight))
+        if t == 11:
+            estimates.append(mhe.amend(7, [7.0]))
+    return estimates
+
+
+def assert_equal(ours, theirs):
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.trajectory.tolist() == other.trajectory.tolist()
+        assert (one.cost, one.status, one.time) == (other.cost, other.status, other.time)
+        assert one.candidate.tolist() == other.candidate.tolist()
+        np.testing.assert_array_equal(one.noises, other.noises)
+
+
+@pytest.mark.parametrize("stop", [0, 1, 5, 8, 10, 12, 29])
+@pytest.mark.parametrize("name", OPTIONS)
+def test_a_restored_estimator_continues_bit_for_bit(name, stop):
+    measurements, options = record(), OPTIONS[name]
+    whole = make(**options)
+    feed(whole, measurements[:stop])
+    restored = pickle.loads(pickle.dumps(whole))
+    loaded = make(**options)
+    loaded.load_state_dict(whole.state_dict())
+    rest = measurements[stop:]
+    expected = feed(whole, rest, stop)
+    assert_equal(feed(restored, rest, stop), expected)
+    assert_equal(feed(loaded, rest, stop), expected)
+    assert whole.covariances().tolist() == restored.covariances().tolist()
+
+
+def test_covariances_are_known_after_a_restart():
+    whole = make()
+    feed(whole, record(12))
+    assert pickle.loads(pickle.dumps(whole)).covariances().tolist() == whole.covariances().tolist()
+
+
+def test_a_kalman_type_observer_and_a_robust_cost_are_restored():
+    system, _, _, scenario = qpmhe.models.batch_reactor()
+    observer = qpmhe.ExtendedKalman(
+        prior=np.eye(2), disturbance=0.01 * np.eye(2), noise=[[0.04]]
+    )
+    cost = qpmhe.RobustCost(
+        prior=qpmhe.ObserverPrior(), disturbance=100.0 * np.eye(2), noise=qpmhe.Huber([[25.0]])
+    )
+    whole = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=6, initial_state=scenario.initial_estimate
+    )
+    measurements = record()
+    feed(whole, measurements[:14])
+    restored = pickle.loads(pickle.dumps(whole))
+    assert_equal(feed(restored, measurements[14:], 14), feed(whole, measurements[14:], 14))
+
+
+def test_a_state_is_a_copy():
+    mhe, other = make(), make()
+    feed(mhe, record(12))
+    state = mhe.state_dict()
+    other.load_state_dict(state)
+    before = other.update([7.0])
+    other.load_state_dict(state)
+    assert_equal([other.update([7.0])], [before])
+
+
+def test_another_process_continues_bit_for_bit(tmp_path):
+    measurements, mhe = record(), make(start="best", max_qps=2)
+    feed(mhe, measurements[:13])
+    np.save(tmp_path / "rest.npy", measurements[13:])
+    (tmp_path / "mhe.pickle").write_bytes(pickle.dumps(mhe))
+    code = (
+        "import pickle, sys, numpy as np\n"
+        "mhe = pickle.load(open(sys.argv[1] + '/mhe.pickle', 'rb'))\n"
+        "rest = np.load(sys.argv[1] + '/rest.npy')\n"
+        "np.save(sys.argv[1] + '/states.npy', [mhe.update(y).state for y in rest])\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
+    expected = [e.state for e in feed(mhe, measurements[13:], 13)]
+    assert np.load(tmp_path / "states.npy").tolist() == np.array(expected).tolist()
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        (None, "None"),
+        ({}, "None"),
+        ({"problem": (2, 1, 0, 7)}, r"\(2, 1, 0, 7\); expected \(2, 1, 0, 6\)"),
+    ],
+)
+def test_a_state_of_another_problem_is_refused(state, words):
+    mhe = make()
+    feed(mhe, record(8))
+    before = mhe.state.copy()
+    with pytest.raises(qpmhe.errors.InvalidInputError, match=words):
+        mhe.load_state_dict(state)
+    assert mhe.state.tolist() == before.tolist()
+    assert mhe.time == 8
+
+
+def test_a_state_of_another_observer_is_refused():
+    system, _, cost, scenario = qpmhe.models.batch_reactor()
+    observer = qpmhe.ExtendedKalman(
+        prior=np.eye(2), disturbance=0.01 * np.eye(2), noise=[[0.04]]
+    )
+    other = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=6, initial_state=scenario.initial_estimate
+    )
+    with pytest.raises(qpmhe.errors.InvalidInputError, match="another observer"):
+        other.load_state_dict(make().state_dict())
