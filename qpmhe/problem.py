@@ -82,6 +82,7 @@ class Problem:
         )
         self._prior_band = band_of(self.prior_weight)
         self._discounted = cost.discount < 1.0
+        self._candidate: Trial | None = None
         self.model = system
         self.prior: Array = np.zeros(system.n)
         self.inputs: Array = np.zeros((0, system.m))
@@ -108,6 +109,7 @@ class Problem:
 
     def bind(self, window: Window) -> None:
         """Take over the window's data, all sets, and the prior z(t-N) as in (eq:prior)."""
+        self._candidate = None
         self.prior = window.candidate[0]
         self.inputs, self.measurements = window.inputs, window.measurements
         self.stage_weights = window.stage_weights
@@ -225,10 +227,14 @@ class Problem:
 
     def candidate(self, window: Window) -> Trial:
         """The candidate of the bound window as a trial: its cost is known already."""
-        residuals, weights = window.residuals, window.majorising_weights
-        if self.discounts is not None:
-            weights = weights * self.discounts[1:, None, None]
-        return Trial(window.candidate, residuals, weights, residuals, window.candidate_cost)
+        if self._candidate is None:
+            residuals, weights = window.residuals, window.majorising_weights
+            if self.discounts is not None:
+                weights = weights * self.discounts[1:, None, None]
+            self._candidate = Trial(
+                window.candidate, residuals, weights, residuals, window.candidate_cost
+            )
+        return self._candidate
 
     def violation(self, trajectory: Array, residuals: Array) -> float:
         """The largest amount by which a point leaves its set, of those not left out."""

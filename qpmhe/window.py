@@ -125,9 +125,11 @@ class Window:
         if dt is not None:
             self._u[k, m] = dt
             self._last_irregular = self.time
+        self._special[k] = False
+        self._weight[k] = self._cost.stage_weight
         if noise_weight is not None:
             self._own_noise[self.time] = noise_weight
-        self._set_weight(k, self.time)
+            self._set_weight(k, self.time)
         outcome = self._enter(k, self.time)
         self.end = k + 1
         self.time += 1

@@ -398,6 +398,35 @@ def test_a_jacobian_that_ignores_the_input():
     np.testing.assert_array_equal(found, [2.0 * np.eye(2)] * 3)
 
 
+def test_a_jacobian_that_is_wrong_at_the_initial_state_is_refused_there():
+    # At the probes, near one, the wrong term is lost among the others.
+    system = system_of(
+        lambda x: x + 1e-9 * x**4, f_jacobian=lambda x: np.diag(1.0 + 0.0 * x)
+    )
+    system.check(np.array([1.0, 2.0]), NONE)
+    with pytest.raises(ModelError) as caught:
+        system.check(np.array([1.0, 1000.0]), NONE)
+    assert "f_jacobian[1, 1] is 1 at x = [1.0, 1000.0]" in str(caught.value)
+    assert "there is 5" in str(caught.value)
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=1.0)
+    with pytest.raises(ModelError, match=r"f_jacobian\[1, 1\] is 1 at"):
+        qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([0.1, 0.1]), cost, horizon=2, initial_state=[1.0, 1000.0]
+        )
+
+
+def test_the_complex_step_is_given_up_where_it_fails_at_the_initial_state():
+    # Real functions of real arguments above a threshold that no probe reaches.
+    system = system_of(
+        lambda x: [math.exp(float(x[0]) - 100.0) if x[0].real > 90.0 else x[0] ** 2, x[1]]
+    )
+    assert system.derivatives["f"] == "complex step"
+    x = np.array([100.0, 1.0])
+    system.check(x, NONE)
+    assert system.derivatives["f"] == "finite differences"
+    np.testing.assert_allclose(system.f_jacobian(x, NONE), np.eye(2), rtol=1e-6, atol=1e-8)
+
+
 def test_a_jacobian_that_changes_its_argument_is_refused():
     def jacobian(x):
         x *= 2.0

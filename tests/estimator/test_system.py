@@ -5,6 +5,7 @@ import pytest
 
 import qpmhe
 
+from .plain import Record
 from .ways import NONE, PENDULUMS, check_values, pendulum
 
 
@@ -322,3 +323,59 @@ def test_sets_and_sizes_are_kept():
     assert (system.n, system.p, system.m) == (2, 3, 4)
     assert [system.states, system.disturbances, system.noises] == boxes
     assert "n=2, p=3, m=4" in repr(system)
+
+
+# Functions that pass for batched until their branches meet in one batch
+
+
+def slow_far_out(x):
+    return 0.5 * x if x[0] > 50.0 else x + 20.0
+
+
+def test_a_branch_beyond_the_probes_is_found_out_by_values():
+    system = qpmhe.System(slow_far_out, lambda x: x, n=1, p=1)
+    assert system.f.mode == "batched"
+    far = np.array([[60.0], [10.0], [70.0]])
+    expected = np.array([slow_far_out(x) for x in far])
+    nothing = np.zeros((3, 0))
+    assert system.f.agrees(far[[0, 2]], nothing[:2], expected[[0, 2]], 1e-9)
+    assert system.f.mode == "batched"
+    assert not system.f.agrees(far, nothing, expected, 1e-9)
+    assert system.f.mode == "looped"
+    np.testing.assert_array_equal(system.f.batch(far, nothing), expected)
+    assert system.f.agrees(far, nothing, expected, 1e-9)
+
+
+def test_a_function_that_raises_on_many_far_states_is_looped_over():
+    def f(x):
+        if x.ndim > 1 and (x > 50.0).any():
+            raise ValueError("one at a time")
+        return 0.5 * x
+
+    system = qpmhe.System(f, lambda x: x, n=1, p=1)
+    assert system.f.mode == "batched"
+    far = np.array([[60.0], [10.0]])
+    assert not system.f.agrees(far, np.zeros((2, 0)), 0.5 * far, 1e-9)
+    np.testing.assert_array_equal(system.f.batch(far, np.zeros((2, 0))), 0.5 * far)
+
+
+@pytest.mark.parametrize("where", ["f", "h"])
+def test_an_estimator_that_crosses_a_branch_is_judged_by_the_true_cost(where):
+    def bent(x):
+        return x if x[0] < 50.0 else 2.0 * x - 50.0
+
+    f, h = (slow_far_out, lambda x: x) if where == "f" else (lambda x: 0.9 * x + 10.0, bent)
+    mhe = qpmhe.MovingHorizonEstimator(
+        qpmhe.System(f, h, n=1, p=1), qpmhe.Luenberger([0.4]),
+        qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=3.0),
+        horizon=8, initial_state=[30.0], max_qps=2,
+    )
+    kept = Record(h, [[0.4]], [30.0], [np.diag([1.0]), np.diag([2.0]), np.diag([3.0])], 8)
+    sides = set()
+    for y in (30.0, 52.0, 70.0, 40.0, 55.0, 66.0, 45.0, 60.0):
+        estimate = mhe.update([y])
+        kept.push(f, [y])
+        assert estimate.candidate_cost == pytest.approx(kept.cost(kept.candidate), rel=1e-10)
+        assert estimate.cost == pytest.approx(kept.cost(estimate.trajectory), rel=1e-10)
+        sides |= set(estimate.trajectory[:, 0] > 50.0)
+    assert sides == {True, False}

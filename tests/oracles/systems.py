@@ -21,7 +21,8 @@ class Case:
     draws : (sequence, sequence)
         Disturbances and noises are drawn evenly from plus and minus these.
     sets : dict
-        For "box" and "polytope" each the sets X, W and V.
+        The sets X, W and V for each kind: "box", "polytope", and "noise_free" where W has
+        components of no width.
     """
 
     def __init__(self, step, output, truth, start, gain, deviations, draws, sets, horizon=6):
@@ -63,7 +64,9 @@ class Case:
             states=states, disturbances=disturbances, noises=noises,
         )
         common = {"horizon": self.horizon, "initial_state": self.start}
-        return (system, qpmhe.Luenberger(self.gain), self.cost), common
+        gain = self.gain.copy()
+        gain[disturbances.fixed_components] = 0.0  # or the candidate would be outside
+        return (system, qpmhe.Luenberger(gain), self.cost), common
 
     def record(self, seed, steps):
         rng = np.random.default_rng(seed)
@@ -106,6 +109,24 @@ def reactor():
     )
 
 
+def unknown_rate():
+    """The reactor with its first rate constant as a third, constant state."""
+
+    def step(x, m):
+        rate = x[2] * x[0] ** 2 - 0.64 * x[1]
+        return [x[0] - 0.2 * rate, x[1] + 0.1 * rate, x[2]]
+
+    states = qpmhe.Box([0.0, 0.65, 0.13], [4.5, 3.5, 0.3])
+    return Case(
+        step, lambda x, m: [x[0] + x[1]],
+        truth=[2.8, 0.7, 0.16], start=[3.2, 0.7, 0.17], gain=[[0.05], [0.05], [0.0]],
+        deviations=([1.0, 1.0, 0.05], [0.1, 0.1, 0.1], [0.2]), draws=([0.15, 0.15, 0.0], [0.5]),
+        sets={
+            "noise_free": (states, symmetric(0.06, 0.06, 0.0), qpmhe.Box(-1.2, 0.4)),
+        },
+    )
+
+
 def van_der_pol():
     def step(x, m):
         return [x[0] + 0.1 * x[1], x[1] + 0.1 * ((1 - x[0] ** 2) * x[1] - x[0])]
@@ -122,6 +143,7 @@ def van_der_pol():
                 qpmhe.Polytope([[1.0, 0.3], [-1.0, -0.3], [0.2, 1.0]], [1.75, 1.9, 1.2]),
                 around([0, 0], 0.09, 0.09), qpmhe.Polytope([[1.0], [-1.0]], [0.35, 1.2]),
             ),
+            "noise_free": (symmetric(1.78, 0.9), symmetric(0.0, 0.06), qpmhe.Box(-1.2, 0.35)),
         },
     )
 
@@ -138,7 +160,11 @@ def pendulum():
             "box": (symmetric(1.14, 2.26), symmetric(0.032, 0.065), qpmhe.Box(-0.8, 0.32)),
             "polytope": (
                 qpmhe.Polytope([[1.0, 0.3], [0.0, -1.0]], [1.18, 2.26]),
-                around([0, 0], 0.05, 0.1), qpmhe.Polytope([[1.0], [-1.0]], [0.34, 0.8]),
+                around([0, 0], 0.07, 0.14), qpmhe.Polytope([[1.0], [-1.0]], [0.33, 0.8]),
+            ),
+            "noise_free": (
+                qpmhe.Polytope([[1.0, 0.3], [0.0, -1.0]], [1.18, 2.3]), symmetric(0.0, 0.0),
+                qpmhe.Box(-0.8, 0.34),
             ),
         },
     )
@@ -177,18 +203,18 @@ def stirred_tank():
 
     return Case(
         step, lambda x, m: [x[1], x[0] * x[1]],
-        truth=[0.26, 1.13], start=[0.3, 1.16], gain=[[0.0, 0.05], [0.05, 0.0]],
+        truth=[0.26, 1.13], start=[0.34, 1.17], gain=[[0.0, 0.05], [0.05, 0.0]],
         deviations=([0.2, 0.1], [0.03, 0.02], [0.05, 0.1]),
         draws=([0.03, 0.02], [0.1, 0.2]),
         sets={
             "box": (
-                qpmhe.Box([0.24, 1.0], [0.5, 1.18]), symmetric(0.015, 0.012),
-                qpmhe.Box([-0.3, -0.6], [0.08, 0.13]),
+                qpmhe.Box([0.22, 1.0], [0.5, 1.2]), symmetric(0.015, 0.01),
+                qpmhe.Box([-0.3, -0.6], [0.097, 0.185]),
             ),
             "polytope": (
-                qpmhe.Box([0.1, 0.8], [1.0, 1.5]) & qpmhe.Polytope([[-1.0, 1.0]], [0.94]),
+                qpmhe.Box([0.1, 0.8], [1.0, 1.5]) & qpmhe.Polytope([[-1.0, 1.0]], [0.96]),
                 around([0, 0], 0.02, 0.015),
-                qpmhe.Polytope([[1.0, 0.2], [0.2, 1.0], [-1, -1]], [0.09, 0.15, 0.6]),
+                qpmhe.Polytope([[1.0, 0.2], [0.2, 1.0], [-1, -1]], [0.12, 0.19, 0.6]),
             ),
         },
     )
@@ -207,23 +233,28 @@ def tracking():
         step, output,
         truth=[2.8, 1.8, -0.2, 0.2], start=[2.9, 2.2, 0.0, 0.1],
         gain=[[0.05, -0.05], [0.05, 0.1], [0.02, -0.02], [0.02, 0.05]],
-        deviations=([0.5, 0.5, 0.5, 0.5], [0.05, 0.05, 0.1, 0.1], [0.2, 0.1]),
+        deviations=([0.5, 0.5, 0.5, 0.5], [0.1, 0.1, 0.2, 0.2], [0.2, 0.1]),
         draws=([0.02, 0.02, 0.1, 0.1], [0.4, 0.2]),
         sets={
             "box": (
                 qpmhe.Box([0.5, 2.0, -0.15, -0.4], [3.2, 6.0, 0.4, 0.2]),
-                symmetric(0.055, 0.055, 0.024, 0.024), qpmhe.Box([-1.5, -0.5], [0.27, 0.17]),
+                symmetric(0.055, 0.055, 0.024, 0.022), qpmhe.Box([-1.5, -0.5], [0.27, 0.17]),
             ),
             "polytope": (
-                qpmhe.Polytope([[0, 0, 1, 1], [-1, -1, 0, 0], [0, 0, -1, 0]], [0.2, -4.6, 0.2]),
-                around([0, 0, 0, 0], 0.14, 0.14, 0.06, 0.06),
+                qpmhe.Polytope([[0, 0, 1, 1], [-1, -1, 0, 0], [0, 0, -1, 0]], [0.3, -4.0, 0.3]),
+                around([0, 0, 0, 0], 0.16, 0.16, 0.06, 0.05),
                 qpmhe.Polytope([[1, 0.5], [0, 1], [-1, -1]], [0.32, 0.18, 1.5]),
+            ),
+            "noise_free": (
+                qpmhe.Box([0.5, 2.0, -0.3, -0.4], [3.2, 6.0, 0.4, 0.3]),
+                symmetric(0.0, 0.0, 0.024, 0.022) & qpmhe.Polytope([[0, 0, 1, 1]], [0.03]),
+                qpmhe.Box([-1.5, -0.5], [0.3, 0.19]),
             ),
         },
     )
 
 
 SYSTEMS = {
-    "reactor": reactor, "van_der_pol": van_der_pol, "pendulum": pendulum, "tanks": tanks,
+    "reactor": reactor, "unknown_rate": unknown_rate, "van_der_pol": van_der_pol, "pendulum": pendulum, "tanks": tanks,
     "stirred_tank": stirred_tank, "tracking": tracking,
 }
