@@ -6,7 +6,7 @@ ARGS ?=
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: reproduce test lint types examples wheel clean
+.PHONY: reproduce test lint types examples docs wheel clean
 
 # One stamp for each set of extras, renewed when the project's requirements change.
 $(VENV)/.%: pyproject.toml
@@ -29,13 +29,17 @@ types: $(VENV)/.dev
 examples: $(VENV)/.test
 	$(BIN)/python examples/quickstart.py
 	$(BIN)/python examples/paper_figure.py --out results
+	$(BIN)/python examples/outliers.py --seeds 4 --out results
 	$(BIN)/python examples/benchmarks/step_time.py --steps 60
 	if [ -d "$(DATA)" ]; then $(BIN)/python examples/battery_soc.py --data "$(DATA)" --out results; \
 	else echo "no battery data at '$(DATA)': battery example left out"; fi
+
+docs: $(VENV)/.docs
+	$(BIN)/mkdocs build --strict
 
 wheel: $(VENV)/.dev
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
 
 clean:
-	rm -rf $(VENV) dist results .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) dist results site .mypy_cache .pytest_cache .ruff_cache .hypothesis

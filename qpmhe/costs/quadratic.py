@@ -104,8 +104,13 @@ class QuadraticCost(Cost):
         )
 
     @property
-    def constants(self) -> CostConstants:
-        """The constants of (eq:exp_bounds): extreme eigenvalues of the weights, a = 2."""
+    def constants(self) -> CostConstants | None:
+        """Constants of (eq:exp_bounds): extreme eigenvalues of the weights, a = 2.
+
+        None with a discount: the bounds then shrink with the age of a stage.
+        """
+        if self.discount < 1.0:
+            return None
         if isinstance(self.prior, ObserverPrior):
             prior = (self.prior.minimum, self.prior.maximum)
         else:

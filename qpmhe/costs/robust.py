@@ -73,7 +73,9 @@ class RobustCost(Cost):
 
     @property
     def constants(self) -> CostConstants | None:
-        """The constants of (eq:exp_bounds), if all losses have the same exponent."""
+        """The constants of (eq:exp_bounds), if all losses have one exponent, undiscounted."""
+        if self.discount < 1.0:
+            return None
         losses = (self.prior_loss, self.disturbance_loss, self.noise_loss)
         exponent = self.noise_loss.exponent
         if exponent is None or any(loss.exponent != exponent for loss in losses):

@@ -78,11 +78,7 @@ def feed(mhe, arguments, y=None):
 
 
 # What is known of y at first, where True stands for a component that comes late.
-HIDDEN = {
-    "all": [True, True, True],
-    "some": [False, True, True],
-    "one": [True, False, False],
-}
+HIDDEN = {"all": [True, True, True], "some": [False, True, True]}
 
 
 def same(one, other):
@@ -219,6 +215,19 @@ def test_nothing_new_changes_nothing(nothing):
         after = mhe.amend(when, nothing)
         same(before, after)
         np.testing.assert_array_equal(mhe.state, before.state)
+
+
+@pytest.mark.parametrize("known", ["all", "two", "one", "none"])
+def test_a_late_measurement_too_large_to_square_is_nothing_new(known):
+    hidden = {"all": [], "two": [0], "one": [0, 1], "none": [0, 1, 2]}[known]
+    record = samples(6, missing=0.0)
+    record[4][0][hidden] = np.nan
+    mhe = estimator()
+    for arguments in record:
+        before = feed(mhe, arguments)
+    after = mhe.amend(4, [1e200, None, None])
+    assert Status.MODEL_FAILED not in after.status
+    same(before, after)
 
 
 def test_components_that_come_one_by_one():

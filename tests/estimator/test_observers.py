@@ -258,10 +258,11 @@ def test_the_covariance_stays_symmetric_and_positive(prior, disturbance, noise):
             prior=prior * np.eye(n), disturbance=disturbance * np.eye(n), noise=noise * np.eye(p)
         )
         covariance = observer.initial_covariance()
+        system = linear_system(a, c)
         for _ in range(50):
             there = generator.random(p) < share
             sample = qpmhe.Sample(
-                linear_system(a, c), np.zeros(0), f_jacobian=a, h_jacobian=c,
+                system, np.zeros(0), f_jacobian=a, h_jacobian=c,
                 observed=None if there.all() else there, covariance=covariance,
             )
             _, covariance = observer.correct(np.zeros(n), np.zeros(p), sample)

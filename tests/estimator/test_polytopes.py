@@ -99,7 +99,7 @@ def missed(one, point, known):
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.4, 1.0])
-@pytest.mark.parametrize("kind", ["rows", "both", "more"])
+@pytest.mark.parametrize("kind", ["rows", "more"])
 @pytest.mark.parametrize("names", [NAMES, *((name,) for name in NAMES)], ids="-".join)
 def test_the_verdict(names, kind, missing):
     case, inside = Case(names, kind, missing), set()
@@ -129,7 +129,7 @@ def test_the_verdict(names, kind, missing):
 @pytest.mark.parametrize("names", [NAMES, *((name,) for name in NAMES)], ids="-".join)
 def test_rows_and_bounds_of_the_qp(names, kind, missing):
     case = Case(names, kind, missing)
-    for t in range(6):
+    for t in range(5):
         case.push()
         candidate, trajectory = case.window.candidate.copy(), case.trajectory(0.5)
         check_qp(case, case.subproblem.at_candidate(case.problem, case.window), candidate)
@@ -217,27 +217,38 @@ def estimator(sets, backend="auto", **options):
     )
 
 
+@pytest.fixture(scope="module")
+def boxed_estimates():
+    """Converged estimates with each set written as a box, and how often it binds."""
+    result = {}
+    for name in NAMES:
+        boxed, free = estimator({name: qpmhe.Box(*BOUNDS[name])}), estimator({})
+        result[name] = [boxed.update(y) for y in MEASURED]
+        binding = [
+            estimate.cost > free.update(y).cost * (1 + 1e-6)
+            for estimate, y in zip(result[name], MEASURED, strict=True)
+        ]
+        assert sum(binding) >= (2 if name == "noises" else 6)
+    return result
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_box_written_as_rows_gives_the_same_estimates(backend, name):
-    boxed = estimator({name: qpmhe.Box(*BOUNDS[name])})
+def test_a_box_written_as_rows_gives_the_same_estimates(backend, name, boxed_estimates):
     rows = estimator({name: as_polytope(*BOUNDS[name])}, backend)
-    free, bound = estimator({}), 0
-    for y in MEASURED:
-        one, other, unbounded = boxed.update(y), rows.update(y), free.update(y)
+    for y, one in zip(MEASURED[:8], boxed_estimates[name][:8], strict=True):
+        other = rows.update(y)
         assert one.dropped == other.dropped == ()
         assert other.cost == pytest.approx(one.cost, rel=1e-5)
         np.testing.assert_allclose(other.trajectory, one.trajectory, atol=3e-3)
         assert other.cost <= other.candidate_cost
-        bound += one.cost > unbounded.cost * (1 + 1e-6)
-    assert bound >= (2 if name == "noises" else 6)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_half_plane_across_the_states(backend):
     plane = qpmhe.Polytope([[1.0, 1.0]], [0.35])
-    mhe, active = estimator({"states": plane}, backend, max_qps=4), 0
-    for y in MEASURED:
+    mhe, active = estimator({"states": plane}, backend, max_qps=3), 0
+    for y in MEASURED[:10]:
         estimate = mhe.update(y)
         assert estimate.dropped == ()
         sums = estimate.trajectory.sum(axis=1)

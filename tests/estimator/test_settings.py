@@ -131,7 +131,7 @@ def test_settings_are_kept_and_frozen():
         "start": "best", "candidate": "reinitialized", "time_budget": 3.5, "delay": 1,
     }
     settings = estimator(**given).settings
-    assert dataclasses.asdict(settings) == given
+    assert given.items() <= dataclasses.asdict(settings).items()
     with pytest.raises(dataclasses.FrozenInstanceError):
         settings.horizon = 5
     defaults = dataclasses.asdict(estimator().settings)

@@ -54,7 +54,7 @@ class Case:
             noise=spd(generator, self.p),
         )
         self.horizon = horizon
-        self.pushes = 3 * max(64, horizon) + horizon + 10
+        self.pushes = 2 * max(64, horizon) + horizon + 10
         self.ys = generator.standard_normal((self.pushes, self.p))
         self.us = generator.standard_normal((self.pushes, self.m))
         self.ys[generator.random(self.ys.shape) < missing] = np.nan

@@ -68,6 +68,25 @@ class Case:
         gain[disturbances.fixed_components] = 0.0  # or the candidate would be outside
         return (system, qpmhe.Luenberger(gain), self.cost), common
 
+    def judged(self, kind, trajectory, prior, Y):
+        """J, and how far x, w and v are from the boundaries of X, W and V: negative outside.
+
+        Components of no width count only where they are violated.
+        """
+        P, Q, R = self.cost.prior, self.cost.disturbance, self.cost.noise
+        offset = trajectory[0] - prior
+        J, points = offset @ P @ offset, ([], [], [])
+        for x, following, y in zip(trajectory[:-1], trajectory[1:], Y, strict=True):
+            w, v = following - self.f(x), y - self.h(x)
+            J += w @ Q @ w + v @ R @ v
+            for collected, point in zip(points, (x, w, v), strict=True):
+                collected.append(point)
+        points[0].append(trajectory[-1])
+        return J, [
+            min(_margin(one, point) for point in several)
+            for one, several in zip(self.sets[kind], points, strict=True)
+        ]
+
     def record(self, seed, steps):
         rng = np.random.default_rng(seed)
         x, Y = self.truth, []
@@ -75,6 +94,15 @@ class Case:
             Y.append(self.h(x) + rng.uniform(-self.draws[1], self.draws[1]))
             x = self.f(x) + rng.uniform(-self.draws[0], self.draws[0])
         return np.array(Y)
+
+
+def _margin(one, point):
+    rows = one.matrix @ point
+    gaps = np.concatenate(
+        [point - one.lower, one.upper - point, rows - one.row_lower, one.row_upper - rows]
+    )
+    fixed = np.concatenate([np.tile(one.lower == one.upper, 2), np.zeros(2 * rows.size, bool)])
+    return np.where(fixed & (gaps >= -1e-12), np.inf, gaps).min()
 
 
 def around(center, *half):
@@ -143,7 +171,7 @@ def van_der_pol():
                 qpmhe.Polytope([[1.0, 0.3], [-1.0, -0.3], [0.2, 1.0]], [1.75, 1.9, 1.2]),
                 around([0, 0], 0.09, 0.09), qpmhe.Polytope([[1.0], [-1.0]], [0.35, 1.2]),
             ),
-            "noise_free": (symmetric(1.78, 0.9), symmetric(0.0, 0.06), qpmhe.Box(-1.2, 0.35)),
+            "noise_free": (symmetric(1.72, 0.85), symmetric(0.0, 0.045), qpmhe.Box(-1.2, 0.35)),
         },
     )
 
@@ -154,13 +182,13 @@ def pendulum():
 
     return Case(
         step, lambda x, m: [m.sin(x[0])],
-        truth=[0.8, 0.0], start=[1.1, 0.2], gain=[[0.05], [0.1]],
-        deviations=([0.5, 0.5], [0.05, 0.2], [0.2]), draws=([0.05, 0.2], [0.4]),
+        truth=[1.0, 0.2], start=[1.1, 0.2], gain=[[0.05], [0.1]],
+        deviations=([0.5, 0.5], [0.05, 0.2], [0.12]), draws=([0.05, 0.2], [0.4]),
         sets={
             "box": (symmetric(1.14, 2.26), symmetric(0.032, 0.065), qpmhe.Box(-0.8, 0.32)),
             "polytope": (
                 qpmhe.Polytope([[1.0, 0.3], [0.0, -1.0]], [1.18, 2.26]),
-                around([0, 0], 0.07, 0.14), qpmhe.Polytope([[1.0], [-1.0]], [0.33, 0.8]),
+                around([0, 0], 0.06, 0.125), qpmhe.Polytope([[1.0], [-1.0]], [0.33, 0.8]),
             ),
             "noise_free": (
                 qpmhe.Polytope([[1.0, 0.3], [0.0, -1.0]], [1.18, 2.3]), symmetric(0.0, 0.0),
@@ -255,6 +283,11 @@ def tracking():
 
 
 SYSTEMS = {
-    "reactor": reactor, "unknown_rate": unknown_rate, "van_der_pol": van_der_pol, "pendulum": pendulum, "tanks": tanks,
-    "stirred_tank": stirred_tank, "tracking": tracking,
+    "reactor": reactor,
+    "unknown_rate": unknown_rate,
+    "van_der_pol": van_der_pol,
+    "pendulum": pendulum,
+    "tanks": tanks,
+    "stirred_tank": stirred_tank,
+    "tracking": tracking,
 }
