@@ -17,8 +17,9 @@ def window_covariances(problem: Problem, trajectory: Array) -> Array:
     r"""Covariances (K + 1, n, n) of the states of a trajectory, given its window.
 
     Diagonal blocks of the inverse of the Gauss-Newton Hessian of J/2, by the Kalman filter
-    and the Rauch-Tung-Striebel smoother of the linearisation, which is that inverse in
-    covariance form and takes noise-free components (zero covariance of w) as they are.
+    and the smoother of Bryson and Frazier of the linearisation: that inverse in covariance
+    form. It inverts no covariance of a state, so that noise-free components (zero
+    covariance of w) are taken as they are.
 
     Parameters
     ----------
@@ -34,8 +35,8 @@ def window_covariances(problem: Problem, trajectory: Array) -> Array:
 
     References
     ----------
-    Rauch, Tung, Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA
-    Journal 3 (1965).
+    Bierman, Fixed interval smoothing with discrete measurements, International Journal of
+    Control 18 (1973), the modified Bryson-Frazier smoother.
     """
     states, n, count = trajectory[:-1], trajectory.shape[1], trajectory.shape[0] - 1
     trial = problem.evaluate(trajectory)
@@ -48,29 +49,28 @@ def window_covariances(problem: Problem, trajectory: Array) -> Array:
         ) from error
     if not (np.isfinite(a_all).all() and np.isfinite(c_all).all()):
         raise InvalidInputError("the Jacobians are not finite along the estimate.")
-    q = trial.weights.shape[-1]
+    q, eye = trial.weights.shape[-1], np.eye(n)
     weights = np.broadcast_to(trial.weights, (count, q, q))
     noisy = np.ones(n, dtype=np.bool_)
     if problem.disturbances is not None:
         noisy[problem.noise_free] = False
-    filtered = np.empty((count, n, n))
-    predicted = np.empty((count + 1, n, n))
-    predicted[0] = np.linalg.inv(problem.prior_weight_at(trajectory[0] - problem.prior))
+    block = np.ix_(noisy, noisy)
+    prior = np.linalg.inv(problem.prior_weight_at(trajectory[0] - problem.prior))
+    covariance = np.empty((count + 1, n, n))
+    covariance[0] = 0.5 * (prior + prior.T)
+    # Of each stage: I - K C, and C^T S^{-1} C, from the information C^T R C of its outputs,
+    # which a missing component simply does not add to.
+    closed, gained = np.empty((count, n, n)), np.empty((count, n, n))
     for i in range(count):
-        # Information form of the update: a missing component has zero weight, which no
-        # covariance can say.
-        c, information = c_all[i], weights[i, n:, n:]
-        gain = np.linalg.solve(
-            np.eye(n) + predicted[i] @ c.T @ information @ c, predicted[i]
-        )
-        filtered[i] = 0.5 * (gain + gain.T)
-        moved = a_all[i] @ filtered[i] @ a_all[i].T
-        block = np.ix_(noisy, noisy)
+        information = c_all[i].T @ weights[i, n:, n:] @ c_all[i]
+        closed[i] = np.linalg.inv(eye + covariance[i] @ information)
+        gained[i] = information @ closed[i]
+        moved = a_all[i] @ closed[i] @ covariance[i] @ a_all[i].T
         moved[block] += np.linalg.inv(weights[i, :n, :n][block])
-        predicted[i + 1] = 0.5 * (moved + moved.T)
-    smoothed = predicted.copy()
+        covariance[i + 1] = 0.5 * (moved + moved.T)
+    later = np.zeros((n, n))  # what later outputs tell of the state
     for i in range(count - 1, -1, -1):
-        # A singular prediction (no noise, singular A) has the pseudo-inverse as its gain.
-        back = filtered[i] @ a_all[i].T @ np.linalg.pinv(predicted[i + 1], hermitian=True)
-        smoothed[i] = filtered[i] + back @ (smoothed[i + 1] - predicted[i + 1]) @ back.T
-    return smoothed
+        through = a_all[i] @ closed[i]
+        later = gained[i] + through.T @ later @ through
+        covariance[i] -= covariance[i] @ later @ covariance[i]
+    return 0.5 * (covariance + covariance.transpose(0, 2, 1))

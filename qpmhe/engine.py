@@ -122,8 +122,9 @@ class PythonEngine:
         with np.errstate(all="ignore"):
             self._window.amend(time, y)
             self._trajectory = None  # it does not belong to the window before this one
+            missing = not self._window.observed[-1].all()
             held = not math.isfinite(self._window.candidate_cost)
-            estimate = self._estimate(False, held, False, began)
+            estimate = self._estimate(missing, held, False, began)
         self._history[-1] = estimate.state
         return estimate
 

@@ -270,6 +270,8 @@ class MovingHorizonEstimator:
             as it was.
         """
         oldest, newest = self.time - self._engine.length, self.time - 1
+        if newest < 0:
+            raise InvalidInputError(f"time is {time!r}, but there is no sample yet; update first.")
         if isinstance(time, bool) or not isinstance(time, (int, np.integer)) or not (
             oldest <= time <= newest
         ):

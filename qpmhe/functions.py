@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import ModelError
+from .tracing import mixes_states
 
 __all__ = ["BatchedFunction"]
 
@@ -119,9 +120,21 @@ class BatchedFunction:
                     found = np.asarray(raw, dtype=np.float64)
             except Exception:  # a function of one state may do anything on many
                 continue
-            if found.shape == expected.shape and np.allclose(found, expected, rtol=1e-9):
+            same = found.shape == expected.shape and np.allclose(found, expected, rtol=1e-9)
+            if same and not self._mixes(mode, x, u):
                 return
         self.mode = "looped"
+
+    def _mixes(self, mode: str, x: Array, u: Array) -> bool:
+        """Whether the function, called in this mode, decides for a batch by some of it."""
+        # No other dimension must have the batch's length.
+        count = 7 + max(*self.shape, x.shape[1], u.shape[1])
+        x, u = (np.resize(values, (count, values.shape[1])) for values in (x, u))
+        arguments: tuple[Array, ...] = (x, u) if self._takes_input else (x,)
+        if mode == "columns":
+            arguments = tuple(values.T for values in arguments)
+        with np.errstate(all="ignore"):
+            return mixes_states(self._function, *arguments, batch=count)
 
     def _probe(self, x: Array, u: Array) -> Array | None:
         """The checked value at a probe; None where the function cannot be used there."""

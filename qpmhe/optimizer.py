@@ -33,6 +33,10 @@ _ROUNDING = 1e-12
 # A set missed by less than this is for the first of these lengths, not for a correction.
 _NEARLY = 1e-6
 
+# On curved sets J can only be lowered as far as feasibility can be told: where no length
+# helps and no more than this many times the tolerance was promised, that is convergence.
+_STALLED = 1e3
+
 # Second-order corrections of a trial that misses a curved set.
 _CORRECTIONS = 2
 
@@ -265,7 +269,8 @@ class Optimizer:
                 if trial.cost < target:
                     break
             else:
-                outcome.events |= Status.NO_DECREASE
+                stalled = solved and 0.0 <= promised <= _STALLED * enough
+                outcome.events |= Status.CONVERGED if stalled else Status.NO_DECREASE
                 return False
         outcome.trial, outcome.improved = trial, True
         if solved and best.cost - trial.cost <= enough:

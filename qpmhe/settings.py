@@ -50,7 +50,8 @@ class Settings:
     delay: int = 0
 
     def __post_init__(self) -> None:
-        count("horizon", self.horizon, 1)
+        # NumPy's numbers are numbers, and some that are handed on do not take them.
+        object.__setattr__(self, "horizon", count("horizon", self.horizon, 1))
         if self.max_qps is not None:
             count("max_qps", self.max_qps, 0, " None stands for convergence.")
         if self.max_solver_iterations is not None:
@@ -62,7 +63,7 @@ class Settings:
         positive("tolerance", self.tolerance)
         if self.time_budget is not None:
             positive("time_budget", self.time_budget)
-        count("delay", self.delay, 0)
+        object.__setattr__(self, "delay", count("delay", self.delay, 0))
         if self.delay > self.horizon:
             raise OptionError(
                 f"delay is {self.delay!r}; expected at most the horizon, {self.horizon}: older "

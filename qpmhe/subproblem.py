@@ -21,6 +21,9 @@ __all__ = ["Subproblem"]
 
 Array = NDArray[np.float64]
 
+# A second-order correction goes this share of itself further, to land inside.
+_BEYOND = 0.1
+
 
 class Subproblem:
     r"""Gauss-Newton QPs in the increments d of a trajectory.
@@ -92,8 +95,9 @@ class Subproblem:
         """Shift the rows of a QP by what its linearisation missed at a trial.
 
         With the same matrices, W and V then hold for the true residuals of a point near the
-        trial up to third order: a second-order correction. Rows that the solver itself
-        left violated are moved inwards by twice that.
+        trial up to third order: a second-order correction. It is carried a little further,
+        so that the third order does not leave the sets again, and by twice what the solver
+        itself left violated.
 
         Parameters
         ----------
@@ -107,11 +111,12 @@ class Subproblem:
         n, step = self._n, trial.trajectory - around.trajectory
         linear = around.residuals - np.matmul(self.jacobian, step[:-1, :, None])[:, :, 0]
         linear[:, :n] += step[1:]
-        margin = 2.0 * qp.violation(step)
-        self._set_rows(qp, problem, around.residuals + (trial.residuals - linear),
-                       around.trajectory)
-        room = qp.row_upper - qp.row_lower
-        inwards = np.where(room > 4.0 * margin, margin, 0.0)
+        bent = trial.residuals - linear
+        margin = np.full_like(qp.row_lower, 2.0 * qp.violation(step))
+        margin[:-1, self._w] += _BEYOND * np.abs(bent[:, :n] @ self._w_rows.T)
+        margin[:-1, self._v] += _BEYOND * np.abs(bent[:, n:] @ self._v_rows.T)
+        self._set_rows(qp, problem, around.residuals + bent, around.trajectory)
+        inwards = np.where(qp.row_upper - qp.row_lower > 4.0 * margin, margin, 0.0)
         qp.row_lower += inwards
         qp.row_upper -= inwards
 

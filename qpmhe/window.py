@@ -150,7 +150,7 @@ class Window:
             The late measurement.
         """
         k = self.end - (self.time - time)
-        new = np.isfinite(y)
+        new = np.abs(y) < _LARGEST
         self._y[k, new] = y[new]
         self._observed[k] |= new
         self._set_weight(k, time)
@@ -224,9 +224,10 @@ class Window:
             sample.system, sample.u, sample.observed = model, u, observed
             if self._jacobians:
                 self._differentiate(k, model, z, u)
+            if self._own_noise or sample.noise_weight is not None:
+                sample.noise_weight = self._own_noise.get(time)
             if self._covariance is not None:
                 sample.covariance = self._covariance[k]
-                sample.noise_weight = self._own_noise.get(time)
             correction[:], posterior = self._observer.correct(z, error, sample)
             following += correction
         except Exception:  # a model function outside its domain: bad luck, not bad input

@@ -69,8 +69,11 @@ class Cost(ABC):
         noise: Array,
         discount: float,
     ) -> None:
-        if isinstance(discount, bool) or not isinstance(discount, (int, float)) or not (
-            0.0 < discount <= 1.0
+        kinds = (int, float, np.integer, np.floating)
+        if (
+            isinstance(discount, bool)
+            or not isinstance(discount, kinds)
+            or not 0.0 < discount <= 1.0
         ):
             raise OptionError(f"discount is {discount!r}; expected a number in (0, 1].")
         self.discount = float(discount)

@@ -1,5 +1,7 @@
 """Covariances of the window's states against the dense inverse of the Hessian."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -261,6 +263,21 @@ def test_there_are_none_without_jacobians(jacobian, text):
     )
     mhe.update([1.0])
     with pytest.raises(InvalidInputError, match=text):
+        mhe.covariances()
+
+
+@pytest.mark.parametrize("root", [np.sqrt, lambda x: [math.sqrt(x[0])]], ids=["NaN", "raises"])
+def test_there_are_none_along_a_stage_that_failed(root):
+    mhe = qpmhe.MovingHorizonEstimator(
+        qpmhe.System(root, lambda x: x, n=1, p=1), qpmhe.Luenberger([0.9]),
+        qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0),
+        horizon=3, initial_state=[1.0], max_qps=0,
+    )
+    for y in (1.0, -5.0, 1.0, 1.0):
+        estimate = mhe.update([y])
+    assert estimate.cost == math.inf
+    assert (estimate.trajectory[:-1] < 0.0).any()
+    with pytest.raises(InvalidInputError, match="Jacobians"):
         mhe.covariances()
 
 

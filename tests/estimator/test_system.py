@@ -325,38 +325,61 @@ def test_sets_and_sizes_are_kept():
     assert "n=2, p=3, m=4" in repr(system)
 
 
-# Functions that pass for batched until their branches meet in one batch
+# Functions that decide by some states of a batch for all of it
 
 
 def slow_far_out(x):
     return 0.5 * x if x[0] > 50.0 else x + 20.0
 
 
-def test_a_branch_beyond_the_probes_is_found_out_by_values():
-    system = qpmhe.System(slow_far_out, lambda x: x, n=1, p=1)
-    assert system.f.mode == "batched"
-    far = np.array([[60.0], [10.0], [70.0]])
-    expected = np.array([slow_far_out(x) for x in far])
-    nothing = np.zeros((3, 0))
-    assert system.f.agrees(far[[0, 2]], nothing[:2], expected[[0, 2]], 1e-9)
-    assert system.f.mode == "batched"
-    assert not system.f.agrees(far, nothing, expected, 1e-9)
+FAR = np.array([[60.0], [10.0], [70.0]])
+
+
+@pytest.mark.parametrize(
+    "far_out",
+    [
+        pytest.param(lambda x: x[0] > 50.0, id="x[0]"),
+        pytest.param(lambda x: np.max(x) > 50.0, id="max"),
+        pytest.param(lambda x: (x > 50.0).any(), id="any"),
+        pytest.param(lambda x: np.all(x > 50.0), id="all"),
+        pytest.param(lambda x: x.sum() > 50.0, id="sum"),
+        pytest.param(lambda x: np.linalg.norm(x) > 50.0, id="norm"),
+        pytest.param(lambda x: float(x.max()) > 50.0, id="float"),
+    ],
+)
+def test_a_branch_beyond_the_probes_is_no_branch_of_a_batch(far_out):
+    system = qpmhe.System(
+        lambda x: 0.5 * x if far_out(x) else x + 20.0, lambda x: x, n=1, p=1
+    )
+    found = system.f.batch(FAR, np.zeros((3, 0)))
+    np.testing.assert_array_equal(found, [[30.0], [30.0], [35.0]])
+
+
+@pytest.mark.parametrize(
+    "f",
+    [
+        pytest.param(lambda x: slow_far_out(np.asarray(x)), id="hidden"),
+        pytest.param(slow_far_out, id="plain"),
+    ],
+)
+def test_a_branch_is_found_out_by_its_values_at_the_latest(f):
+    system, nothing = qpmhe.System(f, lambda x: x, n=1, p=1), np.zeros((3, 0))
+    expected = np.array([f(x) for x in FAR])
+    system.f.agrees(FAR, nothing, expected, 1e-9)
     assert system.f.mode == "looped"
-    np.testing.assert_array_equal(system.f.batch(far, nothing), expected)
-    assert system.f.agrees(far, nothing, expected, 1e-9)
+    np.testing.assert_array_equal(system.f.batch(FAR, nothing), expected)
+    assert system.f.agrees(FAR, nothing, expected, 1e-9)
 
 
 def test_a_function_that_raises_on_many_far_states_is_looped_over():
     def f(x):
-        if x.ndim > 1 and (x > 50.0).any():
+        if x.ndim > 1 and (np.asarray(x) > 50.0).any():
             raise ValueError("one at a time")
         return 0.5 * x
 
     system = qpmhe.System(f, lambda x: x, n=1, p=1)
-    assert system.f.mode == "batched"
-    far = np.array([[60.0], [10.0]])
-    assert not system.f.agrees(far, np.zeros((2, 0)), 0.5 * far, 1e-9)
-    np.testing.assert_array_equal(system.f.batch(far, np.zeros((2, 0))), 0.5 * far)
+    assert not system.f.agrees(FAR, np.zeros((3, 0)), 0.5 * FAR, 1e-9)
+    np.testing.assert_array_equal(system.f.batch(FAR, np.zeros((3, 0))), 0.5 * FAR)
 
 
 @pytest.mark.parametrize("where", ["f", "h"])
