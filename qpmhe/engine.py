@@ -147,10 +147,11 @@ class PythonEngine:
         status = outcome.events | (Status.IMPROVED if outcome.improved else Status.CANDIDATE)
         if missing:
             status |= Status.MISSING
-        if held or flat or not math.isfinite(outcome.reference.cost):
-            # The last is a failed stage that is still in the window: nothing can be judged by
-            # a candidate without a cost, and no solver is to blame.
-            status = (status | Status.MODEL_FAILED) & ~Status.NO_DECREASE
+        if held or flat:
+            status |= Status.MODEL_FAILED
+        elif not math.isfinite(outcome.reference.cost):
+            # No solver is to blame where nothing can be judged.
+            status = (status | Status.FAILED_STAGE) & ~Status.NO_DECREASE
         trial, reference = outcome.trial, outcome.reference
         trajectory, residuals = trial.trajectory, trial.residuals
         if not outcome.improved:

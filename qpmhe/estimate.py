@@ -36,6 +36,8 @@ class Status(enum.Flag):
     SOLVER_STOPPED = enum.auto()
     #: A model function raised or was not finite.
     MODEL_FAILED = enum.auto()
+    #: The model failed at an earlier stage of the window: the candidate has no finite cost.
+    FAILED_STAGE = enum.auto()
     #: Components of the newest measurement are missing or not finite; they were left out.
     MISSING = enum.auto()
     #: The candidate is outside of sets; these were left out in this step.
@@ -71,6 +73,10 @@ _TEXTS = {
     Status.MODEL_FAILED: (
         "A model function raised or was not finite; bound the states, or make the model "
         "defined on all of them."
+    ),
+    Status.FAILED_STAGE: (
+        "The model failed at an earlier stage, which is still in the window: the candidate has "
+        "no finite cost, and any trajectory that has one is taken."
     ),
     Status.MISSING: (
         "The measurement is missing in part or whole (not finite); its noise term was left "

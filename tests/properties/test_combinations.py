@@ -1,4 +1,7 @@
-"""Every combination of sets, inputs, data, cost and start keeps the promise at every step."""
+"""Every combination of sets, inputs, data, cost and start keeps the promise at every step.
+
+And what becomes of a candidate outside of the sets, and of a step whose time is up.
+"""
 
 import itertools
 
@@ -7,6 +10,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Status
+from qpmhe.solvers import Backend, RawSolution, Solver, SolveStatus
 
 NAN = np.nan
 N, P, STEPS, HORIZON = 3, 2, 8, 4
@@ -214,3 +218,195 @@ def test_the_sets_bind(sets):
             U = case.U[len(Y) - length : len(Y)]
             crossed |= set(case.outside(unbound.trajectory, Y[-length:], U))
     assert crossed == set(case.sets)
+
+
+# Sets that the candidate leaves at times, and their names.
+TIGHT = {
+    "X": {"states": qpmhe.Box([0.15, -0.28, 0.34], [0.65, 0.0, 0.45])},
+    "rows of X": {"states": qpmhe.Polytope([[-1.0, -1.0, 0.0]], [0.12])},
+    "W": {"disturbances": qpmhe.Box([-0.03] * 3, [0.008] * 3)},
+    "V": {"noises": qpmhe.Box([-0.4, -0.2], [0.1, 0.1])},
+    "X, W and V": {
+        "states": qpmhe.Box([0.15, -0.28, 0.34], [0.65, 0.0, 0.45]),
+        "disturbances": qpmhe.Box([-0.03] * 3, [0.008] * 3),
+        "noises": qpmhe.Box([-0.4, -0.2], [0.1, 0.1]),
+    },
+}
+BACKENDS = qpmhe.solvers.available()
+INEQUALITY_BACKENDS = [b for b in BACKENDS if qpmhe.solvers.backend(b).inequalities]
+
+
+def tight(name, **options):
+    """Estimates of a case in tight sets, each with its data and whether its candidate is out."""
+    case = Case("no sets", True, "complete", "quadratic")
+    case.sets = TIGHT[name]
+    case.system = qpmhe.System(f, h, n=N, p=P, m=2, **case.sets)
+    observer = list(Case("no sets", True, "complete", "quadratic").estimates(max_qps=0))
+    found, outsiders = [], 0
+    for (estimate, known), (free, _) in zip(case.estimates(**options), observer, strict=True):
+        length = len(estimate.noises)
+        data = known[-length:], case.U[len(known) - length : len(known)]
+        outside = case.outside(free.trajectory, *data)
+        found.append((estimate, free, data, outside))
+        outsiders += bool(outside)
+    assert 2 <= outsiders <= STEPS - 2
+    return case, found
+
+
+@pytest.mark.parametrize("max_qps", [0, 1, None])
+@pytest.mark.parametrize("name", TIGHT)
+def test_drop_leaves_out_the_violated_sets_and_no_others(name, max_qps):
+    case, found = tight(name, outside="drop", max_qps=max_qps)
+    for estimate, free, data, outside in found:
+        assert estimate.dropped == outside
+        assert (Status.SETS_DROPPED in estimate.status) == bool(outside)
+        assert estimate.candidate.tolist() == free.trajectory.tolist()
+        assert estimate.candidate_cost == free.cost
+        assert set(case.outside(estimate.trajectory, *data)) <= set(outside)
+        assert estimate.improved == (max_qps != 0)
+        assert not estimate.status & (Status.PROJECTED | Status.CANDIDATE_OUTSIDE)
+
+
+@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("name", TIGHT)
+def test_keep_returns_the_candidate_bit_for_bit(name, start):
+    case, found = tight(name, outside="keep", start=start)
+    for estimate, free, data, outside in found:
+        assert estimate.dropped == ()
+        assert estimate.candidate.tolist() == free.trajectory.tolist()
+        if outside:
+            assert estimate.status == Status.CANDIDATE | Status.CANDIDATE_OUTSIDE
+            assert estimate.trajectory.tolist() == free.trajectory.tolist()
+            assert estimate.disturbances.tolist() == free.disturbances.tolist()
+            assert estimate.noises.tolist() == free.noises.tolist()
+            assert estimate.cost == estimate.candidate_cost == free.cost
+            assert estimate.qps == estimate.corrections == 0
+        else:
+            assert Status.IMPROVED in estimate.status
+            assert case.outside(estimate.trajectory, *data) == ()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", TIGHT)
+def test_project_puts_the_candidate_inside(name, backend):
+    case, found = tight(name, outside="project", backend=backend)
+    for estimate, free, data, outside in found:
+        if not outside:
+            assert estimate.candidate.tolist() == free.trajectory.tolist()
+            assert estimate.dropped == ()
+            assert Status.PROJECTED not in estimate.status
+        elif backend in INEQUALITY_BACKENDS:
+            assert Status.PROJECTED in estimate.status
+            assert estimate.dropped == ()
+            assert case.outside(estimate.candidate, *data) == ()
+            prior = estimate.candidate[0]
+            cost = plain_cost("quadratic", estimate.candidate, prior, *data)
+            # The prior is the observer's, not that of the projection.
+            prior = free.candidate[0]
+            cost = plain_cost("quadratic", estimate.candidate, prior, *data)
+            assert estimate.candidate_cost == pytest.approx(cost, rel=1e-9)
+        else:
+            # Nothing but the box of X is kept by clipping; else the sets are dropped.
+            assert (Status.PROJECTED in estimate.status) != bool(estimate.dropped)
+        assert estimate.cost <= estimate.candidate_cost
+        assert set(case.outside(estimate.trajectory, *data)) <= set(estimate.dropped)
+        assert bool(estimate.dropped) == (Status.SETS_DROPPED in estimate.status)
+
+
+def test_the_projection_into_a_box_of_states_is_the_nearest_point():
+    _, found = tight("X", outside="project")
+    box = TIGHT["X"]["states"]
+    for estimate, free, _, _ in found:
+        nearest = np.clip(free.trajectory, box.lower, box.upper)
+        np.testing.assert_allclose(estimate.candidate, nearest, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_without_anything_inside_the_violated_sets_are_dropped(backend):
+    """The states must stay in X, where y is out of reach of any noise in V."""
+    system = qpmhe.System(
+        lambda x: 0.9 * x, lambda x: x, n=1, p=1,
+        states=qpmhe.Box(-1.0, 1.0), noises=qpmhe.Box(-2.0, 2.0),
+    )
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.01]), qpmhe.QuadraticCost(prior=1, disturbance=1, noise=1),
+        horizon=3, initial_state=[0.5], outside="project", backend=backend, max_qps=2,
+    )
+    assert Status.SETS_DROPPED not in mhe.update([0.7]).status
+    for _ in range(3):
+        estimate = mhe.update([5.0])
+        assert Status.SETS_DROPPED in estimate.status
+        assert Status.PROJECTED not in estimate.status
+        assert estimate.dropped == ("noises",)
+        assert estimate.improved
+        assert np.abs(estimate.trajectory).max() <= 1.0
+
+
+class Clock:
+    """A clock that goes on by one second with each QP that is solved."""
+
+    def __init__(self, monkeypatch):
+        self.now = 0.0
+        for module in ("estimator", "engine", "optimizer"):
+            monkeypatch.setattr(f"qpmhe.{module}.perf_counter", lambda: self.now)
+
+    def solver(self, options):
+        clock, inner = self, qpmhe.solvers.create("auto", options)
+
+        class Ticking(Solver):
+            def _solve(self, qp, start):
+                clock.now += 1.0
+                found = inner.solve(qp, start)
+                return RawSolution(
+                    found.d, found.status is SolveStatus.SOLVED, found.iterations,
+                    found.bound_duals, found.row_duals,
+                )
+
+        return Ticking(options)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    made = Clock(monkeypatch)
+    qpmhe.solvers.register(Backend("ticking", made.solver, "a test's"))
+    yield made
+    qpmhe.solvers.unregister("ticking")
+
+
+@pytest.mark.parametrize("sets", SETS)
+@pytest.mark.parametrize("budget", [0.5, 1.5, 2.5])
+def test_no_qp_is_begun_when_the_time_is_up(clock, budget, sets):
+    case = Case(sets, True, "missing", "quadratic")
+    up = 0
+    for estimate, known in case.estimates(
+        backend="ticking", max_qps=None, time_budget=budget, tolerance=1e-15
+    ):
+        case.check(estimate, known)
+        assert estimate.improved
+        assert estimate.step_time == estimate.solve_time == estimate.qps + estimate.corrections
+        assert estimate.step_time < budget + 1.0
+        up += Status.TIME_UP in estimate.status
+    assert up > STEPS // 2
+
+
+@pytest.mark.parametrize("outside", ["drop", "project", "keep"])
+@pytest.mark.parametrize("name", TIGHT)
+def test_without_time_for_any_qp_the_candidate_is_the_estimate(clock, monkeypatch, name, outside):
+    monkeypatch.setattr("qpmhe.optimizer.perf_counter", lambda: clock.now + 2.0)
+    case, found = tight(name, backend="ticking", time_budget=1.0, outside=outside)
+    assert clock.now == 0.0
+    for estimate, free, _, outsider in found:
+        assert estimate.trajectory.tolist() == free.trajectory.tolist()
+        assert Status.CANDIDATE in estimate.status
+        assert (Status.TIME_UP in estimate.status) == (outside != "keep" or not outsider)
+        assert estimate.qps == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_solvers_with_next_to_no_time_do_no_harm(monkeypatch, backend):
+    """Their own clocks run; the one between QPs stands still, so that they are called."""
+    monkeypatch.setattr("qpmhe.optimizer.perf_counter", lambda: 0.0)
+    case = Case("polytopes", True, "missing", "quadratic")
+    for estimate, known in case.estimates(backend=backend, time_budget=1e-9):
+        case.check(estimate, known)
+        assert estimate.qps > 0
