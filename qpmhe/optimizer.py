@@ -78,6 +78,8 @@ class Outcome:
         Seconds in the solver.
     dropped : tuple of str
         Names of the sets that were left out.
+    deadline : float
+        Reading of the clock after which nothing is begun.
     """
 
     reference: Trial
@@ -90,6 +92,14 @@ class Outcome:
     solver_iterations: int | None = 0
     solve_time: float = 0.0
     dropped: tuple[str, ...] = ()
+    deadline: float = math.inf
+
+    def late(self) -> bool:
+        """Whether the time is up, which is noted then."""
+        late = self.deadline < math.inf and perf_counter() > self.deadline
+        if late:
+            self.events |= Status.TIME_UP
+        return late
 
     def count(self, iterations: int | None, seconds: float) -> None:
         """Add a solve's iterations and time."""
@@ -151,7 +161,7 @@ class Optimizer:
             Reading of ``time.perf_counter`` after which no QP is begun.
         """
         candidate = problem.candidate(window)
-        outcome = Outcome(candidate, candidate)
+        outcome = Outcome(candidate, candidate, deadline=deadline)
         if problem.constrained and not self._reconcile(problem, window, outcome):
             return outcome
         if self._limit == 0:
@@ -163,8 +173,7 @@ class Optimizer:
             if trial.cost < _target(outcome.trial):
                 outcome.trial, outcome.improved = trial, True
         for _ in range(self._limit):
-            if perf_counter() > deadline:
-                outcome.events |= Status.TIME_UP
+            if outcome.late():
                 break
             if outcome.trial is candidate:
                 qp = self._subproblem.at_candidate(problem, window)
@@ -202,6 +211,8 @@ class Optimizer:
         qp = self._subproblem.nearest(problem, window)
         trial = candidate
         for attempt in range(1 + _CORRECTIONS):
+            if outcome.late():
+                return Trial(*_parts(candidate), math.inf, math.inf)
             step = self._solve(qp, outcome).d
             if step is None:
                 return Trial(*_parts(candidate), math.inf, math.inf)
@@ -282,6 +293,8 @@ class Optimizer:
         """Second-order corrections of a trial that misses a set by its curvature."""
         best = outcome.trial
         for _ in range(_CORRECTIONS):
+            if outcome.late():
+                break
             self._subproblem.corrected(qp, problem, best, trial)
             step = self._solve(qp, outcome).d
             outcome.corrections += 1

@@ -239,7 +239,7 @@ def test_a_box_written_as_rows_gives_the_same_estimates(backend, name, boxed_est
     for y, one in zip(MEASURED[:8], boxed_estimates[name][:8], strict=True):
         other = rows.update(y)
         assert one.dropped == other.dropped == ()
-        assert other.cost == pytest.approx(one.cost, rel=1e-5)
+        assert other.cost == pytest.approx(one.cost, rel=2e-4)
         np.testing.assert_allclose(other.trajectory, one.trajectory, atol=3e-3)
         assert other.cost <= other.candidate_cost
 

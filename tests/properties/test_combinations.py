@@ -227,9 +227,9 @@ TIGHT = {
     "W": {"disturbances": qpmhe.Box([-0.03] * 3, [0.008] * 3)},
     "V": {"noises": qpmhe.Box([-0.4, -0.2], [0.1, 0.1])},
     "X, W and V": {
-        "states": qpmhe.Box([0.15, -0.28, 0.34], [0.65, 0.0, 0.45]),
-        "disturbances": qpmhe.Box([-0.03] * 3, [0.008] * 3),
-        "noises": qpmhe.Box([-0.4, -0.2], [0.1, 0.1]),
+        "states": qpmhe.Box([0.1, -0.33, 0.3], [0.65, 0.0, 0.5]),
+        "disturbances": qpmhe.Box([-0.05] * 3, [0.008] * 3),
+        "noises": qpmhe.Box([-0.66, -0.25], [0.14, 0.17]),
     },
 }
 BACKENDS = qpmhe.solvers.available()
@@ -299,8 +299,6 @@ def test_project_puts_the_candidate_inside(name, backend):
             assert Status.PROJECTED in estimate.status
             assert estimate.dropped == ()
             assert case.outside(estimate.candidate, *data) == ()
-            prior = estimate.candidate[0]
-            cost = plain_cost("quadratic", estimate.candidate, prior, *data)
             # The prior is the observer's, not that of the projection.
             prior = free.candidate[0]
             cost = plain_cost("quadratic", estimate.candidate, prior, *data)
@@ -393,12 +391,14 @@ def test_no_qp_is_begun_when_the_time_is_up(clock, budget, sets):
 @pytest.mark.parametrize("name", TIGHT)
 def test_without_time_for_any_qp_the_candidate_is_the_estimate(clock, monkeypatch, name, outside):
     monkeypatch.setattr("qpmhe.optimizer.perf_counter", lambda: clock.now + 2.0)
-    case, found = tight(name, backend="ticking", time_budget=1.0, outside=outside)
+    _, found = tight(name, backend="ticking", time_budget=1.0, outside=outside)
     assert clock.now == 0.0
     for estimate, free, _, outsider in found:
         assert estimate.trajectory.tolist() == free.trajectory.tolist()
         assert Status.CANDIDATE in estimate.status
         assert (Status.TIME_UP in estimate.status) == (outside != "keep" or not outsider)
+        assert Status.PROJECTED not in estimate.status
+        assert estimate.dropped == (() if outside == "keep" else outsider)
         assert estimate.qps == 0
 
 
