@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,6 +42,8 @@ def window_covariances(problem: Problem, trajectory: Array) -> Array:
     """
     states, n, count = trajectory[:-1], trajectory.shape[1], trajectory.shape[0] - 1
     trial = problem.evaluate(trajectory)
+    if trial.violation == math.inf:
+        raise InvalidInputError("the model has no finite values along the estimate.")
     try:
         a_all = np.asarray(problem.model.f_jacobian.batch(states, problem.inputs))
         c_all = np.asarray(problem.model.h_jacobian.batch(states, problem.inputs))

@@ -123,7 +123,7 @@ class PythonEngine:
             self._window.amend(time, y)
             self._trajectory = None  # it does not belong to the window before this one
             missing = not self._window.observed[-1].all()
-            held = not math.isfinite(self._window.candidate_cost)
+            held = self._window.newest_is_held
             estimate = self._estimate(missing, held, False, began)
         self._history[-1] = estimate.state
         return estimate

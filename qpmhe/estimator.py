@@ -144,6 +144,7 @@ class MovingHorizonEstimator:
             )
         self.initial_state: Array = self._checked_start(initial_state)
         self._no_input = np.zeros(system.m)
+        self._timed_is_checked = False
         self._engine = PythonEngine(system, observer, cost, self.settings, self.initial_state)
 
     def _checked_start(self, initial_state: ArrayLike) -> Array:
@@ -233,10 +234,18 @@ class MovingHorizonEstimator:
         u_array = self._no_input if u is None and system.m == 0 else self._input(u)
         if dt is not None:
             dt = positive("dt", dt)
-            _ = system.timed  # raises here, before the sample is taken, if there is none
+            self._check_timed(dt)
         if noise_weight is not None:
             noise_weight = positive_definite("noise_weight", noise_weight, system.p)
+            self.cost.check_noise(noise_weight)
         return self._engine.step(y_array, u_array, dt, noise_weight, began)
+
+    def _check_timed(self, dt: float) -> None:
+        """Insist, before the sample is taken, that there is a model with this step."""
+        if not self._timed_is_checked:
+            u = np.append(self._no_input, dt)
+            self.system.timed.check(self.initial_state, u)
+            self._timed_is_checked = True
 
     def _measurement(self, y: ArrayLike | None) -> Array:
         p = self.system.p

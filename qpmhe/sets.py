@@ -187,7 +187,9 @@ class Polytope(ConvexSet):
     Raises
     ------
     SetError
-        If the shapes do not fit, a number is not finite, a row is zero, or the set is empty.
+        If the shapes do not fit, a row is zero, or the set is empty.
+    InvalidInputError
+        If a number is not finite.
     """
 
     __slots__ = ()

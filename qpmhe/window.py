@@ -102,6 +102,11 @@ class Window:
         """Whether some stage of the window has a step of unusual length."""
         return self.time - self._last_irregular <= self.length
 
+    @property
+    def newest_is_held(self) -> bool:
+        """Whether the newest stage could not be evaluated."""
+        return not math.isfinite(self._stage_cost[self.end - 1])
+
     def push(
         self, y: Array, u: Array, dt: float | None = None, noise_weight: Array | None = None
     ) -> tuple[bool, bool, bool]:

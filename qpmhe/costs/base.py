@@ -151,6 +151,20 @@ class Cost(ABC):
         joint[self.n :, self.n :] = self.noise if noise is None else noise
         return joint
 
+    def check_noise(self, noise: Array) -> None:  # noqa: B027 - most costs take any weight
+        """Insist that a weight of one sample's noise fits the cost.
+
+        Parameters
+        ----------
+        noise : (p, p) array
+            Symmetric positive definite.
+
+        Raises
+        ------
+        WeightError
+            If the cost cannot use it.
+        """
+
     def partial_weight(self, observed: Mask, noise: Array | None = None) -> Array:
         """The stage weight where only some components of y are there; zero on the others.
 

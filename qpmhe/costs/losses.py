@@ -37,10 +37,24 @@ class Loss(ABC):
         self.weight = positive_definite("weight", weight)
         self.dimension = self.weight.shape[0]
         self.per_component = bool(per_component)
-        off_diagonal = self.weight - np.diag(np.diag(self.weight))
-        if self.per_component and off_diagonal.any():
+        self.check_weight(self.weight)
+
+    def check_weight(self, weight: Array) -> None:
+        """Insist on a diagonal weight where the loss is per component.
+
+        Parameters
+        ----------
+        weight : (d, d) array
+            The weight.
+
+        Raises
+        ------
+        WeightError
+            If it is not diagonal where it must be.
+        """
+        if self.per_component and (weight - np.diag(np.diag(weight))).any():
             raise WeightError(
-                f"weight is {self.weight.tolist()}; a loss per component needs a diagonal weight. "
+                f"weight is {weight.tolist()}; a loss per component needs a diagonal weight. "
                 "Transform the outputs so that their noises are independent."
             )
 

@@ -101,6 +101,10 @@ class RobustCost(Cost):
         joint[:, n:, n:] = self.noise_loss.majorise(residuals[:, n:], weights[..., n:, n:])
         return joint
 
+    def check_noise(self, noise: Array) -> None:
+        """Insist on a diagonal weight where the loss is per component; see `Cost`."""
+        self.noise_loss.check_weight(noise)
+
     def prior_cost(self, offset: Array, weight: Array) -> float:
         """The loss of the initial error; see `Cost.prior_cost`."""
         return float(self.prior_loss.cost(offset[None], weight)[0])

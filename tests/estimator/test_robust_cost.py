@@ -316,3 +316,17 @@ def test_weights_that_are_not_positive_definite(name):
         WeightError, [f"{name} has the eigenvalue -1", "positive definite"],
         lambda: qpmhe.RobustCost(**weights),
     )
+
+
+def test_a_loss_per_component_refuses_a_correlated_weight_of_one_sample():
+    cost = qpmhe.RobustCost(
+        prior=np.eye(2), disturbance=np.eye(2), noise=qpmhe.Huber(np.eye(2), per_component=True)
+    )
+    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=2, p=2)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(0.3 * np.eye(2)), cost, horizon=3, initial_state=[0.0, 0.0]
+    )
+    with pytest.raises(qpmhe.errors.WeightError, match="diagonal"):
+        mhe.update([1.0, 1.0], noise_weight=[[2.0, 1.0], [1.0, 2.0]])
+    assert mhe.time == 0
+    mhe.update([1.0, 1.0], noise_weight=[[2.0, 0.0], [0.0, 1.0]])
