@@ -277,7 +277,7 @@ def test_there_are_none_along_a_stage_that_failed(root):
         estimate = mhe.update([y])
     assert estimate.cost == math.inf
     assert (estimate.trajectory[:-1] < 0.0).any()
-    with pytest.raises(InvalidInputError, match="Jacobians"):
+    with pytest.raises(InvalidInputError, match="along the estimate"):
         mhe.covariances()
 
 
