@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from .._checks import positive_definite
-from ..errors import ShapeError
-from ..system import System
-from .base import Observer, Sample
+from .base import Sample
+from .kalman_type import KalmanType
 
 __all__ = ["ExtendedKalman"]
 
 Array = NDArray[np.float64]
 
 
-class ExtendedKalman(Observer):
+class ExtendedKalman(KalmanType):
     r"""The one-step predictor of the extended Kalman filter.
 
     With A and C the Jacobians of f and h at z(t):
@@ -50,33 +48,12 @@ class ExtendedKalman(Observer):
 
     needs_jacobians = True
 
-    def __init__(self, *, prior: ArrayLike, disturbance: ArrayLike, noise: ArrayLike) -> None:
-        self._prior = positive_definite("prior covariance", prior)
-        self._disturbance = positive_definite("disturbance covariance", disturbance)
-        self._noise = positive_definite("noise covariance", noise)
-
-    def check(self, system: System, initial_state: Array) -> None:
-        """Insist on covariances of the system's dimensions; see `Observer.check`."""
-        for name, matrix, size in (
-            ("prior", self._prior, system.n),
-            ("disturbance", self._disturbance, system.n),
-            ("noise", self._noise, system.p),
-        ):
-            if matrix.shape[0] != size:
-                raise ShapeError(
-                    f"{name} covariance has shape {matrix.shape}; expected ({size}, {size})."
-                )
-
-    def initial_covariance(self) -> Array:
-        """P(0)."""
-        return self._prior
-
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""
         a, c, covariance = sample.f_jacobian, sample.h_jacobian, sample.covariance
         if a is None or c is None or covariance is None:
             raise ValueError("the extended Kalman observer needs Jacobians and a covariance")
-        r = self._noise if sample.noise_weight is None else np.linalg.inv(sample.noise_weight)
+        r = self._noise_of(sample)
         if sample.observed is not None:
             there = sample.observed
             c, r, v = c[there], r[np.ix_(there, there)], v[there]

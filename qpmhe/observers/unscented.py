@@ -7,10 +7,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import positive, positive_definite
-from ..errors import ShapeError
-from ..system import System
-from .base import Observer, Sample
+from .._checks import positive
+from .base import Sample
+from .kalman_type import KalmanType
 
 __all__ = ["UnscentedKalman"]
 
@@ -20,7 +19,7 @@ Array = NDArray[np.float64]
 _CLOSEST = 1e-3
 
 
-class UnscentedKalman(Observer):
+class UnscentedKalman(KalmanType):
     r"""A one-step predictor whose gain comes from sigma points instead of Jacobians.
 
     With S the Cholesky factor of P(t), c the spread and the deviations
@@ -87,33 +86,15 @@ class UnscentedKalman(Observer):
         noise: ArrayLike,
         spread: float = math.sqrt(3.0),
     ) -> None:
-        self._prior = positive_definite("prior covariance", prior)
-        self._disturbance = positive_definite("disturbance covariance", disturbance)
-        self._noise = positive_definite("noise covariance", noise)
+        super().__init__(prior=prior, disturbance=disturbance, noise=noise)
         self._spread = positive("spread", spread)
-
-    def check(self, system: System, initial_state: Array) -> None:
-        """Insist on covariances of the system's dimensions; see `Observer.check`."""
-        for name, matrix, size in (
-            ("prior", self._prior, system.n),
-            ("disturbance", self._disturbance, system.n),
-            ("noise", self._noise, system.p),
-        ):
-            if matrix.shape[0] != size:
-                raise ShapeError(
-                    f"{name} covariance has shape {matrix.shape}; expected ({size}, {size})."
-                )
-
-    def initial_covariance(self) -> Array:
-        """P(0)."""
-        return self._prior
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""
         system, covariance = sample.system, sample.covariance
         if covariance is None:
             raise ValueError("the unscented Kalman observer needs a covariance")
-        r = self._noise if sample.noise_weight is None else np.linalg.inv(sample.noise_weight)
+        r = self._noise_of(sample)
         moves = self._spread * np.linalg.cholesky(covariance).T
         share = np.ones(z.size)
         if system.states is not None:
