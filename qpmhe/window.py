@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .costs import Cost
-from .linearization import StageTerms
 from .observers import Observer, Sample
+from .stages import Stages
 from .system import System
 
 __all__ = ["Window"]
@@ -22,15 +21,12 @@ Array = NDArray[np.float64]
 _LARGEST = 1e150
 
 
-class Window:
+class Window(Stages):
     r"""Samples y(t-N), ..., y(t-1) with the observer's states z(t-N), ..., z(t).
 
     The observer's trajectory changes only where a late measurement or a restart makes it,
     so what depends on it alone is computed when a stage enters and kept while it stays: the
     residuals :math:`(L(i), v_z(i))`, their cost, the Jacobians and the Gauss-Newton terms.
-
-    The arrays are longer than the window, which slides along them; at the end its stages
-    move back to the front. Thus every window is a plain slice.
 
     Parameters
     ----------
@@ -57,40 +53,12 @@ class Window:
         self._system, self._observer, self._cost = system, observer, cost
         self._n, self._m, self._linearized = n, m, linearized
         self._jacobians = linearized or observer.needs_jacobians
-        self.horizon = horizon
-        room = horizon + max(horizon, 64)
-        self._room = room
-        self._z = np.zeros((room + 1, n))
-        # The input of each stage, and behind it the length of its step where that is unusual.
-        self._y, self._u = np.zeros((room, p)), np.zeros((room, m + 1))
-        self._irregular = np.zeros(room, dtype=np.bool_)
-        self._observed = np.ones((room, p), dtype=np.bool_)
-        # Stages whose weight is not the cost's own, because y is missing or has its own noise.
-        self._special = np.zeros(room, dtype=np.bool_)
-        self._own_noise: dict[int, Array] = {}  # by time
-        self._residuals = np.zeros((room, n + p))
-        self._weight = np.zeros((room, n + p, n + p))
-        # With a cost that is not quadratic: the weights that majorise it at the candidate.
-        self._majorising = self._weight if cost.quadratic else np.zeros((room, n + p, n + p))
-        self._stage_cost = np.zeros(room)
-        self.terms = StageTerms(room, n, p)
-        covariance = observer.initial_covariance()
-        self._covariance = None if covariance is None else np.zeros((room + 1, n, n))
-        self._initial_state = initial_state
-        self._z[0] = initial_state
-        if self._covariance is not None:
-            self._covariance[0] = covariance
-        self.time = 0  # samples ever pushed: the window ends at x(time)
-        self.start = self.end = 0
-        self._last_special = self._last_irregular = -horizon - 1
+        super().__init__(
+            n, p, m, horizon, initial_state, observer.initial_covariance(), cost.quadratic
+        )
         self._sample = Sample(system, np.zeros(m))
         # gamma^0, gamma^1, ... from the newest stage backwards, and the prior's behind.
         self._ages = cost.discount ** np.arange(horizon, -1, -1.0) if cost.discount < 1 else None
-
-    @property
-    def length(self) -> int:
-        """N_t, the number of stages in the window."""
-        return self.end - self.start
 
     @property
     def has_special_weights(self) -> bool:
@@ -101,11 +69,6 @@ class Window:
     def has_irregular_steps(self) -> bool:
         """Whether some stage of the window has a step of unusual length."""
         return self.time - self._last_irregular <= self.length
-
-    @property
-    def newest_is_held(self) -> bool:
-        """Whether the newest stage could not be evaluated."""
-        return not math.isfinite(self._stage_cost[self.end - 1])
 
     def push(
         self, y: Array, u: Array, dt: float | None = None, noise_weight: Array | None = None
@@ -310,69 +273,6 @@ class Window:
         if there.any():
             self.model.h.agrees(states[there], inputs[there], fitted[there], rounding)
 
-    def _per_stage(self) -> tuple[Array, ...]:
-        arrays: tuple[Array | Any, ...] = (
-            self._y, self._u, self._irregular, self._observed, self._special,
-            self._residuals, self._weight, self._stage_cost,
-        )
-        return arrays if self._cost.quadratic else (*arrays, self._majorising)
-
-    def _move_to_front(self) -> None:
-        keep, end = self.end - self.start, self.end
-        for array in self._per_stage():
-            array[:keep] = array[end - keep : end]
-        self.terms.keep_last(end, keep)
-        for states in (self._z, self._covariance):
-            if states is not None:
-                states[: keep + 1] = states[end - keep : end + 1]
-        self.start, self.end = 0, keep
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that the window knows, as copies of arrays and numbers."""
-        stages = slice(self.start, self.end)
-        points = slice(self.start, self.end + 1)
-        return {
-            "time": self.time,
-            "z": self._z[points].copy(),
-            "covariance": None if self._covariance is None else self._covariance[points].copy(),
-            "stages": [array[stages].copy() for array in self._per_stage()],
-            "terms": [array[stages].copy() for array in self.terms.arrays()],
-            "own_noise": {time: weight.copy() for time, weight in self._own_noise.items()},
-            "last_special": self._last_special,
-            "last_irregular": self._last_irregular,
-        }
-
-    def fits(self, state: dict[str, Any]) -> bool:
-        """Whether a state is of a window like this one."""
-        return (state["covariance"] is None) == (self._covariance is None) and len(
-            state["stages"]
-        ) == len(self._per_stage())
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` of an equal window gave."""
-        length = len(state["z"]) - 1
-        self.start, self.end, self.time = 0, length, int(state["time"])
-        self._z[: length + 1] = state["z"]
-        if self._covariance is not None:
-            self._covariance[: length + 1] = state["covariance"]
-        for array, saved in zip(self._per_stage(), state["stages"], strict=True):
-            array[:length] = saved
-        for array, saved in zip(self.terms.arrays(), state["terms"], strict=True):
-            array[:length] = saved
-        self._own_noise = {time: weight.copy() for time, weight in state["own_noise"].items()}
-        self._last_special = int(state["last_special"])
-        self._last_irregular = int(state["last_irregular"])
-
-    @property
-    def candidate(self) -> Array:
-        """Candidate trajectory z(t-N), ..., z(t) (eq:warmstart): a view."""
-        return self._z[self.start : self.end + 1]
-
-    @property
-    def residuals(self) -> Array:
-        """Joint residuals (L(i), v_z(i)) of the candidate: a view."""
-        return self._residuals[self.start : self.end]
-
     @property
     def candidate_cost(self) -> float:
         """J of the candidate; its prior term is 0 exactly."""
@@ -388,16 +288,6 @@ class Window:
             return np.ones(self.length + 1)
         # gamma^K for the prior, gamma^(K-1), ..., gamma^0 for the stages.
         return self._ages[self.horizon - self.length :]
-
-    @property
-    def measurements(self) -> Array:
-        """y, with a number of no weight where it is missing: a view."""
-        return self._y[self.start : self.end]
-
-    @property
-    def observed(self) -> NDArray[np.bool_]:
-        """Which components of y are there: a view."""
-        return self._observed[self.start : self.end]
 
     @property
     def inputs(self) -> Array:
@@ -428,8 +318,3 @@ class Window:
         if self._cost.quadratic:
             return self.stage_weights
         return self._majorising[self.start : self.end]
-
-    @property
-    def prior_covariance(self) -> Array | None:
-        """The observer's covariance at z(t-N), if it has one."""
-        return None if self._covariance is None else self._covariance[self.start]
