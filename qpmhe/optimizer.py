@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from qpmhe_solvers import QP, Solution, Solver, SolveStatus
 from .estimate import Status
 from .exact import ExactSolution, ExactStep
 from .problem import Problem, Trial
+from .settings import Settings
 from .subproblem import Subproblem
 from .window import Window
 
@@ -41,17 +41,6 @@ _STALLED = 1e3
 _CORRECTIONS = 2
 
 _NONE = Status(0)
-
-
-class Choices(Protocol):
-    """The settings that the optimizer reads."""
-
-    @property
-    def tolerance(self) -> float: ...
-    @property
-    def outside(self) -> str: ...
-    @property
-    def qp_limit(self) -> int: ...
 
 
 @dataclass(slots=True)
@@ -133,7 +122,7 @@ class Optimizer:
         self,
         subproblem: Subproblem,
         solver: Solver,
-        settings: Choices,
+        settings: Settings,
         exact: ExactStep | None = None,
     ) -> None:
         self._subproblem, self._solver, self._exact = subproblem, solver, exact

@@ -41,3 +41,25 @@ def test_one_exact_step_is_better_than_one_reweighted():
     reweighted = sum(e.cost for e in estimates(noise, max_qps=1))
     exact = sum(e.cost for e in estimates(noise, max_qps=1, subproblem="exact"))
     assert exact < reweighted
+
+
+def test_with_gross_outliers_hubers_rmse_is_at_most_half_the_quadratics():
+    system, observer, quadratic, scenario = qpmhe.models.batch_reactor()
+    huber = qpmhe.RobustCost(
+        prior=quadratic.prior, disturbance=quadratic.disturbance,
+        noise=qpmhe.Huber(quadratic.noise),
+    )
+    squares = {"quadratic": [], "huber": []}
+    for seed in range(4):
+        states, measurements = scenario.simulate(seed)
+        rng = np.random.default_rng([seed, 1])
+        hit = rng.random(measurements.shape) < 0.05
+        wrong = measurements + hit * rng.choice([-8.0, 8.0], measurements.shape)
+        for name, cost in (("quadratic", quadratic), ("huber", huber)):
+            mhe = qpmhe.MovingHorizonEstimator(
+                system, observer, cost, horizon=10,
+                initial_state=scenario.initial_estimate, max_qps=5,
+            )
+            squares[name].append(np.sum((mhe.run(wrong).states - states) ** 2, axis=1))
+    rmse = {name: np.sqrt(np.mean(values)) for name, values in squares.items()}
+    assert rmse["huber"] <= 0.5 * rmse["quadratic"]
