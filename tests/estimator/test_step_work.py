@@ -1,0 +1,82 @@
+"""How much work a step does, counted and not timed."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+import qpmhe
+
+
+class Counted:
+    """The reactor's functions, with counts of calls on one state and on many."""
+
+    def __init__(self):
+        reactor = qpmhe.models.batch_reactor()
+        self.single, self.many = {}, {}
+        self.system = qpmhe.System(
+            self.counting("f", reactor.system.f), self.counting("h", reactor.system.h),
+            n=2, p=1,
+            f_jacobian=self.counting("A", reactor.system.f_jacobian),
+            h_jacobian=self.counting("C", reactor.system.h_jacobian),
+        )
+        self.observer, self.cost = reactor.observer, reactor.cost
+        self.measurements = reactor.scenario.simulate(0, 60).measurements
+
+    def counting(self, name, function):
+        def counted(x):
+            nothing = np.empty((*x.shape[:-1], 0))
+            counts = self.single if x.ndim == 1 else self.many
+            counts[name] = counts.get(name, 0) + 1
+            return function.batch(x, nothing) if x.ndim > 1 else function(x, nothing)
+
+        return counted
+
+    def estimator(self, **options):
+        return qpmhe.MovingHorizonEstimator(
+            self.system, self.observer, self.cost, horizon=10, initial_state=[3.0, 0.0], **options
+        )
+
+
+@pytest.mark.parametrize(("max_qps", "trials"), [(0, 0), (1, 1), (2, 2)])
+def test_the_model_is_evaluated_once_at_each_new_observer_state(max_qps, trials):
+    counted = Counted()
+    mhe = counted.estimator(max_qps=max_qps, backend="banded")
+    for y in counted.measurements[:40]:
+        mhe.update(y)
+    counted.single.clear()
+    counted.many.clear()
+    steps = 20
+    for y in counted.measurements[40:]:
+        mhe.update(y)
+    # One state a sample: the rest of the window is remembered.
+    assert counted.single["f"] == counted.single["h"] == steps
+    assert counted.single.get("A", 0) == counted.single.get("C", 0) == (steps if max_qps else 0)
+    # One batch a trial, and now and then one to make sure that batches may be trusted.
+    for name in ("f", "h"):
+        assert trials * steps <= counted.many.get(name, 0) <= trials * steps + 2
+    # The first QP needs no Jacobians but those of the newest stage.
+    assert counted.many.get("A", 0) == max(0, max_qps - 1) * steps
+
+
+@pytest.mark.parametrize("options", [{}, {"max_qps": 2, "start": "best"}], ids=["one", "two"])
+def test_memory_does_not_grow(options):
+    reactor = qpmhe.models.batch_reactor()
+    measurements = reactor.scenario.simulate(0, 500).measurements
+    mhe = qpmhe.MovingHorizonEstimator(
+        *reactor[:3], horizon=10, initial_state=[3.0, 0.0], **options
+    )
+
+    def steps(count):
+        for _ in range(count):
+            for y in measurements:
+                mhe.update(y)
+
+    steps(2)
+    tracemalloc.start()
+    steps(1)
+    before = tracemalloc.get_traced_memory()[0]
+    steps(10)
+    after = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert after - before < 20_000  # bytes, over 5,000 steps
