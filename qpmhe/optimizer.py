@@ -256,9 +256,14 @@ class Optimizer:
         else:
             promised = abs(float(np.vdot(qp.gradient, step)))
         trial = self._trial(problem, best, step)
-        if not trial.cost < target and _NEARLY < trial.violation < math.inf and qp.rows:
-            step = step.copy()  # a correction's solve reuses the solver's workspace
-            trial = self._corrected(problem, qp, outcome, trial)
+        if not trial.cost < target and 0.0 < trial.violation < math.inf and qp.rows:
+            missed = trial
+            if trial.violation <= _NEARLY:
+                trial = self._trial(problem, best, _LENGTHS[0] * step)
+            # A set missed by its curvature is missed by the first length as well.
+            if not trial.cost < target and not (solved and promised <= enough):
+                step = step.copy()  # a correction's solve reuses the solver's workspace
+                trial = self._corrected(problem, qp, outcome, missed)
         if not trial.cost < target:
             # Near a minimum J cannot be lowered beyond its rounding: not a failure.
             if solved and promised <= enough:
