@@ -76,15 +76,20 @@ class PythonEngine:
 
     def reset(self, initial_state: Array) -> None:
         """Forget all measurements and start at this state."""
-        settings = self._settings
-        self._window = Window(
-            self._system, self._observer, self._cost, settings.horizon, initial_state,
-            settings.qp_limit > 0,
-        )
+        self._window = self._fresh_window(initial_state)
         self._trajectory: Array | None = None  # the last estimate's
         self._dropped: tuple[str, ...] = ()
         # Estimates of x(t-N), ..., x(t), each made at its own time.
-        self._history: deque[Array] = deque([initial_state.copy()], maxlen=settings.horizon + 1)
+        self._history: deque[Array] = deque(
+            [initial_state.copy()], maxlen=self._settings.horizon + 1
+        )
+
+    def _fresh_window(self, initial_state: Array) -> Window:
+        settings = self._settings
+        return Window(
+            self._system, self._observer, self._cost, settings.horizon, initial_state,
+            settings.qp_limit > 0,
+        )
 
     @property
     def state(self) -> Array:
@@ -150,8 +155,9 @@ class PythonEngine:
         if held or flat:
             status |= Status.MODEL_FAILED
         elif not math.isfinite(outcome.reference.cost):
-            # No solver is to blame where nothing can be judged.
-            status = (status | Status.FAILED_STAGE) & ~Status.NO_DECREASE
+            status |= Status.FAILED_STAGE
+        if not math.isfinite(outcome.reference.cost):
+            status &= ~Status.NO_DECREASE  # no solver is to blame where nothing can be judged
         trial, reference = outcome.trial, outcome.reference
         trajectory, residuals = trial.trajectory, trial.residuals
         if not outcome.improved:
@@ -214,24 +220,40 @@ class PythonEngine:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where another estimator stopped."""
         mine, system = self._size(), self._system
-        if not isinstance(state, dict) or tuple(state.get("problem", ())) != mine:
-            found = state.get("problem") if isinstance(state, dict) else state
+        found = state.get("problem") if isinstance(state, dict) else state
+        if not isinstance(found, (tuple, list)) or tuple(found) != mine:
             raise InvalidInputError(
                 f"the state is of a problem with (n, p, m, horizon) = {found!r}; expected {mine}."
             )
-        if not self._window.fits(state["window"]):
-            raise InvalidInputError("the state is of an estimator with another observer or cost.")
-        self.reset(np.array(state["history"][-1]))
-        self._window.load_state_dict(state["window"])
+        try:
+            if not self._window.fits(state["window"]):
+                raise InvalidInputError(
+                    "the state is of an estimator with another observer or cost."
+                )
+            history = [np.array(x, np.float64).reshape(system.n) for x in state["history"]]
+            window = self._fresh_window(history[-1])
+            window.load_state_dict(state["window"])
+            trajectory, dropped = state["trajectory"], tuple(state["dropped"])
+            if trajectory is not None:
+                trajectory = np.array(trajectory, np.float64).reshape(-1, system.n)
+            modes, methods = tuple(state["modes"]), tuple(state["methods"])
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            if isinstance(error, InvalidInputError):
+                raise
+            raise InvalidInputError(
+                f"the state is damaged ({type(error).__name__}: {error}); expected what "
+                "state_dict gave, unchanged."
+            ) from error
+        # All of it could be read: from here on nothing fails, and nothing is half done.
+        self._window, self._trajectory, self._dropped = window, trajectory, dropped
         self._history.clear()
-        self._history.extend(np.array(x) for x in state["history"])
-        self._dropped = tuple(state["dropped"])
-        for function, mode in zip((system.f, system.h), state["modes"], strict=True):
+        self._history.extend(history)
+        for function, mode in zip((system.f, system.h), modes, strict=True):
             function.mode = mode
-        jacobians = (system.f_jacobian, system.h_jacobian)
-        for jacobian, method in zip(jacobians, state["methods"], strict=True):
+        for jacobian, method in zip(
+            (system.f_jacobian, system.h_jacobian), methods, strict=True
+        ):
             jacobian.use(method)
-        if state["trajectory"] is not None:
-            self._trajectory = np.array(state["trajectory"])
+        if trajectory is not None:
             self._problem.bind(self._window)
             self._problem.leave_out(self._dropped)

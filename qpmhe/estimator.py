@@ -348,7 +348,8 @@ class MovingHorizonEstimator:
         }
 
     def __setstate__(self, saved: dict[str, Any]) -> None:
-        self.__init__(  # type: ignore[misc]
+        # The checks and the solver's making run again: a snapshot is input like any other.
+        self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
             *saved["arguments"], initial_state=saved["initial_state"], **vars(saved["settings"])
         )
         self.load_state_dict(saved["state"])
@@ -377,7 +378,8 @@ class MovingHorizonEstimator:
         inputs : (T, m) array_like, optional
             The inputs of the same times.
         covariances : bool
-            Whether to compute the covariance of each estimate.
+            Whether to compute the covariance of each estimate; NaN where the model cannot
+            be linearised along it.
 
         Returns
         -------
@@ -403,8 +405,15 @@ class MovingHorizonEstimator:
         for y, u in zip(ys, us, strict=True):
             estimates.append(self.update(y, u))
             if covariances:
-                collected.append(self.covariances()[-1])
+                collected.append(self._newest_covariance())
         return Run(start, estimates, np.array(collected) if covariances else None)
+
+    def _newest_covariance(self) -> Array:
+        try:
+            value: Array = self.covariances()[-1]
+        except (InvalidInputError, np.linalg.LinAlgError):  # bad luck: the record goes on
+            value = np.full((self.system.n, self.system.n), np.nan)
+        return value
 
 
 def _is(value: object, kind: type, name: str, expected: str) -> None:

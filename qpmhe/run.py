@@ -46,7 +46,8 @@ class Run:
     delayed : (T, n) array
         Estimates with the estimator's delay, NaN where the window did not reach that far.
     covariances : (T, n, n) array or None
-        Covariances of the estimates of x(1), ..., x(T), if they were asked for.
+        Covariances of the estimates of x(1), ..., x(T), if they were asked for; NaN where
+        the model could not be linearised.
     """
 
     def __init__(

@@ -243,7 +243,8 @@ def _made(maker: Function, arguments: dict[str, Any]) -> Any:
 def _over_leading(function: BatchedFunction, written: Any) -> Function:
     """A function of (..., n), whatever way the user's was written."""
     if function.plain:
-        return written  # type: ignore[no-any-return]
+        plain: Function = written
+        return plain
 
     def evaluate(x: Array, *inputs: Array) -> Any:
         u = inputs[0] if inputs else np.empty((*x.shape[:-1], 0))

@@ -301,3 +301,17 @@ def test_they_follow_an_amended_measurement():
         case.kept.amend(5 - age, y)
         hessian = case.kept.hessian(estimate.trajectory)
         close(case.mhe.covariances(), blocks(np.linalg.inv(hessian), 2))
+
+
+def test_a_run_goes_on_where_there_are_no_covariances():
+    mhe = qpmhe.MovingHorizonEstimator(
+        qpmhe.System(np.sqrt, lambda x: x, n=1, p=1), qpmhe.Luenberger([0.9]),
+        qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0),
+        horizon=2, initial_state=[1.0], max_qps=0,
+    )
+    run = mhe.run([1.0, -5.0, 1.0, 1.0, 1.0, 1.0, 1.0], covariances=True)
+    assert len(run) == 7
+    known = np.isfinite(run.covariances[:, 0, 0])
+    assert known[0]
+    assert known[-1]
+    assert not known.all()

@@ -132,6 +132,40 @@ def test_a_state_of_another_problem_is_refused(state, words):
     assert mhe.time == 8
 
 
+def damaged(key, value):
+    mhe = make()
+    feed(mhe, record(8))
+    state = mhe.state_dict()
+    if value is None:
+        del state[key]
+    else:
+        state[key] = value
+    return state
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        damaged("window", None),
+        damaged("window", 3),
+        damaged("history", []),
+        damaged("history", [[1.0, 2.0, 3.0]]),
+        damaged("modes", None),
+        damaged("trajectory", "text"),
+        damaged("problem", 3),
+    ],
+)
+def test_a_damaged_state_is_refused_and_nothing_is_half_done(state):
+    mhe, twin = make(), make()
+    measurements = record(12)
+    feed(mhe, measurements[:5])
+    feed(twin, measurements[:5])
+    words = r"the state is (damaged|of a problem)"
+    with pytest.raises(qpmhe.errors.InvalidInputError, match=words):
+        mhe.load_state_dict(state)
+    assert_equal(feed(mhe, measurements[5:], 5), feed(twin, measurements[5:], 5))
+
+
 def test_a_state_of_another_observer_is_refused():
     system, _, cost, scenario = qpmhe.models.batch_reactor()
     observer = qpmhe.ExtendedKalman(
