@@ -80,8 +80,8 @@ class Window(Stages):
         missing, held, flat : bool
             Whether a component of y is not finite; whether f, h or the observer raised or
             were not finite at z(t); whether only the Jacobians did. A held stage keeps its
-            measurement; the observer holds its state, and the candidate's cost is infinite
-            while the stage stays.
+            measurement; the observer goes on where the model last worked, and the
+            candidate's cost is infinite while the stage stays.
         """
         if self.end == self._room:
             self._move_to_front()
