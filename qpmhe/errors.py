@@ -13,6 +13,8 @@ from qpmhe_solvers.errors import (
 
 __all__ = [
     "BackendError",
+    "CompilationError",
+    "EngineWarning",
     "InvalidInputError",
     "ModelError",
     "OptionError",
@@ -34,3 +36,11 @@ class WeightError(InvalidInputError):
 
 class SetError(InvalidInputError):
     """A set that is empty, inverted or of the wrong dimension."""
+
+
+class CompilationError(QpmheError):
+    """C code that could not be compiled or loaded here."""
+
+
+class EngineWarning(UserWarning):
+    """Something is carried out by a slower means than was asked for; results are the same."""

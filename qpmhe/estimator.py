@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from time import perf_counter
 from typing import Any
 
@@ -11,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from qpmhe_solvers.errors import tell_unknown_options
 
 from ._checks import positive, positive_definite, record, vector
+from .compiled import CompiledEngine
 from .costs import Cost, ObserverPrior
 from .engine import PythonEngine
-from .errors import InvalidInputError, ShapeError
+from .errors import CompilationError, EngineWarning, InvalidInputError, ShapeError
 from .estimate import Estimate
 from .observers import Observer
 from .run import Run
@@ -61,8 +63,12 @@ class MovingHorizonEstimator:
     tolerance : float
         The sequence of QPs has converged when a QP that was solved lowers J by less than
         this share of it.
-    engine : {"python"}
-        How the step is carried out.
+    engine : {"python", "compiled"}
+        How the step is carried out. ``compiled`` generates C code for the whole step from a
+        system made by `System.from_casadi`, a quadratic cost and an observer with constant
+        gain, compiles it once and keeps it in a cache on disk; QPs with active inequalities
+        are solved by an interior-point method in it. Without a C compiler, a warning tells
+        so and the Python step is taken.
     outside : {"drop", "project", "keep"}
         What to do where the candidate is outside of the sets: ``drop`` leaves the violated
         sets out in this step, the paper's remedy after Assumption ass:observer; ``project``
@@ -145,7 +151,7 @@ class MovingHorizonEstimator:
         self.initial_state: Array = self._checked_start(initial_state)
         self._no_input = np.zeros(system.m)
         self._timed_is_checked = False
-        self._engine = PythonEngine(system, observer, cost, self.settings, self.initial_state)
+        self._engine = _engine_for(system, observer, cost, self.settings, self.initial_state)
 
     def _checked_start(self, initial_state: ArrayLike) -> Array:
         state = vector("initial_state", initial_state, self.system.n)
@@ -180,6 +186,11 @@ class MovingHorizonEstimator:
     def state(self) -> Array:
         """The current estimate of x(t+1), or the initial one before the first measurement."""
         return self._engine.state
+
+    @property
+    def engine(self) -> str:
+        """How the step is carried out: ``python`` or ``compiled``."""
+        return "compiled" if isinstance(self._engine, CompiledEngine) else "python"
 
     @property
     def time(self) -> int:
@@ -392,21 +403,23 @@ class MovingHorizonEstimator:
             If a shape is wrong; no sample has been taken then.
         """
         ys = record("measurements", measurements, self.system.p)
-        us: Any = [None] * len(ys)
+        us = None
         if inputs is not None:
             us = record("inputs", inputs, self.system.m)
+            if len(us) != len(ys):
+                raise ShapeError(
+                    f"inputs has {len(us)} samples; expected {len(ys)}, one for each measurement."
+                )
         elif self.system.m:
             self._input(None)
-        if len(us) != len(ys):
-            raise ShapeError(
-                f"inputs has {len(us)} samples; expected {len(ys)}, one for each measurement."
-            )
+        if isinstance(self._engine, CompiledEngine) and not covariances:
+            return self._engine.run(ys, us)
         start, estimates, collected = self.state.copy(), [], []
-        for y, u in zip(ys, us, strict=True):
+        for y, u in zip(ys, [None] * len(ys) if us is None else us, strict=True):
             estimates.append(self.update(y, u))
             if covariances:
                 collected.append(self._newest_covariance())
-        return Run(start, estimates, np.array(collected) if covariances else None)
+        return Run.of(start, estimates, np.array(collected) if covariances else None)
 
     def _newest_covariance(self) -> Array:
         try:
@@ -414,6 +427,22 @@ class MovingHorizonEstimator:
         except (InvalidInputError, np.linalg.LinAlgError):  # bad luck: the record goes on
             value = np.full((self.system.n, self.system.n), np.nan)
         return value
+
+
+def _engine_for(
+    system: System, observer: Observer, cost: Cost, settings: Settings, initial_state: Array
+) -> PythonEngine | CompiledEngine:
+    """The engine that the settings ask for, or the Python one where it cannot be compiled."""
+    if settings.engine == "compiled":
+        try:
+            return CompiledEngine(system, observer, cost, settings, initial_state)
+        except CompilationError as error:
+            warnings.warn(
+                f"engine='compiled' is carried out by the Python step: {error}",
+                EngineWarning,
+                stacklevel=4,
+            )
+    return PythonEngine(system, observer, cost, settings, initial_state)
 
 
 def _is(value: object, kind: type, name: str, expected: str) -> None:

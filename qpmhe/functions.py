@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .errors import ModelError
 from .tracing import mixes_states
 
-__all__ = ["BatchedFunction"]
+__all__ = ["BatchedFunction", "positional_arguments"]
 
 Array = NDArray[Any]
 Probes = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -58,7 +58,7 @@ class BatchedFunction:
             raise ModelError(f"{name} is {function!r}; expected a function of the state.")
         self.name, self.shape = name, shape
         self._function, self._inputs = function, inputs
-        self._takes_input = inputs > 0 and _positional_arguments(name, function) != 1
+        self._takes_input = inputs > 0 and positional_arguments(name, function) != 1
         if inputs == 0 and _required_arguments(function) > 1:
             raise ModelError(
                 f"{name} needs more than one argument, but the system has no inputs; "
@@ -219,7 +219,7 @@ class BatchedFunction:
             )
 
 
-def _positional_arguments(name: str, function: Callable[..., Any]) -> int | None:
+def positional_arguments(name: str, function: Callable[..., Any]) -> int | None:
     """How many positional arguments function can take; None if it cannot be told."""
     try:
         parameters = inspect.signature(function).parameters.values()

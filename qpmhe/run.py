@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,21 +15,13 @@ from .estimate import Estimate, Status
 __all__ = ["Run"]
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.intp]
 
 
 class Run:
     """Results of T consecutive updates, as arrays.
 
     Parameters
-    ----------
-    start : (n,) array
-        The estimate before the first update.
-    estimates : sequence of Estimate
-        What the updates returned.
-    covariances : (T, n, n) array, optional
-        Covariances of their states.
-
-    Attributes
     ----------
     states : (T + 1, n) array
         Estimates of x(0), ..., x(T), each made before y of its own time: row 0 is the start.
@@ -36,51 +30,96 @@ class Run:
     costs, candidate_costs : (T,) array
         True cost J of estimate and candidate.
     times, solve_times : (T,) array
-        Seconds for each update, and for the QP solver in it.
+        Seconds for each update, and for the QP solver in it. A compiled run is timed in
+        pieces of some hundred samples, and its solver not at all (NaN).
     qps : (T,) array
         QPs solved.
     solver_iterations : (T,) array
         The solver's own iterations, -1 where it does not tell.
-    statuses : list of Status
-        Outcome and events of each step.
     delayed : (T, n) array
         Estimates with the estimator's delay, NaN where the window did not reach that far.
-    covariances : (T, n, n) array or None
+    flags : (T,) array
+        Values of the statuses.
+    covariances : (T, n, n) array, optional
         Covariances of the estimates of x(1), ..., x(T), if they were asked for; NaN where
         the model could not be linearised.
+
+    Attributes
+    ----------
+    statuses : list of Status
+        Outcome and events of each step.
     """
 
     def __init__(
         self,
-        start: Array,
-        estimates: Sequence[Estimate],
+        *,
+        states: Array,
+        filtered: Array,
+        costs: Array,
+        candidate_costs: Array,
+        times: Array,
+        solve_times: Array,
+        qps: Integers,
+        solver_iterations: Integers,
+        delayed: Array,
+        flags: NDArray[np.integer[Any]],
         covariances: Array | None = None,
     ) -> None:
+        self.states, self.filtered, self.delayed = states, filtered, delayed
+        self.costs, self.candidate_costs = costs, candidate_costs
+        self.times, self.solve_times = times, solve_times
+        self.qps, self.solver_iterations = qps, solver_iterations
+        self.flags, self.covariances = flags, covariances
+
+    @classmethod
+    def of(
+        cls, start: Array, estimates: Sequence[Estimate], covariances: Array | None = None
+    ) -> Run:
+        """Collect what single updates returned.
+
+        Parameters
+        ----------
+        start : (n,) array
+            The estimate before the first update.
+        estimates : sequence of Estimate
+            What the updates returned.
+        covariances : (T, n, n) array, optional
+            Covariances of their states.
+        """
         n = start.size
-        self.states: Array = np.array([start, *(e.state for e in estimates)])
-        self.filtered: Array = np.array([e.filtered for e in estimates]).reshape(-1, n)
-        self.costs: Array = np.array([e.cost for e in estimates])
-        self.candidate_costs: Array = np.array([e.candidate_cost for e in estimates])
-        self.times: Array = np.array([e.step_time for e in estimates])
-        self.solve_times: Array = np.array([e.solve_time for e in estimates])
-        self.qps = np.array([e.qps for e in estimates], dtype=np.intp)
-        self.solver_iterations = np.array(
-            [-1 if e.solver_iterations is None else e.solver_iterations for e in estimates],
-            dtype=np.intp,
-        )
         nothing = np.full(n, np.nan)
-        self.delayed: Array = np.array(
-            [nothing if e.delayed is None else e.delayed for e in estimates]
-        ).reshape(-1, n)
-        self.covariances = covariances
-        self.statuses: list[Status] = [e.status for e in estimates]
+        return cls(
+            states=np.array([start, *(e.state for e in estimates)]),
+            filtered=np.array([e.filtered for e in estimates]).reshape(-1, n),
+            costs=np.array([e.cost for e in estimates]),
+            candidate_costs=np.array([e.candidate_cost for e in estimates]),
+            times=np.array([e.step_time for e in estimates]),
+            solve_times=np.array([e.solve_time for e in estimates]),
+            qps=np.array([e.qps for e in estimates], dtype=np.intp),
+            solver_iterations=np.array(
+                [-1 if e.solver_iterations is None else e.solver_iterations for e in estimates],
+                dtype=np.intp,
+            ),
+            delayed=np.array(
+                [nothing if e.delayed is None else e.delayed for e in estimates]
+            ).reshape(-1, n),
+            flags=np.array([e.status.value for e in estimates], dtype=np.intp),
+            covariances=covariances,
+        )
+
+    @cached_property
+    def statuses(self) -> list[Status]:
+        """Outcome and events of each step."""
+        known = {value: Status(value) for value in np.unique(self.flags).tolist()}
+        return [known[value] for value in self.flags.tolist()]
 
     def __len__(self) -> int:
-        return len(self.statuses)
+        return self.flags.size
 
     def share(self, flag: Status) -> float:
         """The share of steps whose status has this flag."""
-        return sum(flag in status for status in self.statuses) / max(1, len(self.statuses))
+        has = (self.flags & flag.value) == flag.value
+        return float(has.sum()) / max(1, len(self))
 
     def reasons(self) -> dict[str, int]:
         """How often each combination of flags occurred, the most frequent first."""

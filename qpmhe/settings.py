@@ -8,12 +8,13 @@ from typing import Literal, get_args
 from ._checks import count, positive
 from .errors import OptionError
 
-__all__ = ["Candidate", "Convex", "Policy", "Settings", "Start"]
+__all__ = ["Candidate", "Convex", "Engine", "Policy", "Settings", "Start"]
 
 Policy = Literal["drop", "project", "keep"]
 Start = Literal["candidate", "best"]
 Candidate = Literal["observer", "reinitialized"]
 Convex = Literal["qp", "exact"]
+Engine = Literal["python", "compiled"]
 
 # With max_qps=None the sequence ends by convergence; this bounds it where that fails.
 _SAFETY_LIMIT = 100
@@ -70,7 +71,7 @@ class Settings:
                 "states are not in the window."
             )
         for name, choices in (
-            ("engine", ("python",)),
+            ("engine", get_args(Engine)),
             ("outside", get_args(Policy)),
             ("start", get_args(Start)),
             ("candidate", get_args(Candidate)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from .discretize import discretize
 from .errors import InvalidInputError, ModelError, SetError
 from .functions import BatchedFunction, Probes
 from .sets import ConvexSet
+
+if TYPE_CHECKING:
+    from .codegen.expressions import CasadiModel
 
 __all__ = ["System"]
 
@@ -94,6 +97,8 @@ class System:
         self.h_jacobian = Jacobian(self.h, h_jacobian, self.m, probes)
         #: The sampling time of a system made by `from_ode`, None otherwise.
         self.dt: float | None = None
+        #: The same model as CasADi functions, of a system made by `from_casadi`.
+        self.symbolic: CasadiModel | None = None
         self._timed: Callable[[], System] | None = None
         self._recipe: tuple[Function, dict[str, Any]] = (
             type(self),
@@ -183,6 +188,62 @@ class System:
         system._timed = timed
         return system
 
+    @classmethod
+    def from_casadi(
+        cls,
+        f: Any,
+        h: Any,
+        *,
+        dt: float | None = None,
+        method: str = "rk4",
+        n: int | None = None,
+        p: int | None = None,
+        m: int | None = None,
+        states: ConvexSet | None = None,
+        disturbances: ConvexSet | None = None,
+        noises: ConvexSet | None = None,
+        compiled: bool | None = None,
+    ) -> System:
+        r"""A model written for CasADi, with exact Jacobians, evaluated without Python.
+
+        Its functions are compiled once, kept in a cache on disk, and called on a whole
+        window at once; without a C compiler CasADi's own virtual machine evaluates them.
+        Such a system is also what ``engine="compiled"`` and `qpmhe.codegen` need.
+
+        Parameters
+        ----------
+        f, h : casadi.Function or callable
+            (x) or (x, u) to a column: functions of CasADi, or Python functions that take
+            symbolic columns and return one column or a list of entries.
+        dt : float, optional
+            If given, f is the right-hand side of an ODE, which is discretised with this
+            sampling time; u is held over the step.
+        method : {"rk4", "euler"}
+            Its discretisation.
+        n, p, m : int, optional
+            Numbers of states, outputs and inputs; n (and m, if there are inputs) are needed
+            where f is no casadi.Function.
+        states, disturbances, noises : Box or Polytope, optional
+            The sets X, W and V.
+        compiled : bool, optional
+            Whether to compile the functions; left out, wherever there is a compiler.
+
+        Raises
+        ------
+        ModelError, SetError, OptionError
+            If something does not fit.
+        InvalidInputError
+            If CasADi is not installed.
+        CompilationError
+            If ``compiled`` is True, and it fails.
+        """
+        from .adapters.casadi import casadi_system
+
+        return casadi_system(
+            f, h, dt=dt, method=method, n=n, p=p, m=m, states=states,
+            disturbances=disturbances, noises=noises, compiled=compiled,
+        )
+
     def __reduce__(self) -> tuple[Any, ...]:
         # Made anew from the user's functions: the closures inside cannot be pickled.
         return _made, self._recipe
@@ -194,12 +255,12 @@ class System:
         Raises
         ------
         InvalidInputError
-            If the system is not made by `from_ode`.
+            If the system has no model in continuous time.
         """
         if self._timed is None:
             raise InvalidInputError(
                 "the system is discrete: steps of another length need a model in continuous "
-                "time, made by System.from_ode."
+                "time, as System.from_ode takes it."
             )
         return self._timed()
 

@@ -79,7 +79,7 @@ class PaperStudy:
             estimates.append(mhe.update(y))
             if tick:
                 tick()
-        return Run(scenario.initial_estimate, estimates)
+        return Run.of(scenario.initial_estimate, estimates)
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ class IpoptComparison:
             estimates.append(mhe.update(y))
             if tick:
                 tick()
-        return Run(self.study.model.scenario.initial_estimate, estimates)
+        return Run.of(self.study.model.scenario.initial_estimate, estimates)
 
 
 def ipopt_rows(study: PaperStudy, tick: Tick | None = None) -> list[Row]:

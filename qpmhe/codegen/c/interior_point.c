@@ -1,0 +1,410 @@
+/* The QP with inequalities: a primal-dual interior-point method of Mehrotra's kind, whose
+ * Newton matrices have the block-banded form of factor.c.
+ *
+ *     min d'H d / 2 + g'd   s.t.   low <= c(d) <= high
+ *
+ * The rows c of stage i are those of X (on d(i)), of W (on d(i+1) - A d(i)) and of V (on
+ * -C d(i)): each set's components first, then its general inequalities. */
+
+enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED };
+
+#if CONSTRAINED
+
+#define ROWS MHE_STAGE_ROWS
+#define X_COUNT (MHE_X_SET * (NX + MHE_X_ROWS))
+#define W_COUNT (MHE_W_SET * (NX + MHE_W_ROWS))
+#define V_COUNT (MHE_V_SET * (NY + MHE_V_ROWS))
+
+/* Rows that stage i has: the last state has no disturbance and no noise. */
+static int mhe_rows_at(const mhe_estimator *e, int i) { return i < e->length ? ROWS : X_COUNT; }
+
+/* Limits of the rows of one set about the point q where the QP is built. */
+static void mhe_limit(int n, int count, const real *q, const real *lower, const real *upper,
+                      const real *rows, const real *row_lower, const real *row_upper,
+                      const uint8_t *known, int active, mhe_row *out)
+{
+    for (int j = 0; j < n; j++) {
+        const int there = active && (!known || known[j]);
+        out[j].low = there ? lower[j] - q[j] : -INFINITY;
+        out[j].high = there ? upper[j] - q[j] : INFINITY;
+    }
+    for (int i = 0; i < count; i++) {
+        int there = active;
+        for (int j = 0; j < n; j++)
+            if (known && !known[j] && rows[i * n + j] != 0) there = 0;
+        const real value = mhe_dot(n, rows + i * n, q);
+        out[n + i].low = there ? row_lower[i] - value : -INFINITY;
+        out[n + i].high = there ? row_upper[i] - value : INFINITY;
+    }
+}
+
+#define LIMIT(set, n, count, q, known, active, out) \
+    mhe_limit(n, count, q, (set).lower, (set).upper, (set).rows, (set).row_lower, \
+              (set).row_upper, known, active, out)
+
+/* Limits of all rows about a trajectory with residuals w and v. */
+static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, int sets, const real *x,
+                           const real *w, const real *v)
+{
+    const mhe_settings *s = e->settings;
+    for (int i = 0; i <= e->length; i++) {
+        mhe_row *rows = k->rows + i * ROWS;
+#if MHE_X_SET
+        LIMIT(s->states, NX, MHE_X_ROWS, x + i * NX, 0, sets & STATES, rows);
+        rows += X_COUNT;
+#endif
+        if (i == e->length) break;
+#if MHE_W_SET
+        LIMIT(s->disturbances, NX, MHE_W_ROWS, w + i * NX, 0, sets & DISTURBANCES, rows);
+        rows += W_COUNT;
+#endif
+#if MHE_V_SET
+        const mhe_stage *stage = mhe_stage_at(e, i);
+        LIMIT(s->noises, NY, MHE_V_ROWS, v + i * NY, stage->is_complete ? 0 : stage->is_observed,
+              sets & NOISES, rows);
+#endif
+    }
+    (void)x; (void)w; (void)v;
+}
+
+static void mhe_values_of(int n, int count, const real *q, const real *rows, mhe_row *out)
+{
+    for (int j = 0; j < n; j++) out[j].value = q[j];
+    for (int i = 0; i < count; i++) out[n + i].value = mhe_dot(n, rows + i * n, q);
+}
+
+/* rows.value = c(d). */
+static void mhe_rows_times(const mhe_estimator *e, mhe_workspace *k, const real *d)
+{
+    const mhe_settings *s = e->settings;
+    for (int i = 0; i <= e->length; i++) {
+        mhe_row *rows = k->rows + i * ROWS;
+        const real *own = d + i * NX;
+#if MHE_X_SET
+        mhe_values_of(NX, MHE_X_ROWS, own, s->states.rows, rows);
+        rows += X_COUNT;
+#endif
+        if (i == e->length) break;
+#if MHE_W_SET
+        real q[NX];
+        for (int j = 0; j < NX; j++)
+            q[j] = own[NX + j] - mhe_dot(NX, k->at[i]->f_jacobian + j * NX, own);
+        mhe_values_of(NX, MHE_W_ROWS, q, s->disturbances.rows, rows);
+        rows += W_COUNT;
+#endif
+#if MHE_V_SET
+        real r[NY];
+        for (int j = 0; j < NY; j++) r[j] = -mhe_dot(NX, k->at[i]->h_jacobian + j * NX, own);
+        mhe_values_of(NY, MHE_V_ROWS, r, s->noises.rows, rows);
+#endif
+    }
+    (void)s;
+}
+
+static void mhe_loads_of(int n, int count, const real *rows, const mhe_row *in, real *out)
+{
+    for (int j = 0; j < n; j++) out[j] = in[j].load;
+    for (int i = 0; i < count; i++)
+        for (int j = 0; j < n; j++) out[j] += in[n + i].load * rows[i * n + j];
+}
+
+/* out += c' load. */
+static void mhe_add_loads(const mhe_estimator *e, const mhe_workspace *k, real *out)
+{
+    const mhe_settings *s = e->settings;
+    for (int i = 0; i <= e->length; i++) {
+        const mhe_row *rows = k->rows + i * ROWS;
+        real *own = out + i * NX;
+#if MHE_X_SET
+        real x[NX];
+        mhe_loads_of(NX, MHE_X_ROWS, s->states.rows, rows, x);
+        for (int j = 0; j < NX; j++) own[j] += x[j];
+        rows += X_COUNT;
+#endif
+        if (i == e->length) break;
+#if MHE_W_SET
+        real w[NX];
+        const real *A = k->at[i]->f_jacobian;
+        mhe_loads_of(NX, MHE_W_ROWS, s->disturbances.rows, rows, w);
+        for (int r = 0; r < NX; r++) {
+            own[NX + r] += w[r];
+            for (int j = 0; j < NX; j++) own[j] -= w[r] * A[r * NX + j];
+        }
+        rows += W_COUNT;
+#endif
+#if MHE_V_SET
+        real v[NY];
+        const real *C = k->at[i]->h_jacobian;
+        mhe_loads_of(NY, MHE_V_ROWS, s->noises.rows, rows, v);
+        for (int r = 0; r < NY; r++)
+            for (int j = 0; j < NX; j++) own[j] -= v[r] * C[r * NX + j];
+#endif
+    }
+    (void)s;
+}
+
+/* panel += weight a a' (upper half). */
+static void mhe_add_square(real *panel, real weight, const real *a)
+{
+    for (int i = 0; i < NX; i++) {
+        const real scaled = weight * a[i];
+        if (scaled == 0) continue;
+        for (int j = i & ~3; j < NX; j++) panel[i * WIDTH + j] += scaled * a[j];
+    }
+}
+
+/* panels += c' diag(weight) c. */
+static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
+{
+    const mhe_settings *s = e->settings;
+    for (int i = 0; i <= e->length; i++) {
+        const mhe_row *rows = k->rows + i * ROWS;
+        real *panel = k->panels + i * NX * WIDTH;
+#if MHE_X_SET
+        for (int j = 0; j < NX; j++) panel[j * WIDTH + j] += rows[j].weight;
+        for (int r = 0; r < MHE_X_ROWS; r++)
+            mhe_add_square(panel, rows[NX + r].weight, s->states.rows + r * NX);
+        rows += X_COUNT;
+#endif
+        if (i == e->length) break;
+#if MHE_W_SET
+        const real *A = k->at[i]->f_jacobian;
+        real *next = panel + NX * WIDTH;
+        for (int r = 0; r < NX; r++) {
+            const real weight = rows[r].weight;
+            if (weight == 0) continue;
+            mhe_add_square(panel, weight, A + r * NX);
+            next[r * WIDTH + r] += weight;
+            for (int j = 0; j < NX; j++) panel[j * WIDTH + NX + r] -= weight * A[r * NX + j];
+        }
+        for (int r = 0; r < MHE_W_ROWS; r++) {
+            const real weight = rows[NX + r].weight, *row = s->disturbances.rows + r * NX;
+            real a[NX];
+            if (weight == 0) continue;
+            for (int j = 0; j < NX; j++) {
+                a[j] = 0;
+                for (int q = 0; q < NX; q++) a[j] -= row[q] * A[q * NX + j];
+            }
+            mhe_add_square(panel, weight, a);
+            mhe_add_square(next, weight, row);
+            for (int j = 0; j < NX; j++)
+                for (int q = 0; q < NX; q++)
+                    panel[j * WIDTH + NX + q] += weight * a[j] * row[q];
+        }
+        rows += W_COUNT;
+#endif
+#if MHE_V_SET
+        const real *C = k->at[i]->h_jacobian;
+        for (int r = 0; r < NY; r++)
+            if (rows[r].weight != 0) mhe_add_square(panel, rows[r].weight, C + r * NX);
+        for (int r = 0; r < MHE_V_ROWS; r++) {
+            const real *row = s->noises.rows + r * NY;
+            real c[NX];
+            if (rows[NY + r].weight == 0) continue;
+            for (int j = 0; j < NX; j++) {
+                c[j] = 0;
+                for (int q = 0; q < NY; q++) c[j] += row[q] * C[q * NX + j];
+            }
+            mhe_add_square(panel, rows[NY + r].weight, c);
+        }
+#endif
+    }
+    (void)s;
+}
+
+/* The largest amount by which a row is missed; rows.value = c(d) afterwards. */
+static real mhe_row_violation(const mhe_estimator *e, mhe_workspace *k, const real *d)
+{
+    real worst = 0;
+    mhe_rows_times(e, k, d);
+    for (int i = 0; i <= e->length; i++)
+        for (int r = 0; r < mhe_rows_at(e, i); r++) {
+            const mhe_row *row = k->rows + i * ROWS + r;
+            worst = fmax(worst, fmax(row->low - row->value, row->value - row->high));
+        }
+    return worst;
+}
+
+/* out = H d, from the panels before they are factorised. */
+static void mhe_hessian_times(const mhe_workspace *k, int count, const real *d, real *out)
+{
+    for (int j = 0; j < (count + 1) * NX; j++) out[j] = 0;
+    for (int i = 0; i <= count; i++) {
+        const real *panel = k->panels + i * NX * WIDTH;
+        const int last = i < count ? 2 * NX : NX;
+        for (int r = 0; r < NX; r++) {
+            const real *row = panel + r * WIDTH, own = d[i * NX + r];
+            real *target = out + i * NX;
+            real sum = row[r] * own;
+            for (int c = r + 1; c < last; c++) {
+                sum += row[c] * d[i * NX + c];
+                target[c] += row[c] * own;
+            }
+            target[r] += sum;
+        }
+    }
+}
+
+/* Step that keeps a positive variable positive. */
+static real mhe_longest(real length, real variable, real change)
+{
+    return change < 0 && -variable < length * change ? -variable / change : length;
+}
+
+/* Right-hand side of the Newton equations for a target of the complementarity products. */
+static void mhe_set_loads(const mhe_estimator *e, mhe_workspace *k, real target)
+{
+    for (int i = 0; i <= e->length; i++)
+        for (int r = 0; r < mhe_rows_at(e, i); r++) {
+            mhe_row *q = k->rows + i * ROWS + r;
+            q->load = 0;
+            if (q->dual_low > 0)
+                q->load += (target - q->correction_low - q->dual_low * q->residual_low) /
+                               q->slack_low - q->dual_low;
+            if (q->dual_high > 0)
+                q->load -= (target - q->correction_high - q->dual_high * q->residual_high) /
+                               q->slack_high - q->dual_high;
+        }
+    memcpy(k->direction, k->residual, sizeof(real) * (size_t)(e->length + 1) * NX);
+    mhe_add_loads(e, k, k->direction);
+}
+
+/* Changes of one row's variables along the direction, whose c is in `value`. */
+static void mhe_changes(const mhe_row *q, real target, real *changes)
+{
+    for (int side = 0; side < 4; side++) changes[side] = 0;
+    if (q->dual_low > 0) {
+        changes[0] = q->value + q->residual_low;
+        changes[1] = (target - q->correction_low - q->dual_low * changes[0]) / q->slack_low -
+                     q->dual_low;
+    }
+    if (q->dual_high > 0) {
+        changes[2] = q->residual_high - q->value;
+        changes[3] = (target - q->correction_high - q->dual_high * changes[2]) / q->slack_high -
+                     q->dual_high;
+    }
+}
+
+/* Solve the QP whose limits and terms are in place; `step` holds the minimiser without
+ * inequalities and `promise` its |g'd|. A dual variable of 0 marks a side that is not there. */
+static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const real *offset,
+                              int nearest, real promise, int limit, int *iterations)
+{
+    const mhe_settings *s = e->settings;
+    const int count = e->length, size = (count + 1) * NX;
+    const real missed = mhe_row_violation(e, k, k->step);
+    const real scale = nearest ? missed * missed : promise;
+    const real primal_tolerance = s->solver_tolerance / 100;
+    real steepest = 0, products = 0;
+    int sides = 0;
+    for (int i = 0; i <= count; i++)
+        for (int r = 0; r < mhe_rows_at(e, i); r++) {
+            mhe_row *q = k->rows + i * ROWS + r;
+            q->dual_low = q->dual_high = 0;
+            q->slack_low = q->slack_high = 1;
+            q->residual_low = q->residual_high = 0;
+            if (isfinite(q->low)) q->slack_low = fmax(-q->low, missed), sides++;
+            if (isfinite(q->high)) q->slack_high = fmax(q->high, missed), sides++;
+        }
+    if (!sides) return SOLVED;
+    const real start = fmax(scale / sides, EPSILON * EPSILON);
+    for (int i = 0; i <= count; i++)
+        for (int r = 0; r < mhe_rows_at(e, i); r++) {
+            mhe_row *q = k->rows + i * ROWS + r;
+            if (isfinite(q->low)) q->dual_low = start / q->slack_low;
+            if (isfinite(q->high)) q->dual_high = start / q->slack_high;
+        }
+    memset(k->step, 0, sizeof(real) * (size_t)size);
+    for (*iterations = 0;; ++*iterations) {
+        real infeasible = 0, unbalanced = 0, length = 1, after = 0;
+        mhe_build(e, k, offset, nearest);
+        mhe_hessian_times(k, count, k->step, k->product);
+        mhe_rows_times(e, k, k->step);
+        products = 0;
+        for (int i = 0; i <= count; i++)
+            for (int r = 0; r < mhe_rows_at(e, i); r++) {
+                mhe_row *q = k->rows + i * ROWS + r;
+                q->correction_low = q->correction_high = 0;
+                q->weight = 0;
+                if (q->dual_low > 0) {
+                    q->residual_low = q->value - q->low - q->slack_low;
+                    infeasible = fmax(infeasible, fabs(q->residual_low));
+                    products += q->slack_low * q->dual_low;
+                    q->weight += q->dual_low / q->slack_low;
+                }
+                if (q->dual_high > 0) {
+                    q->residual_high = q->high - q->value - q->slack_high;
+                    infeasible = fmax(infeasible, fabs(q->residual_high));
+                    products += q->slack_high * q->dual_high;
+                    q->weight += q->dual_high / q->slack_high;
+                }
+                q->load = q->dual_low - q->dual_high;
+            }
+        for (int j = 0; j < size; j++) {
+            k->residual[j] = -k->product[j] - k->gradient[j];
+            steepest = fmax(steepest, fabs(k->gradient[j]));
+        }
+        mhe_add_loads(e, k, k->residual);
+        for (int j = 0; j < size; j++) unbalanced = fmax(unbalanced, fabs(k->residual[j]));
+        if (infeasible <= primal_tolerance && unbalanced <= s->solver_tolerance * (1 + steepest) &&
+            products <= s->solver_tolerance / 1000 * scale)
+            return SOLVED;
+        if (*iterations == limit) return STOPPED;
+        mhe_add_weights(e, k);
+        if (!mhe_factorise(k, count)) return *iterations ? STOPPED : FAILED;
+        real target = 0;
+        for (int corrector = 0; corrector < 2; corrector++) {
+            mhe_set_loads(e, k, target);
+            if (!mhe_solve(k, count, k->direction)) return *iterations ? STOPPED : FAILED;
+            mhe_rows_times(e, k, k->direction);
+            length = 1;
+            for (int i = 0; i <= count; i++)
+                for (int r = 0; r < mhe_rows_at(e, i); r++) {
+                    const mhe_row *q = k->rows + i * ROWS + r;
+                    real change[4];
+                    mhe_changes(q, target, change);
+                    length = mhe_longest(length, q->slack_low, change[0]);
+                    length = mhe_longest(length, q->dual_low, change[1]);
+                    length = mhe_longest(length, q->slack_high, change[2]);
+                    length = mhe_longest(length, q->dual_high, change[3]);
+                }
+            if (corrector) break;
+            after = 0;
+            for (int i = 0; i <= count; i++)
+                for (int r = 0; r < mhe_rows_at(e, i); r++) {
+                    mhe_row *q = k->rows + i * ROWS + r;
+                    real change[4];
+                    mhe_changes(q, target, change);
+                    if (q->dual_low > 0)
+                        after += (q->slack_low + length * change[0]) *
+                                 (q->dual_low + length * change[1]);
+                    if (q->dual_high > 0)
+                        after += (q->slack_high + length * change[2]) *
+                                 (q->dual_high + length * change[3]);
+                    q->correction_low = change[0] * change[1];
+                    q->correction_high = change[2] * change[3];
+                }
+            const real ratio = after / products;
+            target = ratio * ratio * ratio * products / sides;
+        }
+        length *= (real)0.995;
+        if (!(length > 1e-10)) return STOPPED;
+        for (int j = 0; j < size; j++) k->step[j] += length * k->direction[j];
+        for (int i = 0; i <= count; i++)
+            for (int r = 0; r < mhe_rows_at(e, i); r++) {
+                mhe_row *q = k->rows + i * ROWS + r;
+                real change[4];
+                mhe_changes(q, target, change);
+                if (q->dual_low > 0) {
+                    q->slack_low += length * change[0];
+                    q->dual_low += length * change[1];
+                }
+                if (q->dual_high > 0) {
+                    q->slack_high += length * change[2];
+                    q->dual_high += length * change[3];
+                }
+            }
+    }
+}
+
+#endif

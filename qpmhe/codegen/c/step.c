@@ -1,0 +1,148 @@
+/* What the caller sees. */
+
+static void mhe_remember(mhe_estimator *e, const real *state)
+{
+    e->newest = e->newest < MHE_HORIZON ? e->newest + 1 : 0;
+    memcpy(e->history + e->newest * NX, state, sizeof(real) * NX);
+}
+
+/* Estimate on the window as it stands, and keep what the next step needs. */
+static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int failed,
+                             int before)
+{
+    const mhe_stage *newest = mhe_stage_at(e, e->length - 1);
+    const size_t size = sizeof(real) * (size_t)(e->length + 1) * NX;
+    mhe_improve(e, k, o, before);
+    const int held = !isfinite(newest->cost), judged = isfinite(o->reference->cost);
+    if (!newest->is_complete) o->events |= MHE_MISSING;
+    if (held || failed)
+        o->events |= MHE_MODEL_FAILED;
+    else if (!judged)
+        o->events |= MHE_FAILED_STAGE;
+    if (!judged) o->events &= ~MHE_NO_DECREASE;
+    memcpy(e->trajectory, o->best->x, size);
+    e->has_trajectory = 1;
+    if (held && o->best != o->reference)
+        memcpy(e->z_end, o->best->x + e->length * NX, sizeof e->z_end);
+}
+
+static void mhe_step(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u,
+                     real step, const real *noise_weight, mhe_outcome *o)
+{
+    const int before = e->settings->start_at_best && e->has_trajectory ? e->length : -1;
+    int failed = mhe_push(e, y, u, step, noise_weight);
+    if (e->settings->reinitialize) {
+        /* The ring of estimates reaches back to that of the window's first state. */
+        int at = e->newest - (e->length - 1);
+        if (at < 0) at += MHE_HORIZON + 1;
+        memcpy(mhe_stage_at(e, 0)->z, e->history + at * NX, sizeof(real) * NX);
+        mhe_replay(e, 0);
+    }
+    mhe_estimate_now(e, k, o, failed, before);
+    mhe_remember(e, o->best->x + e->length * NX);
+}
+
+static void mhe_fill(mhe_estimator *e, const mhe_outcome *o, mhe_estimate *out)
+{
+    const int count = e->length;
+    const mhe_trial *best = o->best;
+    const size_t states = sizeof(real) * (size_t)(count + 1) * NX;
+    memcpy(out->trajectory, best->x, states);
+    memcpy(out->candidate, o->reference->x, states);
+    memcpy(out->disturbances, best->w, sizeof(real) * (size_t)count * NX);
+    memcpy(out->noises, best->v, sizeof(real) * (size_t)count * NY);
+    for (int i = 0; i < count; i++) {
+        const mhe_stage *stage = mhe_stage_at(e, i);
+        if (stage->is_complete) continue;
+        for (int j = 0; j < NY; j++)
+            if (!stage->is_observed[j]) out->noises[i * NY + j] = NAN;
+    }
+    out->cost = best->cost;
+    out->candidate_cost = o->reference->cost;
+    out->time = e->time - 1;
+    out->length = count;
+    out->status = o->events;
+    out->qps = o->qps;
+    out->iterations = o->iterations;
+    out->corrections = o->corrections;
+    out->dropped = o->dropped;
+}
+
+void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
+{
+    memset(e, 0, sizeof *e);
+    e->settings = settings;
+    memcpy(e->initial_state, x0, sizeof e->initial_state);
+    memcpy(e->z_end, x0, sizeof e->z_end);
+    memcpy(e->history, x0, sizeof(real) * NX);
+}
+
+void mhe_update_special(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u,
+                        real step, const real *noise_weight, mhe_estimate *out)
+{
+    mhe_outcome outcome;
+    mhe_step(e, k, y, u, step, noise_weight, &outcome);
+    mhe_fill(e, &outcome, out);
+}
+
+void mhe_update(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u,
+                mhe_estimate *out)
+{
+    mhe_update_special(e, k, y, u, 0, 0, out);
+}
+
+int mhe_amend(mhe_estimator *e, mhe_workspace *k, int64_t time, const real *y,
+              mhe_estimate *out)
+{
+    const int64_t age = e->time - time;
+    mhe_outcome outcome;
+    if (age < 1 || age > e->length) return -1;
+    const int i = e->length - (int)age;
+    mhe_stage *stage = mhe_stage_at(e, i);
+    for (int j = 0; j < NY; j++)
+        if (y[j] < LARGEST && y[j] > -LARGEST) {
+            stage->y[j] = y[j];
+            stage->is_observed[j] = 1;
+        }
+    mhe_set_noise_weight(e->settings, stage);
+    mhe_replay(e, i);
+    /* The kept trajectory does not belong to the window before this one. */
+    mhe_estimate_now(e, k, &outcome, 0, -1);
+    memcpy(e->history + e->newest * NX, outcome.best->x + e->length * NX, sizeof(real) * NX);
+    mhe_fill(e, &outcome, out);
+    return 0;
+}
+
+void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64_t samples,
+             const real *y, const real *u, const mhe_log *log)
+{
+    int64_t at = 0;
+    for (int64_t member = 0; member < members; member++) {
+        mhe_estimator *e = estimators + member;
+        for (int64_t t = 0; t < samples; t++, at++) {
+            mhe_outcome o;
+            mhe_step(e, k, y + at * NY, u ? u + at * NU : 0, 0, 0, &o);
+            const int count = e->length, delay = e->settings->delay;
+            const real *newest = o.best->x + count * NX;
+            for (int j = 0; j < NX; j++) {
+                if (log->states) log->states[at * NX + j] = newest[j];
+                if (log->filtered) log->filtered[at * NX + j] = newest[j - NX];
+                if (log->delayed)
+                    log->delayed[at * NX + j] = delay <= count ? newest[j - delay * NX] : NAN;
+            }
+            if (log->costs) log->costs[at] = o.best->cost;
+            if (log->candidate_costs) log->candidate_costs[at] = o.reference->cost;
+            if (log->status) log->status[at] = o.events;
+            if (log->qps) log->qps[at] = o.qps;
+            if (log->iterations) log->iterations[at] = o.iterations;
+        }
+    }
+}
+
+void mhe_sizes(int64_t *sizes)
+{
+    sizes[0] = (int64_t)sizeof(mhe_estimator);
+    sizes[1] = (int64_t)sizeof(mhe_workspace);
+    sizes[2] = (int64_t)sizeof(mhe_estimate);
+    sizes[3] = (int64_t)sizeof(mhe_settings);
+}

@@ -1,0 +1,132 @@
+"""C source in, loaded library out, with a cache on disk."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+
+from platformdirs import user_cache_path
+
+from ..errors import CompilationError
+
+__all__ = ["cache_directory", "compiled_library", "find_compiler"]
+
+# Contraction and the like may round differently, but keep infinities and NaN.
+_FLAGS = ("-std=c99", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno",
+          "-fno-trapping-math")
+_FAST = ("-O3", "-march=native")
+
+
+def find_compiler() -> list[str] | None:
+    """The C compiler's command: ``$CC`` if set, else cc, gcc or clang; None without any."""
+    named = os.environ.get("CC")
+    if named is not None:
+        command = shlex.split(named)
+        path = shutil.which(command[0]) if command else None
+        return [path, *command[1:]] if path else None
+    for name in ("cc", "gcc", "clang"):
+        path = shutil.which(name)
+        if path is not None:
+            return [path]
+    return None
+
+
+def cache_directory() -> Path:
+    """Where compiled libraries are kept: ``$QPMHE_CACHE_DIR``, else the user's cache folder."""
+    named = os.environ.get("QPMHE_CACHE_DIR")
+    return Path(named) if named else user_cache_path("qpmhe")
+
+
+@lru_cache(maxsize=1)
+def _processor() -> str:
+    """What the machine code depends on: a home directory may serve several machines."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    wanted = {line for line in lines if line.startswith(("flags", "Features", "model name"))}
+    return "\n".join((platform.machine(), platform.processor(), *sorted(wanted)))
+
+
+def compiled_library(files: dict[str, str], main: str, key: str | None = None) -> ctypes.CDLL:
+    """Compile C source and load it; a library made before is loaded from the cache.
+
+    Parameters
+    ----------
+    files : dict
+        Text of each file, by name.
+    main : str
+        Name of the file to compile.
+    key : str, optional
+        What tells libraries apart, if not the files' whole text.
+
+    Raises
+    ------
+    CompilationError
+        If there is no C compiler, or it fails.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise CompilationError(
+            "there is no C compiler (cc, gcc or clang); install one, or set CC to its path."
+        )
+    stamp = os.stat(compiler[0])
+    parts = (
+        *compiler, str(stamp.st_size), str(stamp.st_mtime_ns), *_FLAGS, *_FAST, _processor(),
+        key if key is not None else "".join(f"{name}\0{files[name]}\0" for name in sorted(files)),
+    )
+    digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+    folder = _usable_folder()
+    path = folder / f"{digest}.so"
+    if path.exists():
+        try:
+            return ctypes.CDLL(str(path))
+        except OSError:  # damaged: made anew below
+            pass
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        for name, text in files.items():
+            Path(scratch, name).write_text(text, encoding="ascii")
+        made = Path(scratch, "library.so")
+        _run(compiler, Path(scratch, main), made)
+        # In one motion, so that no process sees half a file.
+        os.replace(made, path)
+    return ctypes.CDLL(str(path))
+
+
+def _usable_folder() -> Path:
+    for folder in (cache_directory(), Path(tempfile.gettempdir(), f"qpmhe-{os.getuid()}")):
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid():
+            return folder
+    raise CompilationError(
+        f"{cache_directory()} cannot be written; set QPMHE_CACHE_DIR to a folder that can."
+    )
+
+
+def _run(compiler: list[str], source: Path, target: Path) -> None:
+    message = ""
+    # Not every compiler knows its machine by this flag.
+    for flags in (_FAST, ("-O2",)):
+        command = [*compiler, *_FLAGS, *flags, "-o", str(target), str(source), "-lm"]
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, timeout=600, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            message = str(error)
+            continue
+        if done.returncode == 0:
+            return
+        message = (done.stderr or done.stdout).strip()[-2000:]
+    raise CompilationError(f"{' '.join(compiler)} failed: {message}")

@@ -1,0 +1,208 @@
+"""A model as CasADi functions, in the form from which C code and evaluators are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from .._checks import count, positive
+from ..discretize import METHODS
+from ..errors import InvalidInputError, ModelError, OptionError
+from ..functions import positional_arguments
+
+__all__ = ["CasadiModel", "casadi_model", "import_casadi"]
+
+
+def import_casadi() -> Any:
+    """The casadi package, which is imported late.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is not installed.
+    """
+    try:
+        import casadi
+    except ImportError as error:
+        raise InvalidInputError(
+            "the model needs CasADi, which is not installed; pip install 'qpmhe[casadi]'."
+        ) from error
+    return casadi
+
+
+@dataclass(frozen=True)
+class CasadiModel:
+    """f and h, or the rate of an ODE and h, as functions of (x, u).
+
+    Parameters
+    ----------
+    f, h : casadi.Function
+        (x, u) to a dense column; u has no rows where there are no inputs.
+    n, p, m : int
+        Numbers of states, outputs and inputs.
+    dt : float or None
+        Sampling time of an ODE; None where f is the discrete-time map itself.
+    method : str or None
+        Its discretisation.
+    """
+
+    f: Any
+    h: Any
+    n: int
+    p: int
+    m: int
+    dt: float | None = None
+    method: str | None = None
+
+    def with_jacobian(self, which: str) -> tuple[Any, list[int]]:
+        """A function of (x, u) to the value and the nonzeros of its Jacobian by x.
+
+        Parameters
+        ----------
+        which : {"f", "h"}
+            The function.
+
+        Returns
+        -------
+        function : casadi.Function
+            (x, u) to the value and a column of nonzeros.
+        places : list of int
+            Where each nonzero is in the dense Jacobian, counted by rows.
+        """
+        ca, function = import_casadi(), getattr(self, which)
+        x, u = _symbols(ca, function, self.n, self.m)
+        value = function(x, u)
+        slopes = ca.jacobian(value, x)
+        rows, columns = slopes.sparsity().get_triplet()
+        nonzeros = ca.sparsity_cast(slopes, ca.Sparsity.dense(slopes.nnz(), 1))
+        made = ca.Function(f"{which}_jacobian", [x, u], [value, nonzeros])
+        return made, [row * self.n + column for row, column in zip(rows, columns, strict=True)]
+
+    def step(self) -> Any:
+        """The discrete-time map as a casadi.Function of (x, u, dt)."""
+        ca = import_casadi()
+        x, u = _symbols(ca, self.f, self.n, self.m)
+        dt = type(x).sym("dt")
+        if self.method is None:
+            following = self.f(x, u)
+        elif self.method == "euler":
+            following = x + dt * self.f(x, u)
+        else:
+            k1 = self.f(x, u)
+            k2 = self.f(x + dt / 2 * k1, u)
+            k3 = self.f(x + dt / 2 * k2, u)
+            k4 = self.f(x + dt * k3, u)
+            following = x + dt / 6 * (k1 + 2 * (k2 + k3) + k4)
+        return ca.Function("step", [x, u, dt], [following])
+
+
+def casadi_model(
+    f: Any,
+    h: Any,
+    *,
+    n: int | None = None,
+    p: int | None = None,
+    m: int | None = None,
+    dt: float | None = None,
+    method: str = "rk4",
+) -> CasadiModel:
+    """Check a model given to CasADi and bring it to the common form.
+
+    Parameters
+    ----------
+    f, h : casadi.Function or callable
+        As for `qpmhe.System.from_casadi`.
+    n, p, m, dt, method
+        As there.
+
+    Raises
+    ------
+    InvalidInputError
+        If CasADi is missing, or an argument does not fit; subclasses tell what.
+    """
+    ca = import_casadi()
+    if method not in METHODS:
+        raise OptionError(f"method is {method!r}; expected one of {', '.join(METHODS)}.")
+    if isinstance(f, ca.Function):
+        _check_arguments("f", f)
+        n = _agreed("n", n, f.numel_in(0))
+        m = _agreed("m", m, f.numel_in(1) if f.n_in() > 1 else 0)
+    elif n is None:
+        raise InvalidInputError("n is missing: f is no casadi.Function, which would tell it.")
+    n, m = count("n", n, 1), count("m", 0 if m is None else m, 0)
+    made_f = _canonical(ca, "f", f, n, m)
+    made_h = _canonical(ca, "h", h, n, m)
+    _agreed("the number of values of f", n, made_f.numel_out(0))
+    p = _agreed("p", p, made_h.numel_out(0))
+    if dt is None:
+        return CasadiModel(made_f, made_h, n, p, m)
+    return CasadiModel(made_f, made_h, n, p, m, positive("dt", dt), method)
+
+
+def _check_arguments(name: str, function: Any) -> None:
+    if function.n_in() not in (1, 2) or function.n_out() != 1:
+        raise ModelError(
+            f"{name} has {function.n_in()} inputs and {function.n_out()} outputs; expected "
+            "(x) or (x, u) to one column."
+        )
+
+
+def _agreed(name: str, stated: int | None, found: int) -> int:
+    if stated is not None and stated != found:
+        raise ModelError(f"{name} is {found}, as the function has it; expected {stated}.")
+    return int(found)
+
+
+def _symbols(ca: Any, function: Any, n: int, m: int) -> tuple[Any, Any]:
+    kind = ca.SX if function.is_a("SXFunction") else ca.MX
+    return kind.sym("x", n), kind.sym("u", m)
+
+
+def _canonical(ca: Any, name: str, given: Any, n: int, m: int) -> Any:
+    """(x, u) to a dense column, of scalar operations where that is possible."""
+    call: Callable[[Any, Any], Any]
+    if isinstance(given, ca.Function):
+        _check_arguments(name, given)
+        sizes = [given.numel_in(i) for i in range(given.n_in())]
+        if sizes[0] != n or (len(sizes) > 1 and sizes[1] != m):
+            raise ModelError(
+                f"{name} takes arguments of sizes {sizes}; expected n = {n}"
+                + (f" and m = {m}." if m else ", and no inputs.")
+            )
+        call = given if given.n_in() > 1 else _without_input(given)
+    elif callable(given):
+        call = _with_inputs(name, given, m)
+    else:
+        raise ModelError(f"{name} is {given!r}; expected a casadi.Function or a callable.")
+    error: Exception | None = None
+    for kind in (ca.SX, ca.MX):
+        x, u = kind.sym("x", n), kind.sym("u", m)
+        try:
+            value = call(x, u)
+            if isinstance(value, (list, tuple)):
+                value = ca.vertcat(*value)
+            function = ca.Function(name, [x, u], [ca.densify(ca.vec(kind(value)))])
+        except Exception as caught:  # whatever the user's function makes of symbols
+            error = caught
+            continue
+        try:
+            return function.expand()
+        except Exception:  # operations that have no scalar form
+            return function
+    raise ModelError(
+        f"{name} cannot be evaluated on CasADi symbols ({type(error).__name__}: {error}); write "
+        "it with CasADi's functions (casadi.sin, casadi.vertcat), or use qpmhe.System."
+    )
+
+
+def _with_inputs(name: str, function: Callable[..., Any], m: int) -> Callable[[Any, Any], Any]:
+    takes_input = m > 0 and positional_arguments(name, function) != 1
+    return function if takes_input else _without_input(function)
+
+
+def _without_input(function: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+    def call(x: Any, _: Any) -> Any:
+        return function(x)
+
+    return call

@@ -1,0 +1,169 @@
+"""The C structures of a generated estimator, as NumPy sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..costs import Cost
+from ..estimate import Status
+from ..observers import Luenberger, SteadyStateKalman
+from ..sets import ConvexSet
+from ..settings import Settings
+from ..system import System
+
+__all__ = ["SET_NAMES", "Layout", "settings_record"]
+
+SET_NAMES = ("states", "disturbances", "noises")
+
+_POLICIES = ("drop", "project", "keep")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Sizes that are fixed when an estimator is compiled.
+
+    Parameters
+    ----------
+    nx, ny, nu, horizon : int
+        Numbers of states, outputs and inputs; N.
+    sets : tuple of (bool, int)
+        Whether there is a set of states, disturbances and noises, and how many general
+        inequalities it has.
+    continuous : int
+        0 for a map, 1 for an Euler step of a rate, 4 for a Runge-Kutta step.
+    real : str
+        ``double`` or ``float``.
+    """
+
+    nx: int
+    ny: int
+    nu: int
+    horizon: int
+    sets: tuple[tuple[bool, int], ...]
+    continuous: int
+    real: str = "double"
+
+    @classmethod
+    def of(cls, system: System, horizon: int, continuous: int, real: str = "double") -> Layout:
+        """The sizes of an estimator of a system."""
+        sets = tuple(
+            (one is not None, 0 if one is None else one.matrix.shape[0])
+            for one in (system.states, system.disturbances, system.noises)
+        )
+        return cls(system.n, system.p, system.m, horizon, sets, continuous, real)
+
+    @property
+    def number(self) -> type[Any]:
+        """NumPy's type of the reals."""
+        return np.float64 if self.real == "double" else np.float32
+
+    def header_values(self) -> dict[str, Any]:
+        """What the header's template is filled with."""
+        bits = (f"    MHE_{flag.name} = {flag.value}" for flag in Status)
+        values = {
+            "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
+            "continuous": self.continuous, "real": self.real, "status": ",\n".join(bits),
+        }
+        for letter, (there, rows) in zip("xwv", self.sets, strict=True):
+            values[f"{letter}_set"] = int(there)
+            values[f"{letter}_rows"] = rows
+        return values
+
+    def settings_type(self) -> np.dtype[Any]:
+        """``mhe_settings``."""
+        r, n, p = self.number, self.nx, self.ny
+        fields: list[Any] = [
+            ("gain", r, n * p), ("prior_weight", r, n * n), ("disturbance_weight", r, n * n),
+            ("noise_weight", r, p * p), ("discount", r), ("sample_time", r), ("tolerance", r),
+            ("solver_tolerance", r),
+        ]
+        for name, size, (_, rows) in zip(SET_NAMES, (n, n, p), self.sets, strict=True):
+            space = max(rows, 1)
+            fields.append((name, np.dtype([
+                ("lower", r, size), ("upper", r, size), ("rows", r, space * size),
+                ("row_lower", r, space), ("row_upper", r, space),
+            ], align=True)))
+        options = ("max_qps", "max_iterations", "outside", "start_at_best", "reinitialize", "delay")
+        fields += [(name, np.int32) for name in options]
+        return np.dtype(fields, align=True)
+
+    def estimate_type(self) -> np.dtype[Any]:
+        """``mhe_estimate``."""
+        r, n, p, count = self.number, self.nx, self.ny, self.horizon
+        return np.dtype([
+            ("cost", r), ("candidate_cost", r), ("trajectory", r, (count + 1, n)),
+            ("candidate", r, (count + 1, n)), ("disturbances", r, (count, n)),
+            ("noises", r, (count, p)), ("time", np.int64), ("length", np.int32),
+            ("status", np.int32), ("qps", np.int32), ("iterations", np.int32),
+            ("corrections", np.int32), ("dropped", np.int32),
+        ], align=True)
+
+    def estimator_type(self) -> np.dtype[Any]:
+        """``mhe_estimator``."""
+        r, n, p, count = self.number, self.nx, self.ny, self.horizon
+        terms = np.dtype([
+            ("f_jacobian", r, (n, n)), ("h_jacobian", r, (p, n)), ("hessian", r, (n, n)),
+            ("coupling", r, (n, n)), ("own", r, n), ("following", r, n),
+        ], align=True)
+        stage = np.dtype([
+            ("z", r, n), ("y", r, p), ("u", r, max(self.nu, 1)), ("step", r), ("w", r, n),
+            ("v", r, p), ("noise_weight", r, (p, p)), ("own_noise_weight", r, (p, p)),
+            ("cost", r), ("has_own_noise", np.int32), ("is_irregular", np.int32),
+            ("is_complete", np.int32), ("is_observed", np.uint8, p), ("terms", terms),
+        ], align=True)
+        return np.dtype([
+            ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
+            ("length", np.int32), ("newest", np.int32), ("has_trajectory", np.int32),
+            ("initial_state", r, n), ("z_end", r, n), ("history", r, (count + 1, n)),
+            ("trajectory", r, (count + 1, n)), ("stages", stage, count),
+        ], align=True)
+
+
+def settings_record(
+    layout: Layout,
+    system: System,
+    observer: Luenberger | SteadyStateKalman,
+    cost: Cost,
+    settings: Settings,
+) -> NDArray[Any]:
+    """The estimator's data and options as one ``mhe_settings``.
+
+    Parameters
+    ----------
+    layout : Layout
+        The sizes.
+    system, observer, cost, settings
+        The estimator's.
+    """
+    record = np.zeros((), layout.settings_type())
+    record["gain"] = observer.gain.ravel()
+    record["prior_weight"] = np.asarray(cost.prior).ravel()
+    record["disturbance_weight"] = cost.disturbance.ravel()
+    record["noise_weight"] = cost.noise.ravel()
+    record["discount"] = cost.discount
+    record["sample_time"] = system.dt or 0.0
+    single = layout.real == "float"
+    # What single precision can tell apart ends earlier.
+    record["tolerance"] = max(settings.tolerance, 1e-6 if single else 0.0)
+    record["solver_tolerance"] = max(settings.solver_tolerance, 1e-4 if single else 0.0)
+    for name in SET_NAMES:
+        one: ConvexSet | None = getattr(system, name)
+        if one is None:
+            continue
+        part = record[name]
+        part["lower"], part["upper"] = one.lower, one.upper
+        rows = one.matrix.shape[0]
+        part["rows"][: one.matrix.size] = one.matrix.ravel()
+        part["row_lower"][:rows], part["row_upper"][:rows] = one.row_lower, one.row_upper
+    record["max_qps"] = settings.qp_limit
+    most = settings.max_solver_iterations
+    record["max_iterations"] = 0 if settings.backend == "banded" else most or 50
+    record["outside"] = _POLICIES.index(settings.outside)
+    record["start_at_best"] = settings.start == "best"
+    record["reinitialize"] = settings.candidate == "reinitialized"
+    record["delay"] = settings.delay
+    return record

@@ -1,0 +1,195 @@
+"""C source of a model and of the whole estimator around it."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from importlib.resources import files
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .expressions import CasadiModel, import_casadi
+from .layout import Layout
+
+__all__ = ["CONTINUOUS", "estimator_files", "model_files"]
+
+CONTINUOUS = {None: 0, "euler": 1, "rk4": 4}
+
+
+@lru_cache(maxsize=16)
+def template(name: str) -> str:
+    """Text of a file among the package's C templates."""
+    return files(__package__).joinpath("c", name).read_text(encoding="ascii")
+
+
+def renamed(text: str, name: str) -> str:
+    """The text with the prefix ``mhe`` of all names replaced."""
+    if name == "mhe":
+        return text
+    return re.sub(r"\bMHE_", f"{name.upper()}_", re.sub(r"\bmhe_", f"{name}_", text))
+
+
+def prologue() -> str:
+    """Short names for what the header defines."""
+    return (
+        "#include <math.h>\n#include <string.h>\n\n"
+        "#define real mhe_real\n#define NX MHE_NX\n#define NY MHE_NY\n#define NU MHE_NU\n"
+        "#define SIZE(n) ((n) > 0 ? (n) : 1)\n\n"
+    )
+
+
+def model_source(model: CasadiModel) -> str:
+    """The model in C: CasADi's code for f, h and their Jacobians, and the discretisation.
+
+    Parameters
+    ----------
+    model : CasadiModel
+        The model.
+
+    Returns
+    -------
+    str
+        C source, to come after `prologue`.
+    """
+    ca = import_casadi()
+    generator = ca.CodeGenerator("mhe_model.c", {"casadi_int": "int", "include_math": False})
+    calls = []
+    for which in ("f", "h"):
+        function = getattr(model, which)
+        name = f"mhe_casadi_{which}"
+        generator.add(_named(ca, function, name, model))
+        calls.append(_call(f"mhe_call_{which}", name, function, 1))
+        slopes, places = model.with_jacobian(which)
+        name = f"mhe_casadi_{which}_jacobian"
+        generator.add(_named(ca, slopes, name, model))
+        calls.append(_call(f"mhe_call_{which}_jacobian", name, slopes, 2))
+        listed = ", ".join(str(place) for place in places) or "0"
+        calls.append(
+            f"#define MHE_{which.upper()}_NONZEROS {len(places)}\n"
+            f"static const int mhe_{which}_place[] = {{{listed}}};\n"
+        )
+    return "\n".join((
+        "#define casadi_real mhe_real", _bare(generator.dump()), *calls, template("model.c")
+    ))
+
+
+# A function that other programs would call, on one line or on several.
+_EXPORTED = re.compile(
+    r"^CASADI_SYMBOL_EXPORT (?P<head>[^\n]*?)\{(?:[^\n]*\}\n|\n.*?^\}\n)", re.M | re.S
+)
+
+
+def _bare(text: str) -> str:
+    """CasADi's code without what only a caller from outside needs, all of it static.
+
+    Static, so that a compiler can inline it and no name leaves the file.
+    """
+
+    def kept(match: re.Match[str]) -> str:
+        wanted = "casadi_real** arg" in match["head"]
+        return match[0].replace("CASADI_SYMBOL_EXPORT", "static") if wanted else ""
+
+    text = _EXPORTED.sub(kept, text)
+    text = re.sub(r"^(casadi_real|casadi_int|void|int) casadi_", r"static \1 casadi_", text,
+                  flags=re.M)
+    for line in re.findall(r"^static const casadi_int casadi_s\d+.*\n", text, re.M):
+        name = re.search(r"casadi_s\d+", line)
+        assert name is not None
+        if len(re.findall(rf"\b{name[0]}\b", text)) <= 2:  # here and where it is renamed
+            text = text.replace(line, "")
+    return text
+
+
+def _named(ca: Any, function: Any, name: str, model: CasadiModel) -> Any:
+    kind = ca.SX if function.is_a("SXFunction") else ca.MX
+    x, u = kind.sym("x", model.n), kind.sym("u", model.m)
+    return ca.Function(name, [x, u], function.call([x, u]))
+
+
+def _call(name: str, inner: str, function: Any, outputs: int) -> str:
+    """A C function of plain arrays around one with CasADi's calling convention."""
+    results = ", ".join(f"real *out{i}" for i in range(outputs))
+    return (
+        f"static void {name}(const real *x, const real *u, {results})\n{{\n"
+        f"    const real *arg[{max(function.sz_arg(), 2) + 2}];\n"
+        f"    real *res[{function.sz_res() + 2}];\n"
+        f"    int iw[{function.sz_iw() + 1}];\n"
+        f"    real w[{function.sz_w() + 1}];\n"
+        "    arg[0] = x;\n    arg[1] = u;\n"
+        + "".join(f"    res[{i}] = out{i};\n" for i in range(outputs))
+        + f"    {inner}(arg, res, iw, w, 0);\n}}\n"
+    )
+
+
+def model_files(model: CasadiModel) -> dict[str, str]:
+    """Source of a library that evaluates a model, in double precision."""
+    head = (
+        "#include <stdint.h>\ntypedef double mhe_real;\n"
+        f"#define MHE_NX {model.n}\n#define MHE_NY {model.p}\n#define MHE_NU {model.m}\n"
+        f"#define MHE_CONTINUOUS {CONTINUOUS[model.method]}\n"
+    )
+    return {"model.c": head + prologue() + model_source(model) + template("model_api.c")}
+
+
+def header(name: str, values: dict[str, Any]) -> str:
+    """The estimator's header with its sizes filled in."""
+    return renamed(Template(template("estimator.h")).substitute(values, name=name), name)
+
+
+def estimator_files(
+    model: CasadiModel, layout: Layout, settings: NDArray[Any], name: str = "mhe"
+) -> tuple[dict[str, str], str]:
+    """Header and source of a whole estimator.
+
+    Parameters
+    ----------
+    model : CasadiModel
+        The model.
+    layout : Layout
+        Sizes and precision.
+    settings : structured array
+        The default settings, a ``mhe_settings``.
+    name : str
+        Prefix of all public names, and name of the files.
+
+    Returns
+    -------
+    files : dict
+        Text of ``<name>.h`` and ``<name>.c``.
+    structure : str
+        The text without the default settings: equal texts make equal machine code.
+    """
+    head = header(name, {**layout.header_values(), "version": version()})
+    parts = ("window.c", "factor.c", "interior_point.c", "optimizer.c", "step.c")
+    body = prologue() + model_source(model) + "\n".join(template(part) for part in parts)
+    data = (
+        "\n/* Weights, gain, sets and options of the estimator that this was made from. */\n"
+        f"const mhe_settings mhe_default_settings = {_initializer(settings)};\n"
+    )
+    text = renamed(f'#include "mhe.h"\n{body}{data}', name).replace('"mhe.h"', f'"{name}.h"')
+    return {f"{name}.h": head, f"{name}.c": text}, head + body
+
+
+def version() -> str:
+    """The package's."""
+    from .. import __version__
+
+    return __version__
+
+
+def _initializer(record: NDArray[Any]) -> str:
+    names = record.dtype.names
+    if names:
+        inner = ",\n".join(f"    .{name} = {_initializer(record[name])}" for name in names)
+        return f"{{\n{inner}\n}}"
+    if record.shape:
+        return "{" + ", ".join(_initializer(item) for item in record) + "}"
+    value = record.item()
+    if isinstance(value, int):
+        return str(value)
+    if np.isinf(value):
+        return "INFINITY" if value > 0 else "-INFINITY"
+    return repr(value)
