@@ -248,7 +248,7 @@ static void mhe_hessian_times(const mhe_workspace *k, int count, const real *d, 
 /* Step that keeps a positive variable positive. */
 static real mhe_longest(real length, real variable, real change)
 {
-    return change < 0 && -variable < length * change ? -variable / change : length;
+    return length * change < -variable ? -variable / change : length;
 }
 
 /* Right-hand side of the Newton equations for a target of the complementarity products. */
