@@ -1,6 +1,6 @@
 """Suboptimal moving horizon estimation by sequences of convex QPs, with a stability promise."""
 
-from . import errors, models, solvers
+from . import codegen, errors, models, solvers
 from .costs import (
     Cost,
     CostConstants,
@@ -62,6 +62,7 @@ __all__ = [
     "UnscentedKalman",
     "__version__",
     "augment_parameters",
+    "codegen",
     "design_luenberger",
     "errors",
     "models",

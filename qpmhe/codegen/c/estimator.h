@@ -42,7 +42,8 @@ typedef $real mhe_real;
 #define MHE_STAGE_ROWS \
     (MHE_X_SET * (MHE_NX + MHE_X_ROWS) + MHE_W_SET * (MHE_NX + MHE_W_ROWS) + \
      MHE_V_SET * (MHE_NY + MHE_V_ROWS))
-#define MHE_WIDTH ((2 * MHE_NX + 3) / 4 * 4)
+/* Length of a panel's rows, for whole registers. */
+#define MHE_WIDTH (MHE_NX < 24 ? (2 * MHE_NX + 3) / 4 * 4 : (2 * MHE_NX + 31) / 32 * 32)
 
 /* Bits of estimate.status. */
 enum {
@@ -144,7 +145,7 @@ typedef struct {
     mhe_real low, high;
     mhe_real slack_low, slack_high, dual_low, dual_high;
     mhe_real residual_low, residual_high, correction_low, correction_high;
-    mhe_real value, weight, load;
+    mhe_real inverse_low, inverse_high, value, weight, load;
 } mhe_row;
 
 typedef struct {

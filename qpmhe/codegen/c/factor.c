@@ -1,4 +1,4 @@
-/* The Gauss-Newton QP without inequalities: one block-banded Cholesky factorisation.
+/* The Gauss-Newton QP without inequalities: one block-banded L D L' factorisation.
  *
  * Panel k holds, by rows, the upper half of the Hessian's diagonal block of d(k) and beside
  * it the block that couples d(k) with d(k+1). What lies left of the diagonal is not read for
@@ -42,64 +42,82 @@ static void mhe_assemble(const mhe_estimator *e, mhe_workspace *k, const real *o
     }
 }
 
-/* Overwrite the panels by their Cholesky factor; whether they were positive definite. */
+/* Columns of a panel that are updated at once: as many as fit in a processor's registers, and
+ * a fixed number, so that a compiler can keep them there. */
+#define CHUNK (WIDTH < 48 ? WIDTH : 32)
+
+/* Overwrite the panels by the rows of D L', with H = L D L'; whether H was positive definite.
+ * No square roots: their latency would be half of the time at small sizes. */
 static int mhe_factorise(mhe_workspace *k, int count)
 {
     for (int i = 0; i <= count; i++) {
-        real *panel = k->panels + i * NX * WIDTH, *inverse = k->inverse_pivots + i * NX;
-        for (int j = 0; j < NX; j++) {
-            real *row = panel + j * WIDTH;
-            const real pivot = row[j];
-            if (!(pivot > 0) || !isfinite(pivot)) return 0;
-            const real scale = 1 / sqrt(pivot);
-            inverse[j] = scale;
-            for (int c = j & ~3; c < WIDTH; c++) row[c] *= scale;
-            for (int r = j + 1; r < NX; r++) {
-                real *other = panel + r * WIDTH;
-                const real factor = row[r];
-                for (int c = r & ~3; c < WIDTH; c++) other[c] -= factor * row[c];
+        real *restrict panel = k->panels + i * NX * WIDTH;
+        real *restrict inverse = k->inverse_pivots + i * NX;
+        for (int r = 0; r < NX; r++) {
+            real *row = panel + r * WIDTH;
+            for (int b = r / CHUNK * CHUNK; b < WIDTH; b += CHUNK) {
+                real sums[CHUNK];
+                for (int c = 0; c < CHUNK; c++) sums[c] = row[b + c];
+                for (int j = 0; j < r; j++) {
+                    const real *above = panel + j * WIDTH + b, factor = panel[j * WIDTH + r] * inverse[j];
+                    for (int c = 0; c < CHUNK; c++) sums[c] -= factor * above[c];
+                }
+                for (int c = 0; c < CHUNK; c++) row[b + c] = sums[c];
             }
+            const real pivot = row[r];
+            if (!(pivot > 0) || !isfinite(pivot)) return 0;
+            inverse[r] = 1 / pivot;
         }
         if (i == count) break;
-        real *next = panel + NX * WIDTH;
+        real *restrict next = panel + NX * WIDTH;
         for (int r = 0; r < NX; r++) {
             real sums[NX];
             for (int c = 0; c < NX; c++) sums[c] = 0;
             for (int j = 0; j < NX; j++) {
-                const real *row = panel + j * WIDTH + NX, factor = row[r];
-                for (int c = r & ~3; c < NX; c++) sums[c] += factor * row[c];
+                const real *row = panel + j * WIDTH + NX, factor = row[r] * inverse[j];
+                for (int c = 0; c < NX; c++) sums[c] += factor * row[c];
             }
-            for (int c = r; c < NX; c++) next[r * WIDTH + c] -= sums[c];
+            for (int c = 0; c < NX; c++) next[r * WIDTH + c] -= sums[c];
         }
     }
     return 1;
 }
 
 /* b := H^-1 b; whether the result is finite. */
-static int mhe_solve(const mhe_workspace *k, int count, real *b)
+static int mhe_solve(const mhe_workspace *k, int count, real *restrict b)
 {
     for (int i = 0; i <= count; i++) {
-        const real *panel = k->panels + i * NX * WIDTH, *inverse = k->inverse_pivots + i * NX;
-        real *own = b + i * NX;
+        const real *restrict panel = k->panels + i * NX * WIDTH;
+        const real *restrict inverse = k->inverse_pivots + i * NX;
+        real *own = b + i * NX, sums[NX];
+        for (int c = 0; c < NX; c++) sums[c] = 0;
         for (int j = 0; j < NX; j++) {
             const real *row = panel + j * WIDTH, value = own[j] * inverse[j];
             own[j] = value;
-            const int last = i < count ? 2 * NX : NX;
-            for (int c = j + 1; c < last; c++) own[c] -= row[c] * value;
+            for (int c = j + 1; c < NX; c++) own[c] -= row[c] * value;
+            for (int c = 0; c < NX; c++) sums[c] += row[NX + c] * value;
         }
+        if (i == count) break;
+        for (int c = 0; c < NX; c++) own[NX + c] -= sums[c];
     }
     for (int i = count; i >= 0; i--) {
-        const real *panel = k->panels + i * NX * WIDTH, *inverse = k->inverse_pivots + i * NX;
+        const real *restrict panel = k->panels + i * NX * WIDTH;
+        const real *restrict inverse = k->inverse_pivots + i * NX;
         real *own = b + i * NX;
-        const int last = i < count ? 2 * NX : NX;
+        for (int j = 0; i < count && j < NX; j++) {
+            const real *row = panel + j * WIDTH + NX;
+            real sums[4] = {0, 0, 0, 0}; /* four sums, so that they can be made side by side */
+            int c = 0;
+            for (; c + 4 <= NX; c += 4)
+                for (int q = 0; q < 4; q++) sums[q] += row[c + q] * own[NX + c + q];
+            for (; c < NX; c++) sums[0] += row[c] * own[NX + c];
+            own[j] -= inverse[j] * ((sums[0] + sums[1]) + (sums[2] + sums[3]));
+        }
         for (int j = NX - 1; j >= 0; j--) {
             const real *row = panel + j * WIDTH;
-            real sums[4] = {0, 0, 0, 0}; /* four sums, so that they can be made side by side */
-            int c = j + 1;
-            for (; c + 4 <= last; c += 4)
-                for (int q = 0; q < 4; q++) sums[q] += row[c + q] * own[c + q];
-            for (; c < last; c++) sums[0] += row[c] * own[c];
-            own[j] = (own[j] - ((sums[0] + sums[1]) + (sums[2] + sums[3]))) * inverse[j];
+            real sum = 0;
+            for (int c = j + 1; c < NX; c++) sum += row[c] * own[c];
+            own[j] -= inverse[j] * sum;
         }
     }
     return mhe_all_finite((count + 1) * NX, b);

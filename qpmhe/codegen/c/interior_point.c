@@ -245,10 +245,17 @@ static void mhe_hessian_times(const mhe_workspace *k, int count, const real *d, 
     }
 }
 
-/* Step that keeps a positive variable positive. */
-static real mhe_longest(real length, real variable, real change)
+/* The largest ratio of a decrease to its variable, kept as a fraction: no division each. */
+typedef struct {
+    real decrease, variable;
+} mhe_ratio;
+
+static void mhe_meet(mhe_ratio *worst, real variable, real change)
 {
-    return length * change < -variable ? -variable / change : length;
+    if (-change * worst->variable > worst->decrease * variable) {
+        worst->decrease = -change;
+        worst->variable = variable;
+    }
 }
 
 /* Right-hand side of the Newton equations for a target of the complementarity products. */
@@ -259,11 +266,11 @@ static void mhe_set_loads(const mhe_estimator *e, mhe_workspace *k, real target)
             mhe_row *q = k->rows + i * ROWS + r;
             q->load = 0;
             if (q->dual_low > 0)
-                q->load += (target - q->correction_low - q->dual_low * q->residual_low) /
-                               q->slack_low - q->dual_low;
+                q->load += (target - q->correction_low - q->dual_low * q->residual_low) *
+                               q->inverse_low - q->dual_low;
             if (q->dual_high > 0)
-                q->load -= (target - q->correction_high - q->dual_high * q->residual_high) /
-                               q->slack_high - q->dual_high;
+                q->load -= (target - q->correction_high - q->dual_high * q->residual_high) *
+                               q->inverse_high - q->dual_high;
         }
     memcpy(k->direction, k->residual, sizeof(real) * (size_t)(e->length + 1) * NX);
     mhe_add_loads(e, k, k->direction);
@@ -275,12 +282,12 @@ static void mhe_changes(const mhe_row *q, real target, real *changes)
     for (int side = 0; side < 4; side++) changes[side] = 0;
     if (q->dual_low > 0) {
         changes[0] = q->value + q->residual_low;
-        changes[1] = (target - q->correction_low - q->dual_low * changes[0]) / q->slack_low -
+        changes[1] = (target - q->correction_low - q->dual_low * changes[0]) * q->inverse_low -
                      q->dual_low;
     }
     if (q->dual_high > 0) {
         changes[2] = q->residual_high - q->value;
-        changes[3] = (target - q->correction_high - q->dual_high * changes[2]) / q->slack_high -
+        changes[3] = (target - q->correction_high - q->dual_high * changes[2]) * q->inverse_high -
                      q->dual_high;
     }
 }
@@ -330,13 +337,15 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
                     q->residual_low = q->value - q->low - q->slack_low;
                     infeasible = fmax(infeasible, fabs(q->residual_low));
                     products += q->slack_low * q->dual_low;
-                    q->weight += q->dual_low / q->slack_low;
+                    q->inverse_low = 1 / q->slack_low;
+                    q->weight += q->dual_low * q->inverse_low;
                 }
                 if (q->dual_high > 0) {
                     q->residual_high = q->high - q->value - q->slack_high;
                     infeasible = fmax(infeasible, fabs(q->residual_high));
                     products += q->slack_high * q->dual_high;
-                    q->weight += q->dual_high / q->slack_high;
+                    q->inverse_high = 1 / q->slack_high;
+                    q->weight += q->dual_high * q->inverse_high;
                 }
                 q->load = q->dual_low - q->dual_high;
             }
@@ -357,17 +366,18 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
             mhe_set_loads(e, k, target);
             if (!mhe_solve(k, count, k->direction)) return *iterations ? STOPPED : FAILED;
             mhe_rows_times(e, k, k->direction);
-            length = 1;
+            mhe_ratio worst = {1, 1};
             for (int i = 0; i <= count; i++)
                 for (int r = 0; r < mhe_rows_at(e, i); r++) {
                     const mhe_row *q = k->rows + i * ROWS + r;
                     real change[4];
                     mhe_changes(q, target, change);
-                    length = mhe_longest(length, q->slack_low, change[0]);
-                    length = mhe_longest(length, q->dual_low, change[1]);
-                    length = mhe_longest(length, q->slack_high, change[2]);
-                    length = mhe_longest(length, q->dual_high, change[3]);
+                    mhe_meet(&worst, q->slack_low, change[0]);
+                    mhe_meet(&worst, q->dual_low, change[1]);
+                    mhe_meet(&worst, q->slack_high, change[2]);
+                    mhe_meet(&worst, q->dual_high, change[3]);
                 }
+            length = worst.variable / worst.decrease;
             if (corrector) break;
             after = 0;
             for (int i = 0; i <= count; i++)
