@@ -149,7 +149,9 @@ class PythonEngine:
         start = self._shifted() if settings.start == "best" else None
         deadline = math.inf if settings.time_budget is None else began + settings.time_budget
         outcome = self._optimizer.improve(problem, window, start, deadline)
-        status = outcome.events | (Status.IMPROVED if outcome.improved else Status.CANDIDATE)
+        status = Status.IMPROVED if outcome.improved else Status.CANDIDATE
+        if outcome.events:
+            status |= outcome.events
         if missing:
             status |= Status.MISSING
         if held or flat:

@@ -178,18 +178,13 @@ class Problem:
         Never raises on account of the model: where f or h raise or are not finite, or a
         constraint is violated, the cost is infinite.
         """
-        n = self._n
-        residuals = np.empty((trajectory.shape[0] - 1, self._q))
         try:
             if self._rolls_out:
                 trajectory = self.restored(trajectory)
-            states = trajectory[:-1]
-            np.subtract(trajectory[1:], self.model.f.batch(states, self.inputs),
-                        out=residuals[:, :n])
-            np.subtract(self.measurements, self.model.h.batch(states, self.inputs),
-                        out=residuals[:, n:])
+            residuals = self._residuals(trajectory)
         except Exception:  # a model function outside its domain: such a trial is worthless
-            return Trial(trajectory, residuals, self.stage_weights, residuals, math.inf, math.inf)
+            nothing = np.full((trajectory.shape[0] - 1, self._q), np.nan)
+            return Trial(trajectory, nothing, self.stage_weights, nothing, math.inf, math.inf)
         weights, weighted, cost = self._cost_of(residuals)
         offset = trajectory[0] - self.prior
         if self._cost.quadratic:
@@ -205,6 +200,19 @@ class Problem:
             if violation > _FEASIBLE:
                 cost = math.inf
         return Trial(trajectory, residuals, weights, weighted, cost, violation)
+
+    def _residuals(self, trajectory: Array) -> Array:
+        """Residuals w and v of each stage; raises what the model raises."""
+        model, n = self.model, self._n
+        if model.joint is not None:
+            return model.joint.residuals(trajectory, self.measurements, self.inputs)
+        residuals = np.empty((trajectory.shape[0] - 1, self._q))
+        states = trajectory[:-1]
+        ahead = model.f.batch(states, self.inputs)
+        np.subtract(trajectory[1:], ahead, out=residuals[:, :n])
+        outputs = model.h.batch(states, self.inputs)
+        np.subtract(self.measurements, outputs, out=residuals[:, n:])
+        return residuals
 
     def _cost_of(self, residuals: Array) -> tuple[Array, Array, float]:
         """Majorising weights, weighted residuals, and the stages' cost."""

@@ -53,6 +53,7 @@ class Subproblem:
         self._terms = StageTerms(horizon, n, p)
         self._scaled = StageTerms(horizon, n, p) if cost.discount < 1.0 else None
         self._disturbance_band = band_of(cost.disturbance)
+        self._nothing = np.zeros(n)
         self._x_rows = system.states.matrix if system.states else np.empty((0, n))
         self._w_rows = _as_rows(system.disturbances, n)
         self._v_rows = _as_rows(system.noises, p)
@@ -67,7 +68,7 @@ class Subproblem:
         if self._scaled is not None:
             self._scaled.copy_scaled(terms, first, window.discounts[1:])
             terms, first = self._scaled, 0
-        return self._assemble(problem, problem.candidate(window), terms, first, count)
+        return self._assemble(problem, problem.candidate(window), terms, first, count, True)
 
     def at(self, problem: Problem, trial: Trial) -> QP | None:
         """The QP around any trajectory; None where the model has no Jacobians there."""
@@ -82,7 +83,7 @@ class Subproblem:
         if not np.isfinite(jacobian).all():
             return None
         terms.set_all(trial.weights, trial.residuals, trial.weighted)
-        return self._assemble(problem, trial, terms, 0, count)
+        return self._assemble(problem, trial, terms, 0, count, False)
 
     def nearest(self, problem: Problem, window: Window) -> QP:
         """The QP of the point nearest to the candidate among those that satisfy the rows."""
@@ -121,7 +122,13 @@ class Subproblem:
         qp.row_upper -= inwards
 
     def _assemble(
-        self, problem: Problem, trial: Trial, terms: StageTerms, first: int, count: int
+        self,
+        problem: Problem,
+        trial: Trial,
+        terms: StageTerms,
+        first: int,
+        count: int,
+        at_candidate: bool,
     ) -> QP:
         n = self._n
         qp = self._qps.get(count)
@@ -138,13 +145,15 @@ class Subproblem:
             disturbance_band = np.array([band_of(w[:n, :n]) for w in weights])
             band[count] = disturbance_band[-1]
             disturbance_band = disturbance_band[:-1]
-        offset = trial.trajectory[0] - problem.prior
         np.add(terms.panel[first + 1 : last], disturbance_band, out=band[1:count])
-        np.add(terms.panel[first], problem.prior_band_at(offset), out=band[0])
         np.add(terms.own[first + 1 : last], terms.following[first : last - 1],
                out=gradient[1:count])
-        prior_weight = problem.prior_weight_at(offset)
-        np.add(terms.own[first], prior_weight.dot(offset), out=gradient[0])
+        # The candidate starts at the prior.
+        offset = self._nothing if at_candidate else trial.trajectory[0] - problem.prior
+        np.add(terms.panel[first], problem.prior_band_at(offset), out=band[0])
+        gradient[0] = terms.own[first]
+        if not at_candidate:
+            gradient[0] += problem.prior_weight_at(offset).dot(offset)
         gradient[count] = terms.following[last - 1]
         #: Jacobians (K, n + p, n) of (f, h) along the trajectory of the last QP.
         self.jacobian: Array = terms.jacobian[first:last]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,20 @@ from .sets import ConvexSet
 if TYPE_CHECKING:
     from .codegen.expressions import CasadiModel
 
-__all__ = ["System"]
+__all__ = ["Joint", "System"]
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
+
+
+class Joint(Protocol):
+    """Several of a model's functions by one call."""
+
+    def stage(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Values f (n,), h (p,) and their Jacobian (n + p, n) at one state, until the next call."""
+
+    def residuals(self, trajectory: Array, y: Array, u: Array) -> Array:
+        """Residuals (w, v) along a trajectory (K + 1, n), in a (K, n + p) array of their own."""
 
 
 @tell_unknown_options
@@ -97,6 +107,8 @@ class System:
         self.h_jacobian = Jacobian(self.h, h_jacobian, self.m, probes)
         #: The sampling time of a system made by `from_ode`, None otherwise.
         self.dt: float | None = None
+        #: f, h and Jacobians by one call, where the model offers that.
+        self.joint: Joint | None = None
         #: The same model as CasADi functions, of a system made by `from_casadi`.
         self.symbolic: CasadiModel | None = None
         self._timed: Callable[[], System] | None = None

@@ -56,6 +56,7 @@ class Window(Stages):
         super().__init__(
             n, p, m, horizon, initial_state, observer.initial_covariance(), cost.quadratic
         )
+        self._weighted = np.zeros(n + p)  # weight times residual of the stage that enters
         self._sample = Sample(system, np.zeros(m))
         # gamma^0, gamma^1, ... from the newest stage backwards, and the prior's behind.
         self._ages = cost.discount ** np.arange(horizon, -1, -1.0) if cost.discount < 1 else None
@@ -185,12 +186,21 @@ class Window(Stages):
                 model, u = self._system.timed, self._u[k]
             # Copied at once: a function may return one array every time, and derivatives
             # by differences call it again.
-            following[:] = model.f(z, u)
-            np.subtract(self._y[k], model.h(z, u), out=error)
+            joint = model.joint if self._jacobians else None
+            if joint is None:
+                following[:] = model.f(z, u)
+                np.subtract(self._y[k], model.h(z, u), out=error)
+            else:
+                ahead, output, slopes = joint.stage(z, u)
+                following[:] = ahead
+                np.subtract(self._y[k], output, out=error)
+                self.terms.jacobian[k] = slopes
             if observed is not None:
                 error[~observed] = 0.0
             sample.system, sample.u, sample.observed = model, u, observed
-            if self._jacobians:
+            if joint is not None:
+                self._offer_jacobians(k)
+            elif self._jacobians:
                 self._differentiate(k, model, z, u)
             if self._own_noise or sample.noise_weight is not None:
                 sample.noise_weight = self._own_noise.get(time)
@@ -207,7 +217,8 @@ class Window(Stages):
         if not math.isfinite(following.dot(following)):
             return math.inf
         if self._cost.quadratic:
-            cost = float(residual.dot(weight).dot(residual))
+            self._weighted = weight.dot(residual)
+            cost = float(self._weighted.dot(residual))
         else:
             cost = float(self._cost.stage_costs(residual[None], weight)[0])
         return cost if math.isfinite(cost) else math.inf
@@ -220,7 +231,13 @@ class Window(Stages):
         except Exception:  # a user's Jacobian outside its domain
             # An observer that never reads it goes on; `_linearize` sees the NaN.
             jacobian[:] = np.nan
-        self._sample.f_jacobian, self._sample.h_jacobian = jacobian[:n], jacobian[n:]
+        self._offer_jacobians(k)
+
+    def _offer_jacobians(self, k: int) -> None:
+        if self._observer.needs_jacobians:
+            jacobian = self.terms.jacobian[k]
+            self._sample.f_jacobian = jacobian[: self._n]
+            self._sample.h_jacobian = jacobian[self._n :]
 
     def _linearize(self, k: int) -> bool:
         residual = self._residuals[k]
@@ -230,8 +247,8 @@ class Window(Stages):
             self.terms.jacobian[k] = np.eye(*self.terms.jacobian[k].shape)
         if not self._cost.quadratic:
             self._majorising[k] = self._cost.majorise(residual[None], self._weight[k])[0]
-        weight = self._majorising[k]
-        self.terms.set_stage(k, weight, residual, weight.dot(residual))
+            self._weighted = self._majorising[k].dot(residual)
+        self.terms.set_stage(k, self._majorising[k], residual, self._weighted)
         return linear
 
     def _hold(self, k: int) -> None:

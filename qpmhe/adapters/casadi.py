@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,9 +21,12 @@ from ..system import System
 __all__ = ["casadi_system"]
 
 Array = NDArray[np.float64]
-# Fixed buffers for states, inputs and the result, and what computes one from the others.
-Buffers = tuple[Array, Array, Array, Callable[[], object]]
-Maker = Callable[[int, bool], Buffers]
+# Fixed arrays for states, inputs and results, and what computes these from those.
+Buffers = tuple[Array, Array, dict[str, Array], Callable[[], object]]
+# Makes buffers for a number of states and the wanted results.
+Maker = Callable[[int, tuple[str, ...]], Buffers]
+
+_MOST_KEPT = 64
 
 
 def casadi_system(
@@ -47,15 +51,22 @@ def casadi_system(
         As there.
     """
     model = casadi_model(f, h, n=n, p=p, m=m, dt=dt, method=method)
-    makers = _makers(model, compiled)
     sets = {"states": states, "disturbances": disturbances, "noises": noises}
+    library = _library(model, compiled)
 
     def made(timed: bool) -> System:
-        functions = {name: _Evaluator(maker, timed) for name, maker in makers.items()}
-        return System(
-            functions["f"], functions["h"], n=model.n, p=model.p, m=model.m + timed,
-            f_jacobian=functions["f_jacobian"], h_jacobian=functions["h_jacobian"], **sets,
+        maker = (
+            partial(_interpreted, model, timed) if library is None
+            else partial(_compiled, model, library, timed)
         )
+        evaluator = _Evaluator(maker)
+        one = {name: partial(evaluator.one, name) for name in _NAMES}
+        system = System(
+            one["f"], one["h"], n=model.n, p=model.p, m=model.m + timed,
+            f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"], **sets,
+        )
+        system.joint = evaluator
+        return system
 
     system = made(False)
     system.symbolic, system.dt = model, model.dt
@@ -70,136 +81,209 @@ def casadi_system(
     return system
 
 
+_NAMES = ("f", "h", "f_jacobian", "h_jacobian")
+_VALUES = ("f", "h")
+_RESIDUALS = ("residuals",)
+
+
 class _Evaluator:
-    """A function of (x, u) over (n,) or (B, n) that works on buffers kept between calls.
+    """Functions of (x, u) over (n,) or (B, n) that work on buffers kept between calls.
 
     Parameters
     ----------
     maker : callable
-        Makes the buffers for B states; told whether u ends with the length of the step.
-    timed : bool
-        Whether it does.
+        Makes the buffers.
     """
 
-    def __init__(self, maker: Maker, timed: bool) -> None:
-        self._maker, self._timed = maker, timed
+    def __init__(self, maker: Maker) -> None:
+        self._maker = maker
         self._local = threading.local()  # two threads must not share buffers
 
-    def __call__(self, x: Array, u: Array | None = None) -> Array:
-        count = x.shape[0] if x.ndim > 1 else 0
-        try:
-            buffers = self._local.buffers[count]
-        except (AttributeError, KeyError):
-            buffers = self._fresh(count)
-        states, inputs, result, evaluate = buffers
+    def one(self, name: str, x: Array, u: Array | None = None) -> Array:
+        """A fresh array of one of the four functions' values.
+
+        Parameters
+        ----------
+        name : str
+            Which.
+        x : (n,) or (B, n) array
+            States.
+        u : array, optional
+            Inputs, where there are any.
+        """
+        single = x.ndim == 1
+        states, inputs, results, evaluate = self._buffers(
+            1 if single else x.shape[0], (name,)
+        )
         states[...] = x
         if u is not None:
             inputs[...] = u
         evaluate()
-        value: Array = result.copy()
+        result = results[name]
+        value: Array = result[0].copy() if single else result.copy()
         return value
 
-    def _fresh(self, count: int) -> Buffers:
-        states, inputs, result, evaluate = self._maker(max(count, 1), self._timed)
-        if count == 0:
-            states, inputs, result = states[0], inputs[0], result[0]
-        kept = self._local.__dict__.setdefault("buffers", {})
-        if len(kept) > 64:  # of a caller whose batches have all sorts of lengths
-            kept.clear()
-        kept[count] = states, inputs, result, evaluate
-        buffers: Buffers = kept[count]
-        return buffers
+    def stage(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """f, h and their joint Jacobian at one state: good until the next call.
 
+        Parameters
+        ----------
+        x : (n,) array
+            The state.
+        u : (m,) array
+            The input.
+        """
+        states, inputs, results, evaluate = self._buffers(1, _NAMES)
+        states[...] = x
+        inputs[...] = u
+        evaluate()
+        return results["f"], results["h"], results["joint"]
 
-def _makers(model: CasadiModel, compiled: bool | None) -> dict[str, Maker]:
-    shapes = {
-        "f": (model.n,), "h": (model.p,),
-        "f_jacobian": (model.n, model.n), "h_jacobian": (model.p, model.n),
-    }
-    if compiled is not False and (compiled or find_compiler() is not None):
+    def residuals(self, trajectory: Array, y: Array, u: Array) -> Array:
+        """A fresh array of w and v along a trajectory.
+
+        Parameters
+        ----------
+        trajectory : (K + 1, n) array
+            States.
+        y, u : (K, p) and (K, m) array
+            Measurements and inputs.
+        """
+        states, inputs, results, evaluate = self._buffers(y.shape[0], _RESIDUALS)
+        states[...] = trajectory
+        inputs[...] = u
+        results["y"][...] = y
+        evaluate()
+        value: Array = results["residuals"].copy()
+        return value
+
+    def _buffers(self, count: int, names: tuple[str, ...]) -> Buffers:
         try:
-            library = compiled_library(model_files(model), "model.c")
-        except CompilationError:
-            if compiled:
-                raise
-        else:
-            return {name: _compiled(model, library, name, shapes[name]) for name in shapes}
-    return {name: _interpreted(model, name, shapes[name]) for name in shapes}
+            found: Buffers = self._local.kept[count, names]
+        except (AttributeError, KeyError):
+            kept = self._local.__dict__.setdefault("kept", {})
+            if len(kept) >= _MOST_KEPT:  # of a caller whose batches have all sorts of lengths
+                kept.clear()
+            found = kept[count, names] = self._maker(count, names)
+        return found
 
 
-def _buffers(
-    model: CasadiModel, count: int, shape: tuple[int, ...], timed: bool
-) -> tuple[Array, Array, Array]:
-    return (
-        np.zeros((count, model.n)), np.zeros((count, model.m + timed)),
-        np.zeros((count, *shape)),
-    )
-
-
-def _compiled(model: CasadiModel, library: Any, name: str, shape: tuple[int, ...]) -> Maker:
-    """Evaluation by the loops of model_api.c."""
+def _library(model: CasadiModel, compiled: bool | None) -> ctypes.PyDLL | None:
+    """The model's machine code; None where CasADi is to evaluate it."""
+    if compiled is False or (compiled is None and find_compiler() is None):
+        return None
+    try:
+        library = compiled_library(model_files(model), "model.c")
+    except CompilationError:
+        if compiled:
+            raise
+        return None
     # A handle that keeps the interpreter's lock: the calls are shorter than handing it over.
-    own = ctypes.PyDLL(library._name)
-    function = own.mhe_jacobians if name.endswith("jacobian") else own.mhe_values
+    return ctypes.PyDLL(library._name)
+
+
+def _results(model: CasadiModel, count: int, names: tuple[str, ...]) -> dict[str, Array]:
+    n, p = model.n, model.p
+    shapes = {"f": (n,), "h": (p,), "f_jacobian": (n, n), "h_jacobian": (p, n)}
+    if names == _RESIDUALS:
+        return {"residuals": np.zeros((count, n + p)), "y": np.zeros((count, p))}
+    results = {name: np.zeros((count, *shapes[name])) for name in names}
+    if names == _NAMES:
+        # One state alone: both Jacobians are parts of one array.
+        joint = results["joint"] = np.zeros((n + p, n))
+        results["f_jacobian"], results["h_jacobian"] = joint[None, :n], joint[None, n:]
+        results["f"], results["h"] = results["f"][0], results["h"][0]
+    return results
+
+
+def _compiled(
+    model: CasadiModel, library: ctypes.PyDLL, timed: bool, count: int, names: tuple[str, ...]
+) -> Buffers:
+    """Evaluation by the loops of model_api.c."""
+    along = names == _RESIDUALS
+    states, inputs = np.zeros((count + along, model.n)), np.zeros((count, model.m + timed))
+    results = _results(model, count, names)
+    # C takes inputs and steps as arrays of their own.
+    us = np.zeros((count, model.m)) if timed else inputs
+    steps = np.zeros(count) if timed else None
+    slopes = any(name.endswith("jacobian") for name in names)
+    order: tuple[str, ...]
+    if along:
+        function, order = library.mhe_residuals, ("y", *_RESIDUALS)
+    elif slopes:
+        function, order = library.mhe_jacobians, _NAMES
+    else:
+        function, order = library.mhe_values, _VALUES
     function.restype = None
+    targets = [results.get(name) for name in order]
+    run = partial(
+        function, ctypes.c_int64(count), _pointer(states), _pointer(us), _pointer(steps),
+        ctypes.c_double(model.dt or 0.0), *(_pointer(target) for target in targets),
+    )
+    if steps is None:
+        # With the arrays, of which `run` has only the addresses.
+        return states, inputs, {**results, "_inputs": us}, run
 
-    def make(count: int, timed: bool) -> Buffers:
-        states, inputs, result = _buffers(model, count, shape, timed)
-        # C takes inputs and steps as arrays of their own.
-        us = np.zeros((count, model.m)) if timed else inputs
-        steps = np.zeros(count) if timed else None
-        targets = (result, None) if name.startswith("f") else (None, result)
-        arguments = (
-            ctypes.c_int64(count), _pointer(states), _pointer(us), _pointer(steps),
-            ctypes.c_double(model.dt or 0.0), _pointer(targets[0]), _pointer(targets[1]),
-        )
-        kept = (us, steps)  # only their addresses are in the arguments
+    def run_timed() -> None:
+        us[...] = inputs[:, : model.m]
+        steps[...] = inputs[:, model.m]
+        run()
 
-        def evaluate() -> None:
-            function(*arguments)
-
-        def evaluate_timed() -> None:
-            kept[0][...] = inputs[:, : model.m]
-            kept[1][...] = inputs[:, model.m]  # type: ignore[index]
-            function(*arguments)
-
-        return states, inputs, result, evaluate_timed if timed else evaluate
-
-    return make
+    return states, inputs, results, run_timed
 
 
 def _pointer(array: Array | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(None if array is None else array.ctypes.data)
 
 
-def _interpreted(model: CasadiModel, name: str, shape: tuple[int, ...]) -> Maker:
+def _interpreted(
+    model: CasadiModel, timed: bool, count: int, names: tuple[str, ...]
+) -> Buffers:
     """Evaluation by CasADi's virtual machine, mapped over the states."""
+    if names == _RESIDUALS:
+        return _interpreted_residuals(model, timed, count)
     ca = import_casadi()
-    which = name[0]
     kind = ca.SX if model.f.is_a("SXFunction") and model.h.is_a("SXFunction") else ca.MX
-    x, inputs = kind.sym("x", model.n), kind.sym("u", model.m + 1)
-    u, dt = inputs[: model.m], inputs[model.m]
-    value = model.step()(x, u, dt) if which == "f" else model.h(x, u)
-    if name.endswith("jacobian"):
-        # Transposed: CasADi stores by columns, NumPy by rows.
-        value = ca.densify(ca.jacobian(value, x).T)
-    function = ca.Function(name, [x, inputs], [value])
+    x, given = kind.sym("x", model.n), kind.sym("u", model.m + 1)
+    u, dt = given[: model.m], given[model.m]
+    following, output = model.step()(x, u, dt), model.h(x, u)
+    # Transposed: CasADi stores by columns, NumPy by rows.
+    columns = {
+        "f": lambda: following,
+        "h": lambda: output,
+        "f_jacobian": lambda: ca.densify(ca.jacobian(following, x).T),
+        "h_jacobian": lambda: ca.densify(ca.jacobian(output, x).T),
+    }
+    function = ca.Function("model", [x, given], [columns[name]() for name in names])
+    if count > 1:
+        function = function.map(count)
+    states, inputs = np.zeros((count, model.n)), np.zeros((count, model.m + timed))
+    results = _results(model, count, names)
+    all_inputs = inputs if timed else np.full((count, model.m + 1), model.dt or 0.0)
+    buffer, run = function.buffer()
+    buffer.set_arg(0, states.data)
+    buffer.set_arg(1, all_inputs.data)
+    for i, name in enumerate(names):
+        buffer.set_res(i, results[name].data)
+    kept = buffer, function  # `run` refers to them
 
-    def make(count: int, timed: bool) -> Buffers:
-        states, given, result = _buffers(model, count, shape, timed)
-        all_inputs = given if timed else np.full((count, model.m + 1), model.dt or 0.0)
-        mapped = function.map(count) if count > 1 else function
-        buffer, run = mapped.buffer()
-        buffer.set_arg(0, states.data)
-        buffer.set_arg(1, all_inputs.data)
-        buffer.set_res(0, result.data)
-        kept = (buffer, mapped)  # the run refers to them
+    def evaluate() -> None:
+        if not timed and kept:
+            all_inputs[:, : model.m] = inputs
+        run()
 
-        def evaluate() -> None:
-            if not timed and kept:
-                all_inputs[:, : model.m] = given
-            run()
+    return states, inputs, results, evaluate
 
-        return states, given, result, evaluate
 
-    return make
+def _interpreted_residuals(model: CasadiModel, timed: bool, count: int) -> Buffers:
+    states, inputs, values, evaluate_values = _interpreted(model, timed, count, _VALUES)
+    results = _results(model, count, _RESIDUALS)
+    trajectory, residuals, n = np.zeros((count + 1, model.n)), results["residuals"], model.n
+
+    def evaluate() -> None:
+        states[...] = trajectory[:-1]
+        evaluate_values()
+        np.subtract(trajectory[1:], values["f"], out=residuals[:, :n])
+        np.subtract(results["y"], values["h"], out=residuals[:, n:])
+
+    return trajectory, inputs, results, evaluate

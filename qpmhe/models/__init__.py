@@ -4,4 +4,11 @@ from .batch_reactor import BatchReactor, batch_reactor
 from .chain import ChainOfMasses, chain_of_masses
 from .scenario import Record, Scenario
 
-__all__ = ["BatchReactor", "ChainOfMasses", "Record", "Scenario", "batch_reactor", "chain_of_masses"]
+__all__ = [
+    "BatchReactor",
+    "ChainOfMasses",
+    "Record",
+    "Scenario",
+    "batch_reactor",
+    "chain_of_masses",
+]

@@ -10,13 +10,29 @@ void mhe_values(int64_t count, const real *x, const real *u, const real *step, r
     }
 }
 
+/* The values come with the Jacobians; a null pointer leaves out. */
 void mhe_jacobians(int64_t count, const real *x, const real *u, const real *step, real usual,
-                   real *f_jacobian, real *h_jacobian)
+                   real *f, real *h, real *f_jacobian, real *h_jacobian)
 {
     real next[NX], y[NY];
     for (int64_t k = 0; k < count; k++, x += NX, u += NU) {
         if (f_jacobian)
-            mhe_f_jacobian(x, u, step ? step[k] : usual, next, f_jacobian + k * NX * NX);
-        if (h_jacobian) mhe_h_jacobian(x, u, y, h_jacobian + k * NY * NX);
+            mhe_f_jacobian(x, u, step ? step[k] : usual, f ? f + k * NX : next,
+                           f_jacobian + k * NX * NX);
+        if (h_jacobian)
+            mhe_h_jacobian(x, u, h ? h + k * NY : y, h_jacobian + k * NY * NX);
+    }
+}
+
+/* Residuals (w, v) of each stage along a trajectory of count + 1 states. */
+void mhe_residuals(int64_t count, const real *x, const real *u, const real *step, real usual,
+                   const real *y, real *residuals)
+{
+    for (int64_t k = 0; k < count; k++, x += NX, u += NU, y += NY, residuals += NX + NY) {
+        real f[NX], h[NY];
+        mhe_f(x, u, step ? step[k] : usual, f);
+        mhe_h(x, u, h);
+        for (int j = 0; j < NX; j++) residuals[j] = x[NX + j] - f[j];
+        for (int j = 0; j < NY; j++) residuals[NX + j] = y[j] - h[j];
     }
 }
