@@ -115,7 +115,7 @@ class EstimatorLibrary:
         Its sizes.
     settings : structured array
         The ``mhe_settings`` in use; must outlive all estimators that point to it.
-    update, update_special, amend, reset, run : ctypes functions
+    update, update_special, update_members, amend, reset, run : ctypes functions
         The C functions of these names.
 
     Raises
@@ -140,13 +140,17 @@ class EstimatorLibrary:
         pointer, integer = ctypes.c_void_p, ctypes.c_int64
         self.update, self.update_special = quick.mhe_update, quick.mhe_update_special
         self.amend, self.reset, self.run = quick.mhe_amend, quick.mhe_reset, library.mhe_run
-        for function in (self.update, self.update_special, self.reset, self.run):
+        self.update_members = library.mhe_update_members
+        for function in (
+            self.update, self.update_special, self.reset, self.run, self.update_members
+        ):
             function.restype = None
         self.update_special.argtypes = [
             pointer, pointer, pointer, pointer, ctypes.c_double, pointer, pointer
         ]
         self.amend.argtypes = [pointer, pointer, integer, pointer, pointer]
         self.reset.argtypes = [pointer, pointer, pointer]
+        self.update_members.argtypes = [pointer, integer, pointer, pointer, pointer, pointer]
         self.run.argtypes = [pointer, integer, pointer, integer, pointer, pointer, pointer]
 
     def _check_sizes(self, library: ctypes.PyDLL) -> int:

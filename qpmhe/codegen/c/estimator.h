@@ -183,6 +183,10 @@ void mhe_update(mhe_estimator *estimator, mhe_workspace *workspace, const mhe_re
 int mhe_amend(mhe_estimator *estimator, mhe_workspace *workspace, int64_t time,
               const mhe_real *y, mhe_estimate *estimate);
 
+/* One sample of each of many estimators, each with an estimate of its own. */
+void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspace *workspace,
+                        const mhe_real *y, const mhe_real *u, mhe_estimate *estimates);
+
 /* Take whole records in: `members` estimators one after the other, `samples` each. */
 void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *workspace,
              int64_t samples, const mhe_real *y, const mhe_real *u, const mhe_log *log);

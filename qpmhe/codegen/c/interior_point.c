@@ -310,11 +310,12 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
             q->dual_low = q->dual_high = 0;
             q->slack_low = q->slack_high = 1;
             q->residual_low = q->residual_high = 0;
-            if (isfinite(q->low)) q->slack_low = fmax(-q->low, missed), sides++;
-            if (isfinite(q->high)) q->slack_high = fmax(q->high, missed), sides++;
+            if (isfinite(q->low)) q->slack_low = fmax(-q->low, 3 * missed), sides++;
+            if (isfinite(q->high)) q->slack_high = fmax(q->high, 3 * missed), sides++;
         }
     if (!sides) return SOLVED;
-    const real start = fmax(scale / sides, EPSILON * EPSILON);
+    /* Generous slacks and products: from smaller ones it crept on some QPs. */
+    const real start = fmax(10 * scale, EPSILON * EPSILON);
     for (int i = 0; i <= count; i++)
         for (int r = 0; r < mhe_rows_at(e, i); r++) {
             mhe_row *q = k->rows + i * ROWS + r;

@@ -91,6 +91,13 @@ void mhe_update(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u
     mhe_update_special(e, k, y, u, 0, 0, out);
 }
 
+void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspace *k,
+                        const real *y, const real *u, mhe_estimate *estimates)
+{
+    for (int64_t i = 0; i < members; i++)
+        mhe_update(estimators + i, k, y + i * NY, NU ? u + i * NU : 0, estimates + i);
+}
+
 int mhe_amend(mhe_estimator *e, mhe_workspace *k, int64_t time, const real *y,
               mhe_estimate *out)
 {
