@@ -1,11 +1,13 @@
 """How much work a step does, counted and not timed."""
 
+import sys
 import tracemalloc
 
 import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.models.batch_reactor import casadi_output, casadi_rate
 
 
 class Counted:
@@ -80,3 +82,70 @@ def test_memory_does_not_grow(options):
     after = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert after - before < 20_000  # bytes, over 5,000 steps
+
+
+def calls_in_a_step(mhe, measurements):
+    """The median of Python and C function calls in one update."""
+    counts = []
+    for y in measurements:
+        calls = [0]
+
+        def count(frame, event, argument, calls=calls):
+            calls[0] += event in ("call", "c_call")
+
+        sys.setprofile(count)
+        mhe.update(y)
+        sys.setprofile(None)
+        counts.append(calls[0])
+    return int(np.median(counts[20:]))
+
+
+# What the steps take now, and a tenth of slack: a guard against creeping growth that no
+# clock has to see.
+@pytest.mark.parametrize(
+    ("options", "most"),
+    [({"max_qps": 0}, 83), ({"max_qps": 1}, 153), ({"max_qps": 2}, 240)],
+    ids=["no QP", "one QP", "two QPs"],
+)
+def test_a_step_takes_no_more_calls_than_it_did(options, most):
+    reactor = qpmhe.models.batch_reactor()
+    mhe = qpmhe.MovingHorizonEstimator(
+        *reactor[:3], horizon=10, initial_state=[3.0, 0.0], backend="banded", **options
+    )
+    assert calls_in_a_step(mhe, reactor.scenario.simulate(0, 60).measurements) <= most
+
+
+def test_a_casadi_model_is_called_twice_in_a_step():
+    reactor = qpmhe.models.batch_reactor()
+    system = qpmhe.System.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, reactor.observer, reactor.cost, horizon=10, initial_state=[3.0, 0.0],
+        backend="banded",
+    )
+    joint, counts = system.joint, {"stage": 0, "residuals": 0}
+
+    class Counting:
+        def stage(self, *arguments):
+            counts["stage"] += 1
+            return joint.stage(*arguments)
+
+        def residuals(self, *arguments):
+            counts["residuals"] += 1
+            return joint.residuals(*arguments)
+
+    system.joint = Counting()
+    for y in reactor.scenario.simulate(0, 30).measurements:
+        mhe.update(y)
+    assert counts == {"stage": 30, "residuals": 30}
+
+
+def test_a_compiled_step_is_one_call_into_c():
+    reactor = qpmhe.models.batch_reactor()
+    system = qpmhe.System.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, reactor.observer, reactor.cost, horizon=10, initial_state=[3.0, 0.0],
+        engine="compiled",
+    )
+    if mhe.engine != "compiled":
+        pytest.skip("no C compiler")
+    assert calls_in_a_step(mhe, reactor.scenario.simulate(0, 60).measurements) <= 12
