@@ -13,7 +13,7 @@ from ._checks import count, numbers
 from .errors import InvalidInputError, ModelError, SetError, ShapeError
 from .functions import BatchedFunction, Probes
 from .sets import Box, ConvexSet
-from .system import System, _probes
+from .system import System, probe_points
 
 __all__ = ["augment_parameters"]
 
@@ -117,7 +117,7 @@ def augment_parameters(
             f"nominal is {values[chosen].tolist()} for the estimated parameters, outside of "
             f"parameter_bounds {parameter_bounds!r}; the prior value must be within."
         )
-    probes = _parameter_probes(_probes(states, n, m), values, chosen, parameter_bounds)
+    probes = _parameter_probes(probe_points(states, n, m), values, chosen, parameter_bounds)
     joint = _Joint(n, m, values, chosen)
     return System(
         joint.function("f", f, n, probes, append=True),

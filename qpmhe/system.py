@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.errors import tell_unknown_options
 
-from ._checks import count, positive
+from ._checks import count
 from .derivatives import Jacobian
-from .discretize import discretize
 from .errors import InvalidInputError, ModelError, SetError
 from .functions import BatchedFunction, Probes
 from .sets import ConvexSet
@@ -21,7 +20,7 @@ from .sets import ConvexSet
 if TYPE_CHECKING:
     from .codegen.expressions import CasadiModel
 
-__all__ = ["Joint", "System"]
+__all__ = ["Joint", "System", "checked_set", "probe_points"]
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
@@ -97,10 +96,10 @@ class System:
         noises: ConvexSet | None = None,
     ) -> None:
         self.n, self.p, self.m = count("n", n, 1), count("p", p, 1), count("m", m, 0)
-        self.states = _set("states", states, self.n)
-        self.disturbances = _set("disturbances", disturbances, self.n)
-        self.noises = _set("noises", noises, self.p)
-        probes = _probes(self.states, self.n, self.m)
+        self.states = checked_set("states", states, self.n)
+        self.disturbances = checked_set("disturbances", disturbances, self.n)
+        self.noises = checked_set("noises", noises, self.p)
+        probes = probe_points(self.states, self.n, self.m)
         self.f = BatchedFunction("f", f, (self.n,), self.m, probes)
         self.h = BatchedFunction("h", h, (self.p,), self.m, probes)
         self.f_jacobian = Jacobian(self.f, f_jacobian, self.m, probes)
@@ -162,43 +161,12 @@ class System:
         ModelError, SetError
             As for `System`.
         """
-        n, m = count("n", n, 1), count("m", m, 0)
-        probes = _probes(_set("states", states, n), n, m)
-        batched = BatchedFunction("rate", rate, (n,), m, probes)
-        given = None
-        if rate_jacobian is not None:
-            Jacobian(batched, rate_jacobian, m, probes)  # compared with differences here
-            given = BatchedFunction("rate_jacobian", rate_jacobian, (n, n), m, probes)
-        step, step_jacobian = discretize(
-            _over_leading(batched, rate), given and _over_leading(given, rate_jacobian), method
-        )
-        length = positive("dt", dt)
-        sets: dict[str, Any] = {
-            "states": states, "disturbances": disturbances, "noises": noises
-        }
-        system = cls(
-            partial(step, length), h, n=n, p=p, m=m,
-            f_jacobian=step_jacobian and partial(step_jacobian, length),
-            h_jacobian=h_jacobian, **sets,
-        )
-        system.dt = length
-        system._recipe = (
-            cls.from_ode,
-            {
-                "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": method,
-                "rate_jacobian": rate_jacobian, "h_jacobian": h_jacobian, **sets,
-            },
-        )
+        from .ode import ode_system
 
-        def timed() -> System:
-            return cls(
-                _timed_by_input(step, m), _without_last(system.h.batch, m), n=n, p=p, m=m + 1,
-                f_jacobian=step_jacobian and _timed_by_input(step_jacobian, m),
-                h_jacobian=_without_last(system.h_jacobian.batch, m), **sets,
-            )
-
-        system._timed = timed
-        return system
+        return ode_system(
+            cls, rate, h, dt=dt, n=n, p=p, m=m, method=method, rate_jacobian=rate_jacobian,
+            h_jacobian=h_jacobian, states=states, disturbances=disturbances, noises=noises,
+        )
 
     @classmethod
     def from_casadi(
@@ -254,6 +222,53 @@ class System:
         return casadi_system(
             f, h, dt=dt, method=method, n=n, p=p, m=m, states=states,
             disturbances=disturbances, noises=noises, compiled=compiled,
+        )
+
+    @classmethod
+    def from_jax(
+        cls,
+        f: Function,
+        h: Function,
+        *,
+        n: int,
+        p: int,
+        m: int = 0,
+        dt: float | None = None,
+        method: str = "rk4",
+        states: ConvexSet | None = None,
+        disturbances: ConvexSet | None = None,
+        noises: ConvexSet | None = None,
+    ) -> System:
+        """A model written for JAX, compiled and vectorised by it, with exact Jacobians.
+
+        Everything is in double precision, whatever the process's own setting is.
+
+        Parameters
+        ----------
+        f, h : callable
+            f(x) or f(x, u) and h(x) or h(x, u) of one state, written with ``jax.numpy``.
+        n, p, m : int
+            Numbers of states, outputs and inputs.
+        dt : float, optional
+            If given, f is the right-hand side of an ODE, which is discretised with this
+            sampling time; u is held over the step.
+        method : {"rk4", "euler"}
+            Its discretisation.
+        states, disturbances, noises : Box or Polytope, optional
+            The sets X, W and V.
+
+        Raises
+        ------
+        ModelError, SetError, OptionError
+            If something does not fit.
+        InvalidInputError
+            If JAX is not installed.
+        """
+        from .adapters.jax import jax_system
+
+        return jax_system(
+            f, h, n=n, p=p, m=m, dt=dt, method=method, states=states,
+            disturbances=disturbances, noises=noises,
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -313,34 +328,8 @@ def _made(maker: Function, arguments: dict[str, Any]) -> Any:
     return maker(**arguments)
 
 
-def _over_leading(function: BatchedFunction, written: Any) -> Function:
-    """A function of (..., n), whatever way the user's was written."""
-    if function.plain:
-        plain: Function = written
-        return plain
-
-    def evaluate(x: Array, *inputs: Array) -> Any:
-        u = inputs[0] if inputs else np.empty((*x.shape[:-1], 0))
-        return function.batch(x, u) if x.ndim > 1 else np.asarray(function(x, u))
-
-    return evaluate
-
-
-def _timed_by_input(step: Function, m: int) -> Function:
-    def evaluate(x: Array, u: Array) -> Any:
-        return step(u[..., m:], x, u[..., :m]) if m else step(u, x)
-
-    return evaluate
-
-
-def _without_last(function: Function, m: int) -> Function:
-    def evaluate(x: Array, u: Array) -> Any:
-        return function(x, u[..., :m]) if x.ndim > 1 else function(x[None], u[None, :m])[0]
-
-    return evaluate
-
-
-def _set(name: str, value: ConvexSet | None, dimension: int) -> ConvexSet | None:
+def checked_set(name: str, value: ConvexSet | None, dimension: int) -> ConvexSet | None:
+    """Insist on a set of this dimension, or none."""
     if value is None:
         return None
     if not isinstance(value, ConvexSet):
@@ -350,7 +339,7 @@ def _set(name: str, value: ConvexSet | None, dimension: int) -> ConvexSet | None
     return value
 
 
-def _probes(states: ConvexSet | None, n: int, m: int) -> Probes:
+def probe_points(states: ConvexSet | None, n: int, m: int) -> Probes:
     """A few irregular points inside the state bounds, to try functions on."""
     generator = np.random.default_rng(20210829)
     probes: Probes = []

@@ -62,7 +62,7 @@ class Multistage(Solver):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=100, help="samples of the record")
-    parser.add_argument("--width", type=float, default=1.5, help="of W, in standard deviations")
+    parser.add_argument("--width", type=float, default=3.0, help="of W, in standard deviations")
     arguments = parser.parse_args()
 
     plain = qpmhe.models.chain_of_masses(MASSES, DIMENSION)
