@@ -118,7 +118,7 @@ class PythonEngine:
                 first = self._history[len(self._history) - window.length]
                 window.replay(window.length, first)
             estimate = self._estimate(missing, held, flat, began)
-        self._history.append(estimate.state)
+        self._history.append(estimate.state.copy())  # a view would keep the trajectory
         return estimate
 
     def amend(self, time: int, y: Array) -> Estimate:
@@ -130,7 +130,7 @@ class PythonEngine:
             missing = not self._window.observed[-1].all()
             held = self._window.newest_is_held
             estimate = self._estimate(missing, held, False, began)
-        self._history[-1] = estimate.state
+        self._history[-1] = estimate.state.copy()
         return estimate
 
     def covariances(self) -> Array:

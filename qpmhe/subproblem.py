@@ -35,7 +35,7 @@ class Subproblem:
     - rows on ``w_i + d_{i+1} - A_i d_i`` from W and on ``v_i - C_i d_i`` from V; a component
       of W of zero width gives an equality row.
 
-    One QP is kept for each window length and overwritten at each use.
+    One QP, of the present window length, is kept and overwritten at each use.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class Subproblem:
         self._rows = sum(rows.shape[0] for rows in (self._w_rows, self._v_rows, self._x_rows))
         ends = np.cumsum([0, *(len(rows) for rows in (self._w_rows, self._v_rows, self._x_rows))])
         self._w, self._v, self._x = (slice(a, b) for a, b in pairwise(ends))
-        self._qps: dict[int, QP] = {}
+        self._qp: QP | None = None
 
     def at_candidate(self, problem: Problem, window: Window) -> QP:
         """The QP around the candidate, from what the window has kept."""
@@ -131,9 +131,9 @@ class Subproblem:
         at_candidate: bool,
     ) -> QP:
         n = self._n
-        qp = self._qps.get(count)
-        if qp is None:
-            qp = self._qps[count] = QP(count + 1, n, self._rows)
+        qp = self._qp
+        if qp is None or qp.stages != count + 1:
+            qp = self._qp = QP(count + 1, n, self._rows)
             qp.row_next[:-1, self._w] = self._w_rows
             qp.row_own[:, self._x] = self._x_rows
         last, band, gradient = first + count, qp.band, qp.gradient

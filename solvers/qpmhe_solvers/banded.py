@@ -38,7 +38,9 @@ class BandedSolver(Solver):
 
         super().__init__(options)
         self._dpbsv, self._dgbsv = dpbsv, dgbsv
-        self._work: dict[tuple[int, int], tuple[Array, Array, Array]] = {}
+        # Workspace for QPs of one size: windows keep theirs, once they are full.
+        self._size = (0, 0)
+        self._work: tuple[Array, Array, Array] | None = None
 
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
         solution = self.solve(qp, start)
@@ -81,13 +83,12 @@ class BandedSolver(Solver):
         return Solution(step, SolveStatus.UNCONSTRAINED, 0, residuals, no_bound, row_duals)
 
     def _cholesky(self, qp: QP) -> Array | None:
-        key = (qp.stages, qp.n)
-        work = self._work.get(key)
-        if work is None:
+        work = self._work
+        if work is None or self._size != (qp.stages, qp.n):
             band, step = np.empty((qp.stages, qp.n, 2 * qp.n)), np.empty((qp.stages, qp.n))
             # Views for LAPACK, made once: Fortran order, so that f2py works in place.
             work = band, band.reshape(qp.size, 2 * qp.n).T, step
-            self._work[key] = work
+            self._work, self._size = work, (qp.stages, qp.n)
         band, lapack_band, step = work
         band[...] = qp.band
         np.negative(qp.gradient, out=step)

@@ -149,3 +149,19 @@ def test_a_compiled_step_is_one_call_into_c():
     if mhe.engine != "compiled":
         pytest.skip("no C compiler")
     assert calls_in_a_step(mhe, reactor.scenario.simulate(0, 60).measurements) <= 12
+
+
+def test_memory_is_in_proportion_to_the_horizon():
+    reactor = qpmhe.models.batch_reactor()
+    measurements = reactor.scenario.simulate(0, 60).measurements
+    taken = []
+    for horizon in (50, 100, 400):  # the first only for what is imported late
+        tracemalloc.start()
+        mhe = qpmhe.MovingHorizonEstimator(
+            *reactor[:3], horizon=horizon, initial_state=[3.0, 0.0], backend="banded"
+        )
+        for k in range(horizon + 20):
+            mhe.update(measurements[k % 60])
+        taken.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+    assert taken[2] < 6 * taken[1]
