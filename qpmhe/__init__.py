@@ -1,6 +1,7 @@
 """Suboptimal moving horizon estimation by sequences of convex QPs, with a stability promise."""
 
-from . import codegen, errors, models, solvers
+from . import batch, codegen, errors, models, solvers
+from .batch import BatchEstimator
 from .costs import (
     Cost,
     CostConstants,
@@ -34,6 +35,7 @@ from .system import System
 __version__ = "0.1.0"
 
 __all__ = [
+    "BatchEstimator",
     "Box",
     "ConvexSet",
     "Cost",
@@ -62,6 +64,7 @@ __all__ = [
     "UnscentedKalman",
     "__version__",
     "augment_parameters",
+    "batch",
     "codegen",
     "design_luenberger",
     "errors",

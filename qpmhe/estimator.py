@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from time import perf_counter
 from typing import Any
 
@@ -14,8 +13,8 @@ from qpmhe_solvers.errors import tell_unknown_options
 from ._checks import positive, positive_definite, record, vector
 from .compiled import CompiledEngine
 from .costs import Cost, ObserverPrior
-from .engine import PythonEngine
-from .errors import CompilationError, EngineWarning, InvalidInputError, ShapeError
+from .engines import engine_for
+from .errors import InvalidInputError, ShapeError
 from .estimate import Estimate
 from .observers import Observer
 from .run import Run
@@ -151,7 +150,7 @@ class MovingHorizonEstimator:
         self.initial_state: Array = self._checked_start(initial_state)
         self._no_input = np.zeros(system.m)
         self._timed_is_checked = False
-        self._engine = _engine_for(system, observer, cost, self.settings, self.initial_state)
+        self._engine = engine_for(system, observer, cost, self.settings, self.initial_state)
 
     def _checked_start(self, initial_state: ArrayLike) -> Array:
         state = vector("initial_state", initial_state, self.system.n)
@@ -427,22 +426,6 @@ class MovingHorizonEstimator:
         except (InvalidInputError, np.linalg.LinAlgError):  # bad luck: the record goes on
             value = np.full((self.system.n, self.system.n), np.nan)
         return value
-
-
-def _engine_for(
-    system: System, observer: Observer, cost: Cost, settings: Settings, initial_state: Array
-) -> PythonEngine | CompiledEngine:
-    """The engine that the settings ask for, or the Python one where it cannot be compiled."""
-    if settings.engine == "compiled":
-        try:
-            return CompiledEngine(system, observer, cost, settings, initial_state)
-        except CompilationError as error:
-            warnings.warn(
-                f"engine='compiled' is carried out by the Python step: {error}",
-                EngineWarning,
-                stacklevel=4,
-            )
-    return PythonEngine(system, observer, cost, settings, initial_state)
 
 
 def _is(value: object, kind: type, name: str, expected: str) -> None:

@@ -34,7 +34,7 @@ class StageTerms:
     """
 
     __slots__ = (
-        "_below", "_flat", "_index", "_n", "_square", "_weighted",
+        "_flat", "_index", "_minus", "_n", "_one", "_square", "_weighted",
         "following", "jacobian", "own", "panel",
     )
 
@@ -45,21 +45,23 @@ class StageTerms:
         self.own: Array = np.zeros((stages, n))
         self.following: Array = np.zeros((stages, n))
         self._index = band_index(n)
-        self._weighted = np.empty((n + p, n))
-        self._flat = np.zeros(2 * n * n + 1)
+        # Of one stage: -G, the numbers that `band_index` points to, and their parts, -W G
+        # behind G^T W G; the block below the diagonal is the upper part of the former.
+        self._minus = np.empty((n + p, n))
+        self._flat = np.zeros(n * n + (n + p) * n + 1)  # the last one stays 0
         self._square = self._flat[: n * n].reshape(n, n)
-        self._below = self._flat[n * n : -1].reshape(n, n)
+        self._weighted = self._flat[n * n : -1].reshape(n + p, n)
+        self._one = np.where(self._index == 2 * n * n, self._flat.size - 1, self._index)
 
     def set_stage(self, k: int, weight: Array, residual: Array, weighted_residual: Array) -> None:
         """Compute the terms of stage k from its Jacobian, which is in place already."""
-        n, weighted = self._n, self._weighted
-        jacobian = self.jacobian[k]
-        np.dot(weight, jacobian, out=weighted)
-        np.dot(jacobian.T, weighted, out=self._square)
-        np.negative(weighted[:n], out=self._below)
-        self._flat.take(self._index, out=self.panel[k], mode="clip")
-        np.negative(residual.dot(weighted), out=self.own[k])
-        self.following[k] = weighted_residual[:n]
+        minus, weighted = self._minus, self._weighted
+        np.negative(self.jacobian[k], out=minus)
+        np.dot(weight, minus, out=weighted)
+        np.dot(minus.T, weighted, out=self._square)
+        self._flat.take(self._one, out=self.panel[k], mode="clip")
+        np.dot(residual, weighted, out=self.own[k])
+        self.following[k] = weighted_residual[: self._n]
 
     def set_all(self, weight: Array, residuals: Array, weighted_residuals: Array) -> None:
         """Compute the terms of the first len(residuals) stages, their Jacobians in place.

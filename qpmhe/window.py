@@ -89,7 +89,8 @@ class Window(Stages):
         k, m = self.end, self._m
         self._y[k] = y
         self._observed[k] = True
-        self._u[k, :m] = u
+        if m:
+            self._u[k, :m] = u
         self._irregular[k] = dt is not None
         if dt is not None:
             self._u[k, m] = dt

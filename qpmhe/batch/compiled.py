@@ -1,0 +1,125 @@
+"""A batch in compiled code, spread over threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..codegen.library import EstimatorLibrary
+from ..compiled import RunLog
+from ..costs import Cost
+from ..observers import Observer
+from ..settings import Settings
+from ..system import System
+from .results import BatchEstimate, BatchRun
+
+__all__ = ["CompiledBatchEngine"]
+
+Array = NDArray[np.float64]
+
+# Fewer members than this are not worth waking a thread for.
+_LEAST = 16
+
+
+class CompiledBatchEngine:
+    """The generated C step for each member; see `qpmhe.batch.engines.BatchEngine`.
+
+    Parameters
+    ----------
+    system, observer, cost, settings
+        What the members have in common.
+    states : (K, n) array
+        The initial estimates.
+    threads : int or None
+        How many threads share the members; None for one for each processor.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        observer: Observer,
+        cost: Cost,
+        settings: Settings,
+        states: Array,
+        threads: int | None,
+    ) -> None:
+        self._library = library = EstimatorLibrary(system, observer, cost, settings)
+        self._m, self._n, self._delay = system.m, system.n, settings.delay
+        count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        wanted = min(threads or count or 1, max(1, len(states) // _LEAST))
+        ends = np.linspace(0, len(states), wanted + 1).astype(int).tolist()
+        self._parts = [slice(a, b) for a, b in pairwise(ends)]
+        self._workspaces = [library.workspace() for _ in self._parts]
+        self._pool = ThreadPoolExecutor(wanted) if wanted > 1 else None
+        self.reset(states)
+
+    def reset(self, states: Array) -> None:
+        """See `qpmhe.batch.engines.BatchEngine.reset`."""
+        self._memory = self._library.estimators(states)
+        self.time = 0
+
+    @property
+    def states(self) -> Array:
+        """See `qpmhe.batch.engines.BatchEngine.states`."""
+        newest = self._memory["newest"]
+        states: Array = self._memory["history"][np.arange(len(newest)), newest]
+        return states
+
+    def step(self, y: Array, u: Array) -> BatchEstimate:
+        """See `qpmhe.batch.engines.BatchEngine.step`."""
+        ys, us = np.ascontiguousarray(y), np.ascontiguousarray(u)
+        found = np.empty(len(ys), self._library.estimate_type)
+
+        def work(part: slice, workspace: NDArray[np.uint8]) -> None:
+            self._library.update_members(
+                self._memory[part].ctypes.data, part.stop - part.start, workspace.ctypes.data,
+                ys[part].ctypes.data, us[part].ctypes.data, found[part].ctypes.data,
+            )
+
+        self._share(work)
+        self.time += 1
+        states = slice(0, int(found["length"][0]) + 1)
+        return BatchEstimate(
+            self.time - 1, found["trajectory"][:, states], found["cost"],
+            found["candidate"][:, states], found["candidate_cost"],
+            found["status"].astype(np.int64), found["qps"].astype(np.intp), self._delay,
+        )
+
+    def run(self, y: Array, u: Array) -> BatchRun:
+        """Take records (K, T, p) and (K, T, m) in without leaving C.
+
+        Parameters
+        ----------
+        y, u : array
+            Measurements and inputs.
+        """
+        ys, us, start = np.ascontiguousarray(y), np.ascontiguousarray(u), self.states
+        samples = ys.shape[1]
+        log = RunLog(ys.shape[:2], self._n)
+
+        def work(part: slice, workspace: NDArray[np.uint8]) -> None:
+            self._library.run(
+                self._memory[part].ctypes.data, part.stop - part.start, workspace.ctypes.data,
+                samples, ys[part].ctypes.data, us[part].ctypes.data if self._m else None,
+                log.pointers(part.start),
+            )
+
+        self._share(work)
+        self.time += samples
+        return BatchRun(
+            states=np.concatenate((start[:, None], log.states), axis=1), filtered=log.filtered,
+            delayed=log.delayed, costs=log.costs, candidate_costs=log.candidate_costs,
+            statuses=log.flags.astype(np.int64), qps=log.qps.astype(np.intp),
+        )
+
+    def _share(self, work: Callable[[slice, NDArray[np.uint8]], None]) -> None:
+        """Do the work on all members, a part a thread; C runs without the interpreter's lock."""
+        if self._pool is None:
+            work(self._parts[0], self._workspaces[0])
+        else:
+            list(self._pool.map(work, self._parts, self._workspaces))

@@ -1,0 +1,138 @@
+"""Batches in compiled code against single estimators."""
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.codegen.compiler import find_compiler
+from qpmhe.models.batch_reactor import casadi_output, casadi_rate
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+
+MEMBERS, STEPS = 40, 30
+BOX = qpmhe.Box([-0.1, -0.1], [0.1, 0.1])
+
+
+def reactor(**sets):
+    model = qpmhe.models.batch_reactor()
+    system = qpmhe.System.from_casadi(
+        casadi_rate, casadi_output, dt=0.1, method="euler", n=2, **sets
+    )
+    return system, model.observer, model.cost
+
+
+def records(seed=0):
+    scenario = qpmhe.models.batch_reactor().scenario
+    y = np.array([scenario.simulate(seed + k, STEPS).measurements for k in range(MEMBERS)])
+    y[3, 5:9] = np.nan  # samples of one member
+    y[7, 12] = np.inf
+    return y
+
+
+def starts():
+    return np.array([3.0, 0.1]) + 0.1 * np.arange(MEMBERS)[:, None] / MEMBERS
+
+
+@pytest.mark.parametrize("threads", [1, 2, None])
+@pytest.mark.parametrize(
+    ("sets", "options"),
+    [
+        ({}, {}), ({}, {"max_qps": 0}), ({}, {"max_qps": None, "start": "best", "delay": 3}),
+        ({"disturbances": BOX}, {"outside": "project", "max_qps": 2}),
+    ],
+    ids=["one", "none", "converged", "sets"],
+)
+def test_each_member_is_a_single_estimator(sets, options, threads):
+    parts, y, x0 = reactor(**sets), records(), starts()
+    shared = {"horizon": 8, "engine": "compiled", **options}
+    batch = qpmhe.BatchEstimator(
+        *parts, members=MEMBERS, initial_states=x0, threads=threads, **shared
+    )
+    assert (batch.mode, batch.mode_reason) == ("compiled", "")
+    estimates = [batch.update(y[:, t]) for t in range(10)]
+    run = batch.run(y[:, 10:])
+    assert batch.time == STEPS
+    for k in range(MEMBERS):
+        mhe = qpmhe.MovingHorizonEstimator(*parts, initial_state=x0[k], **shared)
+        for t in range(STEPS):
+            one = mhe.update(y[k, t])
+            if t < 10:
+                found = estimates[t]
+                np.testing.assert_array_equal(found.trajectories[k], one.trajectory)
+                np.testing.assert_array_equal(found.candidates[k], one.candidate)
+                np.testing.assert_array_equal(found.states[k], one.state)
+                assert found.costs[k] == one.cost
+                assert found.candidate_costs[k] == one.candidate_cost
+                assert found.statuses[k] == one.status
+                assert found.qps[k] == one.qps
+            else:
+                np.testing.assert_array_equal(run.states[k, t - 9], one.state)
+                np.testing.assert_array_equal(run.filtered[k, t - 10], one.filtered)
+                assert run.costs[k, t - 10] == one.cost
+                assert run.statuses[k, t - 10] == one.status.value
+                if one.delayed is not None:
+                    np.testing.assert_array_equal(run.delayed[k, t - 10], one.delayed)
+        np.testing.assert_array_equal(batch.states[k], mhe.state)
+
+
+def test_inputs_of_each_member_and_shared_ones():
+    def f(x, u):
+        return [0.9 * x[0] + u[0], 0.8 * x[1] + 0.1 * x[0] * u[1]]
+
+    system = qpmhe.System.from_casadi(f, lambda x: x[0] + x[1], n=2, m=2)
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[4.0]])
+    generator = np.random.default_rng(2)
+    y, u = generator.normal(size=(20, 12, 1)), generator.normal(size=(20, 12, 2))
+    shared = {"horizon": 5, "engine": "compiled"}
+
+    def batch():
+        return qpmhe.BatchEstimator(
+            system, qpmhe.Luenberger([0.3, 0.2]), cost, members=20, initial_states=[0.0, 0.0],
+            **shared,
+        )
+
+    own, common = batch().run(y, u), batch().run(y, u[0])
+    for k in range(20):
+        for run, inputs in ((own, u[k]), (common, u[0])):
+            mhe = qpmhe.MovingHorizonEstimator(
+                system, qpmhe.Luenberger([0.3, 0.2]), cost, initial_state=[0.0, 0.0], **shared
+            )
+            np.testing.assert_array_equal(run.states[k], mhe.run(y[k], inputs).states)
+
+
+def test_kept_estimates_do_not_change_and_a_reset_starts_again():
+    y = records()
+    batch = qpmhe.BatchEstimator(
+        *reactor(), members=MEMBERS, horizon=8, initial_states=starts(), engine="compiled"
+    )
+    first = batch.update(y[:, 0])
+    kept = first.trajectories.copy()
+    batch.run(y[:, 1:])
+    np.testing.assert_array_equal(first.trajectories, kept)
+    batch.reset()
+    assert batch.time == 0
+    np.testing.assert_array_equal(batch.states, starts())
+    np.testing.assert_array_equal(batch.update(y[:, 0]).trajectories, kept)
+
+
+def test_without_a_compiler_it_is_vectorised_and_says_so(monkeypatch):
+    parts = reactor()
+    monkeypatch.setenv("CC", "/nowhere/cc")
+    with pytest.warns(qpmhe.errors.EngineWarning, match="no C compiler"):
+        batch = qpmhe.BatchEstimator(
+            *parts, members=3, horizon=4, initial_states=[3.0, 0.1], engine="compiled"
+        )
+    assert batch.mode == "vectorised"
+
+
+def test_bad_input():
+    with pytest.raises(qpmhe.errors.OptionError, match="threads"):
+        qpmhe.BatchEstimator(
+            *reactor(), members=3, horizon=4, initial_states=[3.0, 0.1], engine="compiled",
+            threads=0,
+        )
+    plain = qpmhe.models.batch_reactor()
+    with pytest.raises(qpmhe.errors.OptionError, match="from_casadi"):
+        qpmhe.BatchEstimator(
+            *plain[:3], members=3, horizon=4, initial_states=[3.0, 0.1], engine="compiled"
+        )
