@@ -94,10 +94,10 @@ class BandedSolver(Solver):
         np.negative(qp.gradient, out=step)
         flat = step.reshape(qp.size)
         _, _, info = self._dpbsv(lapack_band, flat, lower=1, overwrite_ab=1, overwrite_b=1)
-        # An infinite pivot turns its unknown into 0 and would pass: look at the factor, too.
-        finite = math.isfinite(flat.dot(flat)) and math.isfinite(
-            np.add.reduce(band[:, :, 0], axis=None)
-        )
+        finite = math.isfinite(flat.dot(flat))
+        if finite and np.count_nonzero(flat) < flat.size:
+            # An infinite pivot turns its unknown into 0 and would pass: look at the factor.
+            finite = math.isfinite(np.add.reduce(band[:, :, 0], axis=None))
         return step if info == 0 and finite else None
 
     def _with_equalities(self, qp: QP) -> tuple[Array | None, Array]:
