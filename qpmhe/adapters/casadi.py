@@ -65,6 +65,7 @@ def casadi_system(
             one["f"], one["h"], n=model.n, p=model.p, m=model.m + timed,
             f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"], **sets,
         )
+        system.f_jacobian.method = system.h_jacobian.method = "casadi"
         system.joint = evaluator
         return system
 

@@ -234,11 +234,9 @@ class BatchEstimator:
         us = input_record(U, self.members, self.system.m, ys.shape[1])
         if isinstance(self._engine, CompiledBatchEngine):
             return self._engine.run(ys, us)
-        start = self.states
-        estimates = [
-            self._engine.step(ys[:, t], us[:, t]) for t in range(ys.shape[1])
-        ]
-        return BatchRun.of(start, estimates)
+        steps = ys.shape[1]
+        estimates = (self._engine.step(ys[:, t], us[:, t]) for t in range(steps))
+        return BatchRun.of(self.states, estimates, steps)
 
     def __repr__(self) -> str:
         return (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from functools import cached_property
 
 import numpy as np
@@ -128,18 +128,19 @@ class BatchRun:
         self.statuses, self.qps = statuses, qps
 
     @classmethod
-    def of(cls, start: Array, estimates: Sequence[BatchEstimate]) -> BatchRun:
+    def of(cls, start: Array, estimates: Iterable[BatchEstimate], count: int) -> BatchRun:
         """Collect what single updates returned.
 
         Parameters
         ----------
         start : (K, n) array
             The estimates before the first update.
-        estimates : sequence of BatchEstimate
-            What the updates returned.
+        estimates : iterable of BatchEstimate
+            What the updates return; none is kept, as they hold whole windows.
+        count : int
+            How many there are.
         """
         members, n = start.shape
-        count = len(estimates)
         # Time first while they are written, members first as they are read.
         states, filtered, delayed = (
             np.empty((count + more, members, n)) for more in (1, 0, 0)

@@ -159,3 +159,23 @@ def test_a_jacobian_that_changes_its_argument_is_refused():
 
     with pytest.raises(ModelError, match="f_jacobian changes its argument in place"):
         system_of(lambda x: x**2, f_jacobian=jacobian)
+
+
+def test_at_a_kink_any_slope_between_the_sides_is_a_derivative():
+    def kinked(x):
+        return np.where(x > 0, 0.9 * x, 0.3 * x)
+
+    for slope in (0.3, 0.6, 0.9):
+        system = qpmhe.System(
+            kinked, lambda x: x, n=1, p=1,
+            f_jacobian=lambda x, slope=slope: np.where(
+                x > 0, 0.9, np.where(x < 0, 0.3, slope)
+            )[..., None],
+        )
+        system.check(np.zeros(1), np.zeros(0))
+    wrong = qpmhe.System(
+        kinked, lambda x: x, n=1, p=1,
+        f_jacobian=lambda x: np.where(x > 0, 0.9, np.where(x < 0, 0.3, 1.2))[..., None],
+    )
+    with pytest.raises(qpmhe.errors.ModelError, match="is 1.2 at"):
+        wrong.check(np.zeros(1), np.zeros(0))
