@@ -91,3 +91,17 @@ def positive(name: str, value: Any) -> float:
     ):
         raise OptionError(f"{name} is {value!r}; expected a finite number > 0.")
     return float(value)
+
+
+def check_problem(state: Any, mine: tuple[int, ...]) -> None:
+    """Insist that a snapshot is of a problem of these sizes: (n, p, m, horizon)."""
+    found = state.get("problem") if isinstance(state, dict) else state
+    if (
+        not isinstance(found, (tuple, list))
+        or len(found) != len(mine)
+        or not all(isinstance(size, (int, np.integer)) for size in found)
+        or tuple(found) != mine
+    ):
+        raise InvalidInputError(
+            f"the state is of a problem with (n, p, m, horizon) = {found!r}; expected {mine}."
+        )

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ._checks import check_problem
 from .codegen.layout import SET_NAMES
 from .codegen.library import EstimatorLibrary
 from .costs import Cost
@@ -60,6 +61,10 @@ class CompiledEstimate(Estimate):
         n = sizes[0]
         end = 2 + (numbers[0] + 1) * n
         self.state = block[end - n : end]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        arguments = self._block, self._numbers, self.time, self._sizes, self._delay
+        return _restored, (*arguments, self.step_time)
 
     def _rows(self, start: int, rows: int, width: int) -> Array:
         return self._block[start : start + rows * width].reshape(rows, width)
@@ -137,6 +142,15 @@ class CompiledEstimate(Estimate):
     def solve_time(self) -> float:  # type: ignore[override]
         """Not measured inside of the C step: NaN."""
         return math.nan
+
+
+def _restored(
+    block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int], delay: int,
+    step_time: float,
+) -> CompiledEstimate:
+    estimate = CompiledEstimate(block, numbers, time, sizes, delay)
+    estimate.step_time = step_time
+    return estimate
 
 
 def _dropped(bits: int) -> tuple[str, ...]:
@@ -226,7 +240,6 @@ class CompiledEngine:
             self._memory.ctypes.data, self._library.settings.ctypes.data, start.ctypes.data
         )
         self.time = 0
-        self._dropped = 0
 
     @property
     def state(self) -> Array:
@@ -260,9 +273,9 @@ class CompiledEngine:
         return estimate
 
     def _collect(self, time: int) -> CompiledEstimate:
-        numbers = self._numbers.tolist()
-        self._dropped = numbers[5]
-        return CompiledEstimate(self._block.copy(), numbers, time, self._sizes, self._delay)
+        return CompiledEstimate(
+            self._block.copy(), self._numbers.tolist(), time, self._sizes, self._delay
+        )
 
     def amend(self, time: int, y: Array) -> Estimate:
         """Put a late measurement in its place, and estimate again."""
@@ -308,17 +321,14 @@ class CompiledEngine:
         stages = record["stages"][(record["first"] + np.arange(length)) % self._sizes[2]]
         with np.errstate(all="ignore"):
             _bind(self._problem, self._system, self._cost, stages)
-            self._problem.leave_out(_dropped(self._dropped))
+            self._problem.leave_out(_dropped(int(record["dropped"])))
             return window_covariances(self._problem, record["trajectory"][: length + 1].copy())
 
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt from measurements so far, as plain arrays and numbers."""
-        memory = self._memory.copy()
-        memory["settings"] = 0  # an address, which means nothing elsewhere
-        return {
-            "problem": self._size(), "engine": "compiled", "memory": memory.view(np.uint8),
-            "dropped": self._dropped,
-        }
+        memory = self._memory.view(np.uint8).copy()  # as bytes: padding is copied, too
+        memory.view(self._memory.dtype)["settings"] = 0  # an address means nothing elsewhere
+        return {"problem": self._size(), "engine": "compiled", "memory": memory}
 
     def _size(self) -> tuple[int, ...]:
         system = self._system
@@ -326,19 +336,17 @@ class CompiledEngine:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where another estimator stopped."""
-        mine = self._size()
-        found = state.get("problem") if isinstance(state, dict) else state
-        if not isinstance(found, (tuple, list)) or tuple(found) != mine:
-            raise InvalidInputError(
-                f"the state is of a problem with (n, p, m, horizon) = {found!r}; expected {mine}."
-            )
+        check_problem(state, self._size())
         if state.get("engine") != "compiled":
             raise InvalidInputError(
                 "the state is of an estimator with another engine; expected 'compiled'."
             )
         try:
-            memory = np.array(state["memory"], np.uint8).view(self._memory.dtype)
-            record, dropped = memory[0], int(state["dropped"])
+            given = np.asarray(state["memory"])
+            if given.dtype != np.uint8 or given.ndim != 1:
+                raise TypeError(f"its memory is of type {given.dtype} and shape {given.shape}")
+            memory = given.copy().view(self._memory.dtype)
+            record = memory[0]
             horizon = self._sizes[2]
             sound = (
                 0 <= record["first"] < horizon
@@ -357,7 +365,7 @@ class CompiledEngine:
             )
         memory["settings"] = self._library.settings.ctypes.data
         self._memory[...] = memory
-        self.time, self._dropped = int(record["time"]), dropped
+        self.time = int(record["time"])
 
 
 def _bind(problem: Problem, system: System, cost: Cost, stages: NDArray[Any]) -> None:

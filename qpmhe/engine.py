@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers import SolverOptions, create
 
+from ._checks import check_problem
 from .costs import Cost
 from .covariance import window_covariances
 from .errors import InvalidInputError
@@ -116,7 +117,7 @@ class PythonEngine:
             if self._settings.candidate == "reinitialized":
                 # The history reaches back to the estimate of the window's first state.
                 first = self._history[len(self._history) - window.length]
-                window.replay(window.length, first)
+                missing, held, flat = window.replay(window.length, first)
             estimate = self._estimate(missing, held, flat, began)
         self._history.append(estimate.state.copy())  # a view would keep the trajectory
         return estimate
@@ -221,11 +222,12 @@ class PythonEngine:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where another estimator stopped."""
-        mine, system = self._size(), self._system
-        found = state.get("problem") if isinstance(state, dict) else state
-        if not isinstance(found, (tuple, list)) or tuple(found) != mine:
+        system = self._system
+        check_problem(state, self._size())
+        if state.get("engine", "python") != "python":
             raise InvalidInputError(
-                f"the state is of a problem with (n, p, m, horizon) = {found!r}; expected {mine}."
+                f"the state is of an estimator with engine={state['engine']!r}, which is not at "
+                "work here; install a C compiler, or snapshot with engine='python'."
             )
         try:
             if not self._window.fits(state["window"]):

@@ -63,7 +63,8 @@ class Stages:
         self._stage_cost = np.zeros(room)
         self.terms = StageTerms(room, n, p)
         self._covariance = None if covariance is None else np.zeros((room + 1, n, n))
-        self._initial_state = initial_state
+        # The last state at which the model worked, of the stages that are no longer here.
+        self._earlier, self._earlier_covariance = initial_state, covariance
         self._z[0] = initial_state
         if self._covariance is not None:
             self._covariance[0] = covariance
@@ -88,8 +89,18 @@ class Stages:
         )
         return arrays if self._majorising is self._weight else (*arrays, self._majorising)
 
+    def _last_good(self, before: int) -> tuple[Array, Array | None]:
+        """State and covariance of the last stage before this one at which the model worked."""
+        for k in range(before - 1, -1, -1):
+            if math.isfinite(self._stage_cost[k]):
+                return self._z[k], None if self._covariance is None else self._covariance[k]
+        return self._earlier, self._earlier_covariance
+
     def _move_to_front(self) -> None:
         keep, end = self.end - self.start, self.end
+        state, covariance = self._last_good(self.start)
+        self._earlier = state.copy()
+        self._earlier_covariance = None if covariance is None else covariance.copy()
         for array in self._per_stage():
             array[:keep] = array[end - keep : end]
         self.terms.keep_last(end, keep)
@@ -102,7 +113,10 @@ class Stages:
         """All that the window knows, as copies of arrays and numbers."""
         stages = slice(self.start, self.end)
         points = slice(self.start, self.end + 1)
+        earlier, covariance = self._last_good(self.start)
         return {
+            "earlier": earlier.copy(),
+            "earlier_covariance": None if covariance is None else covariance.copy(),
             "time": self.time,
             "z": self._z[points].copy(),
             "covariance": None if self._covariance is None else self._covariance[points].copy(),
@@ -126,6 +140,12 @@ class Stages:
         self._z[: length + 1] = state["z"]
         if self._covariance is not None:
             self._covariance[: length + 1] = state["covariance"]
+        self._earlier = np.array(state["earlier"], np.float64).reshape(self._z.shape[1])
+        saved_covariance = state["earlier_covariance"]
+        self._earlier_covariance = (
+            None if saved_covariance is None
+            else np.array(saved_covariance, np.float64).reshape(self._z.shape[1], -1)
+        )
         for array, saved in zip(self._per_stage(), state["stages"], strict=True):
             array[:length] = saved
         for array, saved in zip(self.terms.arrays(), state["terms"], strict=True):

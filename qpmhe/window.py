@@ -126,8 +126,10 @@ class Window(Stages):
         self._set_weight(k, time)
         self.replay(self.time - time)
 
-    def replay(self, steps: int, state: Array | None = None) -> None:
+    def replay(self, steps: int, state: Array | None = None) -> tuple[bool, bool, bool]:
         """Redo the last stages, from another state of the observer if one is given.
+
+        What `push` tells is told of the newest one.
 
         Parameters
         ----------
@@ -139,8 +141,10 @@ class Window(Stages):
         first = self.end - steps
         if state is not None:
             self._z[first] = state
+        outcome = False, False, False
         for k in range(first, self.end):
-            self._enter(k, self.time - (self.end - k))
+            outcome = self._enter(k, self.time - (self.end - k))
+        return outcome
 
     def _enter(self, k: int, time: int) -> tuple[bool, bool, bool]:
         """Compute stage k from z(k) and its sample; what `push` tells."""
@@ -257,12 +261,9 @@ class Window(Stages):
 
         The observer goes on where the model last worked: z(t) is where it does not.
         """
-        good = k - 1
-        while good >= 0 and not math.isfinite(self._stage_cost[good]):
-            good -= 1
-        self._z[k + 1] = self._z[good] if good >= 0 else self._initial_state
+        self._z[k + 1], covariance = self._last_good(k)
         if self._covariance is not None:
-            self._covariance[k + 1] = self._covariance[max(good, 0)]
+            self._covariance[k + 1] = covariance
         self._residuals[k] = 0.0
         self.terms.jacobian[k] = np.eye(*self.terms.jacobian[k].shape)
         self._majorising[k] = self._weight[k]

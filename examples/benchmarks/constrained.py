@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import piqp
 from numpy.typing import NDArray
-from qpmhe_solvers import QP, RawSolution, Solver, SolverOptions
 from rich.console import Console
 from rich.table import Table
 
 import qpmhe
 from qpmhe.models.chain import casadi_output, casadi_rate
+from qpmhe_solvers import QP, RawSolution, Solver, SolverOptions
 
 MASSES, DIMENSION, HORIZON = 2, 3, 30
 
@@ -105,6 +105,8 @@ def main() -> None:
     settled = slice(len(solvers[0].seconds) // 3, None)
     reference = statistics.median(solvers[0].seconds[settled])
 
+    iterations = [e.solver_iterations / c for e, c in zip(ours, solved, strict=True)]
+
     table = Table(title=f"One QP with inequalities, n = {plain.system.n}, N = {HORIZON}",
                   title_justify="left")
     for column in ("", "median us", "of PIQP's"):
@@ -117,8 +119,7 @@ def main() -> None:
     console.print(
         f"Rows active (median): {100 * statistics.median(solvers[0].active[settled]):.0f} %. "
         f"Costs agree to {gap:.0e}. QPs in an update: {statistics.median(solved):.0f}, "
-        f"interior-point iterations in each: "
-        f"{statistics.median(e.solver_iterations / c for e, c in zip(ours, solved, strict=True)):.0f}.",
+        f"interior-point iterations in each: {statistics.median(iterations):.0f}.",
         highlight=False,
     )
 

@@ -63,8 +63,7 @@ class Windows:
         self.horizon, self.calls = horizon, Calls(system)
         members, n = initial_states.shape
         self.members = members
-        # As long as those of a single window: how far back a failed model looks depends on it.
-        self._room = room = horizon + max(horizon, 64)
+        self._room = room = 2 * horizon
         self._z = np.zeros((room + 1, members, n))
         self._u = np.zeros((room, members, system.m))
         self._y = np.zeros((room, self._p, members))
@@ -73,6 +72,8 @@ class Windows:
         self.terms = Terms(horizon, n, q, members if linearized else 0)
         #: Weights of the stage in each slot that are not the cost's own.
         self.special: list[Special | None] = [None] * horizon
+        # z of the last stage at which the model worked.
+        self._good = np.empty((members, n))
         self._ahead, self._fitted = np.empty((members, n)), np.empty((self._p, members))
         self._residual, self._weighted = np.empty((q, members)), np.empty((q, members))
         self._jacobian = np.empty((q, n, members))
@@ -90,7 +91,7 @@ class Windows:
         initial_states : (K, n) array
             z(0).
         """
-        self._initial_states = self._z[0] = initial_states
+        self._z[0] = self._good[...] = initial_states
         self.time = self._start = self._end = 0
         self.missing = self.held = self.flat = None
 
@@ -115,6 +116,9 @@ class Windows:
             self.held = bad
             self._hold(k, bad)
             cost[bad] = np.inf
+            np.copyto(self._good, self._z[k], where=~bad[:, None])
+        else:
+            self._good[...] = self._z[k]
         self._stage_cost[k] = cost
         if self._linearized:
             self._linearize(k, slot)
@@ -189,15 +193,8 @@ class Windows:
 
     def _hold(self, k: int, held: Mask) -> None:
         """Fill a stage where the model cannot be evaluated; see `qpmhe.window.Window`."""
-        members = np.flatnonzero(held)
-        good = np.isfinite(self._stage_cost[:k, members])
-        # The last stage at which the model worked, -1 for none.
-        last = np.where(good.any(axis=0), k - 1 - good[::-1].argmax(axis=0), -1) if k else -1
-        self._z[k + 1, members] = np.where(
-            np.less(last, 0)[..., None],
-            self._initial_states[members], self._z[np.maximum(last, 0), members],
-        )
-        self._residual[:, members] = self._weighted[:, members] = 0.0
+        self._z[k + 1, held] = self._good[held]
+        self._residual[:, held] = self._weighted[:, held] = 0.0
 
     def _linearize(self, k: int, slot: int) -> None:
         n, jacobian, eye = self._n, self._jacobian, np.eye(*self._jacobian.shape[:2])

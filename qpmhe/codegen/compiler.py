@@ -29,7 +29,10 @@ def find_compiler() -> list[str] | None:
     """The C compiler's command: ``$CC`` if set, else cc, gcc or clang; None without any."""
     named = os.environ.get("CC")
     if named is not None:
-        command = shlex.split(named)
+        try:
+            command = shlex.split(named)
+        except ValueError:  # quotation marks that do not close
+            command = []
         path = shutil.which(command[0]) if command else None
         return [path, *command[1:]] if path else None
     for name in ("cc", "gcc", "clang"):
@@ -42,7 +45,7 @@ def find_compiler() -> list[str] | None:
 def cache_directory() -> Path:
     """Where compiled libraries are kept: ``$QPMHE_CACHE_DIR``, else the user's cache folder."""
     named = os.environ.get("QPMHE_CACHE_DIR")
-    return Path(named) if named else user_cache_path("qpmhe")
+    return Path(named).absolute() if named else user_cache_path("qpmhe")
 
 
 @lru_cache(maxsize=1)
@@ -85,29 +88,39 @@ def compiled_library(files: dict[str, str], main: str, key: str | None = None) -
     )
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
     folder = _usable_folder()
-    path = folder / f"{digest}.so"
-    if path.exists():
-        try:
-            return ctypes.CDLL(str(path))
-        except OSError:  # damaged: made anew below
-            pass
-    with tempfile.TemporaryDirectory(dir=folder) as scratch:
-        for name, text in files.items():
-            Path(scratch, name).write_text(text, encoding="ascii")
-        made = Path(scratch, "library.so")
-        _run(compiler, Path(scratch, main), made)
-        # In one motion, so that no process sees half a file.
-        os.replace(made, path)
-    return ctypes.CDLL(str(path))
+    path, seal = folder / f"{digest}.so", folder / f"{digest}.sha256"
+    if not _intact(path, seal):
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            for name, text in files.items():
+                Path(scratch, name).write_text(text, encoding="ascii")
+            made, sealed = Path(scratch, "library.so"), Path(scratch, "seal")
+            _run(compiler, Path(scratch, main), made)
+            sealed.write_text(hashlib.sha256(made.read_bytes()).hexdigest(), encoding="ascii")
+            # Each in one motion; a process that sees the one without the other compiles, too.
+            os.replace(made, path)
+            os.replace(sealed, seal)
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError as error:
+        raise CompilationError(f"{path} cannot be loaded ({error}).") from error
+
+
+def _intact(library: Path, seal: Path) -> bool:
+    """Whether a library in the cache is what was put there: a damaged one kills the process."""
+    try:
+        return hashlib.sha256(library.read_bytes()).hexdigest() == seal.read_text("ascii")
+    except (OSError, UnicodeError):
+        return False
 
 
 def _usable_folder() -> Path:
-    for folder in (cache_directory(), Path(tempfile.gettempdir(), f"qpmhe-{os.getuid()}")):
+    user = os.getuid() if hasattr(os, "getuid") else None
+    for folder in (cache_directory(), Path(tempfile.gettempdir(), f"qpmhe-{user}")):
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         except OSError:
             continue
-        if os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid():
+        if os.access(folder, os.W_OK) and user in (None, folder.stat().st_uid):
             return folder
     raise CompilationError(
         f"{cache_directory()} cannot be written; set QPMHE_CACHE_DIR to a folder that can."

@@ -19,6 +19,7 @@ __all__ = ["SET_NAMES", "Layout", "settings_record"]
 
 SET_NAMES = ("states", "disturbances", "noises")
 
+_MOST = int(np.iinfo(np.int32).max)
 _POLICIES = ("drop", "project", "keep")
 
 
@@ -118,8 +119,9 @@ class Layout:
         return np.dtype([
             ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
             ("length", np.int32), ("newest", np.int32), ("has_trajectory", np.int32),
-            ("initial_state", r, n), ("z_end", r, n), ("history", r, (count + 1, n)),
-            ("trajectory", r, (count + 1, n)), ("stages", stage, count),
+            ("dropped", np.int32), ("unused", np.int32), ("last_good", r, n), ("z_end", r, n),
+            ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
+            ("stages", stage, count),
         ], align=True)
 
 
@@ -159,9 +161,9 @@ def settings_record(
         rows = one.matrix.shape[0]
         part["rows"][: one.matrix.size] = one.matrix.ravel()
         part["row_lower"][:rows], part["row_upper"][:rows] = one.row_lower, one.row_upper
-    record["max_qps"] = settings.qp_limit
+    record["max_qps"] = min(settings.qp_limit, _MOST)
     most = settings.max_solver_iterations
-    record["max_iterations"] = 0 if settings.backend == "banded" else most or 50
+    record["max_iterations"] = 0 if settings.backend == "banded" else min(most or 50, _MOST)
     record["outside"] = _POLICIES.index(settings.outside)
     record["start_at_best"] = settings.start == "best"
     record["reinitialize"] = settings.candidate == "reinitialized"

@@ -60,12 +60,14 @@ def model_source(model: CasadiModel) -> str:
     for which in ("f", "h"):
         function = getattr(model, which)
         name = f"mhe_casadi_{which}"
-        generator.add(_named(ca, function, name, model))
-        calls.append(_call(f"mhe_call_{which}", name, function, 1))
+        named = _named(ca, function, name, model)
+        generator.add(named)
+        calls.append(_call(f"mhe_call_{which}", name, named, 1))
         slopes, places = model.with_jacobian(which)
         name = f"mhe_casadi_{which}_jacobian"
-        generator.add(_named(ca, slopes, name, model))
-        calls.append(_call(f"mhe_call_{which}_jacobian", name, slopes, 2))
+        named = _named(ca, slopes, name, model)
+        generator.add(named)
+        calls.append(_call(f"mhe_call_{which}_jacobian", name, named, 2))
         listed = ", ".join(str(place) for place in places) or "0"
         calls.append(
             f"#define MHE_{which.upper()}_NONZEROS {len(places)}\n"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .forms import Form, pattern_of_limits
 from .options import SolverOptions
 from .qp import QP
 from .solution import RawSolution
@@ -17,6 +18,9 @@ from .solver import Solver
 __all__ = ["TRANSLATIONS", "DispatchSolver", "Translation"]
 
 Array = NDArray[np.float64]
+
+# Patterns of limits kept by one solver: with and without sets, at a few phases of sampling.
+_KEPT = 8
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,8 @@ class Translation:
         Cap where none is asked for and the solver's own would let it run for minutes.
     needs_row : bool
         Whether a QP without any inequality row goes wrong, so that a void row is added.
+    keep_empty : bool
+        Whether to give matrices without rows, which qpsolvers would make at each solve.
     """
 
     matrices: Literal["csc", "dense"]
@@ -49,6 +55,7 @@ class Translation:
     time_limit: str | None = None
     start: bool = False
     needs_row: bool = False
+    keep_empty: bool = False
     default_cap: int | None = None
 
 
@@ -77,7 +84,9 @@ TRANSLATIONS: Mapping[str, Translation] = {
     "osqp": Translation(
         "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", start=True
     ),
-    "piqp": Translation("csc", "box", "max_iter", ("eps_abs",), ("eps_rel",)),
+    "piqp": Translation(
+        "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), keep_empty=True
+    ),
     "proxqp": Translation(
         "dense", "box", "max_iter", ("eps_abs",), ("eps_rel",), default_cap=200
     ),
@@ -91,7 +100,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
 
 
 class DispatchSolver(Solver):
-    """Hand the QP to one solver through ``qpsolvers.solve_problem``, built anew each time.
+    """Hand the QP to one solver through ``qpsolvers.solve_problem``.
 
     Parameters
     ----------
@@ -99,6 +108,12 @@ class DispatchSolver(Solver):
         The solver's name in qpsolvers, one of `TRANSLATIONS`.
     options : SolverOptions
         Limits and accuracy, translated into the solver's own keywords.
+
+    Notes
+    -----
+    The solver itself is set up anew each time. What it is handed is laid out once for each
+    pattern of limits and filled in place, so that one instance serves one thread. No solver of
+    the table writes into it, or holds on to it after its solve: the tests look.
     """
 
     def __init__(self, name: str, options: SolverOptions) -> None:
@@ -110,125 +125,41 @@ class DispatchSolver(Solver):
         self._keywords = _keywords(self._translation, options)
         self._problem: Callable[..., Any] = qpsolvers.Problem
         self._solve_problem: Callable[..., Any] = qpsolvers.solve_problem
+        self._forms: dict[Hashable, tuple[Form, Any]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_forms": {}}  # copies of arrays no longer share their numbers
 
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
-        how = self._translation
-        constraints = _Constraints(qp, how)
-        hessian = qp.csc() if how.matrices == "csc" else qp.dense()
-        problem = self._problem(
-            hessian, qp.gradient.ravel().copy(), *constraints.inequalities,
-            *constraints.equalities, *constraints.box,
-        )
-        initial = None if start is None or not how.start else np.ravel(start).copy()
+        form, problem = self._form(qp)
+        form.fill(qp)
+        initial = None
+        if start is not None and self._translation.start:
+            initial = np.ravel(start).copy()
         answer = self._solve_problem(
             problem, self.name, initvals=initial, verbose=False, **self._keywords
         )
-        bound_duals, row_duals = constraints.multipliers(answer)
+        bound_duals, row_duals = form.multipliers(answer)
         iterations, message = _told(answer.extras)
         return RawSolution(
             answer.x, bool(answer.found), iterations, bound_duals, row_duals, message
         )
 
-
-class _Constraints:
-    """A QP's bounds and two-sided rows as qpsolvers wants them, and the way back."""
-
-    def __init__(self, qp: QP, how: Translation) -> None:
-        self._qp = qp
-        lower, upper = qp.lower.ravel(), qp.upper.ravel()
-        row_lower, row_upper = qp.row_lower.ravel(), qp.row_upper.ravel()
-        equal = row_lower == row_upper
-        self._equal = np.flatnonzero(equal)
-        self._row_up = np.flatnonzero(~equal & np.isfinite(row_upper))
-        self._row_low = np.flatnonzero(~equal & np.isfinite(row_lower))
-        self._up = np.flatnonzero(np.isfinite(upper))
-        self._low = np.flatnonzero(np.isfinite(lower))
-        self._as_rows = how.bounds == "rows"
-        self.box: tuple[Array | None, Array | None] = (None, None)
-        if not self._as_rows and (self._up.size or self._low.size):
-            self.box = (lower.copy(), upper.copy())
-        dense = how.matrices == "dense"
-        blocks, sides = [], []
-        rows: Any = None
-        if qp.rows:
-            rows = qp.dense_rows() if dense else qp.csc_rows().tocsr()
-            blocks += [rows[self._row_up], -rows[self._row_low]]
-            sides += [row_upper[self._row_up], -row_lower[self._row_low]]
-        if self._as_rows:
-            blocks += [
-                _unit_rows(self._up, qp.size, dense), -_unit_rows(self._low, qp.size, dense)
-            ]
-            sides += [upper[self._up], -lower[self._low]]
-        side = np.concatenate([*sides, np.empty(0)])
-        if how.needs_row and side.size == 0:
-            blocks, side = [_void_row(qp.size, dense)], np.ones(1)
-        self.inequalities: tuple[Any, Array | None] = (None, None)
-        if side.size:
-            self.inequalities = (_stack(blocks, dense), side)
-        self.equalities: tuple[Any, Array | None] = (None, None)
-        if self._equal.size and rows is not None:
-            self.equalities = (_stack([rows[self._equal]], dense), row_upper[self._equal])
-
-    def multipliers(self, answer: Any) -> tuple[Array | None, Array | None]:
-        """Multipliers of our bounds and rows from those of the qpsolvers form."""
-        qp, ups, lows = self._qp, self._row_up.size, self._row_low.size
-        bound_duals, row_duals = np.zeros(qp.size), np.zeros(qp.stages * qp.rows)
-        wanted = ups + lows + (self._up.size + self._low.size if self._as_rows else 0)
-        z = _numbers(answer.z, wanted)
-        y = _numbers(answer.y, self._equal.size)
-        if z is None or y is None:
-            return None, None
-        if qp.rows:
-            row_duals[self._row_up] += z[:ups]
-            row_duals[self._row_low] -= z[ups : ups + lows]
-            row_duals[self._equal] += y
-        if self._as_rows:
-            split = ups + lows + self._up.size
-            bound_duals[self._up] += z[ups + lows : split]
-            bound_duals[self._low] -= z[split:]
-        elif self.box[0] is not None:
-            z_box = _numbers(answer.z_box, qp.size)
-            if z_box is None:
-                return None, None
-            bound_duals += z_box
-        return bound_duals, row_duals
-
-
-def _numbers(values: Any, size: int) -> Array | None:
-    """The first ``size`` multipliers; none expected may be given as nothing."""
-    if size == 0:
-        return np.empty(0)
-    if values is None:
-        return None
-    numbers = np.asarray(values, dtype=np.float64).ravel()
-    return numbers[:size] if numbers.size >= size else None
-
-
-def _unit_rows(columns: NDArray[np.intp], width: int, dense: bool) -> Any:
-    count = columns.size
-    if dense:
-        rows = np.zeros((count, width))
-        rows[np.arange(count), columns] = 1.0
-        return rows
-    from scipy.sparse import csr_matrix
-
-    return csr_matrix((np.ones(count), columns, np.arange(count + 1)), shape=(count, width))
-
-
-def _void_row(width: int, dense: bool) -> Any:
-    from scipy.sparse import csr_matrix
-
-    return np.zeros((1, width)) if dense else csr_matrix((1, width))
-
-
-def _stack(blocks: list[Any], dense: bool) -> Any:
-    if dense:
-        return np.vstack(blocks)
-    from scipy.sparse import csc_matrix, vstack
-
-    stacked = csc_matrix(vstack(blocks, format="csc"))
-    stacked.sort_indices()
-    return stacked
+    def _form(self, qp: QP) -> tuple[Form, Any]:
+        """The layout for this QP's pattern of limits, and the problem made of its arrays."""
+        key = pattern_of_limits(qp)
+        made = self._forms.pop(key, None)
+        if made is None:
+            how = self._translation
+            form = Form(
+                qp, dense=how.matrices == "dense", box=how.bounds == "box",
+                needs_row=how.needs_row, keep_empty=how.keep_empty,
+            )
+            made = form, self._problem(*form.arguments)
+            if len(self._forms) == _KEPT:
+                del self._forms[next(iter(self._forms))]  # the longest unused
+        self._forms[key] = made
+        return made
 
 
 def _keywords(how: Translation, options: SolverOptions) -> dict[str, Any]:

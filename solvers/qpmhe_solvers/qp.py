@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import ShapeError
+from .patterns import Pattern, hessian_pattern, rows_pattern
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
@@ -44,54 +44,8 @@ def band_of(block: Array) -> Array:
     return panel
 
 
-@dataclass(frozen=True)
-class _Pattern:
-    """Where the entries of a sparse matrix come from: found once, numbers flow through it."""
-
-    source: NDArray[np.intp]  # entry of the stored numbers, in CSC order
-    rows: NDArray[np.int32]
-    columns: NDArray[np.intp]
-    indptr: NDArray[np.int32]
-
-
-def _sorted_pattern(
-    source: NDArray[np.intp],
-    rows: NDArray[np.intp],
-    columns: NDArray[np.intp],
-    valid: NDArray[np.bool_],
-    width: int,
-) -> _Pattern:
-    """Drop the invalid entries of arrays that already run by column, then by row."""
-    counts = np.bincount(columns[valid], minlength=width)
-    return _Pattern(
-        source=source[valid],
-        rows=rows[valid].astype(np.int32),
-        columns=columns[valid],
-        indptr=np.concatenate(([0], np.cumsum(counts))).astype(np.int32),
-    )
-
-
-@lru_cache(maxsize=256)
-def _hessian_pattern(stages: int, n: int) -> _Pattern:
-    k, c, b, r = np.ix_(np.arange(stages), np.arange(n), np.arange(-1, 2), np.arange(n))
-    row, column = (k + b) * n + r, k * n + c + 0 * (b + r)
-    valid = (k + b >= 0) & (k + b < stages) & (c + r >= 0)
-    low, high = np.minimum(row, column), np.maximum(row, column)
-    return _sorted_pattern(low * 2 * n + (high - low), row + 0 * c, column, valid, stages * n)
-
-
-@lru_cache(maxsize=256)
-def _rows_pattern(stages: int, n: int, m: int) -> _Pattern:
-    """Source index: into the flat own rows, followed by the flat next rows."""
-    k, c, b, r = np.ix_(np.arange(stages), np.arange(n), np.arange(-1, 1), np.arange(m))
-    row, column = (k + b) * m + r + 0 * c, k * n + c + 0 * (b + r)
-    valid = (k + b >= 0) & (c + r >= 0)
-    source = row * n + c + np.where(b < 0, stages * m * n, 0)
-    return _sorted_pattern(source, row, column, valid, stages * n)
-
-
-def _csc(pattern: _Pattern, numbers: Array, height: int, width: int) -> csc_matrix:
-    # The solvers may sort or scale in place: every view gets indices of its own.
+def _csc(pattern: Pattern, numbers: Array, height: int, width: int) -> csc_matrix:
+    # Solvers may sort or scale in place: every view gets indices of its own.
     from scipy.sparse import csc_matrix
 
     return csc_matrix(
@@ -180,19 +134,19 @@ class QP:
 
     def dense(self) -> Array:
         """H as a full symmetric (K n, K n) array."""
-        pattern = _hessian_pattern(self.stages, self.n)
+        pattern = hessian_pattern(self.stages, self.n)
         full = np.zeros((self.size, self.size))
         full[pattern.rows, pattern.columns] = self.band.ravel()[pattern.source]
         return full
 
     def csc(self) -> csc_matrix:
         """H as a full symmetric CSC matrix with sorted indices of its own."""
-        pattern = _hessian_pattern(self.stages, self.n)
+        pattern = hessian_pattern(self.stages, self.n)
         return _csc(pattern, self.band.ravel(), self.size, self.size)
 
     def dense_rows(self) -> Array:
         """The general rows [F, G] as a (K rows, K n) array."""
-        pattern = _rows_pattern(self.stages, self.n, self.rows)
+        pattern = rows_pattern(self.stages, self.n, self.rows)
         full = np.zeros((self.stages * self.rows, self.size))
         numbers = np.concatenate((self.row_own.ravel(), self.row_next.ravel()))
         full[pattern.rows, pattern.columns] = numbers[pattern.source]
@@ -200,7 +154,7 @@ class QP:
 
     def csc_rows(self) -> csc_matrix:
         """The general rows [F, G] as a (K rows, K n) CSC matrix with sorted indices."""
-        pattern = _rows_pattern(self.stages, self.n, self.rows)
+        pattern = rows_pattern(self.stages, self.n, self.rows)
         numbers = np.concatenate((self.row_own.ravel(), self.row_next.ravel()))
         return _csc(pattern, numbers, self.stages * self.rows, self.size)
 

@@ -380,12 +380,14 @@ def test_the_common_factorisation_solves_the_qps_that_a_backend_is_given(n, memb
         expected = np.linalg.solve(qp.dense(), qp.gradient.ravel())
         np.testing.assert_allclose(steps[..., k].ravel(), expected, rtol=1e-9, atol=1e-12)
         assert promised[k] == pytest.approx(qp.gradient.ravel() @ expected, rel=1e-9)
+    kept = steps.copy()
     # A member without a solution is told, and spoils no other.
     for spoilt in (np.nan, np.inf, -1e6):
         terms.square[slots[1], n - 1, n - 1, -1] = spoilt
-        again, _, sound = factor.solve(terms, slots, discounts, gradient)
+        with np.errstate(all="ignore"):
+            again, _, sound = factor.solve(terms, slots, discounts, gradient)
         assert sound.tolist() == [True] * (members - 1) + [False]
-        same(again[..., :-1], steps[..., :-1], "the others")
+        np.testing.assert_array_equal(again[..., :-1], kept[..., :-1])
 
 
 def test_a_nearly_singular_qp_is_the_backends_to_solve():
@@ -525,7 +527,7 @@ def test_models_and_steps_in_c(engine):
     system = qpmhe.System.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2)
     Y = np.array([reactor.scenario.simulate(seed, 25).measurements for seed in range(4)])
     Y[2, 3] = np.nan
-    mode = "vectorised" if engine == "python" else "looped"
+    mode = "vectorised" if engine == "python" else "compiled"
     compare((system, *reactor[1:3]), Y, starts=[3.0, 0.0], mode=mode, max_qps=2, engine=engine)
 
 

@@ -177,5 +177,5 @@ def test_at_a_kink_any_slope_between_the_sides_is_a_derivative():
         kinked, lambda x: x, n=1, p=1,
         f_jacobian=lambda x: np.where(x > 0, 0.9, np.where(x < 0, 0.3, 1.2))[..., None],
     )
-    with pytest.raises(qpmhe.errors.ModelError, match="is 1.2 at"):
+    with pytest.raises(qpmhe.errors.ModelError, match=r"is 1\.2 at"):
         wrong.check(np.zeros(1), np.zeros(0))

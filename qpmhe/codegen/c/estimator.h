@@ -117,8 +117,8 @@ typedef struct {
     const mhe_settings *settings;
     int64_t time;                  /* samples taken */
     int32_t first, length;         /* the window in the ring of stages */
-    int32_t newest, has_trajectory;
-    mhe_real initial_state[MHE_NX];
+    int32_t newest, has_trajectory, dropped, unused;
+    mhe_real last_good[MHE_NX];    /* of the stages that have left the window */
     mhe_real z_end[MHE_NX];        /* the observer's state behind the last stage */
     mhe_real history[(MHE_HORIZON + 1) * MHE_NX]; /* ring of estimates of x(t), newest last */
     mhe_real trajectory[(MHE_HORIZON + 1) * MHE_NX];

@@ -44,7 +44,7 @@ static void mhe_assemble(const mhe_estimator *e, mhe_workspace *k, const real *o
 
 /* Columns of a panel that are updated at once: as many as fit in a processor's registers, and
  * a fixed number, so that a compiler can keep them there. */
-#define CHUNK (WIDTH < 48 ? WIDTH : 32)
+#define CHUNK (WIDTH <= 48 ? WIDTH : 32)
 
 /* Overwrite the panels by the rows of D L', with H = L D L'; whether H was positive definite.
  * No square roots: their latency would be half of the time at small sizes. */

@@ -310,12 +310,12 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
             q->dual_low = q->dual_high = 0;
             q->slack_low = q->slack_high = 1;
             q->residual_low = q->residual_high = 0;
-            if (isfinite(q->low)) q->slack_low = fmax(-q->low, 3 * missed), sides++;
-            if (isfinite(q->high)) q->slack_high = fmax(q->high, 3 * missed), sides++;
+            if (isfinite(q->low)) q->slack_low = fmax(-q->low, missed), sides++;
+            if (isfinite(q->high)) q->slack_high = fmax(q->high, missed), sides++;
         }
     if (!sides) return SOLVED;
-    /* Generous slacks and products: from smaller ones it crept on some QPs. */
-    const real start = fmax(10 * scale, EPSILON * EPSILON);
+    /* Generous products: from smaller ones it creeps on some QPs. */
+    const real start = fmax(scale, EPSILON * EPSILON);
     for (int i = 0; i <= count; i++)
         for (int r = 0; r < mhe_rows_at(e, i); r++) {
             mhe_row *q = k->rows + i * ROWS + r;
@@ -392,8 +392,10 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
                     if (q->dual_high > 0)
                         after += (q->slack_high + length * change[2]) *
                                  (q->dual_high + length * change[3]);
-                    q->correction_low = change[0] * change[1];
-                    q->correction_high = change[2] * change[3];
+                    /* Of a step that was cut short, the second order would be misleading:
+                     * with the whole of it there are QPs on which it cycles. */
+                    q->correction_low = length * length * change[0] * change[1];
+                    q->correction_high = length * length * change[2] * change[3];
                 }
             const real ratio = after / products;
             target = ratio * ratio * ratio * products / sides;

@@ -22,6 +22,7 @@ static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
     if (!judged) o->events &= ~MHE_NO_DECREASE;
     memcpy(e->trajectory, o->best->x, size);
     e->has_trajectory = 1;
+    e->dropped = o->dropped;
     if (held && o->best != o->reference)
         memcpy(e->z_end, o->best->x + e->length * NX, sizeof e->z_end);
 }
@@ -36,7 +37,7 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const real *y, const re
         int at = e->newest - (e->length - 1);
         if (at < 0) at += MHE_HORIZON + 1;
         memcpy(mhe_stage_at(e, 0)->z, e->history + at * NX, sizeof(real) * NX);
-        mhe_replay(e, 0);
+        failed = mhe_replay(e, 0);
     }
     mhe_estimate_now(e, k, o, failed, before);
     mhe_remember(e, o->best->x + e->length * NX);
@@ -72,7 +73,7 @@ void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
 {
     memset(e, 0, sizeof *e);
     e->settings = settings;
-    memcpy(e->initial_state, x0, sizeof e->initial_state);
+    memcpy(e->last_good, x0, sizeof e->last_good);
     memcpy(e->z_end, x0, sizeof e->z_end);
     memcpy(e->history, x0, sizeof(real) * NX);
 }

@@ -142,8 +142,8 @@ static int mhe_enter(mhe_estimator *e, int i)
         /* z(i) is where the model does not work: go on where it last did. */
         int good = i - 1;
         while (good >= 0 && !isfinite(mhe_stage_at(e, good)->cost)) good--;
-        memcpy(next, good >= 0 ? mhe_stage_at(e, good)->z : e->initial_state,
-               sizeof e->initial_state);
+        memcpy(next, good >= 0 ? mhe_stage_at(e, good)->z : e->last_good,
+               sizeof e->last_good);
         memset(stage->w, 0, sizeof stage->w);
         memset(stage->v, 0, sizeof stage->v);
     }
@@ -173,6 +173,8 @@ static int mhe_push(mhe_estimator *e, const real *y, const real *u, real step,
 {
     const mhe_settings *s = e->settings;
     if (e->length == MHE_HORIZON) {
+        const mhe_stage *leaving = mhe_stage_at(e, 0);
+        if (isfinite(leaving->cost)) memcpy(e->last_good, leaving->z, sizeof e->last_good);
         e->first = e->first + 1 < MHE_HORIZON ? e->first + 1 : 0;
     } else {
         e->length++;

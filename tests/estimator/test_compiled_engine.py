@@ -1,0 +1,220 @@
+"""Where the compiled engine comes from, and what has no C form."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.codegen.compiler import find_compiler
+from qpmhe.errors import EngineWarning, OptionError, QpmheError
+
+from .test_compiled import estimator, made, system_of
+
+casadi = pytest.importorskip("casadi")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+
+INF = np.inf
+
+
+def fallen_back(model, match):
+    """Insist on a warning that tells why, and on the results of the Python step."""
+    with pytest.warns(EngineWarning, match=match) as caught:
+        mhe = estimator(model)
+    assert [Path(w.filename).name for w in caught] == ["test_compiled.py"]
+    assert mhe.engine == "python"
+    twin = estimator(model, "python")
+    for y in model.Y[:8]:
+        np.testing.assert_array_equal(mhe.update(y).trajectory, twin.update(y).trajectory)
+
+
+@pytest.mark.parametrize("command", ["", " ", "/nowhere/cc", "no-such-compiler -O2", "/tmp"])
+def test_no_compiler(monkeypatch, command):
+    monkeypatch.setenv("CC", command)
+    fallen_back(made("n=1"), "carried out by the Python step: there is no C compiler.*install")
+
+
+def test_no_compiler_on_the_path(monkeypatch, tmp_path):
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    fallen_back(made("n=1"), "there is no C compiler")
+
+
+def test_a_compiler_that_cannot_be_read(monkeypatch):
+    monkeypatch.setenv("CC", 'gcc "')
+    fallen_back(made("n=1"), "carried out by the Python step")
+
+
+def test_a_compiler_that_fails(monkeypatch, tmp_path):
+    program = tmp_path / "cc"
+    program.write_text("#!/bin/sh\necho out of order >&2\nexit 3\n")
+    program.chmod(0o700)
+    monkeypatch.setenv("CC", str(program))
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "cache"))
+    fallen_back(made("n=1"), "failed: out of order")
+    assert list((tmp_path / "cache").iterdir()) == []
+
+
+def test_a_compiler_with_options(monkeypatch, tmp_path):
+    monkeypatch.setenv("CC", f"{find_compiler()[0]} -DNOTHING=1")
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path))
+    assert estimator(made("n=1")).engine == "compiled"
+
+
+@pytest.mark.parametrize("named", [".", "deep/er"])
+def test_a_cache_relative_to_the_working_directory(monkeypatch, tmp_path, named):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("QPMHE_CACHE_DIR", named)
+    assert estimator(made("n=1")).engine == "compiled"
+    assert len(list((tmp_path / named).glob("*.so"))) == 1
+
+
+def test_a_cache_that_cannot_be_written(monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert estimator(made("n=1")).engine == "compiled"
+    assert len(list(tmp_path.glob("qpmhe-*/*.so"))) == 1
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "file"))
+    fallen_back(made("n=1"), "cannot be written; set QPMHE_CACHE_DIR")
+
+
+PROGRAM = """
+import casadi, qpmhe
+system = qpmhe.System.from_casadi(lambda x: 0.9 * x, lambda x: x, n=1, compiled=False)
+cost = qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0)
+mhe = qpmhe.MovingHorizonEstimator(
+    system, qpmhe.Luenberger([0.3]), cost, horizon=2, initial_state=[0.0], engine="compiled"
+)
+print(mhe.engine, repr(float(mhe.run([[1.0], [2.0], [0.5]]).costs.sum())))
+"""
+
+
+def started(folder):
+    return subprocess.Popen(
+        [sys.executable, "-W", "error", "-c", PROGRAM], text=True,
+        env={**os.environ, "QPMHE_CACHE_DIR": str(folder)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )
+
+
+def finished(process):
+    out, err = process.communicate(timeout=100)
+    assert process.returncode == 0, f"{process.returncode}: {err[-500:]}"
+    return out
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """What two processes that begin at once make, and say."""
+    folder = tmp_path_factory.mktemp("cache")
+    processes = [started(folder) for _ in range(2)]
+    said = [finished(process) for process in processes]
+    assert said[0] == said[1]
+    assert said[0].startswith("compiled")
+    assert all(path.is_file() for path in folder.iterdir())  # nothing is left over
+    (made_library,) = folder.glob("*.so")
+    return made_library, said[0]
+
+
+@pytest.mark.parametrize("damage", ["empty", "text", "cut early", "cut late", "zeros", "another"])
+def test_a_damaged_library_is_made_anew(library, damage, tmp_path):
+    path, said = library
+    good = path.read_bytes()
+    other = min(Path(np.__file__).parent.rglob("*.so"), key=lambda p: p.stat().st_size)
+    shutil.copytree(path.parent, tmp_path, dirs_exist_ok=True)
+    (tmp_path / path.name).write_bytes({
+        "empty": b"", "text": b"no library" * 2000, "cut early": good[:1000],
+        "cut late": good[:-100], "zeros": good[:4096] + bytes(len(good) - 4096),
+        "another": other.read_bytes(),
+    }[damage])
+    assert finished(started(tmp_path)) == said
+
+
+def test_weights_and_options_need_no_compiler(monkeypatch, tmp_path):
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path))
+    estimator(made("n=1"))
+    (library,) = tmp_path.glob("*.so")
+    stamp = library.stat()
+    cost = qpmhe.QuadraticCost(prior=2.0, disturbance=3.0, noise=4.0 * np.eye(2), discount=0.9)
+    estimator(
+        made("n=1"), cost=cost, observer=qpmhe.Luenberger([[0.1, 0.1]]), max_qps=None,
+        start="best", delay=1, backend="banded", tolerance=1e-4, initial_state=[0.1],
+    )
+    assert list(tmp_path.glob("*.so")) == [library]
+    assert (library.stat().st_ino, library.stat().st_mtime_ns) == (stamp.st_ino, stamp.st_mtime_ns)
+
+
+def plain():
+    return qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1)
+
+
+def symbolic(**sets):
+    return system_of(lambda x: 0.9 * x, lambda x: x, n=1, **sets)
+
+
+ONES = {"prior": 1.0, "disturbance": 1.0, "noise": 1.0}
+
+
+def uncovered(**given):
+    arguments = {
+        "system": given.pop("system", symbolic)(),
+        "observer": given.pop("observer", lambda: qpmhe.Luenberger([0.3]))(),
+        "cost": given.pop("cost", lambda: qpmhe.QuadraticCost(**ONES))(),
+    }
+    return qpmhe.MovingHorizonEstimator(
+        **arguments, **({"horizon": 2, "initial_state": [0.0], "engine": "compiled"} | given)
+    )
+
+
+class OwnGain(qpmhe.Luenberger):
+    """May correct by anything."""
+
+
+def equality():
+    return qpmhe.Box(-1.0, 1.0) & qpmhe.sets.ConvexSet(
+        np.array([-INF]), np.array([INF]), np.eye(1), np.zeros(1), np.zeros(1)
+    )
+
+
+@pytest.mark.parametrize(
+    ("remedy", "given"),
+    [
+        ("System.from_casadi", {"system": plain}),
+        ("OwnGain has no C form.*constant gain", {"observer": lambda: OwnGain([0.3])}),
+        ("OutputInjection has no C form",
+         {"observer": lambda: qpmhe.OutputInjection(lambda z, v: 0.3 * v)}),
+        ("take a QuadraticCost",
+         {"cost": lambda: qpmhe.RobustCost(**(ONES | {"noise": qpmhe.Huber(1.0, 1.0)}))}),
+        ("take a constant one",
+         {"cost": lambda: qpmhe.QuadraticCost(**(ONES | {"prior": qpmhe.ObserverPrior()})),
+          "observer": lambda: qpmhe.SteadyStateKalman(
+              plain(), [0.0], disturbance=[[1.0]], noise=[[1.0]])}),
+        ("states has a direction of zero width", {"system": lambda: symbolic(
+            states=qpmhe.Box(0.0, 0.0))}),
+        ("disturbances has a direction of zero width.*widen", {"system": lambda: symbolic(
+            disturbances=qpmhe.Box(0.1, 0.1))}),
+        ("noises has a direction of zero width", {"system": lambda: symbolic(
+            noises=equality())}),
+        ("not by 'osqp'; take backend='auto'", {"backend": "osqp"}),
+        ("take 'qp'", {"subproblem": "exact"}),
+        ("max_qps and max_solver_iterations", {"time_budget": 1.0}),
+    ],
+)
+def test_what_has_no_c_form_is_an_error_with_a_remedy(remedy, given):
+    with pytest.raises(OptionError, match=f"no C code for this estimator: .*{remedy}"):
+        uncovered(**given)
+
+
+@pytest.mark.parametrize("option", ["max_qps", "max_solver_iterations"])
+def test_caps_beyond_all_bounds(option):
+    try:
+        mhe = uncovered(**{option: 2**31})
+    except QpmheError:
+        return
+    assert mhe.update([1.0]).improved
