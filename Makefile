@@ -6,7 +6,7 @@ ARGS ?=
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: reproduce test lint types examples docs wheel clean
+.PHONY: reproduce test lint types examples benchmarks docs wheel clean
 
 # One stamp for each set of extras, renewed when the project's requirements change.
 $(VENV)/.%: pyproject.toml
@@ -30,9 +30,19 @@ examples: $(VENV)/.test
 	$(BIN)/python examples/quickstart.py
 	$(BIN)/python examples/paper_figure.py --out results
 	$(BIN)/python examples/outliers.py --seeds 4 --out results
-	$(BIN)/python examples/benchmarks/step_time.py --steps 60
+	$(BIN)/python examples/benchmarks/compare_peers.py --quick --problem reactor --out results
+	$(BIN)/python examples/benchmarks/constrained.py --steps 60 --out results
+	$(BIN)/python examples/benchmarks/batch.py --members 200 --steps 40 --out results
 	if [ -d "$(DATA)" ]; then $(BIN)/python examples/battery_soc.py --data "$(DATA)" --out results; \
 	else echo "no battery data at '$(DATA)': battery example left out"; fi
+
+# All benchmarks, beside all that PyPI has: an hour, most of it compiling; QUICK=--quick for minutes.
+benchmarks: $(VENV)/.test
+	$(BIN)/pip install --quiet --disable-pip-version-check -r examples/benchmarks/requirements.txt
+	$(BIN)/python examples/benchmarks/compare_peers.py $(QUICK) --out results/benchmarks
+	$(BIN)/python examples/benchmarks/scaling.py $(QUICK) --out results/benchmarks
+	$(BIN)/python examples/benchmarks/constrained.py --out results/benchmarks
+	$(BIN)/python examples/benchmarks/batch.py --out results/benchmarks
 
 docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict
