@@ -85,7 +85,8 @@ class Jacobian:
         step = _DIFFERENCE_STEP * np.maximum(1.0, np.abs(x))
         moves = step[..., None, :] * np.eye(n)
         u_all = np.broadcast_to(u[..., None, :], (*moves.shape[:-1], u.shape[-1]))
-        ahead = np.asarray(self._function.batch(x[..., None, :] + moves, u_all))
+        # A copy: a function may return one and the same array every time.
+        ahead = np.array(self._function.batch(x[..., None, :] + moves, u_all))
         behind = np.asarray(self._function.batch(x[..., None, :] - moves, u_all))
         return np.swapaxes((ahead - behind) / (2 * step[..., :, None]), -1, -2)
 

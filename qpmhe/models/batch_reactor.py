@@ -19,8 +19,8 @@ Array = NDArray[Any]
 _K1, _K2 = 0.16, 0.64
 _DT = 0.1
 _STOICHIOMETRY = np.array([-2.0, 1.0])
-# The Jacobian is 2 k_1 x_1 times the first matrix, plus the second.
-_SLOPE = np.array([[-2.0, 0.0], [1.0, 0.0]])
+# The Jacobian is x_1 times the first matrix, plus the second.
+_SLOPE = 2.0 * _K1 * np.array([[-2.0, 0.0], [1.0, 0.0]])
 _CONSTANT = np.array([[0.0, 2.0 * _K2], [0.0, -_K2]])
 
 
@@ -53,8 +53,7 @@ def _rate(x: Array) -> Array:
 
 
 def _rate_jacobian(x: Array) -> Array:
-    slope: Array = np.multiply.outer(2.0 * _K1 * x[..., 0], _SLOPE)
-    slope += _CONSTANT
+    slope: Array = x[..., :1, None] * _SLOPE + _CONSTANT
     return slope
 
 

@@ -285,3 +285,15 @@ def test_the_complex_step_is_given_up_where_it_fails_at_the_initial_state():
     system.check(x, NONE)
     assert system.derivatives["f"] == "finite differences"
     np.testing.assert_allclose(system.f_jacobian(x, NONE), np.eye(2), rtol=1e-6, atol=1e-8)
+
+
+def test_differences_of_a_function_that_returns_one_array_every_time():
+    a, kept = np.array([[0.5, 0.2], [0.1, 0.9]]), {}
+
+    def f(x):
+        x = np.asarray(x, np.float64)
+        return np.matmul(x, a.T, out=kept.setdefault(x.shape, np.empty(x.shape)))
+
+    system = qpmhe.System(f, lambda x: x[..., :1], n=2, p=1)
+    slopes = system.f_jacobian.batch(np.ones((3, 2)), np.zeros((3, 0)))
+    np.testing.assert_allclose(slopes, np.broadcast_to(a, (3, 2, 2)), rtol=1e-7)
