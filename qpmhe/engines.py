@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import warnings
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import CompiledEngine
 from .costs import Cost
 from .engine import PythonEngine
 from .errors import CompilationError, EngineWarning
 from .observers import Observer
 from .settings import Settings
 from .system import System
+
+if TYPE_CHECKING:
+    from .compiled import CompiledEngine
 
 __all__ = ["engine_for"]
 
@@ -36,6 +39,8 @@ def engine_for(
         If the compiled engine does not cover something.
     """
     if settings.engine == "compiled":
+        from .compiled import CompiledEngine  # late: most programs do without
+
         try:
             return CompiledEngine(system, observer, cost, settings, initial_state)
         except CompilationError as error:

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from qpmhe_solvers.errors import tell_unknown_options
 
 from ._checks import positive, positive_definite, record, vector
-from .compiled import CompiledEngine
 from .costs import Cost, ObserverPrior
+from .engine import PythonEngine
 from .engines import engine_for
 from .errors import InvalidInputError, ShapeError
 from .estimate import Estimate
@@ -189,7 +189,7 @@ class MovingHorizonEstimator:
     @property
     def engine(self) -> str:
         """How the step is carried out: ``python`` or ``compiled``."""
-        return "compiled" if isinstance(self._engine, CompiledEngine) else "python"
+        return "python" if isinstance(self._engine, PythonEngine) else "compiled"
 
     @property
     def time(self) -> int:
@@ -411,7 +411,7 @@ class MovingHorizonEstimator:
                 )
         elif self.system.m:
             self._input(None)
-        if isinstance(self._engine, CompiledEngine) and not covariances:
+        if not isinstance(self._engine, PythonEngine) and not covariances:
             return self._engine.run(ys, us)
         start, estimates, collected = self.state.copy(), [], []
         for y, u in zip(ys, [None] * len(ys) if us is None else us, strict=True):

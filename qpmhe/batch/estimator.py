@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -13,7 +15,6 @@ from ..errors import InvalidInputError
 from ..estimator import MovingHorizonEstimator
 from ..observers import Luenberger, Observer
 from ..system import System
-from .compiled import CompiledBatchEngine
 from .engines import BatchEngine
 from .looped import LoopedEngine
 from .results import BatchEstimate, BatchRun
@@ -26,6 +27,9 @@ from .shapes import (
     starts_of,
 )
 from .vectorised import VectorisedEngine, obstacles
+
+if TYPE_CHECKING:
+    from .compiled import CompiledBatchEngine
 
 __all__ = ["BatchEstimator"]
 
@@ -139,9 +143,12 @@ class BatchEstimator:
         self.mode = "looped" if found else "vectorised"
         self.mode_reason = "; ".join(found)
         self._engine: BatchEngine
+        self._compiled: CompiledBatchEngine | None = None
         if one.engine == "compiled":
+            from .compiled import CompiledBatchEngine  # late: most programs do without it
+
             self.mode, self.mode_reason = "compiled", ""
-            self._engine = CompiledBatchEngine(
+            self._engine = self._compiled = CompiledBatchEngine(
                 system, observer, cost, self.settings, states, threads
             )
         elif isinstance(observer, Luenberger) and isinstance(cost, QuadraticCost) and not found:
@@ -232,8 +239,8 @@ class BatchEstimator:
         """
         ys = record_of(Y, self.members, self.system.p)
         us = input_record(U, self.members, self.system.m, ys.shape[1])
-        if isinstance(self._engine, CompiledBatchEngine):
-            return self._engine.run(ys, us)
+        if self._compiled is not None:
+            return self._compiled.run(ys, us)
         steps = ys.shape[1]
         estimates = (self._engine.step(ys[:, t], us[:, t]) for t in range(steps))
         return BatchRun.of(self.states, estimates, steps)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import InvalidInputError, OptionError
-from .library import generated
 
 if TYPE_CHECKING:
     from ..estimator import MovingHorizonEstimator
@@ -57,6 +56,7 @@ def write(
         If this is no estimator, or the directory cannot be written.
     """
     from ..estimator import MovingHorizonEstimator
+    from .library import generated
 
     if not isinstance(estimator, MovingHorizonEstimator):
         raise InvalidInputError(
