@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..codegen.compiler import compiled_library, find_compiler
 from ..codegen.expressions import CasadiModel, casadi_model, import_casadi
 from ..codegen.source import model_files
-from ..errors import CompilationError
+from ..errors import CompilationError, OptionError
 from ..sets import ConvexSet
 from ..system import System
 
@@ -50,6 +50,8 @@ def casadi_system(
     f, h, dt, method, n, p, m, states, disturbances, noises, compiled
         As there.
     """
+    if not (compiled is None or isinstance(compiled, bool)):
+        raise OptionError(f"compiled is {compiled!r}; expected True, False or None.")
     model = casadi_model(f, h, n=n, p=p, m=m, dt=dt, method=method)
     sets = {"states": states, "disturbances": disturbances, "noises": noises}
     library = _library(model, compiled)
@@ -113,6 +115,8 @@ class _Evaluator:
             Inputs, where there are any.
         """
         single = x.ndim == 1
+        if not single and x.shape[0] == 0:  # the virtual machine cannot map over nothing
+            return np.zeros_like(self._buffers(1, (name,))[2][name][:0])
         states, inputs, results, evaluate = self._buffers(
             1 if single else x.shape[0], (name,)
         )

@@ -52,6 +52,8 @@ def write(
     ------
     OptionError
         If something has no C form, or an option is unknown; the text tells the remedy.
+    CompilationError
+        If CasADi has no C code for a part of the model.
     InvalidInputError
         If this is no estimator, or the directory cannot be written.
     """
@@ -71,13 +73,13 @@ def write(
     files, _, _, _ = generated(
         estimator.system, estimator.observer, estimator.cost, estimator.settings, name, real
     )
-    folder = Path(directory)
     try:
+        folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
         for file, text in files.items():
             (folder / file).write_text(text, encoding="ascii")
-    except OSError as error:
+    except (OSError, TypeError, ValueError) as error:
         raise InvalidInputError(
-            f"directory is {str(directory)!r}, which cannot be written ({error})."
+            f"directory is {directory!r}, which cannot be written ({error})."
         ) from error
     return folder / f"{name}.h", folder / f"{name}.c"

@@ -90,19 +90,28 @@ def compiled_library(files: dict[str, str], main: str, key: str | None = None) -
     folder = _usable_folder()
     path, seal = folder / f"{digest}.so", folder / f"{digest}.sha256"
     if not _intact(path, seal):
-        with tempfile.TemporaryDirectory(dir=folder) as scratch:
-            for name, text in files.items():
-                Path(scratch, name).write_text(text, encoding="ascii")
-            made, sealed = Path(scratch, "library.so"), Path(scratch, "seal")
-            _run(compiler, Path(scratch, main), made)
-            sealed.write_text(hashlib.sha256(made.read_bytes()).hexdigest(), encoding="ascii")
-            # Each in one motion; a process that sees the one without the other compiles, too.
-            os.replace(made, path)
-            os.replace(sealed, seal)
+        try:
+            _make(compiler, files, main, path, seal)
+        except OSError as error:  # no output, no space left
+            raise CompilationError(f"{path} cannot be made ({error}).") from error
     try:
         return ctypes.CDLL(str(path))
     except OSError as error:
         raise CompilationError(f"{path} cannot be loaded ({error}).") from error
+
+
+def _make(
+    compiler: list[str], files: dict[str, str], main: str, path: Path, seal: Path
+) -> None:
+    with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+        for name, text in files.items():
+            Path(scratch, name).write_text(text, encoding="ascii")
+        made, sealed = Path(scratch, "library.so"), Path(scratch, "seal")
+        _run(compiler, Path(scratch, main), made)
+        sealed.write_text(hashlib.sha256(made.read_bytes()).hexdigest(), encoding="ascii")
+        # Each in one motion; a process that sees the one without the other compiles, too.
+        os.replace(made, path)
+        os.replace(sealed, seal)
 
 
 def _intact(library: Path, seal: Path) -> bool:
@@ -134,7 +143,7 @@ def _run(compiler: list[str], source: Path, target: Path) -> None:
         command = [*compiler, *_FLAGS, *flags, "-o", str(target), str(source), "-lm"]
         try:
             done = subprocess.run(
-                command, capture_output=True, text=True, timeout=600, check=False
+                command, capture_output=True, text=True, errors="replace", timeout=600, check=False
             )
         except (OSError, subprocess.TimeoutExpired) as error:
             message = str(error)

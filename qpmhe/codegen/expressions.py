@@ -124,6 +124,9 @@ def casadi_model(
     ca = import_casadi()
     if method not in METHODS:
         raise OptionError(f"method is {method!r}; expected one of {', '.join(METHODS)}.")
+    for name, size, least in (("n", n, 1), ("p", p, 1), ("m", m, 0)):
+        if size is not None:
+            count(name, size, least)
     if isinstance(f, ca.Function):
         _check_arguments("f", f)
         n = _agreed("n", n, f.numel_in(0))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
+from ..errors import OptionError
 from ..estimate import Status
 from ..observers import Luenberger, SteadyStateKalman
 from ..sets import ConvexSet
@@ -62,9 +63,15 @@ class Layout:
         """NumPy's type of the reals."""
         return np.float64 if self.real == "double" else np.float32
 
-    def header_values(self) -> dict[str, Any]:
-        """What the header's template is filled with."""
-        bits = (f"    MHE_{flag.name} = {flag.value}" for flag in Status)
+    def header_values(self, name: str) -> dict[str, Any]:
+        """What the header's template is filled with.
+
+        Parameters
+        ----------
+        name : str
+            Prefix of public names.
+        """
+        bits = (f"    {name.upper()}_{flag.name} = {flag.value}" for flag in Status)
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
             "continuous": self.continuous, "real": self.real, "status": ",\n".join(bits),
@@ -140,7 +147,31 @@ def settings_record(
         The sizes.
     system, observer, cost, settings
         The estimator's.
+
+    Raises
+    ------
+    OptionError
+        If a number is beyond the precision's range.
     """
+    # What single precision cannot hold becomes infinite, and is refused below.
+    with np.errstate(over="ignore", under="ignore"):
+        record = _filled(layout, system, observer, cost, settings)
+    for name in ("gain", "prior_weight", "disturbance_weight", "noise_weight"):
+        if not np.isfinite(record[name]).all():
+            raise OptionError(
+                f"{name.replace('_', ' ')} has entries beyond what real={layout.real!r} holds; "
+                "take 'double', or other units."
+            )
+    return record
+
+
+def _filled(
+    layout: Layout,
+    system: System,
+    observer: Luenberger | SteadyStateKalman,
+    cost: Cost,
+    settings: Settings,
+) -> NDArray[Any]:
     record = np.zeros((), layout.settings_type())
     record["gain"] = observer.gain.ravel()
     record["prior_weight"] = np.asarray(cost.prior).ravel()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import CompilationError
 from .expressions import CasadiModel, import_casadi
 from .layout import Layout
 
@@ -27,9 +28,11 @@ def template(name: str) -> str:
 
 def renamed(text: str, name: str) -> str:
     """The text with the prefix ``mhe`` of all names replaced."""
-    if name == "mhe":
-        return text
-    return re.sub(r"\bMHE_", f"{name.upper()}_", re.sub(r"\bmhe_", f"{name}_", text))
+    return re.sub(
+        r"\b(?:mhe|MHE)_",
+        lambda found: f"{name if found[0] == 'mhe_' else name.upper()}_",
+        text,
+    )
 
 
 def prologue() -> str:
@@ -53,6 +56,11 @@ def model_source(model: CasadiModel) -> str:
     -------
     str
         C source, to come after `prologue`.
+
+    Raises
+    ------
+    CompilationError
+        If CasADi has no C code for a part of the model.
     """
     ca = import_casadi()
     generator = ca.CodeGenerator("mhe_model.c", {"casadi_int": "int", "include_math": False})
@@ -73,8 +81,17 @@ def model_source(model: CasadiModel) -> str:
             f"#define MHE_{which.upper()}_NONZEROS {len(places)}\n"
             f"static const int mhe_{which}_place[] = {{{listed}}};\n"
         )
+    code = _bare(generator.dump())
+    if "#error" in code:
+        line = next(line for line in code.splitlines() if "#error" in line)
+        raise CompilationError(
+            f"CasADi writes no C code for a part of the model ({line.strip()}); state it by "
+            "functions that it can, or use engine='python'."
+        )
     return "\n".join((
-        "#define casadi_real mhe_real", _bare(generator.dump()), *calls, template("model.c")
+        # CasADi writes out some functions that are not called.
+        '#if defined(__GNUC__)\n#pragma GCC diagnostic ignored "-Wunused-function"\n#endif',
+        "#define casadi_real mhe_real", code, *calls, template("model.c"),
     ))
 
 
@@ -138,7 +155,7 @@ def model_files(model: CasadiModel) -> dict[str, str]:
 
 def header(name: str, values: dict[str, Any]) -> str:
     """The estimator's header with its sizes filled in."""
-    return renamed(Template(template("estimator.h")).substitute(values, name=name), name)
+    return Template(renamed(template("estimator.h"), name)).substitute(values, name=name)
 
 
 def estimator_files(
@@ -164,7 +181,7 @@ def estimator_files(
     structure : str
         The text without the default settings: equal texts make equal machine code.
     """
-    head = header(name, {**layout.header_values(), "version": version()})
+    head = header(name, {**layout.header_values(name), "version": version()})
     parts = ("window.c", "factor.c", "interior_point.c", "optimizer.c", "step.c")
     body = prologue() + model_source(model) + "\n".join(template(part) for part in parts)
     data = (

@@ -43,7 +43,7 @@ typedef $real mhe_real;
     (MHE_X_SET * (MHE_NX + MHE_X_ROWS) + MHE_W_SET * (MHE_NX + MHE_W_ROWS) + \
      MHE_V_SET * (MHE_NY + MHE_V_ROWS))
 /* Length of a panel's rows, for whole registers. */
-#define MHE_WIDTH (MHE_NX < 24 ? (2 * MHE_NX + 3) / 4 * 4 : (2 * MHE_NX + 31) / 32 * 32)
+#define MHE_PANEL_WIDTH (MHE_NX < 24 ? (2 * MHE_NX + 3) / 4 * 4 : (2 * MHE_NX + 31) / 32 * 32)
 
 /* Bits of estimate.status. */
 enum {
@@ -153,7 +153,7 @@ typedef struct {
     mhe_terms terms[MHE_HORIZON];
     const mhe_terms *at[MHE_HORIZON]; /* the terms of the present QP */
     mhe_real factors[MHE_HORIZON + 1]; /* discounts: of the prior, then of each stage */
-    mhe_real panels[(MHE_HORIZON + 1) * MHE_NX * MHE_WIDTH];
+    mhe_real panels[(MHE_HORIZON + 1) * MHE_NX * MHE_PANEL_WIDTH];
     mhe_real inverse_pivots[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real gradient[(MHE_HORIZON + 1) * MHE_NX], step[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real residual[(MHE_HORIZON + 1) * MHE_NX], direction[(MHE_HORIZON + 1) * MHE_NX];

@@ -4,7 +4,7 @@
  * it the block that couples d(k) with d(k+1). What lies left of the diagonal is not read for
  * its value. */
 
-#define WIDTH MHE_WIDTH
+#define WIDTH MHE_PANEL_WIDTH
 
 /* Fill panels and gradient from the terms in workspace->at, around a trajectory that starts
  * at the given offset from the prior. */

@@ -109,8 +109,7 @@ static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, cons
 static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
 {
     const int count = e->length;
-    real *bent_w = k->residual, *bent_v = k->direction, *d = k->product;
-    real *w = k->bent.w, *v = k->bent.v;
+    real *w = k->bent.w, *v = k->bent.v, *d = k->product;
     for (int j = 0; j < (count + 1) * NX; j++) d[j] = o->spare->x[j] - o->best->x[j];
     const real missed = 2 * mhe_row_violation(e, k, d);
     for (int i = 0; i < count; i++) {
@@ -119,15 +118,13 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
             const int at = i * NX + j;
             const real linear = o->best->w[at] + d[at + NX] -
                                 mhe_dot(NX, t->f_jacobian + j * NX, d + i * NX);
-            bent_w[at] = o->spare->w[at] - linear;
-            w[at] = o->best->w[at] + bent_w[at];
+            w[at] = o->best->w[at] + (o->spare->w[at] - linear);
         }
         for (int j = 0; j < NY; j++) {
             const int at = i * NY + j;
             const real linear =
                 o->best->v[at] - mhe_dot(NX, t->h_jacobian + j * NX, d + i * NX);
-            bent_v[at] = o->spare->v[at] - linear;
-            v[at] = o->best->v[at] + bent_v[at];
+            v[at] = o->best->v[at] + (o->spare->v[at] - linear);
         }
     }
     mhe_set_limits(e, k, o->sets, o->best->x, w, v);
@@ -136,8 +133,9 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
         for (int r = 0; r < mhe_rows_at(e, i); r++) rows[r].load = missed;
 #if MHE_W_SET
         if (i < count) {
-            mhe_values_of(NX, MHE_W_ROWS, bent_w + i * NX, e->settings->disturbances.rows,
-                          rows + X_COUNT);
+            real bent[NX];
+            for (int j = 0; j < NX; j++) bent[j] = w[i * NX + j] - o->best->w[i * NX + j];
+            mhe_values_of(NX, MHE_W_ROWS, bent, e->settings->disturbances.rows, rows + X_COUNT);
             for (int r = 0; r < W_COUNT; r++)
                 rows[X_COUNT + r].load += BEYOND * fabs(rows[X_COUNT + r].value);
         }
@@ -145,7 +143,9 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
 #if MHE_V_SET
         if (i < count) {
             mhe_row *own = rows + X_COUNT + W_COUNT;
-            mhe_values_of(NY, MHE_V_ROWS, bent_v + i * NY, e->settings->noises.rows, own);
+            real bent[NY];
+            for (int j = 0; j < NY; j++) bent[j] = v[i * NY + j] - o->best->v[i * NY + j];
+            mhe_values_of(NY, MHE_V_ROWS, bent, e->settings->noises.rows, own);
             for (int r = 0; r < V_COUNT; r++) own[r].load += BEYOND * fabs(own[r].value);
         }
 #endif

@@ -243,6 +243,7 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, int sets, in
     real worst[3] = {0, 0, 0};
     for (int i = 0; i <= e->length; i++) {
         const real *x = trial->x + i * NX;
+        (void)x;
 #if MHE_X_SET
         if (sets & STATES)
             worst[0] = fmax(worst[0], MISSED(s->states, NX, MHE_X_ROWS, x, 0, 0));
