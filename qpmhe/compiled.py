@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import math
 from time import perf_counter
 from typing import Any
 
@@ -11,150 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._checks import check_problem
-from .codegen.layout import SET_NAMES
 from .codegen.library import EstimatorLibrary
+from .compiled_estimate import CompiledEstimate, dropped_names
 from .costs import Cost
 from .covariance import window_covariances
 from .errors import InvalidInputError
-from .estimate import Estimate, Status
+from .estimate import Estimate
 from .observers import Observer
 from .problem import Problem
 from .run import Run
 from .settings import Settings
 from .system import System
 
-__all__ = ["CompiledEngine", "CompiledEstimate", "RunLog"]
+__all__ = ["CompiledEngine", "RunLog"]
 
 Array = NDArray[np.float64]
 
-_SOLVER_FAILED = Status.SOLVER_FAILED.value
-_MESSAGE = "the factorisation failed: H is not positive definite, or not finite"
 # So that a long record can be interrupted, and its times are means of pieces.
 _PIECE = 256
-
-
-class CompiledEstimate(Estimate):
-    """An estimate whose arrays are views of one block, made when they are asked for.
-
-    Parameters
-    ----------
-    block : (k,) array
-        cost, candidate cost, trajectory, candidate, disturbances, noises, each padded to the
-        horizon.
-    numbers : list of int
-        Window length, status, QPs, iterations, corrections, dropped sets.
-    time : int
-        Index of the newest measurement.
-    sizes : (int, int, int)
-        n, p, N.
-    delay : int
-        Of the delayed estimate.
-    """
-
-    __slots__ = ("_block", "_delay", "_numbers", "_sizes")
-
-    def __init__(
-        self, block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int], delay: int
-    ) -> None:
-        self._block, self._numbers, self.time = block, numbers, time
-        self._sizes, self._delay = sizes, delay
-        n = sizes[0]
-        end = 2 + (numbers[0] + 1) * n
-        self.state = block[end - n : end]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        arguments = self._block, self._numbers, self.time, self._sizes, self._delay
-        return _restored, (*arguments, self.step_time)
-
-    def _rows(self, start: int, rows: int, width: int) -> Array:
-        return self._block[start : start + rows * width].reshape(rows, width)
-
-    @property
-    def cost(self) -> float:  # type: ignore[override]
-        """True cost J of the estimate."""
-        return float(self._block[0])
-
-    @property
-    def candidate_cost(self) -> float:  # type: ignore[override]
-        """True cost J of the candidate."""
-        return float(self._block[1])
-
-    @property
-    def trajectory(self) -> Array:  # type: ignore[override]
-        """Estimates of all states in the window."""
-        return self._rows(2, self._numbers[0] + 1, self._sizes[0])
-
-    @property
-    def candidate(self) -> Array:  # type: ignore[override]
-        """The observer's trajectory, or its projection."""
-        n, _, horizon = self._sizes
-        return self._rows(2 + (horizon + 1) * n, self._numbers[0] + 1, n)
-
-    @property
-    def disturbances(self) -> Array:
-        """w(i) along the trajectory."""
-        n, _, horizon = self._sizes
-        return self._rows(2 + 2 * (horizon + 1) * n, self._numbers[0], n)
-
-    @property
-    def noises(self) -> Array:
-        """v(i) along the trajectory, NaN where y is missing."""
-        n, p, horizon = self._sizes
-        return self._rows(2 + 2 * (horizon + 1) * n + horizon * n, self._numbers[0], p)
-
-    @property
-    def status(self) -> Status:  # type: ignore[override]
-        """Outcome and events."""
-        return Status(self._numbers[1])
-
-    @property
-    def message(self) -> str:  # type: ignore[override]
-        """Words of the QP solver where it failed."""
-        return _MESSAGE if self._numbers[1] & _SOLVER_FAILED else ""
-
-    @property
-    def qps(self) -> int:  # type: ignore[override]
-        """QPs solved."""
-        return self._numbers[2]
-
-    @property
-    def solver_iterations(self) -> int:  # type: ignore[override]
-        """Iterations of the interior-point method."""
-        return self._numbers[3]
-
-    @property
-    def corrections(self) -> int:  # type: ignore[override]
-        """Second-order corrections."""
-        return self._numbers[4]
-
-    @property
-    def dropped(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of the sets that were left out."""
-        return _dropped(self._numbers[5])
-
-    @property
-    def delayed(self) -> Array | None:  # type: ignore[override]
-        """Estimate of x(t+1-k) for the estimator's delay k."""
-        at = self._numbers[0] - self._delay
-        return None if at < 0 else self.trajectory[at]
-
-    @property
-    def solve_time(self) -> float:  # type: ignore[override]
-        """Not measured inside of the C step: NaN."""
-        return math.nan
-
-
-def _restored(
-    block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int], delay: int,
-    step_time: float,
-) -> CompiledEstimate:
-    estimate = CompiledEstimate(block, numbers, time, sizes, delay)
-    estimate.step_time = step_time
-    return estimate
-
-
-def _dropped(bits: int) -> tuple[str, ...]:
-    return tuple(name for i, name in enumerate(SET_NAMES) if bits >> i & 1)
 
 
 class RunLog:
@@ -321,7 +194,7 @@ class CompiledEngine:
         stages = record["stages"][(record["first"] + np.arange(length)) % self._sizes[2]]
         with np.errstate(all="ignore"):
             _bind(self._problem, self._system, self._cost, stages)
-            self._problem.leave_out(_dropped(int(record["dropped"])))
+            self._problem.leave_out(dropped_names(int(record["dropped"])))
             return window_covariances(self._problem, record["trajectory"][: length + 1].copy())
 
     def state_dict(self) -> dict[str, Any]:
