@@ -90,8 +90,11 @@ def model_source(model: CasadiModel) -> str:
         )
     return "\n".join((
         # CasADi writes out some functions that are not called.
-        '#if defined(__GNUC__)\n#pragma GCC diagnostic ignored "-Wunused-function"\n#endif',
-        "#define casadi_real mhe_real", code, *calls, template("model.c"),
+        "#if defined(__GNUC__)\n#pragma GCC diagnostic push\n"
+        '#pragma GCC diagnostic ignored "-Wunused-function"\n#endif',
+        "#define casadi_real mhe_real", code,
+        "#if defined(__GNUC__)\n#pragma GCC diagnostic pop\n#endif",
+        *calls, template("model.c"),
     ))
 
 

@@ -359,7 +359,7 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
         if (infeasible <= primal_tolerance && unbalanced <= s->solver_tolerance * (1 + steepest) &&
             products <= s->solver_tolerance / 1000 * scale)
             return SOLVED;
-        if (*iterations == limit) return STOPPED;
+        if (*iterations >= limit) return STOPPED;
         mhe_add_weights(e, k);
         if (!mhe_factorise(k, count)) return *iterations ? STOPPED : FAILED;
         real target = 0;
