@@ -19,6 +19,8 @@ from .source import CONTINUOUS, estimator_files
 
 __all__ = ["EstimatorLibrary", "generated", "uncovered"]
 
+# Indices in C are of type int.
+_MOST_ENTRIES = 2**31 - 1
 _CONSTANT_GAIN = (Luenberger, HighGain, SteadyStateKalman)
 
 
@@ -50,6 +52,12 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
                 f"the set of {name} has a direction of zero width, which the interior-point "
                 "method in C cannot take; widen it."
             )
+    entries = (settings.horizon + 1) * system.n * (2 * system.n + 32)
+    if entries > _MOST_ENTRIES:
+        return (
+            f"a horizon of {settings.horizon} with {system.n} states needs {entries:.3g} entries "
+            f"in one array, more than the {_MOST_ENTRIES:.3g} that C counts; take a shorter one."
+        )
     if settings.backend not in ("auto", "banded"):
         return (
             f"the compiled step solves its QPs itself, not by {settings.backend!r}; take "

@@ -17,6 +17,8 @@ from .layout import Layout
 
 __all__ = ["CONTINUOUS", "estimator_files", "model_files"]
 
+# Eight (n, n) arrays of them fit on any usual stack.
+_MOST_STATES = 256
 CONTINUOUS = {None: 0, "euler": 1, "rk4": 4}
 
 
@@ -60,8 +62,13 @@ def model_source(model: CasadiModel) -> str:
     Raises
     ------
     CompilationError
-        If CasADi has no C code for a part of the model.
+        If CasADi has no C code for a part of the model, or it has too many states.
     """
+    if model.n > _MOST_STATES:
+        raise CompilationError(
+            f"the model has {model.n} states; compiled code, which keeps (n, n) arrays on the "
+            f"stack, is for at most {_MOST_STATES}. Take engine='python'."
+        )
     ca = import_casadi()
     generator = ca.CodeGenerator("mhe_model.c", {"casadi_int": "int", "include_math": False})
     calls = []

@@ -1,5 +1,6 @@
 """The written C: compiled without a warning, run under sanitizers, compared with Python."""
 
+import dataclasses
 import itertools
 import re
 import shutil
@@ -11,6 +12,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Status, codegen
+from qpmhe.codegen.library import generated
 from qpmhe.errors import InvalidInputError, OptionError, QpmheError
 
 ca = pytest.importorskip("casadi")
@@ -680,3 +682,26 @@ def test_matrix_expressions(case, tmp_path):
     program = compiled(mhe, tmp_path, [*WATCHED, *STRICT])
     commands, expected = record(mhe, 6)
     check(play(program, mhe, commands), expected, 1e-9)
+
+
+def test_what_does_not_fit_into_c_is_refused(tmp_path):
+    def made(n, horizon, compiled=False):
+        system = qpmhe.System.from_casadi(
+            lambda x: 0.9 * x, lambda x: x[0], n=n, compiled=compiled
+        )
+        cost = qpmhe.QuadraticCost(prior=np.eye(n), disturbance=np.eye(n), noise=[[1.0]])
+        return qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger(np.zeros(n)), cost, horizon=horizon,
+            initial_state=np.ones(n), max_qps=0,
+        )
+
+    with pytest.raises(QpmheError, match=r"257 states; .* at most 256"):
+        codegen.write(made(257, 1), tmp_path)
+    assert made(257, 1, None).system.symbolic is not None  # CasADi evaluates it instead
+    settings = made(200, 2).settings
+    with pytest.raises(OptionError, match=r"a horizon of 50000 with 200 states .* shorter one"):
+        generated(
+            made(200, 2).system, qpmhe.Luenberger(np.zeros(200)), made(200, 2).cost,
+            dataclasses.replace(settings, horizon=50000),
+        )
+    assert not list(tmp_path.iterdir())
