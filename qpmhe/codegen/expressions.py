@@ -130,7 +130,10 @@ def casadi_model(
     if isinstance(f, ca.Function):
         _check_arguments("f", f)
         n = _agreed("n", n, f.numel_in(0))
-        m = _agreed("m", m, f.numel_in(1) if f.n_in() > 1 else 0)
+        # An input may act on the output alone.
+        known = [one for one in (f, h) if isinstance(one, ca.Function) and one.n_in() > 1]
+        if known or m is None or isinstance(h, ca.Function):
+            m = _agreed("m", m, known[0].numel_in(1) if known else 0)
     elif n is None:
         raise InvalidInputError("n is missing: f is no casadi.Function, which would tell it.")
     n, m = count("n", n, 1), count("m", 0 if m is None else m, 0)

@@ -508,9 +508,6 @@ WRONG = {
     "size of x": (
         (F, ca.Function("h", [ca.SX.sym("x", 3)], [1.0])), {}, ModelError, "h takes.*n = 2"
     ),
-    "unknown u": (
-        (F, ca.Function("h", [X, U], [X[0] + U])), {}, ModelError, "h takes.*no inputs"
-    ),
     "matrix": (
         (ca.Function("f", [ca.SX.sym("x", 2, 2)], [1.0]), H), {}, ModelError, "f "
     ),
@@ -579,3 +576,12 @@ def test_functions_without_code(compiled):
     system = qpmhe.System.from_casadi(f, h, compiled=compiled)
     z = system.f(np.array([0.7, 0.2]), NONE)
     assert z[0] + 0.1 * np.sin(z[0]) == pytest.approx(0.7, abs=1e-7)
+
+
+def test_an_input_of_the_output_alone():
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    system = qpmhe.System.from_casadi(
+        ca.Function("f", [x], [0.5 * x]), ca.Function("h", [x, u], [x[0] * u]), compiled=False
+    )
+    assert system.m == 1
+    assert system.h(np.array([2.0, 1.0]), np.array([3.0])) == [6.0]
