@@ -18,24 +18,24 @@ from .settings import Settings
 from .subproblem import Subproblem
 from .window import Window
 
-__all__ = ["Optimizer", "Outcome"]
+__all__ = ["LENGTHS", "ROUNDING", "STALLED", "Optimizer", "Outcome"]
 
 Array = NDArray[np.float64]
 
 # Tried in turn where the full step fails: the first where it misses a set by the solver's
 # accuracy; the last is short enough for any descent direction
 # that is worth taking.
-_LENGTHS = (0.9999, 0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)
+LENGTHS = (0.9999, 0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)
 
 # A decrease of J by less than this share is rounding, and no improvement.
-_ROUNDING = 1e-12
+ROUNDING = 1e-12
 
 # A set missed by less than this is for the first of these lengths, not for a correction.
 _NEARLY = 1e-6
 
 # On curved sets J can only be lowered as far as feasibility can be told: where no length
 # helps and no more than this many times the tolerance was promised, that is convergence.
-_STALLED = 1e3
+STALLED = 1e3
 
 # Second-order corrections of a trial that misses a curved set.
 _CORRECTIONS = 2
@@ -259,7 +259,7 @@ class Optimizer:
         if not trial.cost < target and 0.0 < trial.violation < math.inf and qp.rows:
             missed = trial
             if trial.violation <= _NEARLY:
-                trial = self._trial(problem, best, _LENGTHS[0] * step)
+                trial = self._trial(problem, best, LENGTHS[0] * step)
             # A set missed by its curvature is missed by the first length as well.
             if not trial.cost < target and not (solved and promised <= enough):
                 step = step.copy()  # a correction's solve reuses the solver's workspace
@@ -269,12 +269,12 @@ class Optimizer:
             if solved and promised <= enough:
                 outcome.events |= Status.CONVERGED
                 return False
-            for length in _LENGTHS:
+            for length in LENGTHS:
                 trial = self._trial(problem, best, length * step)
                 if trial.cost < target:
                     break
             else:
-                stalled = solved and 0.0 <= promised <= _STALLED * enough
+                stalled = solved and 0.0 <= promised <= STALLED * enough
                 outcome.events |= Status.CONVERGED if stalled else Status.NO_DECREASE
                 return False
         outcome.trial, outcome.improved = trial, True
@@ -312,7 +312,7 @@ def _clipped(problem: Problem, trajectory: Array) -> Array:
 
 def _target(best: Trial) -> float:
     """What a trial's cost must be below to count as better."""
-    return best.cost - _ROUNDING * best.cost if best.cost < math.inf else math.inf
+    return best.cost - ROUNDING * best.cost if best.cost < math.inf else math.inf
 
 
 def _parts(trial: Trial) -> tuple[Array, Array, Array, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -136,7 +137,9 @@ class BatchEstimator:
             time_budget=time_budget, delay=delay,
         )
         self.system, self.observer, self.cost = system, observer, cost
-        self.settings, self.initial_states = one.settings, states
+        # Where it could not be compiled, that was told once.
+        self.settings = replace(one.settings, engine=one.engine)
+        self.initial_states = states
         if threads is not None:
             count("threads", threads, 1)
         found = obstacles(system, observer, cost, self.settings)

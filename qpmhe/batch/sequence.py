@@ -11,7 +11,7 @@ from qpmhe_solvers import Solver, SolveStatus
 
 from ..costs import QuadraticCost
 from ..estimate import Status
-from ..optimizer import _LENGTHS, _ROUNDING, _STALLED
+from ..optimizer import LENGTHS, ROUNDING, STALLED
 from ..settings import Settings
 from .factor import BlockCholesky
 from .fallback import member_qp
@@ -226,7 +226,7 @@ class Sequence:
                 group, steps, target, np.flatnonzero(worse & ~converged), trial, reached,
                 weighted, better,
             )
-            stalled = solved[stuck] & (promised[stuck] <= _STALLED * enough[stuck])
+            stalled = solved[stuck] & (promised[stuck] <= STALLED * enough[stuck])
             flags[members[stuck[stalled]]] |= Status.CONVERGED.value
             flags[members[stuck[~stalled]]] |= Status.NO_DECREASE.value
         done = better & solved & (cost - reached <= enough)
@@ -249,7 +249,7 @@ class Sequence:
 
         The trials that are better are put among the others.
         """
-        for length in _LENGTHS:
+        for length in LENGTHS:
             if not places.size:
                 break
             shorter = np.ascontiguousarray(
@@ -288,4 +288,4 @@ class Sequence:
 
 def _target(cost: Array) -> Array:
     """What a trial's cost must be below to count as better."""
-    return np.where(np.isfinite(cost), cost - _ROUNDING * cost, np.inf)
+    return np.where(np.isfinite(cost), cost - ROUNDING * cost, np.inf)

@@ -125,6 +125,18 @@ def test_without_a_compiler_it_is_vectorised_and_says_so(monkeypatch):
     assert batch.mode == "vectorised"
 
 
+def test_without_a_compiler_a_looped_batch_says_so_once(monkeypatch):
+    parts = reactor(disturbances=BOX)
+    monkeypatch.setenv("CC", "/nowhere/cc")
+    with pytest.warns(qpmhe.errors.EngineWarning) as caught:
+        batch = qpmhe.BatchEstimator(
+            *parts, members=5, horizon=4, initial_states=[3.0, 0.1], engine="compiled"
+        )
+    assert len(caught) == 1
+    batch.update(np.full((5, 1), 3.0))
+    assert (batch.mode, batch.mode_reason) == ("looped", "the system has sets")
+
+
 def test_bad_input():
     with pytest.raises(qpmhe.errors.OptionError, match="threads"):
         qpmhe.BatchEstimator(
