@@ -6,6 +6,7 @@ import hashlib
 import shutil
 import subprocess
 import tempfile
+from abc import abstractmethod
 from contextlib import chdir
 from pathlib import Path
 from typing import Any
@@ -58,9 +59,9 @@ class CasadiProgram(Peer):
         self.name = f"CasADi {self.label} ({words}{'; C' if compiled else ''})"
         self._folder: tempfile.TemporaryDirectory[str] | None = None
 
+    @abstractmethod
     def options(self, problem: Problem) -> dict[str, Any]:
         """Options of ``casadi.nlpsol``."""
-        raise NotImplementedError
 
     def setup(self, problem: Problem) -> None:
         """State the program, compile it if wanted, and prepare the call."""
