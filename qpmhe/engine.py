@@ -150,6 +150,8 @@ class PythonEngine:
         start = self._shifted() if settings.start == "best" else None
         deadline = math.inf if settings.time_budget is None else began + settings.time_budget
         outcome = self._optimizer.improve(problem, window, start, deadline)
+        trial, reference = outcome.trial, outcome.reference
+        trajectory, residuals = trial.trajectory, trial.residuals
         status = Status.IMPROVED if outcome.improved else Status.CANDIDATE
         if outcome.events:
             status |= outcome.events
@@ -157,17 +159,16 @@ class PythonEngine:
             status |= Status.MISSING
         if held or flat:
             status |= Status.MODEL_FAILED
-        elif not math.isfinite(outcome.reference.cost):
+        elif not math.isfinite(reference.cost):
             status |= Status.FAILED_STAGE
-        if not math.isfinite(outcome.reference.cost):
+        if not math.isfinite(reference.cost):
             status &= ~Status.NO_DECREASE  # no solver is to blame where nothing can be judged
-        trial, reference = outcome.trial, outcome.reference
-        trajectory, residuals = trial.trajectory, trial.residuals
         if not outcome.improved:
             trajectory = trajectory.copy()  # of the window, which moves on
-        if window.has_special_weights or not outcome.improved:
+        if problem.observed is not None or not outcome.improved:
             residuals = residuals.copy()
-            residuals[:, self._system.n :][~window.observed] = np.nan
+            if problem.observed is not None:
+                residuals[:, self._system.n :][~problem.observed] = np.nan
         estimate = Estimate(
             window.time - 1,
             trajectory,

@@ -17,8 +17,9 @@ class StageTerms:
 
     The joint residual of stage i is :math:`r_i = (w_i, v_i)`, with
     :math:`w_i = x_{i+1} - f(x_i)` and :math:`v_i = y_i - h(x_i)`. Linearised,
-    :math:`r_i + E d_{i+1} - G_i d_i` with :math:`G_i = [A_i; C_i]` and :math:`E = [I; 0]`.
-    Half its weighted square :math:`\tfrac12 |r_i|_{W_i}^2` adds
+    :math:`r_i + E d_{i+1} - G_i d_i` with :math:`G_i = [A_i; C_i]` and :math:`E = [I; 0]`:
+    the map ``linear[i]`` :math:`= [r_i, -G_i]` is all that is known of a stage. Half the
+    weighted square :math:`\tfrac12 |r_i|_{W_i}^2` adds
 
     - ``panel[i]``: the band of :math:`G_i^\top W_i G_i` and of the coupling block
       :math:`-Q_i A_i` below it, without :math:`Q_{i-1}` of the stage before;
@@ -31,68 +32,98 @@ class StageTerms:
         How many stages there is room for.
     n, p : int
         Numbers of states and outputs.
+
+    Attributes
+    ----------
+    linear : (stages, n + p, 1 + n) array
+        :math:`[r_i, -G_i]`.
+    residuals : (stages, n + p) array
+        The :math:`r_i` in it, a view.
+    panel, own, following : array
+        (stages, n, 2n), (stages, n), (stages, n).
     """
 
     __slots__ = (
-        "_flat", "_index", "_minus", "_n", "_one", "_square", "_weighted",
-        "following", "jacobian", "own", "panel",
+        "_flat", "_index", "_rows", "_square", "_weighted", "_zeros",
+        "following", "linear", "own", "panel", "residuals",
     )
 
     def __init__(self, stages: int, n: int, p: int) -> None:
-        self._n = n
-        self.jacobian: Array = np.zeros((stages, n + p, n))
-        self.panel: Array = np.zeros((stages, n, 2 * n))
-        self.own: Array = np.zeros((stages, n))
-        self.following: Array = np.zeros((stages, n))
-        self._index = band_index(n)
-        # Of one stage: -G, the numbers that `band_index` points to, and their parts, -W G
-        # behind G^T W G; the block below the diagonal is the upper part of the former.
-        self._minus = np.empty((n + p, n))
-        self._flat = np.zeros(n * n + (n + p) * n + 1)  # the last one stays 0
-        self._square = self._flat[: n * n].reshape(n, n)
-        self._weighted = self._flat[n * n : -1].reshape(n + p, n)
-        self._one = np.where(self._index == 2 * n * n, self._flat.size - 1, self._index)
+        q, band = n + p, 2 * n * n
+        self.linear: Array = np.zeros((stages, q, 1 + n))
+        self.residuals: Array = self.linear[:, :, 0]
+        self._rows = np.zeros((stages, band + 2 * n))
+        self.panel: Array = self._rows[:, :band].reshape(stages, n, 2 * n)
+        self.own: Array = self._rows[:, band : band + n]
+        self.following: Array = self._rows[:, band + n :]
+        # Of one stage, with M = [r, -G]: M^T W M, behind it W M, and a number that stays 0.
+        self._flat = np.zeros((1 + n) ** 2 + q * (1 + n) + 1)
+        self._square = self._flat[: (1 + n) ** 2].reshape(1 + n, 1 + n)
+        self._weighted = self._flat[(1 + n) ** 2 : -1].reshape(q, 1 + n)
+        self._zeros = np.zeros(self._flat.size)
+        self._index = _places(n, p)
 
-    def set_stage(self, k: int, weight: Array, residual: Array, weighted_residual: Array) -> None:
-        """Compute the terms of stage k from its Jacobian, which is in place already."""
-        minus, weighted = self._minus, self._weighted
-        np.negative(self.jacobian[k], out=minus)
-        np.dot(weight, minus, out=weighted)
-        np.dot(minus.T, weighted, out=self._square)
-        self._flat.take(self._one, out=self.panel[k], mode="clip")
-        np.dot(residual, weighted, out=self.own[k])
-        self.following[k] = weighted_residual[: self._n]
+    @property
+    def jacobian(self) -> Array:
+        """The Jacobians G_i (stages, n + p, n), a copy."""
+        return -self.linear[:, :, 1:]
 
-    def set_all(self, weight: Array, residuals: Array, weighted_residuals: Array) -> None:
-        """Compute the terms of the first len(residuals) stages, their Jacobians in place.
+    def set_stage(self, k: int, weight: Array) -> float:
+        """Compute the terms of stage k from its linear map, which is in place already.
 
-        The weight is one for all stages, (q, q), or one for each, (stages, q, q).
+        Returns
+        -------
+        float
+            :math:`|r|_W^2`; NaN or infinite where some number of the stage is.
         """
-        n, count = self._n, residuals.shape[0]
-        jacobian = self.jacobian[:count]
-        weighted = np.matmul(weight, jacobian)
-        flat = np.zeros((count, 2 * n * n + 1))
-        flat[:, : n * n] = np.matmul(jacobian.transpose(0, 2, 1), weighted).reshape(count, -1)
-        np.negative(weighted[:, :n].reshape(count, -1), out=flat[:, n * n : -1])
-        panel = self.panel[:count].reshape(count, -1)
-        flat.take(self._index.ravel(), axis=1, out=panel, mode="clip")
-        np.negative(np.matmul(residuals[:, None, :], weighted)[:, 0], out=self.own[:count])
-        self.following[:count] = weighted_residuals[:, :n]
+        linear, flat = self.linear[k], self._flat
+        np.dot(weight, linear, out=self._weighted)
+        np.dot(linear.T, self._weighted, out=self._square)
+        flat.take(self._index, out=self._rows[k], mode="clip")
+        # 0 times what is not finite is NaN, and no square overflows on the way.
+        return float(flat[0] + flat.dot(self._zeros))
+
+    def set_all(self, count: int, weight: Array) -> None:
+        """Compute the terms of the first stages, their linear maps in place.
+
+        Parameters
+        ----------
+        count : int
+            How many stages.
+        weight : (q, q) or (count, q, q) array
+            One weight for all stages, or one for each.
+        """
+        linear = self.linear[:count]
+        weighted = np.matmul(weight, linear)
+        square = np.matmul(linear.transpose(0, 2, 1), weighted)
+        flat = np.concatenate(
+            (square.reshape(count, -1), weighted.reshape(count, -1), np.zeros((count, 1))), axis=1
+        )
+        flat.take(self._index, axis=1, out=self._rows[:count], mode="clip")
 
     def copy_scaled(self, terms: StageTerms, first: int, factors: Array) -> None:
         """Take over the stages of other terms from ``first`` on, each times its factor."""
         count = factors.size
         stages = slice(first, first + count)
-        self.jacobian[:count] = terms.jacobian[stages]
-        np.multiply(terms.panel[stages], factors[:, None, None], out=self.panel[:count])
-        np.multiply(terms.own[stages], factors[:, None], out=self.own[:count])
-        np.multiply(terms.following[stages], factors[:, None], out=self.following[:count])
+        self.linear[:count] = terms.linear[stages]
+        np.multiply(terms._rows[stages], factors[:, None], out=self._rows[:count])
 
     def arrays(self) -> tuple[Array, ...]:
         """The arrays, each with one entry a stage."""
-        return self.jacobian, self.panel, self.own, self.following
+        return self.linear, self._rows
 
     def keep_last(self, end: int, keep: int) -> None:
         """Move the stages end-keep, ..., end-1 to the front."""
         for array in self.arrays():
             array[:keep] = array[end - keep : end]
+
+
+def _places(n: int, p: int) -> NDArray[np.intp]:
+    """Where panel, own and following of a stage stand in [M^T W M, W M, 0], flat."""
+    wide = 1 + n
+    square = np.arange(wide * wide).reshape(wide, wide)
+    weighted = wide * wide + np.arange((n + p) * wide).reshape(n + p, wide)
+    zero = np.array([wide * wide + weighted.size])
+    # The block that couples to the next stage is -Q A, the upper part of -W G.
+    blocks = np.concatenate((square[1:, 1:].ravel(), weighted[:n, 1:].ravel(), zero))
+    return np.concatenate((blocks[band_index(n)].ravel(), square[1:, 0], weighted[:n, 0]))

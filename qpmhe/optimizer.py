@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -201,10 +201,10 @@ class Optimizer:
         trial = candidate
         for attempt in range(1 + _CORRECTIONS):
             if outcome.late():
-                return Trial(*_parts(candidate), math.inf, math.inf)
+                return replace(candidate, cost=math.inf, violation=math.inf)
             step = self._solve(qp, outcome).d
             if step is None:
-                return Trial(*_parts(candidate), math.inf, math.inf)
+                return replace(candidate, cost=math.inf, violation=math.inf)
             trial = self._trial(problem, candidate, step)
             if trial.cost < math.inf or not math.isfinite(trial.violation):
                 return trial
@@ -251,12 +251,14 @@ class Optimizer:
         solved = solution.status is SolveStatus.SOLVED
         if not solved:
             outcome.events |= Status.SOLVER_STOPPED
+        trial = self._trial(problem, best, step)
+        if trial.cost < target:
+            return self._accept(outcome, trial, solved, enough)
         if isinstance(solution, ExactSolution):
             promised = best.cost - solution.predicted
         else:
             promised = abs(float(np.vdot(qp.gradient, step)))
-        trial = self._trial(problem, best, step)
-        if not trial.cost < target and 0.0 < trial.violation < math.inf and qp.rows:
+        if 0.0 < trial.violation < math.inf and qp.rows:
             missed = trial
             if trial.violation <= _NEARLY:
                 trial = self._trial(problem, best, LENGTHS[0] * step)
@@ -277,8 +279,14 @@ class Optimizer:
                 stalled = solved and 0.0 <= promised <= STALLED * enough
                 outcome.events |= Status.CONVERGED if stalled else Status.NO_DECREASE
                 return False
+        return self._accept(outcome, trial, solved, enough)
+
+    @staticmethod
+    def _accept(outcome: Outcome, trial: Trial, solved: bool, enough: float) -> bool:
+        """Take a better trajectory over; whether another QP is worth while."""
+        gained = outcome.trial.cost - trial.cost
         outcome.trial, outcome.improved = trial, True
-        if solved and best.cost - trial.cost <= enough:
+        if solved and gained <= enough:
             outcome.events |= Status.CONVERGED
             return False
         return True
@@ -313,7 +321,3 @@ def _clipped(problem: Problem, trajectory: Array) -> Array:
 def _target(best: Trial) -> float:
     """What a trial's cost must be below to count as better."""
     return best.cost - ROUNDING * best.cost if best.cost < math.inf else math.inf
-
-
-def _parts(trial: Trial) -> tuple[Array, Array, Array, Array]:
-    return trial.trajectory, trial.residuals, trial.weights, trial.weighted

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from .costs import Cost, ObserverPrior
 from .sets import ConvexSet
 from .system import System
 from .window import Window
+
+if TYPE_CHECKING:
+    from .adapters.fused import Fused
 
 __all__ = ["Problem", "Trial"]
 
@@ -37,8 +41,6 @@ class Trial:
         w and v along them.
     weights : (n + p, n + p) or (K, n + p, n + p) array
         Weights of the quadratic forms that majorise the stage costs here.
-    weighted : (K, n + p) array
-        The residuals times these weights.
     cost : float
         J; infinite where the model cannot be evaluated or a constraint is violated.
     violation : float
@@ -48,7 +50,6 @@ class Trial:
     trajectory: Array
     residuals: Array
     weights: Array
-    weighted: Array
     cost: float
     violation: float = 0.0
 
@@ -73,7 +74,7 @@ class Problem:
     """
 
     def __init__(self, system: System, cost: Cost) -> None:
-        self._system, self._cost = system, cost
+        self._system, self._cost, self._quadratic = system, cost, cost.quadratic
         self._n, self._q = system.n, system.n + system.p
         self._prior_rule = cost.prior if isinstance(cost.prior, ObserverPrior) else None
         #: Weight of the initial error, before discount and majorisation.
@@ -83,6 +84,8 @@ class Problem:
         self._prior_band = band_of(self.prior_weight)
         self._discounted = cost.discount < 1.0
         self._candidate: Trial | None = None
+        self._fused: Fused | None = None
+        self._first = 0
         self.model = system
         self.prior: Array = np.zeros(system.n)
         self.inputs: Array = np.zeros((0, system.m))
@@ -111,10 +114,15 @@ class Problem:
         """Take over the window's data, all sets, and the prior z(t-N) as in (eq:prior)."""
         self._candidate = None
         self.prior = window.candidate[0]
-        self.inputs, self.measurements = window.inputs, window.measurements
-        self.stage_weights = window.stage_weights
-        self.observed = window.observed if window.has_special_weights else None
-        self.model = window.model
+        self.measurements = window.measurements
+        if window.unusual:
+            self.inputs, self.model = window.inputs, window.model
+            self.stage_weights = window.stage_weights
+            self.observed = window.observed if window.has_special_weights else None
+        else:
+            self.inputs, self.model = window.usual_inputs, self._system
+            self.stage_weights, self.observed = self._cost.stage_weight, None
+        self._fused, self._first = None if window.unusual else window.fused, window.start
         if self._discounted:
             self.discounts = window.discounts
         if self._prior_rule is not None and window.prior_covariance is not None:
@@ -153,7 +161,7 @@ class Problem:
 
     def prior_band_at(self, offset: Array) -> Array:
         """The same weight as a band panel."""
-        if self._cost.quadratic and self.discounts is None:
+        if self._quadratic and self.discounts is None:
             return self._prior_band
         return band_of(self.prior_weight_at(offset))
 
@@ -181,25 +189,42 @@ class Problem:
         try:
             if self._rolls_out:
                 trajectory = self.restored(trajectory)
+            if self._fused is not None:
+                return self._judged(trajectory, *self._call(self._fused, trajectory))
             residuals = self._residuals(trajectory)
         except Exception:  # a model function outside its domain: such a trial is worthless
             nothing = np.full((trajectory.shape[0] - 1, self._q), np.nan)
-            return Trial(trajectory, nothing, self.stage_weights, nothing, math.inf, math.inf)
-        weights, weighted, cost = self._cost_of(residuals)
+            return Trial(trajectory, nothing, self.stage_weights, math.inf, math.inf)
+        weights, cost = self._cost_of(residuals)
         offset = trajectory[0] - self.prior
-        if self._cost.quadratic:
+        if self._quadratic:
             prior_cost = float(offset.dot(self.prior_weight).dot(offset))
         else:
             prior_cost = self._cost.prior_cost(offset, self.prior_weight)
         cost += prior_cost if self.discounts is None else float(self.discounts[0]) * prior_cost
+        return self._judged(trajectory, residuals, cost, weights)
+
+    def _judged(
+        self, trajectory: Array, residuals: Array, cost: float, weights: Array | None = None
+    ) -> Trial:
+        """The verdict on a trajectory whose residuals and cost are known."""
+        if weights is None:
+            weights = self.stage_weights
         if not math.isfinite(cost):
-            return Trial(trajectory, residuals, weights, weighted, math.inf, math.inf)
+            return Trial(trajectory, residuals, weights, math.inf, math.inf)
         violation = 0.0
         if self.constrained:
             violation = self.violation(trajectory, residuals)
             if violation > _FEASIBLE:
                 cost = math.inf
-        return Trial(trajectory, residuals, weights, weighted, cost, violation)
+        return Trial(trajectory, residuals, weights, cost, violation)
+
+    def _call(self, fused: Fused, trajectory: Array) -> tuple[Array, float]:
+        """Residuals and cost by one call."""
+        count = trajectory.shape[0] - 1
+        fused.states[: count + 1] = trajectory
+        cost = fused.judge(self._first, count)
+        return fused.residuals[:count].copy(), cost
 
     def _residuals(self, trajectory: Array) -> Array:
         """Residuals w and v of each stage; raises what the model raises."""
@@ -214,33 +239,32 @@ class Problem:
         np.subtract(self.measurements, outputs, out=residuals[:, n:])
         return residuals
 
-    def _cost_of(self, residuals: Array) -> tuple[Array, Array, float]:
-        """Majorising weights, weighted residuals, and the stages' cost."""
+    def _cost_of(self, residuals: Array) -> tuple[Array, float]:
+        """Majorising weights, and the stages' cost."""
         weights = self.stage_weights
-        if self._cost.quadratic:
+        if self._quadratic:
             if self.discounts is not None:
                 weights = weights * self.discounts[1:, None, None]
             if weights.ndim == 2:
                 weighted = residuals.dot(weights)
             else:
                 weighted = np.matmul(residuals[:, None, :], weights)[:, 0]
-            return weights, weighted, float(np.vdot(weighted, residuals))
+            return weights, float(weighted.ravel().dot(residuals.ravel()))
         costs = self._cost.stage_costs(residuals, weights)
         weights = self._cost.majorise(residuals, weights)
         if self.discounts is not None:
             weights = weights * self.discounts[1:, None, None]
             costs = costs * self.discounts[1:]
-        weighted = np.matmul(residuals[:, None, :], weights)[:, 0]
-        return weights, weighted, float(costs.sum())
+        return weights, float(costs.sum())
 
     def candidate(self, window: Window) -> Trial:
         """The candidate of the bound window as a trial: its cost is known already."""
         if self._candidate is None:
-            residuals, weights = window.residuals, window.majorising_weights
+            weights = self.stage_weights if self._quadratic else window.majorising_weights
             if self.discounts is not None:
                 weights = weights * self.discounts[1:, None, None]
             self._candidate = Trial(
-                window.candidate, residuals, weights, residuals, window.candidate_cost
+                window.candidate, window.residuals, weights, window.candidate_cost
             )
         return self._candidate
 

@@ -31,6 +31,8 @@ class Stages:
         z(0).
     covariance : (n, n) array or None
         The observer's, of z(0).
+    stage_weight : (n + p, n + p) array
+        Weight of a usual stage.
     quadratic : bool
         Whether the cost's weights majorise it themselves.
     """
@@ -43,6 +45,7 @@ class Stages:
         horizon: int,
         initial_state: Array,
         covariance: Array | None,
+        stage_weight: Array,
         quadratic: bool,
     ) -> None:
         self.horizon = horizon
@@ -56,8 +59,10 @@ class Stages:
         # Stages whose weight is not the cost's own, because y is missing or has its own noise.
         self._special = np.zeros(room, dtype=np.bool_)
         self._own_noise: dict[int, Array] = {}  # by time
-        self._residuals = np.zeros((room, n + p))
-        self._weight = np.zeros((room, n + p, n + p))
+        self._stage_weight = stage_weight
+        self._weight = np.tile(stage_weight, (room, 1, 1))
+        #: Whether any stage may be special or irregular; the places to come never are.
+        self.unusual: bool = False
         # With a cost that is not quadratic: the weights that majorise it at the candidate.
         self._majorising = self._weight if quadratic else np.zeros((room, n + p, n + p))
         self._stage_cost = np.zeros(room)
@@ -85,7 +90,7 @@ class Stages:
     def _per_stage(self) -> tuple[Array, ...]:
         arrays: tuple[Array | Any, ...] = (
             self._y, self._u, self._irregular, self._observed, self._special,
-            self._residuals, self._weight, self._stage_cost,
+            self._weight, self._stage_cost,
         )
         return arrays if self._majorising is self._weight else (*arrays, self._majorising)
 
@@ -107,6 +112,10 @@ class Stages:
         for states in (self._z, self._covariance):
             if states is not None:
                 states[: keep + 1] = states[end - keep : end + 1]
+        if self.unusual:
+            self._observed[keep:], self._special[keep:], self._irregular[keep:] = True, False, False
+            self._weight[keep:] = self._stage_weight
+            self.unusual = bool(self._special[:keep].any() or self._irregular[:keep].any())
         self.start, self.end = 0, keep
 
     def state_dict(self) -> dict[str, Any]:
@@ -151,6 +160,7 @@ class Stages:
         for array, saved in zip(self.terms.arrays(), state["terms"], strict=True):
             array[:length] = saved
         self._own_noise = {time: weight.copy() for time, weight in state["own_noise"].items()}
+        self.unusual = True
         self._last_special = int(state["last_special"])
         self._last_irregular = int(state["last_irregular"])
 
@@ -162,7 +172,7 @@ class Stages:
     @property
     def residuals(self) -> Array:
         """Joint residuals (L(i), v_z(i)) of the candidate: a view."""
-        return self._residuals[self.start : self.end]
+        return self.terms.residuals[self.start : self.end]
 
     @property
     def measurements(self) -> Array:

@@ -74,16 +74,22 @@ class Subproblem:
         """The QP around any trajectory; None where the model has no Jacobians there."""
         states, terms, n = trial.trajectory[:-1], self._terms, self._n
         count = states.shape[0]
-        model, jacobian = problem.model, terms.jacobian[:count]
+        model, linear = problem.model, terms.linear[:count]
         try:
-            jacobian[:, :n] = model.f_jacobian.batch(states, problem.inputs)
-            jacobian[:, n:] = model.h_jacobian.batch(states, problem.inputs)
+            np.negative(model.f_jacobian.batch(states, problem.inputs), out=linear[:, :n, 1:])
+            np.negative(model.h_jacobian.batch(states, problem.inputs), out=linear[:, n:, 1:])
         except Exception:  # a user's Jacobian outside its domain
             return None
-        if not np.isfinite(jacobian).all():
+        if not np.isfinite(linear).all():
             return None
-        terms.set_all(trial.weights, trial.residuals, trial.weighted)
+        linear[:, :, 0] = trial.residuals
+        terms.set_all(count, trial.weights)
         return self._assemble(problem, trial, terms, 0, count, False)
+
+    @property
+    def jacobian(self) -> Array:
+        """Jacobians (K, n + p, n) of (f, h) along the trajectory of the last QP."""
+        return -self._minus_jacobian
 
     def nearest(self, problem: Problem, window: Window) -> QP:
         """The QP of the point nearest to the candidate among those that satisfy the rows."""
@@ -110,7 +116,7 @@ class Subproblem:
             That trajectory, and what became of it.
         """
         n, step = self._n, trial.trajectory - around.trajectory
-        linear = around.residuals - np.matmul(self.jacobian, step[:-1, :, None])[:, :, 0]
+        linear = around.residuals + np.matmul(self._minus_jacobian, step[:-1, :, None])[:, :, 0]
         linear[:, :n] += step[1:]
         bent = trial.residuals - linear
         margin = np.full_like(qp.row_lower, 2.0 * qp.violation(step))
@@ -155,8 +161,7 @@ class Subproblem:
         if not at_candidate:
             gradient[0] += problem.prior_weight_at(offset).dot(offset)
         gradient[count] = terms.following[last - 1]
-        #: Jacobians (K, n + p, n) of (f, h) along the trajectory of the last QP.
-        self.jacobian: Array = terms.jacobian[first:last]
+        self._minus_jacobian = terms.linear[first:last, :, 1:]
         if problem.constrained:
             self._bound(qp, problem, trial)
         return qp
@@ -170,9 +175,9 @@ class Subproblem:
         else:
             qp.lower[...], qp.upper[...] = -np.inf, np.inf
         if self._rows:
-            f_jacobian, h_jacobian = self.jacobian[:, :n], self.jacobian[:, n:]
-            np.negative(np.matmul(self._w_rows, f_jacobian), out=qp.row_own[:-1, self._w])
-            np.negative(np.matmul(self._v_rows, h_jacobian), out=qp.row_own[:-1, self._v])
+            minus = self._minus_jacobian
+            np.matmul(self._w_rows, minus[:, :n], out=qp.row_own[:-1, self._w])
+            np.matmul(self._v_rows, minus[:, n:], out=qp.row_own[:-1, self._v])
             self._set_rows(qp, problem, trial.residuals, trial.trajectory)
 
     def _set_rows(self, qp: QP, problem: Problem, residuals: Array, trajectory: Array) -> None:

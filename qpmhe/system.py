@@ -18,6 +18,7 @@ from .functions import BatchedFunction, Probes
 from .sets import ConvexSet
 
 if TYPE_CHECKING:
+    from .adapters.fused import Fused
     from .codegen.expressions import CasadiModel
 
 __all__ = ["Joint", "System", "checked_set", "probe_points"]
@@ -28,6 +29,9 @@ Function = Callable[..., Any]
 
 class Joint(Protocol):
     """Several of a model's functions by one call."""
+
+    #: What makes the calls of `qpmhe.adapters.fused.Fused`, where the model is machine code.
+    fused: Callable[..., Fused | None] | None
 
     def stage(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Values f (n,), h (p,) and their Jacobian (n + p, n) at one state, until the next call."""

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .costs import Cost
-from .observers import Observer, Sample
+from .costs import Cost, ObserverPrior
+from .observers import Luenberger, Observer, Sample
 from .stages import Stages
 from .system import System
+
+if TYPE_CHECKING:
+    from .adapters.fused import Fused
 
 __all__ = ["Window"]
 
@@ -54,12 +58,26 @@ class Window(Stages):
         self._n, self._m, self._linearized = n, m, linearized
         self._jacobians = linearized or observer.needs_jacobians
         super().__init__(
-            n, p, m, horizon, initial_state, observer.initial_covariance(), cost.quadratic
+            n, p, m, horizon, initial_state, observer.initial_covariance(), cost.stage_weight,
+            cost.quadratic,
         )
-        self._weighted = np.zeros(n + p)  # weight times residual of the stage that enters
         self._sample = Sample(system, np.zeros(m))
+        self._linear = True  # whether the stage that enters has Jacobians
+        self._no_jacobian = -np.eye(n + p, n)  # what stands in for them, with the minus of `linear`
+        #: Whole stages and trajectories by one call each, where the model offers that.
+        self.fused: Fused | None = self._bound() if linearized else None
         # gamma^0, gamma^1, ... from the newest stage backwards, and the prior's behind.
         self._ages = cost.discount ** np.arange(horizon, -1, -1.0) if cost.discount < 1 else None
+
+    def _bound(self) -> Fused | None:
+        joint, observer, cost = self._system.joint, self._observer, self._cost
+        plain = type(observer) is Luenberger and cost.quadratic and cost.discount == 1.0
+        if joint is None or joint.fused is None or not plain or isinstance(cost.prior, ObserverPrior):
+            return None
+        return joint.fused(
+            self.horizon, self._z, self._u, self._y, *self.terms.arrays(), observer.gain,
+            self._stage_weight, cost.prior,
+        )
 
     @property
     def has_special_weights(self) -> bool:
@@ -88,15 +106,12 @@ class Window(Stages):
             self._move_to_front()
         k, m = self.end, self._m
         self._y[k] = y
-        self._observed[k] = True
         if m:
             self._u[k, :m] = u
-        self._irregular[k] = dt is not None
         if dt is not None:
+            self._irregular[k] = self.unusual = True
             self._u[k, m] = dt
             self._last_irregular = self.time
-        self._special[k] = False
-        self._weight[k] = self._cost.stage_weight
         if noise_weight is not None:
             self._own_noise[self.time] = noise_weight
             self._set_weight(k, self.time)
@@ -148,8 +163,15 @@ class Window(Stages):
 
     def _enter(self, k: int, time: int) -> tuple[bool, bool, bool]:
         """Compute stage k from z(k) and its sample; what `push` tells."""
+        if self.fused is not None and not (
+            self.unusual and (self._special[k] or self._irregular[k])
+        ):
+            cost = self.fused.enter(k)
+            if math.isfinite(cost):
+                self._stage_cost[k] = cost
+                return False, False, False
         observed: NDArray[np.bool_] | None = None
-        if self._special[k] and not self._observed[k].all():
+        if self.unusual and not self._observed[k].all():
             observed = self._observed[k]
         cost = self._advance(k, time, observed)
         if not math.isfinite(cost) and observed is None:
@@ -162,8 +184,8 @@ class Window(Stages):
         if held:
             self._hold(k)
         self._stage_cost[k] = cost
-        linear = held or not self._linearized or self._linearize(k)
-        return observed is not None, held, not linear
+        flat = not held and self._linearized and not self._linear
+        return observed is not None, held, flat
 
     def _set_weight(self, k: int, time: int) -> None:
         """The weight of stage k, at this time, from what is observed of it and its noise."""
@@ -171,8 +193,9 @@ class Window(Stages):
         complete = observed.all()
         self._special[k] = own is not None or not complete
         if not self._special[k]:
-            self._weight[k] = self._cost.stage_weight
+            self._weight[k] = self._stage_weight
             return
+        self.unusual = True
         self._last_special = max(self._last_special, time)
         self._y[k, ~observed] = 0.0  # any number: its weight is zero
         if complete:
@@ -182,37 +205,38 @@ class Window(Stages):
 
     def _advance(self, k: int, time: int, observed: NDArray[np.bool_] | None) -> float:
         """Evaluate stage k at z and step the observer; the stage's cost, or infinity."""
-        n, z, following = self._n, self._z[k], self._z[k + 1]
-        model, u = self._system, self._u[k, : self._m]
-        residual, weight, sample = self._residuals[k], self._weight[k], self._sample
-        correction, error = residual[:n], residual[n:]
+        n, z, following, m = self._n, self._z[k], self._z[k + 1], self._m
+        model, u, y, sample = self._system, self._u[k, :m], self._y[k], self._sample
+        linear = self.terms.linear[k]
+        error = linear[n:, 0]
         try:
-            if self._irregular[k]:
+            if self.unusual and self._irregular[k]:
                 model, u = self._system.timed, self._u[k]
-            # Copied at once: a function may return one array every time, and derivatives
-            # by differences call it again.
             joint = model.joint if self._jacobians else None
             if joint is None:
+                # Copied at once: a function may return one array every time, and derivatives
+                # by differences call it again.
                 following[:] = model.f(z, u)
-                np.subtract(self._y[k], model.h(z, u), out=error)
+                np.subtract(y, model.h(z, u), out=error)
+                ahead = following
+                if self._jacobians:
+                    self._differentiate(linear, model, z, u)
             else:
                 ahead, output, slopes = joint.stage(z, u)
-                following[:] = ahead
-                np.subtract(self._y[k], output, out=error)
-                self.terms.jacobian[k] = slopes
+                np.subtract(y, output, out=error)
+                np.negative(slopes, out=linear[:, 1:])
             if observed is not None:
                 error[~observed] = 0.0
             sample.system, sample.u, sample.observed = model, u, observed
-            if joint is not None:
-                self._offer_jacobians(k)
-            elif self._jacobians:
-                self._differentiate(k, model, z, u)
+            if self._observer.needs_jacobians:
+                sample.f_jacobian, sample.h_jacobian = -linear[:n, 1:], -linear[n:, 1:]
             if self._own_noise or sample.noise_weight is not None:
                 sample.noise_weight = self._own_noise.get(time)
             if self._covariance is not None:
                 sample.covariance = self._covariance[k]
-            correction[:], posterior = self._observer.correct(z, error, sample)
-            following += correction
+            correction, posterior = self._observer.correct(z, error, sample)
+            linear[:n, 0] = correction
+            np.add(ahead, correction, out=following)
         except Exception:  # a model function outside its domain: bad luck, not bad input
             return math.inf
         if self._covariance is not None:
@@ -221,40 +245,41 @@ class Window(Stages):
             self._covariance[k + 1] = posterior
         if not math.isfinite(following.dot(following)):
             return math.inf
-        if self._cost.quadratic:
-            self._weighted = weight.dot(residual)
-            cost = float(self._weighted.dot(residual))
-        else:
-            cost = float(self._cost.stage_costs(residual[None], weight)[0])
-        return cost if math.isfinite(cost) else math.inf
+        return self._weigh(k)
 
-    def _differentiate(self, k: int, model: System, z: Array, u: Array) -> None:
-        jacobian, n = self.terms.jacobian[k], self._n
+    @staticmethod
+    def _differentiate(linear: Array, model: System, z: Array, u: Array) -> None:
+        n = z.size
         try:
-            jacobian[:n] = model.f_jacobian(z, u)
-            jacobian[n:] = model.h_jacobian(z, u)
+            np.negative(model.f_jacobian(z, u), out=linear[:n, 1:])
+            np.negative(model.h_jacobian(z, u), out=linear[n:, 1:])
         except Exception:  # a user's Jacobian outside its domain
-            # An observer that never reads it goes on; `_linearize` sees the NaN.
-            jacobian[:] = np.nan
-        self._offer_jacobians(k)
+            # An observer that never reads it goes on; `_weigh` sees the NaN.
+            linear[:, 1:] = np.nan
 
-    def _offer_jacobians(self, k: int) -> None:
-        if self._observer.needs_jacobians:
-            jacobian = self.terms.jacobian[k]
-            self._sample.f_jacobian = jacobian[: self._n]
-            self._sample.h_jacobian = jacobian[self._n :]
-
-    def _linearize(self, k: int) -> bool:
-        residual = self._residuals[k]
-        flat = self.terms.jacobian[k].reshape(-1)
-        linear = math.isfinite(flat.dot(flat))
-        if not linear:
-            self.terms.jacobian[k] = np.eye(*self.terms.jacobian[k].shape)
-        if not self._cost.quadratic:
-            self._majorising[k] = self._cost.majorise(residual[None], self._weight[k])[0]
-            self._weighted = self._majorising[k].dot(residual)
-        self.terms.set_stage(k, self._majorising[k], residual, self._weighted)
-        return linear
+    def _weigh(self, k: int) -> float:
+        """The cost of stage k, or infinity, and its Gauss-Newton terms if these are wanted."""
+        terms, weight = self.terms, self._weight[k]
+        self._linear = True
+        if self._linearized and self._cost.quadratic:
+            cost = terms.set_stage(k, weight)
+            if math.isfinite(cost):
+                return cost
+        residual = terms.residuals[k]
+        cost = float(self._cost.stage_costs(residual[None], weight)[0])
+        if not math.isfinite(cost):
+            return math.inf
+        if self._linearized:
+            if not self._cost.quadratic:
+                weight = self._majorising[k]
+                weight[...] = self._cost.majorise(residual[None], self._weight[k])[0]
+            slopes = terms.linear[k, :, 1:].ravel()
+            # Terms that overflow otherwise are left to the QP, whose data are then not finite.
+            if not (math.isfinite(terms.set_stage(k, weight)) or math.isfinite(slopes.dot(slopes))):
+                self._linear = False
+                terms.linear[k, :, 1:] = self._no_jacobian
+                terms.set_stage(k, weight)
+        return cost
 
     def _hold(self, k: int) -> None:
         """Fill a stage at which the model cannot be evaluated: x(t+1) about x(t).
@@ -264,12 +289,11 @@ class Window(Stages):
         self._z[k + 1], covariance = self._last_good(k)
         if self._covariance is not None:
             self._covariance[k + 1] = covariance
-        self._residuals[k] = 0.0
-        self.terms.jacobian[k] = np.eye(*self.terms.jacobian[k].shape)
+        linear = self.terms.linear[k]
+        linear[:, 0], linear[:, 1:] = 0.0, self._no_jacobian
         self._majorising[k] = self._weight[k]
         if self._linearized:
-            nothing = np.zeros_like(self._residuals[k])
-            self.terms.set_stage(k, self._weight[k], nothing, nothing)
+            self.terms.set_stage(k, self._weight[k])
 
     def restart(self, state: Array) -> None:
         """Go on from another state after a failed stage, whose correction is void anyway."""
@@ -309,11 +333,16 @@ class Window(Stages):
         return self._ages[self.horizon - self.length :]
 
     @property
+    def usual_inputs(self) -> Array:
+        """The inputs u alone: a view."""
+        return self._u[self.start : self.end, : self._m]
+
+    @property
     def inputs(self) -> Array:
         """The inputs u, with the steps' lengths behind them if some are irregular."""
-        u = self._u[self.start : self.end]
         if not self.has_irregular_steps:
-            return u[:, : self._m]
+            return self.usual_inputs
+        u = self._u[self.start : self.end]
         lengths = self._u[:, self._m]
         usual = ~self._irregular[self.start : self.end]
         lengths[self.start : self.end][usual] = self._system.dt

@@ -17,6 +17,7 @@ from ..codegen.source import model_files
 from ..errors import CompilationError, OptionError
 from ..sets import ConvexSet
 from ..system import System
+from .fused import Fused, fused
 
 __all__ = ["casadi_system"]
 
@@ -62,6 +63,8 @@ def casadi_system(
             else partial(_compiled, model, library, timed)
         )
         evaluator = _Evaluator(maker)
+        if library is not None and not timed:
+            evaluator.fused = partial(fused, library, model.dt or 0.0)
         one = {name: partial(evaluator.one, name) for name in _NAMES}
         system = System(
             one["f"], one["h"], n=model.n, p=model.p, m=model.m + timed,
@@ -100,6 +103,7 @@ class _Evaluator:
 
     def __init__(self, maker: Maker) -> None:
         self._maker = maker
+        self.fused: Callable[..., Fused | None] | None = None
         self._local = threading.local()  # two threads must not share buffers
 
     def one(self, name: str, x: Array, u: Array | None = None) -> Array:

@@ -162,7 +162,7 @@ class _Model:
     """
 
     def __init__(self, programs: Programs, length: float | None) -> None:
-        self.n, self.p = programs.n, programs.p
+        self.n, self.p, self.fused = programs.n, programs.p, None
         self._programs = programs
         self._length = b"" if length is None else np.float64(length).tobytes()
         self._splits = programs.timed and length is None

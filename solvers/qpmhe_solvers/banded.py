@@ -18,6 +18,7 @@ __all__ = ["BandedSolver"]
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+_NO_ROWS: Array = np.zeros(0)
 
 class BandedSolver(Solver):
     """Solve ``H d = -g``, exact wherever the result meets every inequality.
@@ -62,7 +63,7 @@ class BandedSolver(Solver):
             SOLVED, UNCONSTRAINED, or FAILED where H is not positive definite or not finite.
             The iterate lives in this solver's workspace until its next solve.
         """
-        row_duals = np.zeros(qp.stages * qp.rows)
+        row_duals = _NO_ROWS
         if qp.rows and (qp.row_lower == qp.row_upper).any():
             step, multipliers = self._with_equalities(qp)
             row_duals = multipliers.ravel()
@@ -73,6 +74,8 @@ class BandedSolver(Solver):
             return Solution(None, SolveStatus.FAILED, 0, message=message)
         if not qp.bounded and not qp.rows:
             return Solution(step, SolveStatus.SOLVED, 0)
+        if not row_duals.size:
+            row_duals = np.zeros(qp.stages * qp.rows)
         no_bound = np.zeros(qp.size)
         # Equality rows hold up to the rounding of the solve.
         rounding = 1e-10 * (1.0 + float(np.abs(step).max())) if row_duals.any() else 0.0

@@ -37,20 +37,23 @@ def parts(f=f, h=h, gain=GAIN, n=2, p=1, discount=1.0, **system):
     return qpmhe.System(f, h, n=n, p=p, **system), qpmhe.Luenberger(gain), cost
 
 
-def same(found, expected, label):
-    """Equal to 1e-10 of each member's largest number; infinite at the same places."""
+def same(found, expected, label, tolerance=1e-10):
+    """Equal up to a share of each member's largest number; infinite at the same places."""
     found, expected = np.asarray(found), np.asarray(expected)
     finite = np.isfinite(expected)
     assert found.shape == expected.shape, label
     assert np.array_equal(np.isfinite(found), finite), label
     size = np.where(finite, np.abs(expected), 0.0).reshape(len(expected), -1).max(axis=1)
-    allowed = 1e-10 * size.reshape(-1, *[1] * (expected.ndim - 1)) + 1e-15
+    allowed = tolerance * size.reshape(-1, *[1] * (expected.ndim - 1)) + 1e-15
     with np.errstate(invalid="ignore"):
         off = np.argwhere((np.abs(found - expected) > allowed) & finite)
     assert not off.size, f"{label}: {off[0]}"
 
 
-def compare(parts, Y, U=None, *, starts, horizon=5, mode="vectorised", before=None, **options):
+def compare(
+    parts, Y, U=None, *, starts, horizon=5, mode="vectorised", before=None, tolerance=1e-10,
+    **options,
+):
     """Run a batch beside single estimators; the estimates of the batch.
 
     ``before(t)`` is called before the step of time t, once for the batch and once for each
@@ -84,7 +87,9 @@ def compare(parts, Y, U=None, *, starts, horizon=5, mode="vectorised", before=No
             (estimate.states, "state"), (estimate.filtered, "filtered"), (batch.states, "state"),
             (estimate.costs, "cost"), (estimate.candidate_costs, "candidate_cost"),
         ):
-            same(several, [getattr(one, name) for one in singly], f"{name} at time {t}")
+            same(
+                several, [getattr(one, name) for one in singly], f"{name} at time {t}", tolerance
+            )
         if singly[0].delayed is None:
             assert estimate.delayed is None
         else:
@@ -250,7 +255,8 @@ def test_a_model_that_is_not_defined_for_some_members(model, options):
     Y[0, 6:30] = np.nan
     Y[2, 10] = Y[3, 14] = np.nan
     one = parts(model, lambda x: x[..., 1:], gain=[[0.4], [0.3]])
-    seen = flags_seen(compare(one, Y, starts=[1.0, 0.5], **options))
+    # From trial to trial through the edge of the domain, rounding grows.
+    seen = flags_seen(compare(one, Y, starts=[1.0, 0.5], tolerance=1e-9, **options))
     assert Status.MODEL_FAILED in seen
     assert Status.FAILED_STAGE in seen
     assert Status.MISSING in seen
