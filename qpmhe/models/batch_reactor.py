@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,45 +10,29 @@ from numpy.typing import NDArray
 from ..costs import QuadraticCost
 from ..observers import Luenberger
 from ..system import System
+from .example import Example
 from .scenario import Scenario
 
-__all__ = ["BatchReactor", "batch_reactor", "casadi_output", "casadi_rate"]
+__all__ = ["batch_reactor", "casadi_output", "casadi_rate"]
 
 Array = NDArray[Any]
 
 _K1, _K2 = 0.16, 0.64
 _DT = 0.1
 _STOICHIOMETRY = np.array([-2.0, 1.0])
+# The rate is linear in the squares of the states and in the states: few and large operations.
+_OF_SQUARES = np.outer([_K1, 0.0], _STOICHIOMETRY)
+_OF_STATES = np.outer([0.0, -_K2], _STOICHIOMETRY)
+_SUM, _SUM_JACOBIAN = np.ones((2, 1)), np.ones((1, 2))
+_SUM_JACOBIAN.flags.writeable = False
 # The Jacobian is x_1 times the first matrix, plus the second.
 _SLOPE = 2.0 * _K1 * np.array([[-2.0, 0.0], [1.0, 0.0]])
 _CONSTANT = np.array([[0.0, 2.0 * _K2], [0.0, -_K2]])
 
 
-class BatchReactor(NamedTuple):
-    """The example's parts.
-
-    Parameters
-    ----------
-    system : System
-        The reactor.
-    observer : Luenberger
-        The paper's observer.
-    cost : QuadraticCost
-        The paper's weights.
-    scenario : Scenario
-        How it is simulated, and where the estimation starts.
-    """
-
-    system: System
-    observer: Luenberger
-    cost: QuadraticCost
-    scenario: Scenario
-
-
 def _rate(x: Array) -> Array:
-    first = x[..., 0]
-    reaction = _K1 * first * first - _K2 * x[..., 1]
-    value: Array = np.multiply.outer(reaction, _STOICHIOMETRY)
+    value: Array = (x * x).dot(_OF_SQUARES)
+    value += x.dot(_OF_STATES)
     return value
 
 
@@ -58,12 +42,12 @@ def _rate_jacobian(x: Array) -> Array:
 
 
 def _output(x: Array) -> Array:
-    total: Array = x[..., :1] + x[..., 1:]
+    total: Array = x.dot(_SUM)
     return total
 
 
 def _output_jacobian(x: Array) -> Array:
-    return np.ones((*x.shape[:-1], 1, 2))
+    return _SUM_JACOBIAN if x.ndim == 1 else np.ones((*x.shape[:-1], 1, 2))
 
 
 def casadi_rate(x: Any) -> Any:
@@ -79,7 +63,7 @@ def casadi_output(x: Any) -> Any:
     return x[0] + x[1]
 
 
-def batch_reactor(method: str = "euler") -> BatchReactor:
+def batch_reactor(method: str = "euler") -> Example:
     r"""The reaction 2A <-> B in a constant-volume batch reactor, as in the paper's section 4.
 
     .. math::
@@ -129,7 +113,9 @@ def batch_reactor(method: str = "euler") -> BatchReactor:
         horizon=10,
         steps=150,
         labels=("x1 (A)", "x2 (B)"),
+        settling_time=2.0,
+        title="Batch reactor, 2A <-> B",
     )
     observer = Luenberger(_DT * np.array([[0.5], [0.5]]))
     cost = QuadraticCost.from_covariances(prior=np.eye(2), disturbance=disturbance, noise=noise)
-    return BatchReactor(system, observer, cost, scenario)
+    return Example(system, observer, cost, scenario)

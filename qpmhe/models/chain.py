@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from .._checks import count
 from ..costs import QuadraticCost
 from ..errors import OptionError
-from ..observers import Luenberger, design_luenberger
+from ..observers import design_luenberger
 from ..system import System
+from .example import Example
 from .scenario import Scenario
 
-__all__ = ["ChainOfMasses", "casadi_output", "casadi_rate", "chain_of_masses"]
+__all__ = ["casadi_output", "casadi_rate", "chain_of_masses"]
 
 Array = NDArray[Any]
 
@@ -26,27 +27,6 @@ _DAMPING = 0.04  # N s/m
 _DT = 0.03  # s
 _POSITION_DISTURBANCE, _VELOCITY_DISTURBANCE = 0.001, 0.03  # m and m/s, a step
 _NOISE, _DISPLACEMENT = 0.03, 0.3  # m
-
-
-class ChainOfMasses(NamedTuple):
-    """The example's parts.
-
-    Parameters
-    ----------
-    system : System
-        The chain.
-    observer : Luenberger
-        With the gain of the stationary Kalman predictor about rest.
-    cost : QuadraticCost
-        Weights, the inverse covariances of the scenario.
-    scenario : Scenario
-        How the chain is simulated, and where the estimation starts.
-    """
-
-    system: System
-    observer: Luenberger
-    cost: QuadraticCost
-    scenario: Scenario
 
 
 class _Chain:
@@ -202,7 +182,7 @@ def casadi_output(masses: int = 2, dimension: int = 3) -> Callable[[Any], Any]:
     return lambda x: x[: masses * dimension]
 
 
-def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") -> ChainOfMasses:
+def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") -> Example:
     r"""Masses in a chain, connected by springs, between a wall and a fixed end point.
 
     .. math::
@@ -254,6 +234,9 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
     In two and three dimensions, the force of a spring is undefined where two neighbours meet:
     x = 0 is no state to start from.
 
+    Once settled, the observer is as good as MHE: its gain is Kalman's, and the prior weight,
+    which is that of the initial error, is a weak one. What MHE gains is the time till then.
+
     References
     ----------
     Wirsching, Bock and Diehl, Fast NMPC of a chain of masses connected by springs, IEEE
@@ -292,13 +275,15 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
         horizon=30,
         steps=120,
         labels=(*(f"{name} (m)" for name in names), *(f"v{name} (m/s)" for name in names)),
+        settling_time=1.5,
+        title=f"Chain of {masses} mass{'es' * (masses > 1)} in {dimension} D",
     )
     swing = _DISPLACEMENT * (_STIFFNESS / _MASS) ** 0.5
     cost = QuadraticCost.from_covariances(
         prior=_diagonal(half, _DISPLACEMENT, swing), disturbance=disturbance, noise=noise
     )
     observer = design_luenberger(system, rest, disturbance=disturbance, noise=noise)
-    return ChainOfMasses(system, observer, cost, scenario)
+    return Example(system, observer, cost, scenario)
 
 
 def _checked(masses: Any, dimension: Any) -> tuple[int, int]:

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import count, positive, positive_definite, vector
+from ..errors import InvalidInputError, ModelError, OptionError
+from ..sets import ConvexSet
 from ..system import System
 
 __all__ = ["Record", "Scenario"]
 
 Array = NDArray[np.float64]
 
+# Draws for one sample until it lies in the sets: more would mean that hardly any does.
+_DRAWS = 1000
 
-class Record(NamedTuple):
-    """A simulated record.
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A simulated record; it unpacks into states, measurements and, if there are any, inputs.
 
     Parameters
     ----------
@@ -24,26 +33,39 @@ class Record(NamedTuple):
         x(0), ..., x(T).
     measurements : (T, p) array
         y(0), ..., y(T-1).
+    inputs : (T, m) array or None
+        u(0), ..., u(T-1); None for a system without inputs.
     """
 
     states: Array
     measurements: Array
+    inputs: Array | None = None
+
+    def __iter__(self) -> Iterator[Array]:
+        yield self.states
+        yield self.measurements
+        if self.inputs is not None:
+            yield self.inputs
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scenario:
-    """How a system is simulated and how its estimation starts.
+    r"""How a system is simulated and how its estimation starts.
+
+    Disturbance and noise are normal and white. Where the system has sets, they are truncated:
+    w(t) to those with :math:`w \in \mathbb W` and :math:`f(x, u) + w \in \mathbb X`, v(t) to
+    :math:`\mathbb V`, by drawing again. Components of a set that have zero width are set.
 
     Parameters
     ----------
     system : System
-        The system, without inputs.
+        The system.
     initial_state : (n,) array
         x(0) of the simulation.
     initial_estimate : (n,) array
         Where the estimation starts.
     disturbance_covariance, noise_covariance : array
-        Covariances of w (n, n) and v (p, p), which are normal and white.
+        Covariances of w (n, n) and v (p, p), before any truncation.
     dt : float
         Sampling time.
     horizon : int
@@ -54,6 +76,23 @@ class Scenario:
         Names of the states with units, for figures.
     time_unit : str
         Unit of dt.
+    inputs : callable, optional
+        inputs(t, x) -> u(t) (m,), from the sample's index t = 0, 1, ... and the true state
+        x(t): known inputs ignore the state, a feedback controller does not. Needed exactly
+        if the system has inputs.
+    settling_time : float
+        From this time on (in time_unit) the initial error counts as decayed.
+    title : str
+        What it is, in one line.
+    resolution : (p,) array, optional
+        Step of outputs that are digital, 0 where they are not. Such an output is h(x)
+        rounded to the nearest multiple of its step, in place of normal noise; the matching
+        variance is the step squared over 12.
+
+    Raises
+    ------
+    ShapeError, WeightError, InvalidInputError, OptionError
+        If something does not fit.
     """
 
     system: System
@@ -66,9 +105,42 @@ class Scenario:
     steps: int
     labels: tuple[str, ...]
     time_unit: str = "s"
+    inputs: Callable[[int, Array], Array] | None = None
+    settling_time: float = 0.0
+    title: str = ""
+    resolution: Array | None = None
+
+    def __post_init__(self) -> None:
+        n, p = self.system.n, self.system.p
+        for name in ("initial_state", "initial_estimate"):
+            state = vector(name, getattr(self, name), n)
+            _insist_on_member(name, state, self.system.states)
+            object.__setattr__(self, name, state)
+        for name, size in (("disturbance_covariance", n), ("noise_covariance", p)):
+            matrix = positive_definite(name.replace("_", " "), getattr(self, name), size)
+            object.__setattr__(self, name, matrix)
+        positive("dt", self.dt)
+        count("horizon", self.horizon, 1)
+        count("steps", self.steps, 1)
+        if len(self.labels) != n:
+            raise OptionError(f"labels has {len(self.labels)} names; expected {n}, one a state.")
+        if not 0.0 <= self.settling_time < math.inf:
+            raise OptionError(
+                f"settling_time is {self.settling_time!r}; expected a finite number >= 0."
+            )
+        if (self.inputs is None) != (self.system.m == 0):
+            raise OptionError(
+                f"inputs is {self.inputs!r}, and the system has {self.system.m} inputs; expected "
+                "a function of time and state exactly if there are any."
+            )
+        if self.resolution is not None:
+            step = vector("resolution", self.resolution, p)
+            if (step < 0.0).any():
+                raise OptionError(f"resolution is {step.tolist()}; expected steps >= 0.")
+            object.__setattr__(self, "resolution", step)
 
     def simulate(self, seed: int, steps: int | None = None) -> Record:
-        """Simulate x(t+1) = f(x(t)) + w(t), y(t) = h(x(t)) + v(t).
+        """Simulate x(t+1) = f(x(t), u(t)) + w(t), y(t) = h(x(t), u(t)) + v(t).
 
         Parameters
         ----------
@@ -80,18 +152,80 @@ class Scenario:
         Returns
         -------
         Record
-            States (T + 1, n) and measurements (T, p).
+            States (T + 1, n), measurements (T, p) and inputs (T, m), if there are any.
+
+        Raises
+        ------
+        OptionError
+            If the seed or the number of steps is not an integer >= 0.
+        ModelError
+            If the state cannot be kept in its set by any disturbance that is drawn, or is
+            not finite.
         """
-        count = self.steps if steps is None else steps
-        generator = np.random.default_rng(seed)
-        n, p, nothing = self.system.n, self.system.p, np.zeros(0)
-        w = generator.standard_normal((count, n)) @ np.linalg.cholesky(
-            self.disturbance_covariance
-        ).T
-        v = generator.standard_normal((count, p)) @ np.linalg.cholesky(self.noise_covariance).T
-        states, measurements = np.empty((count + 1, n)), np.empty((count, p))
+        generator = np.random.default_rng(count("seed", seed, 0))
+        total = self.steps if steps is None else count("steps", steps, 0)
+        system = self.system
+        spread_w = _factor(self.disturbance_covariance)
+        spread_v = _factor(self.noise_covariance)
+        w = generator.standard_normal((total, system.n)) @ spread_w
+        v = generator.standard_normal((total, system.p)) @ spread_v
+        states, measurements = np.empty((total + 1, system.n)), np.empty((total, system.p))
+        inputs = np.empty((total, system.m))
         states[0] = self.initial_state
-        for t in range(count):
-            measurements[t] = self.system.h(states[t], nothing) + v[t]
-            states[t + 1] = self.system.f(states[t], nothing) + w[t]
-        return Record(states, measurements)
+        for t in range(total):
+            x, u = states[t], inputs[t]
+            if self.inputs is not None:
+                u[:] = vector("inputs(t, x)", self.inputs(t, x.copy()), system.m)
+            noise = _inside(v[t], spread_v, generator, (system.noises, 0.0))
+            if noise is None:
+                raise ModelError(f"no noise of sample {t} lies in {system.noises!r}; widen it.")
+            measurements[t] = self._measured(system.h(x, u), noise)
+            reached = system.f(x, u)
+            disturbance = _inside(
+                w[t], spread_w, generator, (system.disturbances, 0.0), (system.states, reached)
+            )
+            if disturbance is None or not np.isfinite(reached).all():
+                raise ModelError(
+                    f"the simulated state cannot go on inside of the sets at sample {t}: it is "
+                    f"{reached.tolist()} without disturbance. Widen the sets, or simulate less."
+                )
+            states[t + 1] = reached + disturbance
+        return Record(states, measurements, inputs if system.m else None)
+
+    def _measured(self, output: Array, noise: Array) -> Array:
+        step = self.resolution
+        if step is None:
+            return output + noise
+        digital = step * np.round(output / np.where(step > 0.0, step, 1.0))
+        return np.where(step > 0.0, digital, output + noise)
+
+
+def _factor(covariance: Array) -> Array:
+    return np.asarray(np.linalg.cholesky(covariance).T, np.float64)
+
+
+def _insist_on_member(name: str, state: Array, states: ConvexSet | None) -> None:
+    if states is not None and states.violation(state) > 0.0:
+        raise InvalidInputError(
+            f"{name} is {state.tolist()}, which is outside of the state set {states!r}."
+        )
+
+
+def _inside(
+    drawn: Array,
+    spread: Array,
+    generator: np.random.Generator,
+    *sets: tuple[ConvexSet | None, Any],
+) -> Array | None:
+    """What was drawn, or drawn again until what each set bounds, s + offset, lies in it."""
+    bounded = [(each, offset) for each, offset in sets if each is not None]
+    for _ in range(_DRAWS):
+        for each, offset in bounded:
+            fixed = each.fixed_components
+            if fixed.size:
+                drawn = drawn.copy()
+                drawn[fixed] = (each.lower - offset)[fixed]
+        if all(each.violation(drawn + offset) == 0.0 for each, offset in bounded):
+            return drawn
+        drawn = generator.standard_normal(drawn.size) @ spread
+    return None

@@ -15,7 +15,8 @@ from qpmhe_solvers import available, backend
 from ..discretize import discretize
 from ..estimate import Status
 from ..estimator import MovingHorizonEstimator
-from ..models.batch_reactor import BatchReactor, batch_reactor, casadi_output, casadi_rate
+from ..models import Example
+from ..models.batch_reactor import batch_reactor, casadi_output, casadi_rate
 from ..models.scenario import Record
 from ..run import Run
 from .ipopt import IpoptEstimator
@@ -52,7 +53,7 @@ class PaperStudy:
     method: str = "euler"
 
     @property
-    def model(self) -> BatchReactor:
+    def model(self) -> Example:
         """System, observer, cost and scenario."""
         return batch_reactor(self.method)
 

@@ -1,0 +1,33 @@
+"""What every model of the zoo consists of."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ..costs import QuadraticCost
+from ..observers import Observer
+from ..system import System
+from .scenario import Scenario
+
+__all__ = ["Example"]
+
+
+class Example(NamedTuple):
+    """A system with all that its estimation needs.
+
+    Parameters
+    ----------
+    system : System
+        The model.
+    observer : Observer
+        The auxiliary observer, stable in the scenario.
+    cost : QuadraticCost
+        Weights, the inverse covariances of the scenario and of the initial error.
+    scenario : Scenario
+        How the system is simulated, and where the estimation starts.
+    """
+
+    system: System
+    observer: Observer
+    cost: QuadraticCost
+    scenario: Scenario
