@@ -44,23 +44,24 @@ class StageTerms:
     """
 
     __slots__ = (
-        "_flat", "_index", "_rows", "_square", "_weighted", "_zeros",
+        "_first", "_flat", "_index", "_square", "_weighted", "_zeros",
         "following", "linear", "own", "panel", "residuals",
     )
 
     def __init__(self, stages: int, n: int, p: int) -> None:
-        q, band = n + p, 2 * n * n
+        q = n + p
         self.linear: Array = np.zeros((stages, q, 1 + n))
         self.residuals: Array = self.linear[:, :, 0]
-        self._rows = np.zeros((stages, band + 2 * n))
-        self.panel: Array = self._rows[:, :band].reshape(stages, n, 2 * n)
-        self.own: Array = self._rows[:, band : band + n]
-        self.following: Array = self._rows[:, band + n :]
+        self.panel: Array = np.zeros((stages, n, 2 * n))
+        self.own: Array = np.zeros((stages, n))
+        self.following: Array = np.zeros((stages, n))
         # Of one stage, with M = [r, -G]: M^T W M, behind it W M, and a number that stays 0.
         self._flat = np.zeros((1 + n) ** 2 + q * (1 + n) + 1)
         self._square = self._flat[: (1 + n) ** 2].reshape(1 + n, 1 + n)
         self._weighted = self._flat[(1 + n) ** 2 : -1].reshape(q, 1 + n)
         self._zeros = np.zeros(self._flat.size)
+        # W r of the disturbances, W M's first column.
+        self._first = self._weighted[:n, 0]
         self._index = _places(n, p)
 
     @property
@@ -79,7 +80,9 @@ class StageTerms:
         linear, flat = self.linear[k], self._flat
         np.dot(weight, linear, out=self._weighted)
         np.dot(linear.T, self._weighted, out=self._square)
-        flat.take(self._index, out=self._rows[k], mode="clip")
+        flat.take(self._index, out=self.panel[k], mode="clip")
+        self.own[k] = self._square[1:, 0]
+        self.following[k] = self._first
         # 0 times what is not finite is NaN, and no square overflows on the way.
         return float(flat[0] + flat.dot(self._zeros))
 
@@ -99,18 +102,22 @@ class StageTerms:
         flat = np.concatenate(
             (square.reshape(count, -1), weighted.reshape(count, -1), np.zeros((count, 1))), axis=1
         )
-        flat.take(self._index, axis=1, out=self._rows[:count], mode="clip")
+        flat.take(self._index, axis=1, out=self.panel[:count], mode="clip")
+        self.own[:count] = square[:, 1:, 0]
+        self.following[:count] = weighted[:, : self.own.shape[1], 0]
 
     def copy_scaled(self, terms: StageTerms, first: int, factors: Array) -> None:
         """Take over the stages of other terms from ``first`` on, each times its factor."""
         count = factors.size
         stages = slice(first, first + count)
         self.linear[:count] = terms.linear[stages]
-        np.multiply(terms._rows[stages], factors[:, None], out=self._rows[:count])
+        np.multiply(terms.panel[stages], factors[:, None, None], out=self.panel[:count])
+        np.multiply(terms.own[stages], factors[:, None], out=self.own[:count])
+        np.multiply(terms.following[stages], factors[:, None], out=self.following[:count])
 
     def arrays(self) -> tuple[Array, ...]:
         """The arrays, each with one entry a stage."""
-        return self.linear, self._rows
+        return self.linear, self.panel, self.own, self.following
 
     def keep_last(self, end: int, keep: int) -> None:
         """Move the stages end-keep, ..., end-1 to the front."""
@@ -119,11 +126,11 @@ class StageTerms:
 
 
 def _places(n: int, p: int) -> NDArray[np.intp]:
-    """Where panel, own and following of a stage stand in [M^T W M, W M, 0], flat."""
+    """Where the panel of a stage stands in [M^T W M, W M, 0], flat."""
     wide = 1 + n
     square = np.arange(wide * wide).reshape(wide, wide)
     weighted = wide * wide + np.arange((n + p) * wide).reshape(n + p, wide)
     zero = np.array([wide * wide + weighted.size])
     # The block that couples to the next stage is -Q A, the upper part of -W G.
     blocks = np.concatenate((square[1:, 1:].ravel(), weighted[:n, 1:].ravel(), zero))
-    return np.concatenate((blocks[band_index(n)].ravel(), square[1:, 0], weighted[:n, 0]))
+    return blocks[band_index(n)]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .costs import Cost, ObserverPrior
-from .observers import Luenberger, Observer, Sample
+from .observers import HighGain, Luenberger, Observer, Sample
 from .stages import Stages
 from .system import System
 
@@ -66,14 +66,17 @@ class Window(Stages):
         self._no_jacobian = -np.eye(n + p, n)  # what stands in for them, with the minus of `linear`
         #: Whole stages and trajectories by one call each, where the model offers that.
         self.fused: Fused | None = self._bound() if linearized else None
+        self._ones = np.ones(horizon)
         # gamma^0, gamma^1, ... from the newest stage backwards, and the prior's behind.
         self._ages = cost.discount ** np.arange(horizon, -1, -1.0) if cost.discount < 1 else None
 
     def _bound(self) -> Fused | None:
         joint, observer, cost = self._system.joint, self._observer, self._cost
-        plain = type(observer) is Luenberger and cost.quadratic and cost.discount == 1.0
-        if joint is None or joint.fused is None or not plain or isinstance(cost.prior, ObserverPrior):
+        if joint is None or joint.fused is None or type(observer) not in (Luenberger, HighGain):
             return None
+        if not cost.quadratic or cost.discount < 1.0 or isinstance(cost.prior, ObserverPrior):
+            return None
+        assert isinstance(observer, Luenberger)
         return joint.fused(
             self.horizon, self._z, self._u, self._y, *self.terms.arrays(), observer.gain,
             self._stage_weight, cost.prior,
@@ -321,7 +324,7 @@ class Window(Stages):
         """J of the candidate; its prior term is 0 exactly."""
         costs = self._stage_cost[self.start : self.end]
         if self._ages is None:
-            return float(np.add.reduce(costs))
+            return float(costs.dot(self._ones[: costs.size]))
         return float(costs.dot(self.discounts[1:]))
 
     @property

@@ -53,7 +53,9 @@ def fused(
     u: Array,
     y: Array,
     linear: Array,
-    terms: Array,
+    panel: Array,
+    own: Array,
+    following: Array,
     gain: Array,
     stage_weight: Array,
     prior_weight: Array,
@@ -68,7 +70,7 @@ def fused(
         Length of the steps.
     horizon : int
         N, the most stages of a trajectory.
-    z, u, y, linear, terms : array
+    z, u, y, linear, panel, own, following : array
         States, inputs (with a place for a step's length behind), measurements, and the
         arrays of `StageTerms`.
     gain : (n, p) array
@@ -83,17 +85,13 @@ def fused(
     gain, stage_weight, prior_weight = (
         np.ascontiguousarray(one) for one in (gain, stage_weight, prior_weight)
     )
-    kept = (z, u, y, gain, stage_weight, prior_weight, linear, terms, states, residuals)
-    at_z, at_u, at_y, at_gain, at_weight, at_prior, at_linear, at_terms, at_states, at_residuals = (
-        ctypes.c_void_p(one.ctypes.data) for one in kept
+    kept = (
+        z, u, y, gain, stage_weight, prior_weight, linear, panel, own, following, states, residuals
     )
+    at = [ctypes.c_void_p(one.ctypes.data) for one in kept]
     usual = ctypes.c_double(dt)
     for function in (library.mhe_enter_stage, library.mhe_judge):
         function.restype = ctypes.c_double
-    enter = partial(
-        library.mhe_enter_stage, at_z, at_u, at_y, usual, at_gain, at_weight, at_linear, at_terms
-    )
-    judge = partial(
-        library.mhe_judge, at_z, at_u, at_y, usual, at_weight, at_prior, at_states, at_residuals
-    )
+    enter = partial(library.mhe_enter_stage, *at[:3], usual, at[3], at[4], *at[6:10])
+    judge = partial(library.mhe_judge, *at[:3], usual, at[4], at[5], *at[10:])
     return Fused(enter, judge, states, residuals, kept)

@@ -52,4 +52,4 @@ class Luenberger(Observer):
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, None]:
         """K v; see `Observer.correct`."""
-        return self.gain @ v, None
+        return self.gain.dot(v), None

@@ -61,13 +61,13 @@ static void mhe_weigh(int columns, const real *W, const real *M, real *product)
 }
 
 /* Stage k of a window with a constant gain: its residual and minus its Jacobian as [r, -G], its
- * Gauss-Newton terms (panel, own, following), the state after it, and its cost, which is NaN
+ * Gauss-Newton terms, the state after it, and its cost, which is NaN
  * where any of these is not finite. All arrays hold one entry a stage; W is the joint weight. */
 real mhe_enter_stage(real *x, const real *us, const real *ys, real usual, const real *gain,
-                     const real *W, real *linear, real *terms, int k)
+                     const real *W, real *linear, real *panel, real *own, real *following, int k)
 {
     const real *z = x + k * NX, *u = us + k * (NU + 1), *y = ys + k * NY;
-    real *next = x + (k + 1) * NX, *M = linear + k * NQ * NM, *row = terms + k * (BAND + 2 * NX);
+    real *next = x + (k + 1) * NX, *M = linear + k * NQ * NM;
     real output[NY], A[NX * NX], C[NY * NX], WM[NQ * NM], S[NM * NM];
     mhe_f_jacobian(z, u, usual, next, A);
     mhe_h_jacobian(z, u, output, C);
@@ -93,12 +93,12 @@ real mhe_enter_stage(real *x, const real *us, const real *ys, real usual, const 
     for (int c = 0; c < NX; c++)
         for (int o = 0; o < 2 * NX; o++) {
             const int r = c + o;
-            row[c * 2 * NX + o] = r < NX ? S[(1 + r) * NM + 1 + c]
+            panel[k * BAND + c * 2 * NX + o] = r < NX ? S[(1 + r) * NM + 1 + c]
                                 : r < 2 * NX ? WM[(r - NX) * NM + 1 + c] : 0;
         }
     for (int j = 0; j < NX; j++) {
-        row[BAND + j] = S[(1 + j) * NM];
-        row[BAND + NX + j] = WM[j * NM];
+        own[k * NX + j] = S[(1 + j) * NM];
+        following[k * NX + j] = WM[j * NM];
     }
     real nothing = 0; /* NaN if anything is not finite: 0 times infinity is, too */
     for (int i = 0; i < NM * NM; i++) nothing += 0 * S[i];
