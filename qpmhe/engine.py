@@ -56,7 +56,7 @@ class PythonEngine:
     ) -> None:
         self._system, self._observer, self._cost = system, observer, cost
         self._settings = settings
-        solver = create(
+        self._solver = solver = create(
             settings.backend,
             SolverOptions(
                 max_iterations=settings.max_solver_iterations,
@@ -77,6 +77,7 @@ class PythonEngine:
 
     def reset(self, initial_state: Array) -> None:
         """Forget all measurements and start at this state."""
+        self._solver.forget()
         self._window = self._fresh_window(initial_state)
         self._trajectory: Array | None = None  # the last estimate's
         self._dropped: tuple[str, ...] = ()
@@ -113,6 +114,8 @@ class PythonEngine:
         """Take a sample in, and estimate."""
         window = self._window
         with np.errstate(all="ignore"):
+            if window.length == self._settings.horizon:
+                self._solver.shift()
             missing, held, flat = window.push(y, u, dt, noise_weight)
             if self._settings.candidate == "reinitialized":
                 # The history reaches back to the estimate of the window's first state.
@@ -206,6 +209,8 @@ class PythonEngine:
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt from measurements so far, as plain arrays and numbers."""
         system = self._system
+        # What a solver keeps is not written down: this estimator goes on without it, too.
+        self._solver.forget()
         return {
             "problem": self._size(),
             "window": self._window.state_dict(),
@@ -250,6 +255,7 @@ class PythonEngine:
                 "state_dict gave, unchanged."
             ) from error
         # All of it could be read: from here on nothing fails, and nothing is half done.
+        self._solver.forget()
         self._window, self._trajectory, self._dropped = window, trajectory, dropped
         self._history.clear()
         self._history.extend(history)

@@ -13,6 +13,7 @@ from .._checks import count, positive
 from ..errors import ModelError
 from ..sets import ConvexSet
 from ..system import System
+from .fused import Fused
 from .jax_programs import Programs
 
 __all__ = ["jax_system"]
@@ -162,7 +163,8 @@ class _Model:
     """
 
     def __init__(self, programs: Programs, length: float | None) -> None:
-        self.n, self.p, self.fused = programs.n, programs.p, None
+        self.n, self.p = programs.n, programs.p
+        self.fused: Callable[..., Fused | None] | None = None
         self._programs = programs
         self._length = b"" if length is None else np.float64(length).tobytes()
         self._splits = programs.timed and length is None

@@ -58,6 +58,7 @@ def _solver(settings: Settings) -> Solver:
         SolverOptions(
             max_iterations=settings.max_solver_iterations,
             absolute_tolerance=float(settings.solver_tolerance),
+            warm_start=False,  # the last QP was another member's
         ),
     )
 

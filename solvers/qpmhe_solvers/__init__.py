@@ -1,8 +1,12 @@
 """QP backends for trajectories: convex QPs in, judged solutions out, estimation unknown."""
 
+from .capabilities import Capabilities, measure
+from .conformance import Conformance, Finding, check
 from .errors import BackendError, InvalidInputError, OptionError, QpmheError, ShapeError
+from .files import StoredQP, dump, load
 from .options import SolverOptions
 from .qp import QP, band_index
+from .recorder import Recording, RecordingWarning
 from .registry import Backend, available, backend, backends, create, register, unregister
 from .solution import RawSolution, Residuals, Solution, SolveStatus
 from .solver import Solver
@@ -11,21 +15,31 @@ __all__ = [
     "QP",
     "Backend",
     "BackendError",
+    "Capabilities",
+    "Conformance",
+    "Finding",
     "InvalidInputError",
     "OptionError",
     "QpmheError",
     "RawSolution",
+    "Recording",
+    "RecordingWarning",
     "Residuals",
     "ShapeError",
     "Solution",
     "SolveStatus",
     "Solver",
     "SolverOptions",
+    "StoredQP",
     "available",
     "backend",
     "backends",
     "band_index",
+    "check",
     "create",
+    "dump",
+    "load",
+    "measure",
     "register",
     "unregister",
 ]

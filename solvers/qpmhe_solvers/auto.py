@@ -41,6 +41,9 @@ class AutoSolver(Solver):
         self._banded = BandedSolver(options)
         self._others: dict[bool, list[Solver]] = {}
 
+    def __reduce__(self) -> tuple[type[AutoSolver], tuple[SolverOptions]]:
+        return type(self), (self.options,)
+
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
         solution = self.solve(qp, start)
         return RawSolution(solution.d, solution.status is SolveStatus.SOLVED)
@@ -66,6 +69,18 @@ class AutoSolver(Solver):
             if answer.status.usable:
                 return answer
         return solution
+
+    def forget(self) -> None:
+        """Let the QP solvers drop what they keep; see `Solver.forget`."""
+        for others in self._others.values():
+            for other in others:
+                other.forget()
+
+    def shift(self) -> None:
+        """Tell the QP solvers; see `Solver.shift`."""
+        for others in self._others.values():
+            for other in others:
+                other.shift()
 
     def prepare(self, size: int) -> None:
         """Make the QP solvers: theirs is a long import.

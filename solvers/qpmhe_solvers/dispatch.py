@@ -43,6 +43,8 @@ class Translation:
         Cap where none is asked for and the solver's own would let it run for minutes.
     needs_row : bool
         Whether a QP without any inequality row goes wrong, so that a void row is added.
+    tells_infeasible : bool
+        Whether its words say so where a QP has no feasible point.
     keep_empty : bool
         Whether to give matrices without rows, which qpsolvers would make at each solve.
     """
@@ -56,6 +58,7 @@ class Translation:
     start: bool = False
     needs_row: bool = False
     keep_empty: bool = False
+    tells_infeasible: bool = False
     default_cap: int | None = None
 
 
@@ -67,6 +70,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
     "clarabel": Translation(
         "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"), ("tol_gap_rel",), "time_limit",
         needs_row=True,
+        tells_infeasible=True,
     ),
     "cvxopt": Translation("csc", "rows", "maxiters", ("abstol", "feastol"), ("reltol",)),
     "daqp": Translation(
@@ -82,15 +86,21 @@ TRANSLATIONS: Mapping[str, Translation] = {
         needs_row=True,
     ),
     "osqp": Translation(
-        "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", start=True
+        "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", start=True,
+        tells_infeasible=True,
     ),
     "piqp": Translation(
-        "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), keep_empty=True
+        "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), keep_empty=True,
+        tells_infeasible=True,
     ),
     "proxqp": Translation(
-        "dense", "box", "max_iter", ("eps_abs",), ("eps_rel",), default_cap=200
+        "dense", "box", "max_iter", ("eps_abs",), ("eps_rel",), default_cap=200,
+        tells_infeasible=True,
     ),
-    "qpalm": Translation("csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit"),
+    "qpalm": Translation(
+        "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit",
+        tells_infeasible=True,
+    ),
     "quadprog": Translation("dense", "rows", None, ()),
     "scs": Translation(
         "csc", "rows", "max_iters", ("eps_abs",), ("eps_rel",), "time_limit_secs", start=True,
@@ -176,7 +186,8 @@ def _keywords(how: Translation, options: SolverOptions) -> dict[str, Any]:
 def _told(extras: Mapping[str, Any]) -> tuple[int | None, str]:
     """The solver's own count and words, wherever this solver keeps them."""
     info = extras.get("info")
-    count = getattr(info, "iter", None)
+    # proxqp's cap is on its outer iterations.
+    count = getattr(info, "iter_ext", getattr(info, "iter", None))
     for key in ("iter", "iterations"):
         count = extras.get(key, count)
     if count is not None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from importlib import metadata
 from importlib.util import find_spec
 
@@ -43,6 +43,12 @@ class Backend:
         Whether the start given to ``solve`` is used.
     time_limit : bool
         Whether ``SolverOptions.time_limit`` is honoured.
+    keeps_duals : bool
+        Whether multipliers of the last solve start the next one, moved by ``Solver.shift``.
+    tells_infeasible : bool
+        Whether its message says "infeasible" where a QP has no feasible point.
+    keeps_workspace : bool
+        Whether the solver is set up once and updated from then on, not anew for each QP.
     """
 
     name: str
@@ -56,6 +62,9 @@ class Backend:
     iterate_at_cap: bool = False
     warm_start: bool = False
     time_limit: bool = False
+    keeps_duals: bool = False
+    tells_infeasible: bool = False
+    keeps_workspace: bool = False
 
     @property
     def available(self) -> bool:
@@ -77,10 +86,16 @@ class Backend:
 
 
 _REGISTRY: dict[str, Backend] = {}
+_GROUP = "qpmhe.backends"
+_looked = False
 
 
 def register(entry: Backend) -> None:
     """Add a backend, so that its name can be used wherever a backend is named.
+
+    An installed package adds its own without being imported by anyone: by an entry point of
+    the group ``qpmhe.backends`` to a `Backend`, or to a function without arguments that
+    returns one, or several. These are loaded when a backend is first looked up.
 
     Parameters
     ----------
@@ -119,11 +134,13 @@ def unregister(name: str) -> None:
 
 def backends() -> tuple[Backend, ...]:
     """All registered backends, installed or not, in order of registration."""
+    _look_for_plugins()
     return tuple(_REGISTRY.values())
 
 
 def available() -> tuple[str, ...]:
     """Names of the backends that can be used here."""
+    _look_for_plugins()
     return tuple(name for name, entry in _REGISTRY.items() if entry.available)
 
 
@@ -140,6 +157,7 @@ def backend(name: str) -> Backend:
     BackendError
         If there is none of that name; the text lists the names there are.
     """
+    _look_for_plugins()
     entry = _REGISTRY.get(name) if isinstance(name, str) else None
     if entry is None:
         raise BackendError(
@@ -173,47 +191,33 @@ def create(name: str, options: SolverOptions | None = None) -> Solver:
     return entry.factory(options if options is not None else SolverOptions())
 
 
-def _register_own() -> None:
-    from .auto import AutoSolver
-    from .banded import BandedSolver
-    from .dispatch import TRANSLATIONS, DispatchSolver
-
-    register(
-        Backend(
-            "auto", AutoSolver, "banded, then a QP", matrices="banded",
-            iteration_cap=True, iterate_at_cap=True, warm_start=True, time_limit=True,
-        )
-    )
-    register(
-        Backend(
-            "banded", BandedSolver, "banded Cholesky", matrices="banded", inequalities=False
-        )
-    )
-    methods = {
-        "clarabel": ("interior point", "clarabel", "clarabel"),
-        "cvxopt": ("interior point", "cvxopt", "cvxopt"),
-        "daqp": ("dual active set", "daqp", "daqp"),
-        "ecos": ("interior point", "ecos", "ecos"),
-        "highs": ("active set", "highspy", "highspy"),
-        "osqp": ("ADMM", "osqp", "osqp"),
-        "piqp": ("interior point", "piqp", "piqp"),
-        "proxqp": ("augmented Lagrangian", "proxsuite", "proxsuite"),
-        "qpalm": ("augmented Lagrangian", "qpalm", "qpalm"),
-        "quadprog": ("dual active set", "quadprog", "quadprog"),
-        "scs": ("ADMM", "scs", "scs"),
-    }
-    for name, (method, module, distribution) in methods.items():
-        how = TRANSLATIONS[name]
-        register(
-            Backend(
-                name, partial(DispatchSolver, name), method, module, distribution,
-                matrices=how.matrices,
-                iteration_cap=how.cap is not None,
-                iterate_at_cap=how.cap is not None and name != "daqp",
-                warm_start=how.start,
-                time_limit=how.time_limit is not None,
+def _look_for_plugins() -> None:
+    """Register, once, what installed packages offer as entry points."""
+    global _looked
+    if _looked:
+        return
+    _looked = True
+    for point in metadata.entry_points(group=_GROUP):
+        try:
+            given = point.load()
+            given = given if isinstance(given, Backend) else given()
+            for entry in (given,) if isinstance(given, Backend) else tuple(given):
+                if not isinstance(entry, Backend):
+                    raise TypeError(f"expected a Backend, got {type(entry).__name__}")
+                register(entry)
+        except Exception as error:  # a package that is broken must not break ours
+            warnings.warn(
+                f"the entry point {point.name!r} ({point.value}) of the group {_GROUP!r} brings "
+                f"no backend: {type(error).__name__}: {error}. Mend or uninstall its package.",
+                stacklevel=3,
             )
-        )
+
+
+def _register_own() -> None:
+    from .own import own_backends
+
+    for entry in own_backends():
+        register(entry)
 
 
 _register_own()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,12 @@ from numpy.typing import NDArray
 
 from .qp import QP
 
-__all__ = ["RawSolution", "Residuals", "Solution", "SolveStatus"]
+__all__ = ["RawSolution", "Residuals", "Solution", "SolveStatus", "residuals"]
 
 Array = NDArray[np.float64]
+
+_NOTHING = np.zeros(0)
+_largest = np.maximum.reduce  # the method of an array comes to this, by detours
 
 
 class SolveStatus(enum.Enum):
@@ -97,34 +101,52 @@ class Residuals:
         bound_duals, row_duals : array or None
             Its multipliers, as in `RawSolution`.
         """
-        primal = qp.violation(d)
-        if bound_duals is None or row_duals is None:
-            return Residuals(primal, float("nan"), float("nan"))
-        curvature = qp.hessian_times(d)
-        stationarity = curvature + qp.gradient
-        gap = float(np.vdot(d, stationarity))
-        z = _present(bound_duals.reshape(qp.stages, qp.n), qp.lower, qp.upper)
-        stationarity = stationarity + z
-        gap += _support(z, qp.lower, qp.upper)
+        duals = None
+        if bound_duals is not None and row_duals is not None:
+            duals = np.concatenate((bound_duals, row_duals), axis=None)
+        if not qp.bounded and not qp.rows:
+            return residuals(qp, d, duals, _NOTHING, _NOTHING)
+        lower = np.concatenate((qp.lower, qp.row_lower), axis=None)
+        upper = np.concatenate((qp.upper, qp.row_upper), axis=None)
+        return residuals(qp, d, duals, lower, upper)
+
+
+def residuals(qp: QP, d: Array, duals: Array | None, lower: Array, upper: Array) -> Residuals:
+    """Residuals of an iterate, with bounds and rows together in one array each.
+
+    Parameters
+    ----------
+    qp : QP
+        The problem.
+    d : (K, n) array
+        The iterate.
+    duals : (K n + K rows,) array or None
+        Multipliers of bounds, then rows.
+    lower, upper : (K n + K rows,) array
+        Their limits; both empty where there is no constraint at all.
+    """
+    size, primal, point = qp.size, 0.0, d.reshape(-1)
+    if lower.size:
+        value = np.concatenate((d, qp.rows_times(d)), axis=None) if qp.rows else point
+        primal = float(_largest(np.maximum(lower - value, value - upper)))
+        # Comparisons with NaN are false: a NaN among the numbers must not pass as feasible.
+        primal = math.inf if math.isnan(primal) else max(primal, 0.0)
+    if duals is None:
+        return Residuals(primal, math.nan, math.nan)
+    force = qp.hessian_times(d).reshape(-1)
+    force += qp.gradient.reshape(-1)
+    gap = float(point.dot(force))
+    if lower.size:
+        side = np.where(duals > 0.0, upper, lower)
+        # Multipliers of absent limits are dropped, and then show as a dual residual.
+        there = np.isfinite(side)
+        duals = duals * there
+        gap += float(duals.dot(np.where(there, side, 0.0)))
+        force += duals[:size]
         if qp.rows:
-            y = row_duals.reshape(qp.stages, qp.rows)
-            y = _present(y, qp.row_lower, qp.row_upper)
-            stationarity = stationarity + qp.rows_transposed_times(y)
-            gap += _support(y, qp.row_lower, qp.row_upper)
-        return Residuals(primal, float(np.abs(stationarity).max()), abs(gap))
-
-
-def _present(multipliers: Array, lower: Array, upper: Array) -> Array:
-    """Multipliers without those of absent bounds, which then show as a dual residual."""
-    absent = np.where(multipliers > 0, upper, -lower) == np.inf
-    return np.where(absent, 0.0, multipliers)
-
-
-def _support(multipliers: Array, lower: Array, upper: Array) -> float:
-    """Sum of multiplier times the bound that it belongs to."""
-    active = multipliers != 0.0
-    side = np.where(multipliers > 0, upper, lower)
-    return float(np.vdot(multipliers[active], side[active]))
+            rows = duals[size:].reshape(qp.stages, qp.rows)
+            force += qp.rows_transposed_times(rows).reshape(-1)
+    return Residuals(primal, float(_largest(np.abs(force))), abs(gap))
 
 
 class Solution:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .flat import FlatQP
 from .options import SolverOptions
 from .qp import QP
-from .solution import RawSolution, Residuals, Solution, SolveStatus
+from .solution import RawSolution, Residuals, Solution, SolveStatus, residuals
 
 __all__ = ["Solver"]
 
@@ -31,12 +34,34 @@ class Solver(ABC):
         Limits and accuracy of every solve.
     """
 
+    _flat: FlatQP | None = None  # kept while the sizes of the QPs stay
+    # Whether Python code may warn during a solve: to keep that inside takes as long as a small QP.
+    _warns: ClassVar[bool] = True
+
     def __init__(self, options: SolverOptions) -> None:
         self.options = options
 
     @abstractmethod
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
         """Solve qp. May raise, hang on to nothing, and lie: `solve` contains all of it."""
+
+    def _solve_flat(self, qp: QP, flat: FlatQP, start: Array | None) -> RawSolution:
+        """Solve qp, whose numbers are gathered already; for those who want them so."""
+        return self._solve(qp, start)
+
+    def shift(self) -> None:  # noqa: B027 - most keep nothing
+        """Say that the trajectory moved on by one stage since the last solve.
+
+        What is kept for stage k + 1 now belongs to stage k; the last stage is new. A solver
+        that keeps nothing from solve to solve has nothing to do.
+        """
+
+    def forget(self) -> None:  # noqa: B027 - most keep nothing
+        """Drop what is kept from solve to solve: the next one is as the first.
+
+        What a solver keeps may change the last digits of what it finds. So whoever wants the
+        same numbers twice asks for this in between.
+        """
 
     def prepare(self, size: int) -> None:  # noqa: B027 - most have nothing to prepare
         """Do beforehand what the first QPs with inequalities would otherwise wait for.
@@ -64,17 +89,28 @@ class Solver(ABC):
             residuals; otherwise FAILED with the reason in its message.
         """
         try:
+            if not self._warns:
+                with np.errstate(all="ignore"):
+                    return self._checked(qp, start)
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                fault = _fault(qp)
-                if fault:
-                    return Solution(None, SolveStatus.FAILED, message=fault)
-                return self._judged(qp, self._solve(qp, self._usable(start, qp)))
+                return self._checked(qp, start)
         except (KeyboardInterrupt, SystemExit, GeneratorExit):
             raise
         except BaseException as error:  # the wall; a panic of compiled code is no Exception
             message = f"{type(error).__name__}: {error}"
             return Solution(None, SolveStatus.FAILED, message=message)
+
+    def _checked(self, qp: QP, start: Array | None) -> Solution:
+        """Look at the data, solve, and judge."""
+        flat = self._flat
+        if flat is None or flat.sizes != (qp.stages, qp.n, qp.rows):
+            flat = self._flat = FlatQP(qp.stages, qp.n, qp.rows)
+        flat.gather(qp)
+        fault = flat.fault()
+        if fault:
+            return Solution(None, SolveStatus.FAILED, message=fault)
+        return self._judged(qp, flat, self._solve_flat(qp, flat, self._usable(start, qp)))
 
     def _usable(self, start: Array | None, qp: QP) -> Array | None:
         if start is None or not self.options.warm_start:
@@ -82,7 +118,7 @@ class Solver(ABC):
         fits = np.shape(start) == (qp.stages, qp.n) and bool(np.isfinite(start).all())
         return start if fits else None
 
-    def _judged(self, qp: QP, raw: object) -> Solution:
+    def _judged(self, qp: QP, flat: FlatQP, raw: object) -> Solution:
         if not isinstance(raw, RawSolution):
             message = f"the backend returned {type(raw).__name__}, not a RawSolution"
             return Solution(None, SolveStatus.FAILED, message=message)
@@ -90,38 +126,41 @@ class Solver(ABC):
         d, message = _as_iterate(raw, qp)
         if d is None:
             return Solution(None, SolveStatus.FAILED, count, message=message)
-        bound_duals = _as_multipliers(raw.bound_duals, qp.size)
-        row_duals = _as_multipliers(raw.row_duals, qp.stages * qp.rows)
-        if not qp.bounded and not qp.rows:
-            bound_duals, row_duals = np.zeros(qp.size), np.zeros(0)  # there is nothing to weigh
-        residuals = Residuals.of(qp, d, bound_duals, row_duals)
+        lower, upper = flat.lower, flat.upper
+        if qp.bounded or qp.rows:
+            bound_duals = _as_multipliers(raw.bound_duals, qp.size)
+            row_duals = _as_multipliers(raw.row_duals, qp.stages * qp.rows)
+            duals = None
+            if bound_duals is not None and row_duals is not None:
+                duals = np.concatenate((bound_duals, row_duals)) if qp.rows else bound_duals
+        else:  # there is nothing to weigh
+            bound_duals, row_duals = np.zeros(qp.size), np.zeros(0)
+            duals = lower = upper = row_duals
+        found = residuals(qp, d, duals, lower, upper)
         if not (isinstance(raw.claimed, (bool, np.bool_)) and raw.claimed):
             status = SolveStatus.STOPPED
-        elif self._confirmed(qp, d, residuals):
+        elif self._confirmed(qp, d, found):
             status = SolveStatus.SOLVED
         else:
             status = SolveStatus.INACCURATE
-        return Solution(d, status, count, residuals, bound_duals, row_duals, message)
+        return Solution(d, status, count, found, bound_duals, row_duals, message)
 
-    def _confirmed(self, qp: QP, d: Array, residuals: Residuals) -> bool:
+    def _confirmed(self, qp: QP, d: Array, found: Residuals) -> bool:
         """Whether the residuals bear a claim out; a claim without multipliers cannot be checked."""
         tolerance = self.options.absolute_tolerance + self.options.relative_tolerance
         limit = max(tolerance, min(_SLACK * tolerance, _LOOSEST))
-        objective = abs(float(np.vdot(d, qp.gradient)))
+        # Mostly the residuals are below the limit as it is, without any scale.
         return (
-            residuals.primal <= limit * (1.0 + float(np.abs(d).max()))
-            and residuals.dual <= limit * (1.0 + float(np.abs(qp.gradient).max()))
-            and residuals.gap <= limit * (1.0 + objective)
+            (found.primal <= limit or found.primal <= limit * (1.0 + float(np.abs(d).max())))
+            and (
+                found.dual <= limit
+                or found.dual <= limit * (1.0 + float(np.abs(qp.gradient).max()))
+            )
+            and (
+                found.gap <= limit
+                or found.gap <= limit * (1.0 + abs(float(np.vdot(d, qp.gradient))))
+            )
         )
-
-
-def _fault(qp: QP) -> str:
-    """What no solver must be given: NaN hangs proxqp and comes back as success from others."""
-    if not qp.finite():
-        return "the QP's data are not finite"
-    if (qp.lower > qp.upper).any() or (qp.row_lower > qp.row_upper).any():
-        return "the QP is infeasible: a lower bound is above its upper bound"
-    return ""
 
 
 def _as_iterate(raw: RawSolution, qp: QP) -> tuple[Array | None, str]:
@@ -130,12 +169,12 @@ def _as_iterate(raw: RawSolution, qp: QP) -> tuple[Array | None, str]:
     if raw.d is None:
         return None, message or "the solver returned no iterate"
     given = np.asarray(raw.d)
-    if np.iscomplexobj(given):
+    if given.dtype.kind == "c":
         return None, "the solver returned complex numbers"
     d = np.array(given, dtype=np.float64)  # a copy: solvers reuse their buffers
     if d.size != qp.size:
         return None, f"the solver returned {d.size} numbers for {qp.size} unknowns"
-    if not np.isfinite(d).all():
+    if not _finite(d):
         return None, "the solver returned an iterate that is not finite"
     return d.reshape(qp.stages, qp.n), message
 
@@ -153,11 +192,15 @@ def _as_multipliers(values: object, size: int) -> Array | None:
         return None
     try:
         given = np.asarray(values)
-        if np.iscomplexobj(given):
+        if given.dtype.kind == "c":
             return None
         multipliers = np.array(given, dtype=np.float64).ravel()
     except (TypeError, ValueError):
         return None
-    if multipliers.size != size or not np.isfinite(multipliers).all():
-        return None
-    return multipliers
+    return multipliers if multipliers.size == size and _finite(multipliers) else None
+
+
+def _finite(values: Array) -> bool:
+    flat = values.reshape(-1)
+    # Squares may overflow where the numbers do not: then each one is looked at.
+    return math.isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())

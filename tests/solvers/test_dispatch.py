@@ -7,15 +7,21 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from qpmhe_solvers import SolverOptions, create
-from qpmhe_solvers.dispatch import TRANSLATIONS
+from qpmhe_solvers import SolverOptions, backends, create
+from qpmhe_solvers.dispatch import TRANSLATIONS, DispatchSolver
 
-from .problems import ARRAYS, CASES, EVERY, make
+from .problems import ARRAYS, CASES, make
 from .test_forms import LETTERS, parts
 
-NAMES = [name for name in TRANSLATIONS if name in EVERY]
+NAMES = [
+    entry.name for entry in backends()
+    if getattr(entry.factory, "func", None) is DispatchSolver and entry.available
+]
 # One of each way to take matrices and bounds.
-WAYS = [name for name in ("clarabel", "daqp", "piqp", "quadprog") if name in EVERY]
+WAYS = [
+    name for name in ("qpsolvers:clarabel", "qpsolvers:daqp", "qpsolvers:piqp", "quadprog")
+    if name in NAMES
+]
 ALL_KINDS = CASES["all kinds"]
 
 
@@ -53,6 +59,13 @@ class Intact:
         for name, array in contents(problem).items():
             assert array is self.arrays[name], name
             np.testing.assert_array_equal(array, self.copies[name], err_msg=name)
+
+
+def test_every_solver_of_the_table_can_be_named():
+    assert {name.removeprefix("qpsolvers:") for name in NAMES} <= set(TRANSLATIONS)
+    names = {entry.name for entry in backends()}
+    for name in TRANSLATIONS:
+        assert (f"qpsolvers:{name}" in names) == (name not in NAMES and name in names)
 
 
 @pytest.mark.parametrize("options", [SolverOptions(), SolverOptions(max_iterations=2)])
@@ -121,7 +134,7 @@ def test_sparse_matrices_are_made_once_for_a_pattern(name, case, monkeypatch):
     count.watch(solver)
     qp, _ = make(**CASES[case])
     solver.solve(qp)
-    assert (count.made > 0) == (TRANSLATIONS[name].matrices == "csc")
+    assert (count.made > 0) == (solver._translation.matrices == "csc")
     count.made = 0
     for _ in range(3):
         qp.gradient[...] += 0.1
@@ -183,7 +196,7 @@ def test_our_part_of_a_solve_leaves_no_memory_behind(name):
     assert len(solver._forms) < len(qps)
 
 
-@pytest.mark.parametrize("name", [name for name in ("daqp", "quadprog") if name in EVERY])
+@pytest.mark.parametrize("name", [name for name in ("qpsolvers:daqp", "quadprog") if name in NAMES])
 def test_a_whole_solve_leaves_no_memory_behind(name):
     assert growth(create(name), [make(**CASES["boxes"])[0]]) < 20_000  # no array a solve
 

@@ -1,0 +1,249 @@
+"""``qpmhe solve-qp``: dumped QPs, solved again by any backends, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from qpmhe_solvers import (
+    QP,
+    Residuals,
+    Solution,
+    SolverOptions,
+    SolveStatus,
+    available,
+    create,
+)
+from qpmhe_solvers.files import StoredQP, load, qp_files
+
+__all__ = ["Replay", "replay", "run"]
+
+# A backend is timed this many times, or until this many seconds are over.
+_REPEATS, _ENOUGH = 7, 0.5
+
+_STYLES = {SolveStatus.SOLVED: "green", SolveStatus.FAILED: "red"}
+
+
+class Replay(NamedTuple):
+    """What came of one QP in one backend.
+
+    Parameters
+    ----------
+    backend : str
+        The backend, or who had answered before.
+    solution : Solution
+        The answer.
+    residuals : Residuals or None
+        Recomputed from the QP's data; None without an iterate.
+    objective : float
+        Value of the objective, NaN without an iterate.
+    seconds : float
+        Median time of a first solve, NaN if not known.
+    """
+
+    backend: str
+    solution: Solution
+    residuals: Residuals | None
+    objective: float
+    seconds: float
+
+
+def run(
+    console: Console,
+    paths: Sequence[Path],
+    backends: Sequence[str] = (),
+    *,
+    max_iterations: int | None = None,
+    tolerance: float | None = None,
+    every: bool = False,
+) -> bool:
+    """Solve each QP of the files with each backend, and print a table for each file.
+
+    Parameters
+    ----------
+    console : rich.console.Console
+        Where to print.
+    paths : sequence of Path
+        Files of `qpmhe.solvers.dump`, or folders of such.
+    backends : sequence of str
+        Names of backends. Without any, the one that the file names, or ``auto``.
+    max_iterations : int, optional
+        Cap on each solver's iterations; as dumped if left out.
+    tolerance : float, optional
+        Absolute tolerance; as dumped if left out.
+    every : bool
+        Whether to take all installed backends.
+
+    Returns
+    -------
+    bool
+        Whether each of the QPs was solved by one of the backends.
+
+    Raises
+    ------
+    InvalidInputError
+        If a file cannot be read, or an option is out of its range; before anything is solved.
+    BackendError
+        If a backend is unknown or not installed; likewise.
+    """
+    changes: dict[str, int | float] = {}
+    if max_iterations is not None:
+        changes["max_iterations"] = max_iterations
+    if tolerance is not None:
+        changes["absolute_tolerance"] = tolerance
+    wanted = list(dict.fromkeys((*backends, *(available() if every else ()))))
+    for name in wanted:
+        create(name)
+    stored = [load(path) for path in qp_files(paths)]
+    options = [replace(one.options or SolverOptions(), **changes) for one in stored]  # type: ignore[arg-type]
+    tables: list[list[Replay]] = []
+    for one, asked in zip(stored, options, strict=True):
+        rows: list[Replay] = []
+        for name in wanted or [_default(one)]:
+            # A solver can crash the process: then the last thing on screen tells which one.
+            with console.status(f"{escape(str(one.path))}: {escape(name)}"):
+                rows.append(replay(one, name, asked))
+        console.print(_table(one, asked, rows), highlight=False)
+        for row in rows:
+            if row.solution.message and not _solved(row):
+                console.print(
+                    f"{escape(row.backend)}: {escape(row.solution.message)}", highlight=False
+                )
+        console.print()
+        tables.append(rows)
+    if len(tables) > 1:
+        console.print(_summary(tables), highlight=False)
+    return all(any(_solved(row) for row in rows) for rows in tables)
+
+
+def replay(stored: StoredQP, name: str, options: SolverOptions) -> Replay:
+    """Solve a QP with a backend, each time with a fresh solver, as a first sample does.
+
+    Parameters
+    ----------
+    stored : StoredQP
+        The QP.
+    name : str
+        A backend.
+    options : SolverOptions
+        Limits and accuracy.
+
+    Raises
+    ------
+    BackendError
+        If the backend is unknown or not installed.
+    """
+    solution = create(name, options).solve(stored.qp, stored.start)  # untimed: with imports
+    times: list[float] = []
+    while len(times) < _REPEATS and sum(times) < _ENOUGH:
+        solver = create(name, options)
+        solver.prepare(stored.qp.size)
+        began = perf_counter()
+        solver.solve(stored.qp, stored.start)
+        times.append(perf_counter() - began)
+    return _judged(name, stored.qp, solution, median(times))
+
+
+def _judged(name: str, qp: QP, solution: Solution, seconds: float = np.nan) -> Replay:
+    d = solution.d
+    if d is None:
+        return Replay(name, solution, None, np.nan, seconds)
+    bound_duals, row_duals = solution.bound_duals, solution.row_duals
+    if not qp.bounded and not qp.rows:
+        bound_duals, row_duals = np.zeros(qp.size), np.zeros(0)
+    with np.errstate(all="ignore"):
+        residuals = Residuals.of(qp, d, bound_duals, row_duals)
+        return Replay(name, solution, residuals, qp.objective(d), seconds)
+
+
+def _default(stored: StoredQP) -> str:
+    return stored.backend if stored.backend in available() else "auto"
+
+
+def _solved(row: Replay) -> bool:
+    return row.solution.status is SolveStatus.SOLVED
+
+
+def _table(stored: StoredQP, options: SolverOptions, rows: list[Replay]) -> Table:
+    qp, before = stored.qp, stored.solution
+    bounds = int(np.isfinite(qp.lower).sum() + np.isfinite(qp.upper).sum())
+    sides = int(np.isfinite(qp.row_lower).sum() + np.isfinite(qp.row_upper).sum())
+    cap = "none" if options.max_iterations is None else options.max_iterations
+    table = Table(
+        title=escape(
+            f"{stored.path}: {qp.stages} stages of {qp.n}, {bounds} bounds, {sides} sides of "
+            f"rows; cap {cap}, tolerance {options.absolute_tolerance:g}"
+            + (f"; dumped by {stored.backend}" if stored.backend else "")
+        ),
+        title_justify="left",
+        caption="Primal (the largest violation), dual and gap: residuals, recomputed from the "
+        "data. d - d0: largest difference from the dumped iterate. ms: median of first solves "
+        "with a fresh solver.",
+        caption_justify="left",
+        padding=(0, 0), box=SIMPLE_HEAD, show_edge=False,
+    )
+    table.add_column("backend", overflow="fold")  # the one that gives way on a narrow screen
+    table.add_column("status", no_wrap=True)
+    for name in ("iter.", "primal", "dual", "gap", "objective", "d - d0", "ms"):
+        table.add_column(name, justify="right", no_wrap=True)
+    reference = None if before is None else before.d
+    if before is not None:
+        _add(table, _judged("as dumped", qp, before), reference)
+        table.add_section()
+    for row in rows:
+        _add(table, row, reference)
+    return table
+
+
+def _add(table: Table, row: Replay, reference: np.ndarray | None) -> None:
+    solution, found = row.solution, row.residuals
+    apart = np.nan
+    if solution.d is not None and reference is not None:
+        apart = float(np.abs(solution.d - reference).max())
+    style = _STYLES.get(solution.status, "yellow")
+    table.add_row(
+        escape(row.backend), f"[{style}]{solution.status.name}[/]",
+        "-" if solution.iterations is None else str(solution.iterations),
+        *(["-"] * 3 if found is None else
+          [_short(found.primal), _short(found.dual), _short(found.gap)]),
+        "-" if np.isnan(row.objective) else f"{row.objective:.7g}",
+        _short(apart),
+        "-" if np.isnan(row.seconds) else f"{1e3 * row.seconds:.3g}",
+    )
+
+
+def _short(value: float) -> str:
+    if np.isnan(value):
+        return "-"
+    return "0" if value == 0.0 else f"{value:.1e}"
+
+
+def _summary(tables: list[list[Replay]]) -> Table:
+    names = list(dict.fromkeys(row.backend for rows in tables for row in rows))
+    table = Table(
+        title=f"{len(tables)} QPs", title_justify="left",
+        caption="ms: median over the QPs, and the longest.", caption_justify="left",
+        padding=(0, 0), box=SIMPLE_HEAD, show_edge=False,
+    )
+    table.add_column("backend", overflow="fold")
+    for name in ("tried", *(status.name.lower() for status in SolveStatus), "ms", "longest"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name in names:
+        rows = [row for replays in tables for row in replays if row.backend == name]
+        counts = [sum(row.solution.status is status for row in rows) for status in SolveStatus]
+        times = [1e3 * row.seconds for row in rows]
+        table.add_row(
+            escape(name), str(len(rows)), *("-" if count == 0 else str(count) for count in counts),
+            f"{median(times):.3g}", f"{max(times):.3g}",
+        )
+    return table

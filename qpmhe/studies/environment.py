@@ -1,0 +1,81 @@
+"""Where a study ran: versions, processor, system, revision."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from qpmhe_solvers import backends
+
+__all__ = ["environment", "revision"]
+
+_PACKAGES = ("qpmhe", "numpy", "scipy", "qpsolvers", "cvxpy", "casadi", "jax", "joblib")
+
+
+@lru_cache(maxsize=1)
+def environment() -> dict[str, Any]:
+    """What this process runs on.
+
+    Returns
+    -------
+    dict
+        ``versions`` (package to version), ``cpu``, ``cores`` (that this process may use),
+        ``python``, ``os``, ``host``, ``threads`` (of the linear algebra, if limited).
+    """
+    packages = dict.fromkeys(
+        [*_PACKAGES, *(entry.distribution for entry in backends() if entry.distribution)]
+    )
+    return {
+        "versions": {name: _version(name) for name in sorted(packages) if _version(name)},
+        "cpu": _processor(),
+        "cores": _cores(),
+        "python": platform.python_version(),
+        "os": platform.platform(),
+        "host": platform.node(),
+        "threads": os.environ.get("OMP_NUM_THREADS"),
+    }
+
+
+@lru_cache(maxsize=128)
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:  # not a Linux
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def revision() -> str | None:
+    """The git revision of the working directory, with ``+`` if files differ; None if none."""
+    try:
+        head = _git("rev-parse", "HEAD")
+        return f"{head}+" if _git("status", "--porcelain", "--untracked-files=no") else head
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _git(*arguments: str) -> str:
+    answer = subprocess.run(
+        ["git", *arguments], capture_output=True, text=True, check=True, timeout=10
+    )
+    return answer.stdout.strip()

@@ -1,0 +1,197 @@
+"""Dumped QPs as a test set of qpbenchmark, whose own runner and report work on it."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from qpmhe_solvers.files import StoredQP, load, qp_files
+from qpmhe_solvers.forms import Form
+from qpmhe_solvers.qp import QP
+
+from ..errors import InvalidInputError, OptionError
+
+if TYPE_CHECKING:
+    import qpsolvers
+
+__all__ = ["ExportedSet", "export_qpbenchmark"]
+
+Matrices = Literal["sparse", "dense"]
+
+# qpbenchmark makes the name of the class from that of the file.
+_SCRIPT = "mhe_qpbenchmark.py"
+_CODE = '''"""A test set of qpbenchmark: qpbenchmark {script} --results-path results.csv run."""
+
+from pathlib import Path
+
+import qpbenchmark
+
+PROBLEMS = Path(__file__).parent / "problems"
+
+
+class MheQpbenchmark(qpbenchmark.TestSet):
+    title = {title!r}
+    description = {description!r}
+    sparse_only = {sparse}
+
+    def __iter__(self):
+        for path in sorted(PROBLEMS.glob("*.npz")):
+            yield qpbenchmark.Problem.load(str(path)).to_{matrices}()
+'''
+
+
+class ExportedSet(NamedTuple):
+    """What was exported.
+
+    Parameters
+    ----------
+    script : Path
+        The Python file that qpbenchmark takes.
+    problems : list of Path
+        One ``.npz`` file a problem, as ``qpsolvers.Problem.load`` reads it.
+    skipped : dict of Path to str
+        Files that were left out, and why.
+    """
+
+    script: Path
+    problems: list[Path]
+    skipped: dict[Path, str]
+
+
+def export_qpbenchmark(
+    files_or_folder: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    out: str | os.PathLike[str],
+    *,
+    matrices: Matrices = "sparse",
+    title: str = "QPs of moving horizon estimation",
+) -> ExportedSet:
+    r"""Write dumped QPs as a test set that the runner of qpbenchmark takes.
+
+    Each becomes
+
+    .. math::
+        \min_x \tfrac12 x^\top P x + q^\top x \quad \text{s.t.} \quad
+        G x \le h, \quad A x = b, \quad l \le x \le u
+
+    without infinite entries: a side of the bounds that is finite throughout is l or u, and one
+    that is finite in part goes to the rows of G. Left out are data that are not finite, on
+    which some solvers hang, and bounds that exclude each other.
+
+    Parameters
+    ----------
+    files_or_folder : path, or iterable of paths
+        Files of `qpmhe.solvers.dump`, and folders of such.
+    out : str or path
+        The folder to write; it is made. It gets the file ``mhe_qpbenchmark.py`` and a folder
+        of problems.
+    matrices : {"sparse", "dense"}
+        What solvers that take both kinds are given. With ``sparse``, solvers without a sparse
+        interface do not take part. The files are dense in any case, of (K n)^2 numbers and more.
+    title : str
+        Title of the report.
+
+    Returns
+    -------
+    ExportedSet
+        What was written, and what was left out.
+
+    Raises
+    ------
+    InvalidInputError
+        If a file is none of `dump`, nothing can be exported, ``out`` holds problems already, or
+        cannot be written to.
+    OptionError
+        If ``matrices`` is neither.
+    """
+    if matrices not in get_args(Matrices):
+        raise OptionError(f"matrices is {matrices!r}; expected 'sparse' or 'dense'.")
+    single = isinstance(files_or_folder, (str, os.PathLike))
+    paths = [files_or_folder] if single else files_or_folder
+    stored = [load(path) for path in qp_files(paths)]  # type: ignore[arg-type]
+    skipped = {one.path: why for one in stored if (why := _unfit(one.qp))}
+    chosen = [one for one in stored if one.path not in skipped]
+    if not chosen:
+        reasons = ", ".join(sorted(set(skipped.values()))) or "no file was given"
+        raise InvalidInputError(f"there is no QP to export: {reasons}; give other files.")
+    folder = Path(out)
+    try:
+        problems = _write(chosen, folder / "problems")
+        script = folder / _SCRIPT
+        code = _CODE.format(
+            script=_SCRIPT, title=title, description=_description(chosen), matrices=matrices,
+            sparse=matrices == "sparse",
+        )
+        script.write_text(code, encoding="utf-8")
+    except OSError as error:
+        raise InvalidInputError(
+            f"cannot write the test set to {folder}: {error.strerror or error}; give a folder "
+            "that can be written to and has space left."
+        ) from error
+    return ExportedSet(script, problems, skipped)
+
+
+def _unfit(qp: QP) -> str:
+    if not qp.finite():
+        return "its data are not finite"
+    if (qp.lower > qp.upper).any() or (qp.row_lower > qp.row_upper).any():
+        return "a lower bound is above its upper bound"
+    return ""
+
+
+def _write(chosen: list[StoredQP], folder: Path) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(folder.glob("*.npz")):
+        raise InvalidInputError(
+            f"the folder {folder} holds problems already; give another one, or remove it."
+        )
+    problems: list[Path] = []
+    names: Counter[str] = Counter()
+    for one in chosen:
+        name = one.path.stem
+        names[name] += 1
+        if names[name] > 1:  # the same name in several folders
+            name = f"{name}_{names[name]}"
+        path = folder / f"{name}.npz"
+        _problem(one.qp).save(str(path))
+        problems.append(path)
+    return problems
+
+
+def _problem(qp: QP) -> qpsolvers.Problem:
+    """The QP in the form of qpsolvers, with dense matrices and finite entries only."""
+    import qpsolvers  # late: it imports every solver that is installed
+
+    sides = [np.isfinite(side) for side in (qp.lower, qp.upper)]
+    box = all(side.all() or not side.any() for side in sides)
+    form = Form(qp, dense=True, box=box, needs_row=False, keep_empty=False)
+    form.fill(qp)
+    P, q, G, h, A, b, lower, upper = form.arguments
+    return qpsolvers.Problem(
+        P, q, G, h, A, b,
+        lower if lower is not None and sides[0].all() else None,
+        upper if upper is not None and sides[1].all() else None,
+    )
+
+
+def _description(chosen: list[StoredQP]) -> str:
+    unknowns = sorted({one.qp.size for one in chosen})
+    span = f"{unknowns[0]} to {unknowns[-1]}" if len(unknowns) > 1 else str(unknowns[0])
+    backends = Counter(one.backend or "unknown" for one in chosen)
+    answers = Counter(
+        one.solution.status.name if one.solution is not None else "not told" for one in chosen
+    )
+    return (
+        f"{len(chosen)} QPs from the steps of qpmhe's moving horizon estimators, with {span} "
+        "unknowns: increments of a state trajectory, with a block-tridiagonal Hessian. "
+        f"Recorded with the backend {_told(backends)}; its verdicts: {_told(answers)}. Every "
+        "solver starts cold here."
+    )
+
+
+def _told(counts: Counter[str]) -> str:
+    return ", ".join(f"{name} ({count})" for name, count in counts.most_common())

@@ -1,0 +1,282 @@
+"""The study's answers in plain sentences, and what limits them; all computed from the data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..summary import PROBLEM, TOLERANCE
+from .words import configuration_words, listed, missing, number, percent, seconds
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+__all__ = ["NEAR", "Answer", "Case", "cases", "chosen", "failures", "limitations"]
+
+#: "Within 1 % of the best RMSE".
+NEAR = 0.01
+_FEW_SEEDS = 10
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One answer.
+
+    Parameters
+    ----------
+    question : str
+        What it answers, in a few words.
+    text : str
+        The answer.
+    """
+
+    question: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """The configurations that can be compared: those of one model, horizon and record length.
+
+    Parameters
+    ----------
+    key : str
+        A short name for files and links.
+    title : str
+        Model, horizon, and length of the records where there are several.
+    summary : pandas.DataFrame
+        Their rows of `qpmhe.studies.summarise`.
+    """
+
+    key: str
+    title: str
+    summary: DataFrame
+
+    @property
+    def whole(self) -> DataFrame:
+        """The configurations of which no cell failed and whose RMSE is finite."""
+        rows = self.summary
+        return rows[(rows["failures"] == 0) & np.isfinite(rows["rmse"].astype(float))]
+
+    def answers(self) -> list[Answer]:
+        """Fastest near the best, most accurate, the observer alone, what failed."""
+        best = chosen(self.summary)
+        if best is None:
+            return [Answer("Result", "No configuration finished all its runs."), self._failed()]
+        fastest, accurate = best
+        found = []
+        if fastest is not None:
+            found.append(Answer(
+                f"Fastest within {percent(NEAR)} of the best RMSE",
+                f"{configuration_words(fastest)}: {seconds(fastest['time_median'])} per step "
+                f"(median), RMSE {_limited(fastest, 'rmse')}.",
+            ))
+        else:
+            found.append(Answer("Fastest", "The study holds no times: it measured accuracy only."))
+        found.append(Answer("Most accurate", self._accurate(accurate, fastest)))
+        observer = self._observer(fastest if fastest is not None else accurate)
+        return [*found, *([observer] if observer else []), self._failed()]
+
+    def front(self) -> list[str]:
+        """The Pareto front in words, the fastest first."""
+        rows = self.summary[self.summary["pareto"]].sort_values("time_median")
+        return [
+            f"{configuration_words(row)} ({seconds(row['time_median'])}, "
+            f"RMSE {number(row['rmse'])})"
+            for _, row in rows.iterrows()
+        ]
+
+    def _accurate(self, accurate: Any, fastest: Any) -> str:
+        same = fastest is not None and fastest.name == accurate.name
+        text = (
+            "That one too" if same
+            else f"{configuration_words(accurate)}: RMSE {_limited(accurate, 'rmse')}"
+            + ("" if fastest is None else f", {seconds(accurate['time_median'])} per step")
+        )
+        rest = self.whole.drop(accurate.name)
+        equal = int((rest["rmse"] <= self.whole["rmse"].min() * (1 + TOLERANCE)).sum())
+        apart = int((
+            (rest["rmse_excess_low"] > 0) & (rest["rmse_excess"] > TOLERANCE)
+        ).sum())
+        reach = "other reaches" if equal == 1 else "others reach"
+        text += f". {equal} {reach} the same RMSE within {percent(TOLERANCE)}"
+        if rest["rmse_excess_low"].notna().any():
+            text += (
+                f"; {apart} of {len(rest)} are worse by more than chance (95 %, paired by seed)"
+            )
+        return text + "."
+
+    def _observer(self, other: Any) -> Answer | None:
+        rows = self.whole[self.whole["backend"] == "observer"]
+        if rows.empty or other["backend"] == "observer":
+            return None
+        observer = rows.iloc[0]
+        ratio = observer["rmse"] / other["rmse"]
+        text = (
+            f"RMSE {_limited(observer, 'rmse')}, {number(ratio)} times that of "
+            f"{configuration_words(other)}"
+        )
+        if np.isfinite(observer["time_median"]):
+            share = observer["time_median"] / other["time_median"]
+            text += (
+                f", in {seconds(observer['time_median'])} per step ({percent(share)} of its time)"
+            )
+        return Answer("Observer alone (no QP)", text + ".")
+
+    def _failed(self) -> Answer:
+        rows = self.summary[self.summary["backend"] != "observer"]
+        never, told = [], []
+        for backend, mine in rows.groupby("backend"):
+            cells, failed = int(mine["seeds"].sum()), int(mine["failures"].sum())
+            share = mine["failed_steps"].max()
+            if failed:
+                told.append(f"{backend}: {failed} of {cells} runs failed")
+            elif share > 0:
+                worst = configuration_words(mine.loc[mine["failed_steps"].idxmax()])
+                told.append(f"{worst}: no run, but {percent(share)} of the steps")
+            else:
+                never.append(str(backend))
+        if not told:
+            everyone = "No backend failed" if len(never) != 1 else f"{never[0]} did not fail"
+            return Answer("Failures", f"{everyone}, in any run or step.")
+        text = f"Never: {listed(never)}. " if never else "Every backend failed somewhere. "
+        return Answer("Failures", f"{text}Failed: {'; '.join(told)}.")
+
+
+def _limited(row: Any, name: str) -> str:
+    """A mean with its confidence limits."""
+    low, high = row[f"{name}_low"], row[f"{name}_high"]
+    if missing(low) or missing(high):
+        return number(row[name])
+    return f"{number(row[name])} (95 %: {number(low)} to {number(high)})"
+
+
+def cases(summary: DataFrame) -> list[Case]:
+    """The summary, divided by problem, in its order."""
+    found: list[Case] = []
+    several = {name: summary[name].nunique(dropna=False) > 1 for name in PROBLEM}
+    for place, ((model, horizon, steps), rows) in enumerate(
+        summary.groupby(list(PROBLEM), dropna=False, sort=False)
+    ):
+        title = f"{model}, " + ("usual N" if missing(horizon) else f"N = {int(horizon)}")
+        if several["steps"]:
+            title += f", T = {int(steps)}"
+        safe = "".join(c if c.isalnum() else "-" for c in title).strip("-")
+        while "--" in safe:
+            safe = safe.replace("--", "-")
+        key = safe if safe not in {case.key for case in found} else f"{safe}-{place}"
+        found.append(Case(key, title, rows))
+    return found
+
+
+def chosen(summary: DataFrame) -> tuple[Any | None, Any] | None:
+    """The fastest configuration near the best RMSE, and the most accurate one.
+
+    Where several have the best RMSE within `qpmhe.studies.summary.TOLERANCE`, the fastest of
+    these stands for them.
+
+    Parameters
+    ----------
+    summary : pandas.DataFrame
+        Rows of one problem.
+
+    Returns
+    -------
+    tuple of row or None
+        The first is None where there are no times; None in all where no configuration
+        finished all its runs.
+    """
+    rows = summary[(summary["failures"] == 0) & np.isfinite(summary["rmse"].astype(float))]
+    if rows.empty:
+        return None
+    least = rows["rmse"].min()
+    timed = rows[rows["time_median"].notna()]
+
+    def first(part: float) -> Any:
+        near = timed[timed["rmse"] <= least * (1 + part)]
+        return None if near.empty else near.loc[near["time_median"].idxmin()]
+
+    accurate = first(TOLERANCE)
+    return first(NEAR), rows.loc[rows["rmse"].idxmin()] if accurate is None else accurate
+
+
+def failures(frame: DataFrame) -> list[dict[str, Any]]:
+    """Failed cells by configuration and reason, the most frequent first.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        One row a cell.
+
+    Returns
+    -------
+    list of dict
+        ``model``, ``configuration``, ``reason``, ``seeds``.
+    """
+    found: dict[tuple[str, str, str], list[int]] = {}
+    for _, row in frame[frame["outcome"] != "done"].iterrows():
+        reason = "not told" if missing(row["reason"]) or not row["reason"] else str(row["reason"])
+        key = (str(row["model"]), configuration_words(row), reason)
+        found.setdefault(key, []).append(int(row["seed"]))
+    ranked = sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))
+    return [
+        {"model": model, "configuration": words, "reason": reason, "seeds": sorted(seeds)}
+        for (model, words, reason), seeds in ranked
+    ]
+
+
+def limitations(frame: DataFrame, summary: DataFrame) -> list[str]:
+    """What the reader must know before trusting the figures.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        One row a cell.
+    summary : pandas.DataFrame
+        Its summary.
+    """
+    seeds = int(summary["seeds"].max())
+    notes = [
+        "A time is that of a whole update: the observer's step, building the QPs, the solver, "
+        "and the verdict on its iterate. It is not the solver's own.",
+        "An RMSE is that of the whole state vector, in the states' own units; where these "
+        "differ in size, the largest rules. The table gives it for each state.",
+        "Confidence limits are those of the mean over seeds (Student's, 95 %). They tell how "
+        "far other noise may move a figure, not another machine, model or tuning.",
+        f"RMSEs within {percent(TOLERANCE)} count as equal on the Pareto front.",
+    ]
+    timed = frame[frame["time_median"].notna()]
+    if timed["shared"].eq(True).any():
+        share = float(timed["shared"].eq(True).mean())
+        notes.append(
+            f"Times were taken while cores were shared with other work in {percent(share)} of "
+            "the runs: medians are usable for ratios, 99 % quantiles and maxima are those of "
+            "the machine as much as of the solver."
+        )
+    if timed.empty:
+        notes.append("No times were taken; there is no Pareto front.")
+    if frame["environment"].nunique() > 1:
+        notes.append(
+            f"The runs were made in {frame['environment'].nunique()} environments (listed "
+            "below); times of one are not comparable to those of another."
+        )
+    if seeds == 1:
+        notes.append("There is one seed only: no confidence limits, no way to tell luck.")
+    elif seeds < _FEW_SEEDS:
+        notes.append(f"There are {seeds} seeds only: the confidence limits are wide.")
+    short = int((summary["seeds"] < seeds).sum())
+    if short:
+        notes.append(
+            f"{short} of {len(summary)} configurations have fewer runs than {seeds}: the study "
+            "is not finished, and their means are over other seeds than those of the rest."
+        )
+    failed = int((frame["outcome"] != "done").sum())
+    if failed:
+        notes.append(
+            f"{failed} of {len(frame)} runs failed (listed below). A configuration with a "
+            "failed run is in the table, with the means of its other runs, but neither on the "
+            "Pareto front nor in the answers."
+        )
+    return notes

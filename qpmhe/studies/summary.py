@@ -1,0 +1,230 @@
+"""From the cells of a study to one row a configuration, with confidence limits over seeds."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import numbers
+from ..errors import InvalidInputError, ShapeError
+
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
+
+__all__ = ["CONFIGURATION", "METRICS", "PROBLEM", "TOLERANCE", "pareto_front", "summarise"]
+
+#: What tells configurations apart.
+CONFIGURATION = (
+    "model", "backend", "qps", "solver_iterations", "horizon", "start", "steps",
+)
+#: What configurations must share to be compared with each other.
+PROBLEM = ("model", "horizon", "steps")
+#: Columns that are averaged over seeds.
+METRICS = (
+    "rmse", "rmse_settled", "nees", "cost_ratio", "improved", "kept", "fallback", "failed_steps",
+    "cap_hits", "qps_mean", "solver_iterations_mean", "time_median", "time_p95", "time_p99",
+    "time_max", "late", "rmse_excess",
+)
+_SHARES = ("improved", "kept", "fallback", "failed_steps", "cap_hits", "late")
+_POSITIVE = tuple(name for name in METRICS if name != "rmse_excess")
+_STATES = ("rmse_states", "rmse_settled_states")
+_DERIVED = ("failed_steps", "rmse_excess")
+_NEEDED = (
+    *CONFIGURATION, "seed", "outcome", "reasons", "shared", *_STATES,
+    *(name for name in METRICS if name not in _DERIVED),
+)
+_FAILED = ("SOLVER_FAILED", "MODEL_FAILED")
+_CONFIDENCE = 0.95
+#: RMSEs that agree within this part are equally accurate.
+TOLERANCE = 1e-3
+
+
+def summarise(frame: DataFrame) -> DataFrame:
+    r"""One row a configuration: means over seeds, their 95 % confidence limits, Pareto front.
+
+    With :math:`n` finished seeds of mean :math:`\bar m` and standard deviation :math:`s`, the
+    limits of a metric's mean are :math:`\bar m \pm t_{0.975, n-1}\, s / \sqrt n` (Student's),
+    cut where the metric cannot lie: shares at 0 and 1, errors and times at 0. One seed has no
+    limits (NaN).
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        One row a cell, with the columns of the store: `CONFIGURATION`, ``seed``, ``steps``,
+        ``outcome``, ``reasons``, ``shared``, and the metrics.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Sorted by `CONFIGURATION`, "converged" and "no cap" (NA) last, with the columns
+
+        - of `CONFIGURATION`; ``seeds`` (cells), ``failures`` (cells that failed), ``shared``
+          (whether any time was taken on shared cores);
+        - of `METRICS`: the mean over finished cells, with ``_low`` and ``_high``. Times in
+          seconds per step. ``failed_steps`` is the share of steps where solver or model
+          failed. ``rmse_excess`` is ``rmse`` relative to that of the most accurate
+          configuration of the same problem (`PROBLEM`), minus 1, taken seed by seed, so that
+          what the seeds have in common cancels;
+        - ``rmse_states`` and ``rmse_settled_states``: lists, a value a state;
+        - ``reasons``: dict, share of the steps with each flag of `qpmhe.Status`;
+        - ``pareto``: whether no configuration of the same problem is faster
+          (``time_median``) and more accurate (``rmse``, where a difference below `TOLERANCE`
+          is none). Only configurations without failed cells take part.
+
+    Raises
+    ------
+    InvalidInputError
+        If a column is missing.
+    """
+    import pandas as pd
+
+    missing = [name for name in _NEEDED if name not in frame.columns]
+    if missing:
+        raise InvalidInputError(
+            f"the frame lacks the column {', '.join(missing)}; expected what the store's frame() "
+            "gives, one row a cell."
+        )
+    cells = frame.reset_index(drop=True)
+    cells["done"], cells["shared"] = cells["outcome"] == "done", cells["shared"].eq(True)
+    for name in METRICS:
+        if name not in _DERIVED:
+            cells[name] = pd.to_numeric(cells[name], errors="coerce").astype(float)
+    cells["failed_steps"] = [
+        _failed_share(reasons, steps)
+        for reasons, steps in zip(cells["reasons"], cells["steps"], strict=True)
+    ]
+    keys = list(CONFIGURATION)
+    groups = cells.groupby(keys, dropna=False, sort=True)
+    summary = groups.agg(
+        seeds=("seed", "size"), failures=("done", lambda done: int((~done).sum())),
+        shared=("shared", "any"),
+    )
+    done = cells[cells["done"]]
+    _add_means(summary, done, [name for name in METRICS if name != "rmse_excess"])
+    summary["rmse_excess"] = np.nan
+    done = done.assign(rmse_excess=_excess(done, summary.reset_index()))
+    _add_means(summary, done, ["rmse_excess"])
+    for name in _STATES:
+        summary[name] = done.groupby(keys, dropna=False)[name].agg(_list_mean)
+    summary["reasons"] = groups[["reasons", "steps"]].apply(_reason_shares)
+    summary = summary.reset_index().sort_values(keys, na_position="last", ignore_index=True)
+    summary["pareto"] = False
+    for _, rows in summary.groupby(list(PROBLEM), dropna=False):
+        whole = rows[rows["failures"] == 0]
+        summary.loc[whole.index, "pareto"] = pareto_front(
+            whole["time_median"], whole["rmse"], TOLERANCE
+        )
+    return summary
+
+
+def _failed_share(reasons: Any, steps: Any) -> float:
+    if not isinstance(reasons, dict) or not steps:
+        return np.nan
+    # Whatever failed in a step is one failed step: solver and model rarely fail in the same one.
+    failed = sum(
+        number for flags, number in reasons.items() if set(str(flags).split("|")) & set(_FAILED)
+    )
+    return min(1.0, float(failed) / float(steps))
+
+
+def _reason_shares(cells: DataFrame) -> dict[str, float]:
+    counts: Counter[str] = Counter()
+    for reasons in cells["reasons"]:
+        counts.update(reasons if isinstance(reasons, dict) else {})
+    steps = float(cells["steps"].sum()) or 1.0
+    return {flag: number / steps for flag, number in counts.most_common()}
+
+
+def _add_means(summary: DataFrame, done: DataFrame, names: list[str]) -> None:
+    from scipy.stats import t as student
+
+    groups = done.groupby(list(CONFIGURATION), dropna=False)[names]
+    mean, deviation, count = groups.mean(), groups.std(), groups.count()
+    factor = student.ppf(0.5 + 0.5 * _CONFIDENCE, np.maximum(count - 1, 1))
+    half = factor * deviation / np.sqrt(count)
+    for name in names:
+        low, high = mean[name] - half[name], mean[name] + half[name]
+        if name in _POSITIVE:
+            low = low.clip(lower=0.0)
+        if name in _SHARES:
+            high = high.clip(upper=1.0)
+        summary[name], summary[f"{name}_low"], summary[f"{name}_high"] = mean[name], low, high
+
+
+def _excess(done: DataFrame, summary: DataFrame) -> Series:
+    """RMSE of each cell above that of the best configuration on the same seed, relative."""
+    import pandas as pd
+
+    excess = pd.Series(np.nan, index=done.index, dtype=float)
+    for _, rows in summary.groupby(list(PROBLEM), dropna=False):
+        # A configuration that failed on the hard seeds must not be what others are measured by.
+        ranked = rows.sort_values(["failures", "rmse"])
+        if ranked.empty or not np.isfinite(ranked["rmse"].iloc[0]):
+            continue
+        best = _cells_of(done, ranked.iloc[0], CONFIGURATION).groupby("seed")["rmse"].mean()
+        mine = _cells_of(done, ranked.iloc[0], PROBLEM)
+        excess[mine.index] = mine["rmse"] / mine["seed"].map(best).astype(float) - 1.0
+    return excess
+
+
+def _cells_of(cells: DataFrame, row: Any, keys: tuple[str, ...]) -> DataFrame:
+    import pandas as pd
+
+    chosen = np.ones(len(cells), dtype=bool)
+    for key in keys:
+        value, column = row[key], cells[key]
+        same = column.isna() if pd.isna(value) else (column == value).fillna(False)
+        chosen &= same.to_numpy(dtype=bool)
+    return cells[chosen]
+
+
+def _list_mean(lists: Series) -> list[float] | None:
+    rows = [np.asarray(one, dtype=float) for one in lists if one is not None]
+    if not rows or len({row.shape for row in rows}) != 1:
+        return None
+    values: list[float] = np.mean(rows, axis=0).tolist()
+    return values
+
+
+def pareto_front(
+    times: ArrayLike, errors: ArrayLike, tolerance: float = 0.0
+) -> NDArray[np.bool_]:
+    """Which points no other point beats: none is at least as good in both and better in one.
+
+    Parameters
+    ----------
+    times, errors : (k,) array_like
+        Less is better. A point that is not finite is never on the front.
+    tolerance : float
+        A slower point is on the front only if its error is below those of all faster points
+        on it by more than this part. Solvers that converge to the same solution differ in
+        the last digits, and without a tolerance each would have a place of its own.
+
+    Returns
+    -------
+    (k,) array of bool
+        True on the front; points that agree in both are on it together.
+
+    Raises
+    ------
+    ShapeError
+        If the two are not of one length.
+    """
+    t, e = numbers("times", times, finite=False), numbers("errors", errors, finite=False)
+    if t.ndim != 1 or t.shape != e.shape:
+        raise ShapeError(
+            f"times and errors have the shapes {t.shape} and {e.shape}; expected (k,) for both."
+        )
+    front = np.zeros(t.size, dtype=bool)
+    least, its_time = np.finfo(float).max, np.nan
+    for k in np.lexsort((e, t)):
+        if not (np.isfinite(t[k]) and np.isfinite(e[k])):
+            continue
+        if e[k] < least - tolerance * abs(least):
+            front[k], least, its_time = True, e[k], t[k]
+        elif e[k] == least and t[k] == its_time:
+            front[k] = True
+    return front

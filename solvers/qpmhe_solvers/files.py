@@ -1,0 +1,298 @@
+"""QPs on disk: one self-describing file each, with what is known of where it came from."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .archive import damaged, foreign, read, write
+from .errors import InvalidInputError
+from .options import SolverOptions
+from .qp import QP
+from .registry import backends
+from .solution import Residuals, Solution, SolveStatus
+
+__all__ = ["StoredQP", "dump", "load", "qp_files"]
+
+Array = NDArray[np.float64]
+
+_FORMAT = "qpmhe QP"
+_VERSION = 1
+_PROBLEM = (
+    "min over d of 1/2 d'Hd + g'd subject to lower <= d[k] <= upper and "
+    "row_lower <= row_own[k] d[k] + row_next[k] d[k+1] <= row_upper, k = 0 ... stages-1; "
+    "band[k, c, o] = H[k n + c + o, k n + c]; g = gradient; arrays are indexed by stages first"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredQP:
+    """What a file of `dump` holds.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    qp : QP
+        The problem, to the last bit as it was.
+    solution : Solution or None
+        What the backend had answered.
+    backend : str
+        Its name, or an empty string.
+    options : SolverOptions or None
+        What it had been asked for.
+    start : (K, n) array or None
+        The point it was started from.
+    versions : mapping of str to str
+        Versions of Python, of this package, and of what solves QPs, where it was written.
+    written : str
+        When, in ISO 8601.
+    """
+
+    path: Path
+    qp: QP
+    solution: Solution | None
+    backend: str
+    options: SolverOptions | None
+    start: Array | None
+    versions: Mapping[str, str]
+    written: str
+
+
+def dump(
+    qp: QP,
+    path: str | os.PathLike[str],
+    *,
+    solution: Solution | None = None,
+    backend: str = "",
+    options: SolverOptions | None = None,
+    start: Array | None = None,
+) -> Path:
+    """Write a QP into an ``.npz`` file, so that it can be solved again elsewhere.
+
+    NumPy alone reads the file: its entry ``header`` is a JSON text that explains the arrays
+    beside it. Nothing in it is pickled. The file appears whole or not at all.
+
+    Parameters
+    ----------
+    qp : QP
+        The problem; it need not be finite.
+    path : str or path
+        The file, by custom with the ending ``.npz``. An existing one is replaced.
+    solution : Solution, optional
+        What a backend answered.
+    backend : str
+        The name of that backend.
+    options : SolverOptions, optional
+        What it was asked for.
+    start : (K, n) array, optional
+        The point it was started from.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is of another kind, or the file cannot be written.
+    """
+    for name, value, kind, optional in (
+        ("qp", qp, QP, False), ("solution", solution, Solution, True),
+        ("backend", backend, str, False), ("options", options, SolverOptions, True),
+    ):
+        if not isinstance(value, kind) and not (optional and value is None):
+            raise InvalidInputError(f"{name} is {value!r}; expected a {kind.__name__}.")
+    arrays = {name: getattr(qp, name) for name in _shapes(qp.stages, qp.n, qp.rows)}
+    arrays["start"] = start
+    answer = None
+    if solution is not None:
+        answer = {
+            "status": solution.status.name,
+            "verdict": solution.status.value,
+            "iterations": None if solution.iterations is None else int(solution.iterations),
+            "message": str(solution.message),
+        }
+        if solution.residuals is not None:
+            told = solution.residuals
+            arrays["residuals"] = np.array([told.primal, told.dual, told.gap])
+        for name in ("d", "bound_duals", "row_duals"):
+            arrays[name] = getattr(solution, name)
+    header = {
+        "format": _FORMAT, "version": _VERSION, "problem": _PROBLEM,
+        "stages": qp.stages, "n": qp.n, "rows": qp.rows, "bounded": bool(qp.bounded),
+        "backend": backend, "options": None if options is None else _plain(options),
+        "answer": answer, "versions": _versions(),
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    target = Path(path)
+    write(target, header, _in_shape(qp, arrays))
+    return target
+
+
+def load(path: str | os.PathLike[str]) -> StoredQP:
+    """Read a file of `dump`.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+
+    Returns
+    -------
+    StoredQP
+        The QP, and what is known of where it came from.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no such file, or it is damaged, of another kind, or of a newer version.
+    """
+    source = Path(path)
+    header, arrays = read(source)
+    if header.get("format") != _FORMAT:
+        raise foreign(source)
+    version = header.get("version")
+    if isinstance(version, int) and version > _VERSION:
+        raise InvalidInputError(
+            f"{source} has version {version} of the format, and this qpmhe reads up to "
+            f"{_VERSION}; upgrade qpmhe to one that is no older than the file."
+        )
+    try:
+        if version != _VERSION:
+            raise ValueError(f"version is {version!r}")
+        return _stored(source, header, arrays)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise damaged(source, error) from error
+
+
+def qp_files(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
+    """The files that are meant by files and folders.
+
+    Parameters
+    ----------
+    paths : iterable of str or path
+        Files are taken as they are; of a folder, all its ``.npz`` files in order of name.
+
+    Raises
+    ------
+    InvalidInputError
+        If a path does not exist, or a folder has no such file.
+    """
+    found: list[Path] = []
+    for path in map(Path, paths):
+        if path.is_dir():
+            within = sorted(path.glob("*.npz"))
+            if not within:
+                raise InvalidInputError(
+                    f"the folder {path} holds no .npz file; expected files of "
+                    "qpmhe.solvers.dump or Recording."
+                )
+            found += within
+        elif path.exists():
+            found.append(path)
+        else:
+            raise InvalidInputError(f"there is no file {path}; look at the spelling.")
+    return found
+
+
+def _shapes(stages: int, n: int, rows: int) -> dict[str, tuple[int, ...]]:
+    return {
+        "band": (stages, n, 2 * n), "gradient": (stages, n),
+        "lower": (stages, n), "upper": (stages, n),
+        "row_own": (stages, rows, n), "row_next": (stages, rows, n),
+        "row_lower": (stages, rows), "row_upper": (stages, rows),
+    }
+
+
+def _answer_shapes(stages: int, n: int, rows: int) -> dict[str, tuple[int, ...]]:
+    return {
+        "start": (stages, n), "d": (stages, n), "residuals": (3,),
+        "bound_duals": (stages * n,), "row_duals": (stages * rows,),
+    }
+
+
+def _in_shape(qp: QP, arrays: dict[str, Any]) -> dict[str, Array]:
+    """The arrays that there are, each as it is to be found again."""
+    size = qp.stages, qp.n, qp.rows
+    shapes, shaped = _shapes(*size) | _answer_shapes(*size), {}
+    for name, values in arrays.items():
+        if values is None:
+            continue
+        try:
+            shaped[name] = np.asarray(values, np.float64).reshape(shapes[name])
+        except (TypeError, ValueError) as error:
+            raise InvalidInputError(
+                f"{name} does not fit the QP ({error}); expected numbers of shape {shapes[name]}."
+            ) from error
+    return shaped
+
+
+def _plain(options: SolverOptions) -> dict[str, Any]:
+    # NumPy's numbers are no JSON.
+    return {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in asdict(options).items()
+    }
+
+
+@lru_cache(maxsize=1)
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    solvers = {entry.distribution for entry in backends() if entry.distribution}
+    for name in ("qpmhe", "numpy", "scipy", "qpsolvers", *sorted(solvers)):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
+
+
+def _stored(source: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> StoredQP:
+    stages, n, rows = (header[name] for name in ("stages", "n", "rows"))
+    shapes = _shapes(stages, n, rows)
+    for name, expected in (shapes | _answer_shapes(stages, n, rows)).items():
+        array = arrays.get(name)
+        # Before the QP is made: it is as large as the header says.
+        if array is not None and (array.shape != expected or array.dtype != np.float64):
+            raise ValueError(f"{name} has shape {array.shape} and type {array.dtype}")
+    qp = QP(stages, n, rows)
+    for name in shapes:
+        setattr(qp, name, np.ascontiguousarray(arrays[name]))
+    if not isinstance(header["bounded"], bool):
+        raise TypeError(f"bounded is {header['bounded']!r}")
+    qp.bounded = header["bounded"]
+    options = header["options"]
+    return StoredQP(
+        source, qp, _answer(header["answer"], arrays), str(header["backend"]),
+        None if options is None else SolverOptions(**options), arrays.get("start"),
+        {str(name): str(version) for name, version in dict(header["versions"]).items()},
+        str(header["written"]),
+    )
+
+
+def _answer(told: dict[str, Any] | None, arrays: dict[str, NDArray[Any]]) -> Solution | None:
+    if told is None:
+        return None
+    status, iterations = SolveStatus[told["status"]], told["iterations"]
+    d = arrays.get("d")
+    if status.usable != (d is not None):
+        raise ValueError(f"status {status.name} does not go with the iterate")
+    if iterations is not None and not isinstance(iterations, int):
+        raise TypeError(f"iterations is {iterations!r}")
+    residuals = arrays.get("residuals")
+    return Solution(
+        d, status, iterations,
+        None if residuals is None else Residuals(*residuals.tolist()),
+        arrays.get("bound_duals"), arrays.get("row_duals"), str(told["message"]),
+    )

@@ -1,0 +1,287 @@
+"""A QP as native solvers take it: laid out once for a structure, then filled in place."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..flat import FlatQP
+from ..patterns import Pattern, chosen_rows, hessian_pattern
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
+
+__all__ = ["Layout", "Structure", "Style", "Voids"]
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Style:
+    """How one solver wants its QP.
+
+    Parameters
+    ----------
+    matrices : {"csc", "dense"}
+        CSC matrices with sorted indices, or dense arrays.
+    triangle : {"upper", "full"}
+        What is stored of a sparse Hessian; a dense one is full.
+    bounds : {"box", "rows"}
+        Whether bounds on the unknowns go apart, or become rows of the constraint matrix.
+    equalities : {"apart", "among"}
+        Whether equality rows have a matrix of their own, or stand first among the rows.
+    sides : {1, 2}
+        Whether a row has an upper side only, or both.
+    infinite : bool
+        Whether a row may have infinite limits on all its sides; otherwise it is made void.
+    """
+
+    matrices: Literal["csc", "dense"]
+    triangle: Literal["upper", "full"] = "full"
+    bounds: Literal["box", "rows"] = "box"
+    equalities: Literal["apart", "among"] = "apart"
+    sides: Literal[1, 2] = 2
+    infinite: bool = True
+
+
+class Structure(NamedTuple):
+    """Which limits a layout has room for, constraint by constraint; bounds come first.
+
+    A limit that is finite at any stage but the last has room at all of these, so that limits
+    which come and go with missing measurements leave the structure as it is.
+    """
+
+    lower: Flags
+    upper: Flags
+    equal: Flags
+
+    @staticmethod
+    def of(flat: FlatQP) -> Structure:
+        """The structure that a QP needs."""
+        stages, n, rows = flat.sizes
+        size = stages * n
+        equal = (flat.lower == flat.upper) & np.isfinite(flat.lower)
+        equal[:size] = False
+        sides = []
+        for limits in (flat.lower, flat.upper):
+            finite = np.isfinite(limits) & ~equal
+            for part in (finite[:size].reshape(stages, n), finite[size:].reshape(stages, rows)):
+                if stages > 1:
+                    part[:-1] = part[:-1].any(axis=0)
+            sides.append(finite & ~equal)
+        return Structure(sides[0], sides[1], equal)
+
+    @property
+    def key(self) -> Hashable:
+        """Something to look it up by."""
+        return tuple(part.tobytes() for part in self)
+
+
+class Voids(NamedTuple):
+    """Rows of a layout without a limit in a certain QP: their entries, and their sides."""
+
+    entries: Index
+    lower: Index
+    upper: Index
+
+
+class Layout:
+    r"""The arrays of a QP for one structure.
+
+    .. math::
+        \min_x \tfrac12 x^\top P x + q^\top x \quad \text{s.t.} \quad
+        l \le C x \le u, \quad A x = b, \quad l_x \le x \le u_x
+
+    in two-sided styles; with one side, C x <= u alone, its rows being the equality rows, those
+    with an upper limit, and those with a lower limit, negated.
+
+    Parameters
+    ----------
+    style : Style
+        How the solver wants it.
+    structure : Structure
+        The limits that there is room for.
+    stages, n, rows : int
+        Sizes of the QP.
+
+    Attributes
+    ----------
+    hessian, matrix, equality_matrix
+        P, C and A: CSC matrices, or arrays.
+    gradient, lower, upper, level, box_lower, box_upper : array
+        q, l, u, b, l_x and u_x; the box is empty where there is none.
+    all_lower, all_upper : array
+        Views of the box's limits, followed by those of C.
+    constraints, equalities : array of int
+        The constraint that each row of C and of A stands for.
+    signs : array
+        -1 for negated rows of C.
+    size, count : int
+        Numbers of unknowns and of constraints.
+    """
+
+    def __init__(
+        self, style: Style, structure: Structure, stages: int, n: int, rows: int
+    ) -> None:
+        flat = FlatQP(stages, n, rows)  # for the places in it only
+        self.style, self.structure = style, structure
+        self.size, self.count = size, count = stages * n, stages * (n + rows)
+        self.equalities, self.constraints, self.signs = _rows(style, structure, size)
+        self.boxed = style.bounds == "box" and bool(
+            structure.lower[:size].any() or structure.upper[:size].any()
+        )
+        hessian = hessian_pattern(stages, n)
+        if style.triangle == "upper" and style.matrices == "csc":
+            hessian = _upper(hessian)
+        patterns = [hessian] + [
+            chosen_rows(stages, n, rows, chosen) for chosen in (self.constraints, self.equalities)
+        ]
+        lower, upper = flat.lower_at + np.arange(count), flat.upper_at + np.arange(count)
+        box = slice(size if self.boxed else 0)
+        above = np.where(self.signs > 0, upper[self.constraints], lower[self.constraints])
+        below = lower[self.constraints] if style.sides == 2 else lower[:0]
+        sources = [
+            hessian.source, *(flat.own_at + pattern.source for pattern in patterns[1:]),
+            flat.gradient_at + np.arange(size), upper[self.equalities],
+            lower[box], below, upper[box], above,
+        ]
+        self._source = np.concatenate(sources)
+        self._values = np.empty(self._source.size)
+        ends = np.cumsum([source.size for source in sources])
+        views = np.split(self._values, ends[:-1])
+        self.gradient, self.level, self.box_lower, self.lower, self.box_upper, self.upper = (
+            views[3:]
+        )
+        self.all_lower = self._values[ends[4] : ends[6]]
+        self.all_upper = self._values[ends[6] :]
+        self._entry_rows = patterns[1].rows
+        self._c_entries = views[1]
+        self._negated = None
+        if style.sides == 1:
+            self._negated = self.signs[self._entry_rows]
+        self._dense: list[tuple[Array, Index, Array]] = []
+        heights = (size, self.constraints.size, self.equalities.size)
+        self.hessian, self.matrix, self.equality_matrix = (
+            self._matrix(pattern, view, height)
+            for pattern, view, height in zip(patterns, views[:3], heights, strict=True)
+        )
+
+    def _matrix(self, pattern: Pattern, values: Array, height: int) -> Any:
+        if self.style.matrices == "dense":
+            full = np.zeros((height, self.size))
+            places = pattern.rows.astype(np.intp) * self.size + pattern.columns
+            self._dense.append((full.reshape(-1), places, values))
+            return full
+        return _csc(pattern, values, height, self.size)
+
+    def voids(self, flat: FlatQP) -> Voids | None:
+        """The rows of C without a limit in this QP, as far as the solver cannot have such.
+
+        Parameters
+        ----------
+        flat : FlatQP
+            A QP that the structure has room for.
+        """
+        if self.style.infinite:
+            return None
+        lower = np.isfinite(flat.lower)[self.constraints]
+        upper = np.isfinite(flat.upper)[self.constraints]
+        void = ~np.where(self.signs > 0, upper, lower) if self._negated is not None else (
+            ~(lower | upper)
+        )
+        if not void.any():
+            return None
+        rows = np.flatnonzero(void)
+        below = rows if self.style.sides == 2 else rows[:0]
+        return Voids(np.flatnonzero(void[self._entry_rows]), below, rows)
+
+    def fill(self, flat: FlatQP, voids: Voids | None) -> None:
+        """Write the numbers of a QP into the arrays.
+
+        Parameters
+        ----------
+        flat : FlatQP
+            A QP that the structure has room for.
+        voids : Voids or None
+            What `voids` tells of it.
+        """
+        # Any mode but the default one writes into ``out`` without a buffer between.
+        flat.numbers.take(self._source, out=self._values, mode="clip")
+        if self._negated is not None:
+            self._c_entries *= self._negated
+            self.upper *= self.signs
+        if voids is not None:  # 0 x between -1 and 1
+            self._c_entries[voids.entries] = 0.0
+            self.lower[voids.lower] = -1.0
+            self.upper[voids.upper] = 1.0
+        for target, places, values in self._dense:
+            target[places] = values
+
+    def duals(self, rows: Array, equalities: Array | None, box: Array | None) -> Array:
+        """Multipliers of all constraints, from those of C, A and the box.
+
+        Parameters
+        ----------
+        rows, equalities, box : array
+            Multipliers, positive on the upper side; None where there is no such part.
+
+        Returns
+        -------
+        (K n + K rows,) array
+        """
+        duals = np.zeros(self.count)
+        if self._negated is None:
+            duals[self.constraints] = rows
+        else:  # a constraint may have two rows
+            upper = self.signs > 0
+            duals[self.constraints[upper]] = rows[upper]
+            duals[self.constraints[~upper]] -= rows[~upper]
+        if equalities is not None and self.equalities.size:
+            duals[self.equalities] = equalities
+        if box is not None and self.boxed:
+            duals[: self.size] = box
+        return duals
+
+
+def _rows(style: Style, structure: Structure, size: int) -> tuple[Index, Index, Array]:
+    """Constraints of the rows of A and of C, and the signs of the latter."""
+    lower, upper = structure.lower.copy(), structure.upper.copy()
+    if style.bounds == "box":
+        lower[:size] = upper[:size] = False
+    equal = np.flatnonzero(structure.equal)
+    if style.sides == 2:
+        parts = [np.flatnonzero(lower | upper)]
+    else:
+        parts = [np.flatnonzero(upper), np.flatnonzero(lower)]
+    signs = np.repeat([1.0, -1.0][: len(parts)], [part.size for part in parts])
+    if style.equalities == "apart":
+        return equal, np.concatenate(parts), signs
+    constraints = np.concatenate([equal, *parts])
+    return equal[:0], constraints, np.concatenate((np.ones(equal.size), signs))
+
+
+def _upper(pattern: Pattern) -> Pattern:
+    """The entries on and above the diagonal."""
+    chosen = pattern.rows <= pattern.columns
+    counts = np.bincount(pattern.columns[chosen], minlength=pattern.indptr.size - 1)
+    return Pattern(
+        pattern.source[chosen], pattern.rows[chosen], pattern.columns[chosen],
+        np.concatenate(([0], np.cumsum(counts))).astype(np.int32),
+    )
+
+
+def _csc(pattern: Pattern, values: Array, height: int, width: int) -> csc_matrix:
+    from scipy.sparse import csc_matrix
+
+    # Indices of its own: those of the patterns are shared, and solvers may sort in place.
+    matrix = csc_matrix(
+        (values.copy(), pattern.rows.copy(), pattern.indptr.copy()), shape=(height, width)
+    )
+    matrix.data = values  # afterwards: of a view into a larger array scipy may make a copy
+    return matrix

@@ -1,0 +1,200 @@
+"""What all native backends share: which workspace is whose, and what it may keep."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from abc import abstractmethod
+from collections.abc import Hashable
+from importlib import import_module
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..flat import FlatQP
+from ..options import SolverOptions
+from ..qp import QP
+from ..solution import RawSolution
+from ..solver import Solver
+from .layout import Layout, Structure, Style, Voids
+
+__all__ = ["Answer", "NativeSolver"]
+
+Array = NDArray[np.float64]
+
+# Workspaces kept by one solver: a window of full length needs one, or one for each structure
+# that its sets have; those of a growing window are used once.
+_KEPT = 4
+# Patterns of limits whose workspace is known without looking at their structure.
+_KNOWN = 64
+
+
+class Answer(NamedTuple):
+    """What a solver said.
+
+    Parameters
+    ----------
+    x : array or None
+        The iterate.
+    duals : (K n + K rows,) array or None
+        Multipliers of all constraints, positive on the upper side.
+    solved : bool
+        Whether it says so.
+    sound : bool
+        Whether the workspace may be kept: solved, or stopped at a limit.
+    iterations : int or None
+        Its count.
+    message : str
+        Its words.
+    """
+
+    x: Array | None
+    duals: Array | None
+    solved: bool
+    sound: bool
+    iterations: int | None
+    message: str
+
+
+class _Workspace:
+    """A solver that is set up, its arrays, and the multipliers that it found last."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        self.handle: Any = None
+        self.duals: Array | None = None
+        self.shifts = 0
+
+
+class NativeSolver(Solver):
+    """A solver with workspaces, one for each structure and size of QPs; few are kept.
+
+    Parameters
+    ----------
+    options : SolverOptions
+        Limits and accuracy. With ``warm_start``, multipliers of the last solve in a workspace
+        start the next one, moved by one stage at each `shift`, where the solver gains by that.
+
+    Notes
+    -----
+    A workspace is dropped when its solver fails, raises, calls a QP infeasible, or brings a
+    number that is not finite. Workspaces stay behind when the solver is copied or pickled.
+    One instance serves one thread.
+    """
+
+    #: The module of the solver, and how it wants its QPs.
+    package: ClassVar[str]
+    style: ClassVar[Style]
+    _warns = False
+
+    def __init__(self, options: SolverOptions) -> None:
+        super().__init__(options)
+        self._package: Any = import_module(self.package)  # late: solvers are optional
+        self._shifts = 0
+        self._workspaces: dict[Hashable, _Workspace] = {}
+        self._known: dict[Hashable, tuple[Hashable, Voids | None]] = {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.options,)
+
+    def shift(self) -> None:
+        """Move what is kept by one stage; see `Solver.shift`."""
+        self._shifts += 1
+
+    def forget(self) -> None:
+        """Drop the workspaces; see `Solver.forget`."""
+        self._workspaces.clear()
+
+    @abstractmethod
+    def _set_up(self, layout: Layout) -> Any:
+        """A solver for the arrays of a layout, which are filled."""
+
+    @abstractmethod
+    def _update(self, handle: Any, layout: Layout) -> None:
+        """Hand the arrays, filled anew, to the solver."""
+
+    @abstractmethod
+    def _run(
+        self, handle: Any, layout: Layout, start: Array | None, duals: Array | None
+    ) -> Answer:
+        """Solve, from an increment (K n,) and multipliers (K n + K rows,); None for zero."""
+
+    def _solve(self, qp: QP, start: Array | None) -> RawSolution:
+        flat = FlatQP(qp.stages, qp.n, qp.rows)
+        flat.gather(qp)
+        return self._solve_flat(qp, flat, start)
+
+    def _solve_flat(self, qp: QP, flat: FlatQP, start: Array | None) -> RawSolution:
+        key, workspace, voids = self._taken(flat)
+        layout = workspace.layout
+        layout.fill(flat, voids)
+        # Whatever raises from here on leaves the workspace out.
+        if workspace.handle is None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                workspace.handle = self._set_up(layout)
+        else:
+            self._update(workspace.handle, layout)
+        point = None if start is None else np.ravel(start)
+        answer = self._run(workspace.handle, layout, point, self._kept_duals(workspace, flat))
+        if answer.sound and _finite(answer.x) and _finite(answer.duals):
+            workspace.duals, workspace.shifts = answer.duals, self._shifts
+            if len(self._workspaces) == _KEPT:
+                del self._workspaces[next(iter(self._workspaces))]  # the longest unused
+            self._workspaces[key] = workspace
+        bounds = rows = None
+        if answer.duals is not None:
+            bounds, rows = answer.duals[: layout.size], answer.duals[layout.size :]
+        return RawSolution(
+            answer.x, answer.solved, answer.iterations, bounds, rows, answer.message
+        )
+
+    def _taken(self, flat: FlatQP) -> tuple[Hashable, _Workspace, Voids | None]:
+        """The workspace for a QP, taken off the shelf, its key, and the QP's void rows."""
+        pattern = (
+            flat.sizes, np.isfinite(flat.limits).tobytes(), (flat.lower == flat.upper).tobytes()
+        )
+        known = self._known.get(pattern)
+        kind = Structure.of(flat).key if known is None else known[0]
+        key = flat.sizes, kind, _scale(flat)
+        workspace = self._workspaces.pop(key, None)
+        if workspace is None:
+            workspace = _Workspace(Layout(self.style, Structure.of(flat), *flat.sizes))
+        if known is None:
+            if len(self._known) == _KNOWN:
+                del self._known[next(iter(self._known))]
+            known = self._known[pattern] = kind, workspace.layout.voids(flat)
+        return key, workspace, known[1]
+
+    def _kept_duals(self, workspace: _Workspace, flat: FlatQP) -> Array | None:
+        """Multipliers of the workspace's last solve, moved with the trajectory."""
+        duals = workspace.duals
+        if duals is None or not self.options.warm_start:
+            return None
+        moved = self._shifts - workspace.shifts
+        if moved == 0:
+            return duals
+        stages, n, rows = flat.sizes
+        if moved >= stages:
+            return None
+        shifted = np.zeros_like(duals)  # nothing is known of new stages
+        for part, width in ((slice(stages * n), n), (slice(stages * n, None), rows)):
+            old, new = duals[part], shifted[part]
+            new[: new.size - moved * width] = old[moved * width :]
+        return shifted
+
+
+def _scale(flat: FlatQP) -> int:
+    """The size of the Hessian, in steps of two decades.
+
+    QPs of other weights, such as projections into the sets between those of the estimation,
+    have a workspace of their own: a solver's scaling and step sizes, and multipliers, are of
+    no use from one to the other, and do harm.
+    """
+    diagonal = flat.numbers[: flat.gradient_at : 2 * flat.sizes[1]]
+    return math.frexp(float(np.maximum.reduce(diagonal)))[1] // 7
+
+
+def _finite(values: Array | None) -> bool:
+    return values is None or bool(np.isfinite(values).all())

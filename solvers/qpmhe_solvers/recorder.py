@@ -1,0 +1,283 @@
+"""QPs collected while something else solves them."""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InvalidInputError, OptionError
+from .files import dump
+from .options import SolverOptions
+from .qp import QP
+from .registry import backend as registered_backend
+from .registry import backends, register, unregister
+from .solution import RawSolution, Solution, SolveStatus
+from .solver import Solver
+
+__all__ = ["Recording", "RecordingWarning"]
+
+Array = NDArray[np.float64]
+
+Which = Literal["suspicious", "failed", "all"]
+
+
+class RecordingWarning(UserWarning):
+    """QPs that should have been recorded were not; what solved them went on undisturbed."""
+
+
+class Recording:
+    """A backend that solves as another one does, and keeps QPs as files of `dump`.
+
+    Inside ``with``, ``recording.backend`` can be named wherever a backend is named::
+
+        with qpmhe.solvers.Recording("folder", "osqp") as recording:
+            mhe = qpmhe.MovingHorizonEstimator(..., backend=recording.backend)
+            mhe.run(measurements)
+
+    Every QP goes to the solver as it is, and what comes back is handed on as it is: results
+    are those of the backend itself. No failure to record reaches the caller; it ends the
+    recording, and a warning tells it when the block ends. Files are written at once, so that
+    those before a crash are safe; only where the solver has a time limit, they wait for the
+    end of the block, so that no step runs late on their account.
+
+    Parameters
+    ----------
+    folder : str or path
+        Where the files go; it is made. Their names, ``qp-000012-failed.npz``, hold a running
+        number of all QPs that were solved, which goes on behind files that are there
+        already, and the verdict.
+    backend : str
+        The backend that solves.
+    only : {"suspicious", "failed", "all"}
+        Which QPs are kept. ``failed`` are those without an iterate. ``suspicious`` are these,
+        those with a claim of success that the residuals do not confirm, those that a solver
+        gave up without having been limited, and those whose inequalities were ignored by a
+        backend that handles them.
+    limit : int
+        Most files to write, at least 1.
+
+    Attributes
+    ----------
+    files : list of Path
+        The files, in the order of their QPs.
+    seen, wanted : int
+        QPs that were solved, and how many of them were to be kept.
+
+    Raises
+    ------
+    BackendError
+        If the backend is unknown.
+    OptionError
+        If ``only`` or ``limit`` is none of these.
+    InvalidInputError
+        If the folder cannot be made or written to.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        backend: str = "auto",
+        *,
+        only: Which = "suspicious",
+        limit: int = 100,
+    ) -> None:
+        self._entry = registered_backend(backend)
+        if only not in get_args(Which):
+            known = ", ".join(repr(choice) for choice in get_args(Which))
+            raise OptionError(f"only is {only!r}; expected one of {known}.")
+        if isinstance(limit, bool) or not isinstance(limit, (int, np.integer)) or limit < 1:
+            raise OptionError(f"limit is {limit!r}; expected an integer >= 1.")
+        self._only, self._limit = only, int(limit)
+        self._folder = _writable(Path(folder))
+        self._offset = _last_number(self._folder)
+        self.files: list[Path] = []
+        self.seen, self.wanted = 0, 0
+        self._fault = ""
+        self._held: list[_Held] = []
+        self._name = ""
+        self._lock = threading.Lock()
+
+    @property
+    def backend(self) -> str:
+        """The name under which it solves, within the block.
+
+        Raises
+        ------
+        InvalidInputError
+            Outside of the block.
+        """
+        if not self._name:
+            raise InvalidInputError(
+                "the recording is not under way; use its backend within "
+                "`with Recording(...) as recording:`."
+            )
+        return self._name
+
+    def __enter__(self) -> Recording:
+        with self._lock:
+            if self._name:
+                raise InvalidInputError("the recording is under way already; make another one.")
+            taken, name, count = {entry.name for entry in backends()}, "", 1
+            while not name or name in taken:
+                name = f"recorded:{self._entry.name}" + (f":{count}" if count > 1 else "")
+                count += 1
+            register(replace(self._entry, name=name, factory=self._make))
+            self._name = name
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        with self._lock:
+            unregister(self._name)
+            self._name = ""
+            held, self._held = self._held, []
+            for one in held:
+                self._write(one)
+            fault, self._fault = self._fault, ""
+        if fault:
+            warnings.warn(
+                f"recording QPs ended after {len(self.files)} files in {self._folder}: {fault}",
+                RecordingWarning, stacklevel=2,
+            )
+
+    def __repr__(self) -> str:
+        return (
+            f"Recording({len(self.files)} files in {str(self._folder)!r}; "
+            f"{self.wanted} of {self.seen} QPs were {self._only})"
+        )
+
+    def _make(self, options: SolverOptions) -> Solver:
+        return _Recorder(self._entry.factory(options), options, self)
+
+    def _take(
+        self, qp: QP, start: Array | None, solution: Solution, options: SolverOptions
+    ) -> None:
+        """Keep a QP if it is one of those to be kept; never raises an `Exception`."""
+        try:
+            with self._lock:
+                if not self._name:
+                    return
+                self.seen += 1
+                if not self._keeps(solution, options):
+                    return
+                self.wanted += 1
+                if self._fault or len(self.files) + len(self._held) >= self._limit:
+                    return
+                one = _Held(self._offset + self.seen, qp, start, solution, options)
+                if options.time_limit is None:
+                    self._write(one)
+                else:
+                    self._held.append(one.copied())
+        except Exception as error:  # nothing that goes wrong here is the caller's business
+            self._fault = f"{type(error).__name__}: {error}"
+
+    def _keeps(self, solution: Solution, options: SolverOptions) -> bool:
+        status = solution.status
+        if self._only == "all" or status is SolveStatus.FAILED:
+            return True
+        if self._only == "failed":
+            return False
+        if status is SolveStatus.STOPPED:
+            return options.max_iterations is None and options.time_limit is None
+        if status is SolveStatus.UNCONSTRAINED:
+            return self._entry.inequalities
+        return status is SolveStatus.INACCURATE
+
+    def _write(self, one: _Held) -> None:
+        if self._fault:
+            return
+        path = self._folder / f"qp-{one.number:06d}-{one.solution.status.name.lower()}.npz"
+        try:
+            dump(
+                one.qp, path, solution=one.solution, backend=self._entry.name,
+                options=one.options, start=one.start,
+            )
+            self.files.append(path)
+        except Exception as error:
+            self._fault = str(error)
+
+
+class _Held(NamedTuple):
+    """A QP with all that goes into its file."""
+
+    number: int
+    qp: QP
+    start: Array | None
+    solution: Solution
+    options: SolverOptions
+
+    def copied(self) -> _Held:
+        """The same in arrays of its own: those of problem and iterate are used again."""
+        qp = QP(self.qp.stages, self.qp.n, self.qp.rows)
+        for name in QP.__slots__:
+            value = getattr(self.qp, name)
+            setattr(qp, name, value.copy() if isinstance(value, np.ndarray) else value)
+        told = self.solution
+        d, start = (None if x is None else np.array(x) for x in (told.d, self.start))
+        solution = Solution(
+            d, told.status, told.iterations, told.residuals, told.bound_duals, told.row_duals,
+            told.message,
+        )
+        return self._replace(qp=qp, start=start, solution=solution)
+
+
+class _Recorder(Solver):
+    """Hands everything on to another solver, and shows its QPs to a recording."""
+
+    def __init__(self, solver: Solver, options: SolverOptions, recording: Recording) -> None:
+        super().__init__(options)
+        self._solver, self._recording = solver, recording
+
+    def _solve(self, qp: QP, start: Array | None) -> RawSolution:
+        return self._solver._solve(qp, start)
+
+    def prepare(self, size: int) -> None:
+        self._solver.prepare(size)
+
+    def forget(self) -> None:
+        self._solver.forget()
+
+    def shift(self) -> None:
+        self._solver.shift()
+
+    def solve(self, qp: QP, start: Array | None = None) -> Solution:
+        try:
+            solution = self._solver.solve(qp, start)
+        except Exception as error:  # a user's solver that overrides the contained `solve`
+            failed = Solution(
+                None, SolveStatus.FAILED, message=f"{type(error).__name__}: {error}"
+            )
+            self._recording._take(qp, start, failed, self.options)
+            raise
+        self._recording._take(qp, start, solution, self.options)
+        return solution
+
+
+def _writable(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(
+            f"cannot make the folder {folder}: {error.strerror}; give another one."
+        ) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InvalidInputError(f"the folder {folder} cannot be written to; give another one.")
+    return folder
+
+
+def _last_number(folder: Path) -> int:
+    found = [re.match(r"qp-(\d+)-", path.name) for path in folder.glob("qp-*.npz")]
+    return max((int(match[1]) for match in found if match), default=0)

@@ -1,0 +1,107 @@
+"""A study that is killed again and again, and what is left of it in the end.
+
+``python -c "from tests.studies.killing import report; report(1000, 5)"`` does it at length.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from qpmhe.studies.errors import StoreError
+from qpmhe.studies.store import Store
+
+_CODE = """
+import sys
+from qpmhe.studies.grid import Study
+from qpmhe.studies.runner import run
+
+run(Study(**eval(sys.argv[1])), sys.argv[2], jobs=2, progress=False)
+"""
+
+
+@dataclass
+class Killed:
+    """What happened.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        All rows in the end.
+    rows : list of int
+        Rows that were there after each kill.
+    kept : bool
+        Whether every row that was ever seen is still there as it was.
+    """
+
+    frame: pd.DataFrame
+    rows: list[int]
+    kept: bool
+
+
+def start(options: dict[str, object], path: Path) -> subprocess.Popen[bytes]:
+    """A study in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-c", _CODE, repr(options), str(path)], stderr=subprocess.DEVNULL
+    )
+
+
+def _seen(path: Path) -> pd.DataFrame:
+    try:
+        return Store(path).frame()
+    except StoreError:  # it was killed before there was a store
+        return pd.DataFrame({"key": [], "finished": [], "times": []})
+
+
+def kill_and_finish(
+    options: dict[str, object], cells: int, kills: int, path: Path, seed: int
+) -> Killed:
+    """Start a study, kill it at random moments, and let it finish."""
+    generator = np.random.default_rng(seed)
+    targets = np.sort(generator.integers(0, int(0.9 * cells), kills))
+    rows: list[int] = []
+    known: dict[str, tuple[str, bytes]] = {}
+    kept = True
+    for target in targets:
+        process = start(options, path)
+        while process.poll() is None and len(_seen(path)) < target:
+            time.sleep(0.02)
+        time.sleep(generator.uniform(0.0, 0.5))
+        process.kill()
+        process.wait()
+        frame = _seen(path)
+        now = {row.key: (row.finished, row.times.tobytes()) for row in frame.itertuples()}
+        kept &= all(now.get(key) == value for key, value in known.items())
+        known = now
+        rows.append(len(frame))
+    code = start(options, path).wait()
+    assert code == 0
+    frame = _seen(path)
+    now = {row.key: (row.finished, row.times.tobytes()) for row in frame.itertuples()}
+    kept &= all(now.get(key) == value for key, value in known.items())
+    return Killed(frame, rows, kept)
+
+
+def report(cells: int, kills: int, seed: int = 0) -> None:
+    """Print what became of this many cells killed so many times."""
+    options: dict[str, object] = {
+        "backends": ["banded"], "qps": [1], "seeds": cells, "steps": 20,
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "store.sqlite"
+        killed = kill_and_finish(options, cells, kills, path, seed)
+        files = sorted(os.listdir(folder))
+    print(
+        f"rows after each kill {killed.rows}; in the end {len(killed.frame)} rows, "
+        f"{killed.frame['key'].nunique()} distinct, outcomes "
+        f"{killed.frame['outcome'].value_counts().to_dict()}; earlier rows unchanged: "
+        f"{killed.kept}; files {files}"
+    )

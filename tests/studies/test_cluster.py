@@ -1,0 +1,134 @@
+"""The same studies on a local Dask cluster of two workers."""
+
+import json
+import logging
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from qpmhe.studies import cluster
+from qpmhe.studies.errors import SchedulerError, StoreError
+from qpmhe.studies.grid import Study
+from qpmhe.studies.runner import run
+from qpmhe.studies.store import Store
+
+distributed = pytest.importorskip("distributed", reason="Dask is not installed")
+
+# What Dask and its own dependencies warn of is theirs.
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+ODD = "tests/studies/odd_models.py"
+SMALL = {"backends": ["banded"], "qps": [0, 1], "seeds": 4, "steps": 12}
+
+
+@pytest.fixture(scope="module")
+def address():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+        ) as made:
+            yield made.scheduler_address
+
+
+def server(*arguments):
+    return subprocess.Popen(
+        [sys.executable, "-m", *arguments, "--no-dashboard"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )
+
+
+def test_results_are_those_of_this_machine(address, tmp_path):
+    study = Study(**SMALL)
+    there = run(study, tmp_path / "there.sqlite", scheduler=address, progress=False).frame()
+    here = run(study, tmp_path / "here.sqlite", progress=False).frame()
+    assert set(there["outcome"]) == {"done"}
+    there, here = there.set_index("key").sort_index(), here.set_index("key").sort_index()
+    assert list(there.index) == list(here.index)
+    for name in ("rmse", "rmse_settled", "cost_ratio", "improved"):
+        np.testing.assert_array_equal(there[name], here[name])
+    assert there["shared"].all()
+
+
+@pytest.mark.parametrize(
+    ("model", "words", "timeout"),
+    [
+        ("raises", "ZeroDivisionError", 60.0),
+        ("is_killed", "the process that ran it died, twice", 60.0),
+        ("hangs", "out of time: the process that ran it was ended", 1.0),
+    ],
+)
+def test_a_cell_that_ends_its_worker_is_a_row(address, tmp_path, model, words, timeout):
+    study = Study(
+        models=[f"{ODD}:{model}"], backends=["banded"], qps=[1], seeds=4, steps=12,
+        cell_timeout=timeout,
+    )
+    store = run(study, tmp_path / "store.sqlite", scheduler=address, progress=False)
+    frame = store.frame().set_index("seed")
+    assert sorted(frame.index) == [0, 1, 2, 3]
+    assert frame["outcome"].to_dict() == {0: "done", 1: "failed", 2: "done", 3: "done"}
+    assert words in frame["reason"][1]
+
+
+def test_a_scheduler_that_is_not_there_is_told_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "_CONNECT", 0.5)
+    for address in ("tcp://127.0.0.1:9", "nonsense://x", "tcp://"):
+        with pytest.raises(SchedulerError, match="no Dask scheduler answers"):
+            run(Study(**SMALL), tmp_path / "store.sqlite", scheduler=address, progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def kill_after(rows, path, process):
+    """Kill a process as soon as a store has this many rows."""
+
+    def wait():
+        while process.poll() is None:
+            with suppress(StoreError):
+                if len(Store(path).frame()) >= rows:
+                    process.kill()
+            time.sleep(0.05)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def test_a_scheduler_that_dies_loses_nothing_and_the_same_call_goes_on(tmp_path):
+    path, contact = tmp_path / "store.sqlite", tmp_path / "scheduler.json"
+    study = Study(**{**SMALL, "seeds": 100, "steps": 150})
+    scheduler = server(
+        "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",
+        "--scheduler-file", str(contact),
+    )
+    worker = None
+    try:
+        until = time.monotonic() + 30
+        while not (contact.exists() and contact.read_text().strip()):
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        address = json.loads(contact.read_text())["address"]
+        worker = server(
+            "distributed.cli.dask_worker", address, "--nworkers", "1", "--nthreads", "1"
+        )
+        kill_after(10, path, scheduler)
+        with pytest.raises(SchedulerError, match="give the same command again"):
+            run(study, path, scheduler=address, progress=False)
+    finally:
+        scheduler.kill()
+        if worker is not None:
+            worker.terminate()
+            worker.wait()
+        scheduler.wait()
+    frame = Store(path).frame()
+    assert 10 <= len(frame) < 200
+    assert set(frame["outcome"]) == {"done"}  # what the cluster could not do is no failure
+    assert not frame["shared"].any()  # one worker with one thread
+    fewer = Study(**{**SMALL, "seeds": 10, "steps": 150})
+    after = run(fewer, path, progress=False).frame()
+    assert list(after["finished"][: len(frame)]) == list(frame["finished"])
+    assert {cell.key for cell in fewer.cells()} <= set(after["key"])

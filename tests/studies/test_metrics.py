@@ -1,0 +1,182 @@
+"""Metrics against plain NumPy on estimators that are run by hand."""
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.studies import metrics
+from qpmhe.studies.cell import OBSERVER, Cell, Task
+from qpmhe.studies.compute import compute
+from qpmhe.studies.sources import find
+
+ALL = frozenset({"accuracy", "time", "covariance"})
+STEPS = 40
+
+
+def by_hand(qps, cap=None, backend="daqp", horizon=10, start="candidate", seed=3, model=None):
+    system, observer, cost, scenario = model or qpmhe.models.batch_reactor()
+    record = scenario.simulate(seed, STEPS)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=horizon, initial_state=scenario.initial_estimate,
+        backend=backend, max_qps=qps, max_solver_iterations=cap, start=start,
+    )
+    estimates, covariances = [], []
+    for y in record.measurements:
+        estimates.append(mhe.update(y))
+        covariances.append(mhe.covariances()[-1])
+    return record.states, scenario.initial_estimate, estimates, covariances
+
+
+def row_of(qps, cap=None, backend="daqp", horizon=10, start="candidate", seed=3, parts=ALL,
+           model="batch_reactor", **options):
+    cell = Cell(model, backend, qps, cap, horizon, start, seed, STEPS)
+    return compute(Task(cell, find(model), frozenset(parts), timeout=60.0, **options))
+
+
+@pytest.mark.parametrize(
+    ("qps", "cap", "backend", "start"),
+    [
+        (0, None, OBSERVER, "candidate"), (1, None, "daqp", "candidate"),
+        (2, 3, "osqp", "candidate"), (None, 1, "osqp", "best"), (1, 1, "proxqp", "candidate"),
+    ],
+)
+def test_a_cell_is_the_run_of_an_estimator_made_by_hand(qps, cap, backend, start):
+    states, initial, estimates, covariances = by_hand(
+        qps, cap, "auto" if backend == OBSERVER else backend, start=start
+    )
+    row = row_of(qps, cap, backend, start=start)
+    assert (row["outcome"], row["reason"]) == ("done", "")
+    errors = np.array([initial, *(e.state for e in estimates)]) - states
+    settled = round(qpmhe.models.batch_reactor().scenario.settling_time / 0.1)
+    assert 0 < settled < STEPS
+    assert row["rmse"] == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()), rel=1e-12)
+    assert row["rmse_settled"] == pytest.approx(
+        np.sqrt((errors[settled:] ** 2).sum(axis=1).mean()), rel=1e-12
+    )
+    assert row["rmse_states"] == pytest.approx(np.sqrt((errors**2).mean(axis=0)), rel=1e-12)
+    assert row["rmse_settled_states"] == pytest.approx(
+        np.sqrt((errors[settled:] ** 2).mean(axis=0)), rel=1e-12
+    )
+    improved = np.mean([e.improved for e in estimates])
+    failed = np.mean([
+        not e.improved and any(
+            flag in e.status
+            for flag in (qpmhe.Status.SOLVER_FAILED, qpmhe.Status.NO_DECREASE)
+        )
+        for e in estimates
+    ])
+    assert row["improved"] == pytest.approx(improved)
+    assert row["fallback"] == pytest.approx(failed)
+    assert row["kept"] == pytest.approx(1.0 - improved - failed)
+    assert row["cap_hits"] == pytest.approx(
+        np.mean([qpmhe.Status.SOLVER_STOPPED in e.status for e in estimates])
+    )
+    for flag in qpmhe.Status:
+        assert row["reasons"].get(flag.name, 0) == sum(flag in e.status for e in estimates)
+    assert row["qps_mean"] == pytest.approx(np.mean([e.qps for e in estimates]))
+    told = [e.solver_iterations for e in estimates if e.solver_iterations is not None]
+    assert row["solver_iterations_mean"] == pytest.approx(
+        np.mean(told) if told else np.nan, nan_ok=True
+    )
+    _, _, converged, _ = by_hand(None, start=start, backend="auto")
+    assert row["cost_ratio"] == pytest.approx(
+        np.mean([e.cost / c.cost for e, c in zip(estimates, converged, strict=True)]), rel=1e-9
+    )
+    expected = [
+        error @ np.linalg.inv(covariance) @ error
+        for error, covariance in zip(errors[1:], covariances, strict=True)
+    ]
+    assert row["nees"] == pytest.approx(np.mean(expected), rel=1e-9)
+
+
+def test_the_observers_cell_is_the_observer():
+    row = row_of(0, None, OBSERVER)
+    assert (row["improved"], row["kept"], row["fallback"]) == (0.0, 1.0, 0.0)
+    assert row["reasons"] == {"CANDIDATE": STEPS, "NO_QPS": STEPS}
+    assert row["cost_ratio"] > 2.0
+    assert row_of(None)["cost_ratio"] == pytest.approx(1.0, rel=1e-6)
+
+
+def test_the_reference_is_that_of_its_own_horizon_and_seed():
+    for horizon, seed in ((3, 0), (10, 0), (3, 5), (10, 3)):
+        assert row_of(None, horizon=horizon, seed=seed)["cost_ratio"] == pytest.approx(1, rel=1e-6)
+
+
+def test_shares_of_steps_that_fail_are_fallback():
+    def run(*flags):
+        ones = np.ones(len(flags))
+        return qpmhe.Run(
+            states=np.zeros((len(flags) + 1, 1)), filtered=ones[:, None], costs=ones,
+            candidate_costs=ones, times=ones, solve_times=ones, qps=np.arange(len(flags)),
+            solver_iterations=np.array([-1, 4] + [-1] * (len(flags) - 2)),
+            delayed=ones[:, None], flags=np.array([flag.value for flag in flags]),
+        )
+
+    status = qpmhe.Status
+    found = metrics.outcomes(run(
+        status.IMPROVED | status.CONVERGED, status.CANDIDATE | status.CONVERGED,
+        status.CANDIDATE | status.SOLVER_FAILED, status.CANDIDATE | status.NO_DECREASE
+        | status.SOLVER_STOPPED, status.IMPROVED | status.SOLVER_FAILED,
+        status.CANDIDATE | status.MODEL_FAILED, status.CANDIDATE | status.NO_QPS,
+        status.CANDIDATE | status.MISSING | status.CONVERGED,
+    ))
+    assert (found["improved"], found["kept"], found["fallback"]) == (2 / 8, 3 / 8, 3 / 8)
+    assert found["cap_hits"] == 1 / 8
+    assert found["solver_iterations_mean"] == 4.0
+    assert found["qps_mean"] == 3.5
+
+
+def test_cost_ratios_leave_out_what_has_no_ratio():
+    costs = np.array([2.0, np.inf, 3.0, 1.0, np.nan, 0.0])
+    reference = np.array([1.0, 1.0, np.inf, 2.0, 1.0, 0.0])
+    assert metrics.cost_ratio(costs, reference) == (2.0 + 0.5) / 2
+    assert np.isnan(metrics.cost_ratio(costs, None))
+    assert np.isnan(metrics.cost_ratio(np.array([np.inf]), np.array([1.0])))
+
+
+def test_consistency_leaves_out_covariances_that_say_nothing():
+    estimates, states = np.array([[9.0], [1.0], [2.0], [3.0]]), np.zeros((4, 1))
+    covariances = np.array([[[0.5]], [[np.nan]], [[0.0]]])
+    assert metrics.consistency(estimates, states, covariances) == 2.0
+    assert np.isnan(metrics.consistency(estimates, states, covariances[[1, 1, 2]]))
+
+
+def test_nothing_settled_has_no_settled_error():
+    found = metrics.accuracy(np.ones((3, 2)), np.zeros((3, 2)), 7)
+    assert found["rmse"] == pytest.approx(np.sqrt(2.0))
+    assert np.isnan(found["rmse_settled"])
+    assert np.isnan(found["rmse_settled_states"]).all()
+
+
+def test_times_are_those_of_the_steps():
+    row = row_of(1)
+    times = row["times"]
+    assert times.shape == (STEPS,)
+    assert times.dtype == np.float32
+    assert (times > 0).all()
+    for name, share in (("median", 50), ("p95", 95), ("p99", 99), ("max", 100)):
+        assert row[f"time_{name}"] == pytest.approx(np.percentile(times, share), rel=1e-5)
+
+
+@pytest.mark.parametrize("part", sorted(ALL))
+def test_only_what_was_asked_for_is_told(part):
+    row = row_of(1, parts=[part])
+    assert ("times" in row) == (part == "time")
+    assert ("cost_ratio" in row) == (part == "accuracy")
+    assert ("nees" in row) == (part == "covariance")
+
+
+def test_models_with_inputs_are_run_with_them():
+    name = next(
+        name for name, make in qpmhe.models.catalogue().items() if make().system.m
+    )
+    system, observer, cost, scenario = qpmhe.models.catalogue()[name]()
+    record = scenario.simulate(3, STEPS)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=5, initial_state=scenario.initial_estimate, max_qps=1,
+        backend="auto",
+    )
+    run = mhe.run(record.measurements, record.inputs)
+    row = row_of(1, backend="auto", horizon=5, model=name, keep=True)
+    assert row["trajectory"]["estimates"] == pytest.approx(run.states, rel=1e-9, abs=1e-12)
+    np.testing.assert_array_equal(row["trajectory"]["states"], record.states)

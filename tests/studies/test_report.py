@@ -1,0 +1,267 @@
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.image import imread
+
+from qpmhe.errors import InvalidInputError
+from qpmhe.studies.report import cases, write_report
+from qpmhe.studies.report.answers import failures, limitations
+from qpmhe.studies.report.profile import profiles
+from qpmhe.studies.report.runs import choose
+from qpmhe.studies.report.static import figures
+from qpmhe.studies.report.static_time import performance
+from qpmhe.studies.report.style import styles
+from qpmhe.studies.report.times import spreads
+from qpmhe.studies.report.words import configuration_words, number, percent, seconds
+from qpmhe.studies.summary import summarise
+
+from .report_study import frame, spoilt, stored, written
+
+
+@dataclass
+class Altered:
+    """The store with other cells."""
+
+    rows: pd.DataFrame
+
+    def frame(self):
+        return self.rows
+
+    def meta(self):
+        return stored().meta()
+
+    def trajectory(self, key):
+        return stored().trajectory(key)
+
+
+def texts(rows):
+    case = next(one for one in cases(summarise(rows)) if one.title.endswith("N = 10"))
+    return {answer.question: answer.text for answer in case.answers()}, case
+
+
+def test_fastest_near_the_best():
+    found, case = texts(frame())
+    rows = [row for _, row in case.summary.iterrows()]
+    least = min(row.rmse for row in rows)
+    near = [row for row in rows if row.rmse <= 1.01 * least]
+    first = min(near, key=lambda row: row.time_median)
+    text = found["Fastest within 1 % of the best RMSE"]
+    assert text.startswith(f"{configuration_words(first)}: {seconds(first.time_median)} per step")
+    assert f"RMSE {number(first.rmse)} (95 %" in text
+
+
+def test_observer_and_failures_are_told():
+    found, case = texts(spoilt("osqp", 1, "out of time"))
+    observer = case.summary[case.summary.backend == "observer"].iloc[0]
+    assert found["Observer alone (no QP)"].startswith(f"RMSE {number(observer.rmse)} ")
+    assert found["Failures"] == "Never: daqp and proxqp. Failed: osqp: 2 of 6 runs failed."
+    assert texts(frame())[0]["Failures"] == "No backend failed, in any run or step."
+
+
+def test_failed_steps_are_told():
+    rows = frame()
+    rows["reasons"] = [
+        {"SOLVER_FAILED": 4} if backend == "osqp" else {} for backend in rows.backend
+    ]
+    told = texts(rows)[0]["Failures"]
+    assert "osqp, 2 QPs per sample, cap 2: no run, but 10 % of the steps" in told
+
+
+def test_accuracy_alone():
+    rows = frame()
+    rows[["time_median", "time_p95", "time_p99", "time_max"]] = np.nan
+    found, _ = texts(rows.assign(times=None))
+    assert "accuracy only" in found["Fastest"]
+    assert "RMSE" in found["Most accurate"]
+    assert any("No times" in note for note in limitations(rows, summarise(rows)))
+
+
+def test_nothing_finished():
+    rows = frame().assign(outcome="failed", reason="crash")
+    found, _ = texts(rows)
+    assert found["Result"] == "No configuration finished all its runs."
+
+
+def test_limitations_follow_the_data():
+    rows = frame()
+    before = " ".join(limitations(rows, summarise(rows)))
+    assert "3 seeds" in before
+    assert "shared" not in before
+    rows = pd.concat([spoilt("osqp", 1, "x").assign(shared=True), rows.assign(environment=1)[:1]])
+    after = " ".join(limitations(rows, summarise(rows)))
+    assert "cores were shared" in after
+    assert "2 environments" in after
+    assert "2 of 31 runs failed" in after
+    assert "fewer runs" in after
+
+
+def test_failures_by_reason():
+    rows = pd.concat([spoilt("osqp", seed, "out of time").query("seed == @seed")
+                      for seed in (0, 2)])
+    found = failures(rows)
+    assert {row["configuration"] for row in found} == {
+        "osqp, 2 QPs per sample", "osqp, 2 QPs per sample, cap 2"
+    }
+    assert all(row["seeds"] == [0, 2] and row["reason"] == "out of time" for row in found)
+
+
+def test_spreads_are_quantiles_of_all_steps():
+    rows = frame().query("horizon == 10")
+    found = {(one.backend, one.cap): one for one in spreads(rows)}
+    mine = rows[(rows.backend == "daqp") & (rows.solver_iterations == 2)]
+    times = np.concatenate(list(mine.times)).astype(float)
+    one = found["daqp", "2"]
+    assert one.steps == 120 == times.size
+    assert (one.median, one.most) == pytest.approx((np.median(times), times.max()))
+
+
+def test_profile_against_its_definition():
+    rows = frame()
+    found = profiles(rows)
+    assert [one.backend for one in found] == ["daqp", "osqp", "proxqp"]
+    assert {one.problems for one in found} == {6}
+    chosen = {}
+    for one in found:
+        mine = rows[[configuration_words(row) == one.words for _, row in rows.iterrows()]]
+        mine = mine[mine.cost_ratio <= 1.01]
+        chosen[one.backend] = dict(
+            zip(zip(mine.horizon, mine.seed, strict=True), mine.time_median, strict=True)
+        )
+    problems = {problem for times in chosen.values() for problem in times}
+    for one in found:
+        for tau in (1.0, 1.5, 3.0, 100.0):
+            share = sum(
+                problem in chosen[one.backend] and chosen[one.backend][problem] <= tau * min(
+                    times[problem] for times in chosen.values() if problem in times
+                )
+                for problem in problems
+            ) / 6
+            assert (one.ratios <= tau).sum() / one.problems == share
+
+
+def test_no_profile_of_one_problem():
+    rows = frame()
+    assert profiles(rows.query("seed == 0 and horizon == 10")) == []
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(0.0, "0"), (0.012345, "0.0123"), (0.99999, "1.00"), (1234567.0, "1.23e+06"),
+     (999.9, "1,000"), (-2.5, "-2.50"), (float("inf"), "∞"), (float("nan"), "–")],  # noqa: RUF001
+)
+def test_numbers_in_words(value, words):
+    assert number(value) == words
+
+
+def test_durations_and_shares_in_words():
+    assert [seconds(one) for one in (1.234e-6, 0.0009999, 0.0123, 2.0)] == [
+        "1.23 µs", "1.00 ms", "12.3 ms", "2.00 s"
+    ]
+    assert [percent(one) for one in (0, 1e-5, 0.123, 0.99999, 1)] == [
+        "0 %", "< 0.1 %", "12.3 %", "> 99.9 %", "100 %"
+    ]
+
+
+def test_thirty_backends_look_different():
+    drawn = styles([f"solver {k:02d}" for k in range(30)])
+    assert len({(one.color, one.symbol) for one in drawn.values()}) == 31
+    assert len({(one.color, one.dash) for one in drawn.values()}) == 31
+
+
+def test_no_text_is_clipped_or_covered():
+    rows = frame()
+    drawn = styles(rows.backend)
+    found = [performance(profiles(rows), drawn)]
+    for case in cases(summarise(rows)):
+        cells = rows[rows.horizon == case.summary.horizon.iloc[0]]
+        runs = choose(stored(), cells, case, 100_000)
+        assert runs.observer is not None
+        found += figures(case, cells, drawn, 1e-3, runs).values()
+    assert len(found) == 9
+    for figure in found:
+        figure.draw_without_rendering()
+        drawn_box, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
+        assert drawn_box.x0 >= -0.01
+        assert drawn_box.y0 >= -0.01
+        assert drawn_box.x1 <= width + 0.01
+        assert drawn_box.y1 <= height + 0.01
+        titles = [figure._suptitle, *figure.legends]
+        for axes in figure.axes:
+            titles += [axes.title, axes._left_title, axes.xaxis.label, axes.yaxis.label]
+        boxes = [one.get_window_extent() for one in titles
+                 if one is not None and (one in figure.legends or one.get_text())]
+        assert not [pair for pair in combinations(boxes, 2) if pair[0].overlaps(pair[1])]
+
+
+def test_report_is_whole_and_needs_no_network():
+    page = written()
+    folder, text = page.parent, page.read_text(encoding="utf-8")
+    assert page.name == "index.html"
+    assert page.stat().st_size < 8e6
+    assert not re.findall(r"""<(?:script|link|img|iframe)[^>]*(?:src|href)\s*=\s*["']?http""", text)
+    names = {path.name for path in folder.iterdir()}
+    stems = {f"batch-reactor-N-{n}-{kind}" for n in (4, 10)
+             for kind in ("accuracy-time", "anytime", "step-times", "run")} | {"profile"}
+    assert names == {"index.html", "summary.csv"} | {f"{s}.{e}" for s in stems
+                                                     for e in ("png", "svg")}
+    for stem in stems:
+        assert imread(folder / f"{stem}.png")[..., :3].std() > 0.02
+    table = pd.read_csv(folder / "summary.csv")
+    assert table.rmse.to_numpy() == pytest.approx(summarise(frame()).rmse.to_numpy())
+    versions = stored().meta()["environments"][0]["versions"]
+    assert f"numpy {versions['numpy']}" in text
+
+
+def test_runs_for_which_there_is_no_room_are_counted():
+    rows = frame().query("horizon == 10")
+    case = next(one for one in cases(summarise(rows)))
+    runs = choose(stored(), rows, case, 0)
+    assert runs.left_out == 7 - len(runs.all)
+    assert 2 <= len(runs.all) < 7
+    assert choose(stored(), rows, case, 10**6).left_out == 0
+
+
+def test_frame_and_meta_do(tmp_path):
+    page = write_report((frame().query("horizon == 4"), stored().meta()), tmp_path)
+    assert 'id="trajectories"' not in page.read_text(encoding="utf-8")
+
+
+def test_failed_runs_are_listed_and_escaped(tmp_path):
+    rows = spoilt("proxqp", 1, "</script><b>out of time").query("horizon == 4")
+    page = write_report(Altered(rows), tmp_path)
+    text = page.read_text(encoding="utf-8")
+    assert "&lt;/script&gt;&lt;b&gt;out of time" in text
+    assert "</script><b>" not in text
+
+
+def test_nothing_to_report(tmp_path):
+    with pytest.raises(InvalidInputError, match="no finished cell"):
+        write_report((frame()[:0], {}), tmp_path)
+
+
+def test_folder_that_cannot_be(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InvalidInputError, match="cannot make the folder"):
+        write_report(stored(), tmp_path / "file" / "out")
+
+
+def test_libraries_are_loaded_late():
+    code = (
+        "import sys, qpmhe.studies.report, qpmhe.cli.report;"
+        "print([m for m in ('pandas', 'plotly', 'itables', 'matplotlib.pyplot')"
+        " if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_missing_library_is_named(monkeypatch, tmp_path):
+    monkeypatch.setattr("qpmhe.studies.report.write.find_spec", lambda name: name != "itables")
+    with pytest.raises(InvalidInputError, match=r"itables.*qpmhe\[studies\]"):
+        write_report(stored(), tmp_path)

@@ -1,0 +1,156 @@
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from .report_study import frame, written
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+ROWS = "document.querySelectorAll('#configurations tbody tr').length"
+FIRST = "[...document.querySelectorAll('#configurations tbody tr')].map(r => r.cells[0].innerText)"
+
+
+def browser_path() -> str:
+    found = os.environ.get("QPMHE_BROWSER") or next(filter(None, map(shutil.which, NAMES)), None)
+    if found is None:
+        pytest.skip(f"no browser: none of {', '.join(NAMES)} is on the path, nor QPMHE_BROWSER set")
+    return found
+
+
+@pytest.fixture(scope="module")
+def browser():
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = browser_path()
+    with sync_api.sync_playwright() as playwright:
+        # Without its sandbox Chromium also starts as root, as in most containers.
+        chromium = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+class Opened:
+    """The report in a browser without network, and all it complained about or asked for."""
+
+    def __init__(self, browser, file: Path, width: int) -> None:
+        self.context = browser.new_context(
+            viewport={"width": width, "height": 900}, offline=True
+        )
+        self.page = self.context.new_page()
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("console", lambda message: self.complaints.append(message.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(file.as_uri())
+        self.page.wait_for_function("window.configurationTable")
+
+
+    def check(self) -> None:
+        assert self.complaints == []
+        # The table's library loads itself from the page's own text.
+        assert [url for url in self.requests if not url.startswith(("file:", "blob:"))] == []
+
+
+@pytest.fixture(scope="module")
+def wide(browser):
+    one = Opened(browser, written(), 1280)
+    yield one
+    one.context.close()
+
+
+@pytest.fixture
+def opened(wide):
+    """The report as it is first seen."""
+    wide.page.click("#all")
+    wide.page.fill("#table input[type=search]", "")
+    wide.page.select_option("#case", "batch-reactor-N-10")
+    yield wide
+    wide.check()
+
+
+def points(page) -> int:
+    return page.evaluate(
+        "document.querySelectorAll('.plot[data-figure=accuracy] .scatterlayer .point').length"
+    )
+
+
+def test_a_filter_changes_table_and_figures(opened):
+    page, rows = opened.page, frame().query("horizon == 10")
+    assert page.evaluate(ROWS) == 7
+    assert "daqp" in page.evaluate(FIRST)
+    before = points(page)
+    page.click("button.backend[data-backend=daqp]")
+    assert page.evaluate(ROWS) == 5
+    assert "daqp" not in page.evaluate(FIRST)
+    assert points(page) == before - 2
+    page.click("#none")
+    assert page.inner_text("#configurations tbody") == "no configuration passes the filters"
+    page.click("#all")
+    assert page.evaluate(ROWS) == 7
+    assert rows.backend.nunique() == 4
+
+
+def test_another_problem(opened):
+    page = opened.page
+    page.select_option("#case", "batch-reactor-N-4")
+    assert page.evaluate(ROWS) == 3
+    visible = page.locator("dl.answers:visible")
+    assert visible.count() == 1
+    assert visible.get_attribute("data-case") == "batch-reactor-N-4"
+
+
+def test_search_and_numeric_order(opened):
+    page = opened.page
+    page.fill("#table input[type=search]", "osqp")
+    assert page.evaluate(ROWS) == 2
+    page.fill("#table input[type=search]", "")
+    head = page.locator("#table thead th", has_text="J / converged")
+    head.locator(".dt-column-title").first.click()
+    place = page.evaluate(
+        "window.configurationTable.columns().titles().toArray().indexOf('J / converged')"
+    )
+    order = "{search: 'applied', order: 'applied'}"
+    shown = page.evaluate(f"window.configurationTable.column({place}, {order}).data().toArray()")
+    # As texts, 10 would come before 2.
+    assert shown == sorted(shown)
+    assert len(shown) == 7
+    assert max(shown) > 10 > 1.5 > min(shown)
+
+
+def test_each_figure_is_drawn_and_its_menus_work(opened):
+    page = opened.page
+    for name in ("accuracy", "anytime", "times", "profile", "trajectories"):
+        assert page.locator(f".plot[data-figure={name}] svg.main-svg").count() > 0, name
+    for menu in page.locator("select[data-figure]:visible").all():
+        for value in menu.locator("option").evaluate_all("all => all.map(one => one.value)"):
+            menu.select_option(value)
+    run = page.locator("select[data-key=run]")
+    line = "document.querySelector('.plot[data-figure=trajectories]').data[2].y.bdata"
+    seen = set()
+    for value in run.locator("option").evaluate_all("all => all.map(one => one.value)"):
+        run.select_option(value)
+        seen.add(page.evaluate(line))
+    assert len(seen) > 1
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_screenshot(browser, wide, width, tmp_path):
+    one = wide if width == 1280 else Opened(browser, written(), width)
+    page = one.page
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    folder = Path(os.environ.get("QPMHE_SCREENSHOTS", tmp_path))
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"report-{width}.png"
+    page.screenshot(path=file, full_page=True)
+    picture = imread(file)[..., :3]
+    assert picture.shape[1] == width
+    assert picture.shape[0] > 2000
+    # Figures are drawn: each band of the page has ink, and the page has the observer's vermilion.
+    assert picture.std() > 0.05
+    assert np.abs(picture - np.array([0xD5, 0x5E, 0x00]) / 255).max(axis=-1).min() < 0.02
+    one.check()
+    if one is not wide:
+        one.context.close()
