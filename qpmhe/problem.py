@@ -235,7 +235,10 @@ class Problem:
         # Contiguous differences put together are faster than writing into columns.
         disturbances = trajectory[1:] - model.f.batch(states, self.inputs)
         noises = self.measurements - model.h.batch(states, self.inputs)
-        return np.concatenate((disturbances, noises), axis=1)
+        residuals: Array = np.concatenate((disturbances, noises), axis=1)
+        if residuals.shape[1] != self._q or residuals.dtype != np.float64:
+            raise TypeError("f or h gave other than real numbers of the right shape")
+        return residuals
 
     def _cost_of(self, residuals: Array) -> tuple[Array, float]:
         """Majorising weights, and the stages' cost."""

@@ -65,7 +65,7 @@ class Window(Stages):
         self._linear = True  # whether the stage that enters has Jacobians
         self._no_jacobian = -np.eye(n + p, n)  # what stands in for them, with the minus of `linear`
         #: Whole stages and trajectories by one call each, where the model offers that.
-        self.fused: Fused | None = self._bound() if linearized else None
+        self.fused: Fused | None = self._bound()
         self._ones = np.ones(horizon)
         # gamma^0, gamma^1, ... from the newest stage backwards, and the prior's behind.
         self._ages = cost.discount ** np.arange(horizon, -1, -1.0) if cost.discount < 1 else None
@@ -261,10 +261,11 @@ class Window(Stages):
             linear[:, 1:] = np.nan
 
     def _weigh(self, k: int) -> float:
-        """The cost of stage k, or infinity, and its Gauss-Newton terms if these are wanted."""
+        """The cost of stage k, or infinity, and its Gauss-Newton terms."""
         terms, weight = self.terms, self._weight[k]
         self._linear = True
-        if self._linearized and self._cost.quadratic:
+        if self._cost.quadratic:
+            # Even where no terms are wanted: so the cost is the same to the last digit.
             cost = terms.set_stage(k, weight)
             if math.isfinite(cost):
                 return cost

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import faulthandler
 import os
+import shutil
 import sys
 import tempfile
 import threading
@@ -40,7 +41,7 @@ def watched(task: Task) -> Iterator[None]:
     """
     notes, mine = _begin(task), object()
     if task.parent is not None:
-        _end_with(task.parent)
+        _end_with(task.parent, task.notes)
     with _LOCK:
         _LIMITS[mine] = monotonic() + task.hard_limit, notes
         _arm()
@@ -56,12 +57,14 @@ def watched(task: Task) -> Iterator[None]:
 
 
 @lru_cache(maxsize=1)
-def _end_with(parent: int) -> None:
+def _end_with(parent: int, notes: str | None) -> None:
     """End this process soon after its parent, which may be killed without a word."""
 
     def wait() -> None:
         while os.getppid() == parent:
             sleep(1.0)
+        if notes is not None:
+            shutil.rmtree(folder_of(notes), ignore_errors=True)
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
