@@ -6,7 +6,7 @@ ARGS ?=
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: reproduce test lint types examples benchmarks docs wheel clean
+.PHONY: reproduce test lint types examples benchmarks comparison docs wheel clean
 
 # One stamp for each set of extras, renewed when the project's requirements change.
 $(VENV)/.%: pyproject.toml
@@ -33,6 +33,8 @@ examples: $(VENV)/.test
 	$(BIN)/python examples/benchmarks/compare_peers.py --quick --problem reactor --out results
 	$(BIN)/python examples/benchmarks/constrained.py --steps 60 --out results
 	$(BIN)/python examples/benchmarks/batch.py --members 200 --steps 40 --out results
+	$(BIN)/python examples/benchmarks/backends.py --quick --out results
+	$(BIN)/qpmhe compare --seeds 2 --steps 40 --solver-iterations 2,none --store results/quick.sqlite --out results/compare
 	if [ -d "$(DATA)" ]; then $(BIN)/python examples/battery_soc.py --data "$(DATA)" --out results; \
 	else echo "no battery data at '$(DATA)': battery example left out"; fi
 
@@ -43,6 +45,12 @@ benchmarks: $(VENV)/.test
 	$(BIN)/python examples/benchmarks/scaling.py $(QUICK) --out results/benchmarks
 	$(BIN)/python examples/benchmarks/constrained.py --out results/benchmarks
 	$(BIN)/python examples/benchmarks/batch.py --out results/benchmarks
+	$(BIN)/python examples/benchmarks/backends.py $(QUICK) --out results/benchmarks
+
+# The page docs/comparison.md, of a run of the default study: ten minutes on two cores.
+comparison: $(VENV)/.test
+	$(BIN)/qpmhe compare --store results/comparison.sqlite --out results/comparison
+	$(BIN)/python examples/studies/comparison_page.py results/comparison.sqlite results/comparison
 
 docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from ..errors import OptionError
+from ..errors import InvalidInputError, OptionError
 from ..studies.export import export as write_table
 from ..studies.grid import Study
 from ..studies.runner import run
@@ -136,6 +136,12 @@ def export(console: Console, store: Path, file: Path) -> None:
 def _run(console: Console, what: Study, store: Path, out: Path, **options: Any) -> None:
     from .report import report
 
+    try:
+        store.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(
+            f"cannot make the folder {store.parent}: {error.strerror}."
+        ) from error
     target = Store(store)
     try:
         run(what, target, progress=console, **options)
