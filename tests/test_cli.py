@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 import qpmhe
 from qpmhe.cli.app import app
+from qpmhe.errors import QpmheError
 
 
 def test_solvers_lists_every_backend():
@@ -43,7 +44,9 @@ def test_reproduce_writes_what_it_says(tmp_path: Path, method):
         assert float(row["i_is_2_x2"]) == run.states[t, 1]
     with (tmp_path / "reproduce_backends.csv").open() as file:
         compared = list(csv.DictReader(file))
-    assert {row["backend"] for row in compared} == set(qpmhe.solvers.available()) - {"auto"}
+    assert {row["backend"] for row in compared} == {
+        name for name in qpmhe.solvers.available() if name != "auto" and ":" not in name
+    }
     with (tmp_path / "reproduce_summary.csv").open() as file:
         summary = {row["run"]: row for row in csv.DictReader(file)}
     # Ipopt and the QPs come to the same minimum of the same problem.
@@ -68,3 +71,43 @@ def test_bad_options_are_told_in_a_line(arguments, words):
     assert answer.returncode == 2
     assert words in answer.stderr
     assert "Traceback" not in answer.stderr
+
+
+def test_compare_report_and_export_one_after_the_other(tmp_path: Path):
+    pytest.importorskip("plotly")
+    store, out = tmp_path / "new" / "store.sqlite", tmp_path / "report"
+    table = tmp_path / "rows.csv"
+    for arguments in (
+        ["compare", "--backend", "banded", "--qps", "0,1", "--seeds", "2", "--steps", "12",
+         "--jobs", "1", "--store", str(store), "--out", str(out)],
+        ["report", str(store), "--out", str(out)],
+        ["export", str(store), str(table)],
+    ):
+        answer = CliRunner().invoke(app, arguments)
+        assert answer.exit_code == 0, answer.output
+    assert (out / "index.html").is_file()
+    assert len(table.read_text().splitlines()) == 1 + 2 * 2
+
+
+def test_a_study_file_with_an_unknown_key_is_refused(tmp_path: Path):
+    pytest.importorskip("joblib")
+    study = tmp_path / "study.toml"
+    study.write_text('backends = ["banded"]\nseed = 3\n')
+    answer = CliRunner().invoke(app, ["study", str(study)])
+    assert answer.exit_code != 0
+    assert isinstance(answer.exception, QpmheError)
+    assert "line 2" in str(answer.exception)
+    assert "seeds" in str(answer.exception)
+    assert list(tmp_path.iterdir()) == [study]
+
+
+@pytest.mark.parametrize(("curvature", "code"), [(1.0, 0), (-1.0, 1)])
+def test_solve_qp_tells_whether_it_was_solved(tmp_path: Path, curvature, code):
+    qp = qpmhe.solvers.QP(2, 1)
+    qp.band[:, :, 0], qp.gradient[...] = curvature, 1.0
+    qpmhe.solvers.dump(qp, tmp_path / "one.npz")
+    answer = CliRunner().invoke(
+        app, ["solve-qp", str(tmp_path / "one.npz"), "--backend", "banded"]
+    )
+    assert answer.exit_code == code, answer.output
+    assert "banded" in answer.output

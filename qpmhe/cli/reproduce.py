@@ -17,12 +17,12 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from qpmhe_solvers import available, backend, create
+from qpmhe_solvers import backend, create
 
 from ..errors import InvalidInputError
 from ..plots import save, trajectories
 from ..studies import PaperStudy, Row, backend_rows, ipopt_rows, paper_rows
-from ..studies.paper import CAPS, ITERATIONS, SETTLED
+from ..studies.paper import CAPS, ITERATIONS, SETTLED, compared_backends
 
 __all__ = ["run"]
 
@@ -57,7 +57,7 @@ def run(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError(f"cannot make the folder {out}: {error.strerror}.") from error
-    names = [name for name in available() if name != "auto"]
+    names = compared_backends()
     runs = len(ITERATIONS) + (4 if with_ipopt else 0) + sum(
         len(CAPS) if backend(name).iteration_cap else 1 for name in names
     )

@@ -163,12 +163,17 @@ def paper_rows(study: PaperStudy, backend_name: str, tick: Tick | None = None) -
     ]
 
 
+def compared_backends() -> tuple[str, ...]:
+    """The installed backends, without ``auto`` and generic forms of those with their own."""
+    return tuple(name for name in available() if name != "auto" and ":" not in name)
+
+
 def backend_rows(
     study: PaperStudy, iterations: int = 2, tick: Tick | None = None
 ) -> Iterator[tuple[str, int | None, Row]]:
     """Every installed backend at each cap on its own iterations, at the same i and record."""
     record, dt = study.record(), study.model.scenario.dt
-    for name in (name for name in available() if name != "auto"):
+    for name in compared_backends():
         for cap in CAPS if backend(name).iteration_cap else (None,):
             yield name, cap, Row.of(name, study.run(iterations, name, cap, tick), record, dt)
 
