@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -273,6 +273,90 @@ class System:
         return jax_system(
             f, h, n=n, p=p, m=m, dt=dt, method=method, states=states,
             disturbances=disturbances, noises=noises,
+        )
+
+    @classmethod
+    def from_control(
+        cls,
+        system: Any,
+        *,
+        dt: float | None = None,
+        method: str | None = None,
+        states: ConvexSet | None = None,
+        disturbances: ConvexSet | None = None,
+        noises: ConvexSet | None = None,
+    ) -> System:
+        """A system of python-control, with the inputs that it has there.
+
+        Parameters
+        ----------
+        system : control.StateSpace or control.NonlinearIOSystem
+            In discrete time as it is; in continuous time it is discretised. Functions that
+            depend on time are taken at time 0.
+        dt : float, optional
+            Sampling time of a system in continuous time.
+        method : {"zoh", "rk4", "euler"}, optional
+            How that is discretised. The default is exact for a held input (``zoh``) where
+            the system is linear, ``rk4`` where it is not.
+        states, disturbances, noises : Box or Polytope, optional
+            The sets X, W and V.
+
+        Raises
+        ------
+        ModelError, SetError, OptionError
+            If something does not fit.
+        InvalidInputError
+            If python-control is not installed.
+        """
+        from .adapters.control import control_system
+
+        return control_system(
+            system, dt=dt, method=method, states=states, disturbances=disturbances,
+            noises=noises,
+        )
+
+    @classmethod
+    def from_sympy(
+        cls,
+        f: Any,
+        h: Any,
+        x: Sequence[Any],
+        u: Sequence[Any] = (),
+        *,
+        dt: float | None = None,
+        method: str = "rk4",
+        states: ConvexSet | None = None,
+        disturbances: ConvexSet | None = None,
+        noises: ConvexSet | None = None,
+    ) -> System:
+        """A model in SymPy's symbols, turned into NumPy functions with exact Jacobians.
+
+        Parameters
+        ----------
+        f, h : sequence of expressions, or a matrix
+            Entries of the next state (or of its rate, with dt) and of the output.
+        x, u : sequence of symbols
+            The states and the inputs.
+        dt : float, optional
+            If given, f is the right-hand side of an ODE, which is discretised with this
+            sampling time; u is held over the step.
+        method : {"rk4", "euler"}
+            Its discretisation.
+        states, disturbances, noises : Box or Polytope, optional
+            The sets X, W and V.
+
+        Raises
+        ------
+        ModelError, SetError, OptionError
+            If something does not fit, such as a symbol that is neither state nor input.
+        InvalidInputError
+            If SymPy is not installed.
+        """
+        from .adapters.sympy import sympy_system
+
+        return sympy_system(
+            f, h, x, u, dt=dt, method=method, states=states, disturbances=disturbances,
+            noises=noises,
         )
 
     def __reduce__(self) -> tuple[Any, ...]:

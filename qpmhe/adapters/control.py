@@ -1,0 +1,163 @@
+"""Systems from those of python-control."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .._checks import positive
+from ..errors import InvalidInputError, ModelError, OptionError
+from ..sets import ConvexSet
+from ..system import System
+
+__all__ = ["control_system"]
+
+Array = NDArray[np.float64]
+Function = Callable[..., Any]
+
+
+def control_system(
+    system: Any,
+    *,
+    dt: float | None = None,
+    method: str | None = None,
+    states: ConvexSet | None = None,
+    disturbances: ConvexSet | None = None,
+    noises: ConvexSet | None = None,
+) -> System:
+    """Make a system from one of python-control; see `qpmhe.System.from_control`.
+
+    Parameters
+    ----------
+    system, dt, method, states, disturbances, noises
+        As there.
+    """
+    control = _import_control()
+    linear = isinstance(system, control.StateSpace)
+    if not linear and not isinstance(system, control.NonlinearIOSystem):
+        raise ModelError(
+            f"system is a {type(system).__name__}; expected a control.StateSpace or a "
+            "control.NonlinearIOSystem. Convert transfer functions by control.ss."
+        )
+    if not system.nstates:
+        raise ModelError("system has no states; there is nothing to estimate.")
+    if system.isctime(strict=True) or (system.dt is None and dt is not None):
+        if dt is None:
+            raise OptionError(
+                "dt is missing: the system is in continuous time; pass the sampling time."
+            )
+        length: float | None = positive("dt", dt)
+    else:
+        if dt is not None and system.dt is not True and dt != system.dt:
+            raise OptionError(
+                f"dt is {dt!r}, but the system is in discrete time with dt = {system.dt!r}; "
+                "leave it out."
+            )
+        length = None
+    sets = {"states": states, "disturbances": disturbances, "noises": noises}
+    if linear:
+        matrices = {name: np.array(getattr(system, name), np.float64) for name in "ABCD"}
+        return _linear(**matrices, dt=length, method=method, sets=sets)
+    made = _nonlinear(system, length, method, sets)
+    made._recipe = (
+        control_system, {"system": system, "dt": dt, "method": method, **sets}
+    )
+    return made
+
+
+def _import_control() -> Any:
+    try:
+        import control
+    except ImportError as error:
+        raise InvalidInputError(
+            "python-control is not installed; pip install control, or give f and h to "
+            "qpmhe.System as functions."
+        ) from error
+    return control
+
+
+def _linear(
+    A: Array,
+    B: Array,
+    C: Array,
+    D: Array,
+    dt: float | None,
+    method: str | None,
+    sets: dict[str, ConvexSet | None],
+) -> System:
+    (n, m), p = B.shape, C.shape[0]
+    a, b = A, B
+    options: dict[str, Any] = {"n": n, "p": p, "m": m, **sets}
+    output, output_jacobian = _affine(C, D, m)
+    if dt is None:
+        if method is not None:
+            raise OptionError(f"method is {method!r}, but the system is in discrete time.")
+    elif method in (None, "zoh"):
+        from scipy.linalg import expm
+
+        # Exact for an input that is held: exp of [A, B; 0, 0] dt.
+        both = np.zeros((n + m, n + m))
+        both[:n, :n], both[:n, n:] = a, b
+        held = expm(both * dt)[:n]
+        a, b = held[:, :n], held[:, n:]
+    else:
+        rate, rate_jacobian = _affine(a, b, m)
+        system = System.from_ode(
+            rate, output, dt=dt, method=method, rate_jacobian=rate_jacobian,
+            h_jacobian=output_jacobian, **options,
+        )
+        return _remembered(system, A, B, C, D, dt, method, sets)
+    step, step_jacobian = _affine(a, b, m)
+    system = System(
+        step, output, f_jacobian=step_jacobian, h_jacobian=output_jacobian, **options
+    )
+    return _remembered(system, A, B, C, D, dt, method, sets)
+
+
+def _remembered(system: System, *arguments: Any) -> System:
+    names = ("A", "B", "C", "D", "dt", "method", "sets")
+    # A control.StateSpace does not pickle, its matrices do.
+    system._recipe = (_linear, dict(zip(names, arguments, strict=True)))
+    return system
+
+
+def _affine(of_state: Array, of_input: Array, m: int) -> tuple[Function, Function]:
+    """Sum of x M^T and u N^T over leading dimensions, and its derivative with respect to x."""
+    by_state, by_input = of_state.T.copy(), of_input.T.copy()
+    constant = of_state.copy()
+
+    def value(x: Array, *u: Array) -> Array:
+        result: Array = x @ by_state
+        if u:
+            result = result + u[0] @ by_input
+        return result
+
+    def slope(x: Array) -> Array:
+        return np.broadcast_to(constant, (*x.shape[:-1], *constant.shape))
+
+    if m == 0:
+        return lambda x: value(x), slope
+    return lambda x, u: value(x, u), lambda x, u: slope(x)  # noqa: ARG005
+
+
+def _nonlinear(
+    system: Any, dt: float | None, method: str | None, sets: dict[str, ConvexSet | None]
+) -> System:
+    m = system.ninputs
+    options: dict[str, Any] = {"n": system.nstates, "p": system.noutputs, "m": m, **sets}
+
+    def at(function: Function) -> Function:
+        # python-control's functions are of one state, and of a time that a System has not.
+        if m == 0:
+            return lambda x: np.asarray(function(0.0, x, np.zeros(0)))
+        return lambda x, u: np.asarray(function(0.0, x, u))
+
+    update, output = at(system.dynamics), at(system.output)
+    if dt is None:
+        if method is not None:
+            raise OptionError(f"method is {method!r}, but the system is in discrete time.")
+        return System(update, output, **options)
+    return System.from_ode(update, output, dt=dt, method=method or "rk4", **options)

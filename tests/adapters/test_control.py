@@ -1,0 +1,120 @@
+"""Systems of python-control beside the same ones written with NumPy."""
+
+import pickle
+import sys
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete
+
+import qpmhe
+from qpmhe import System
+from qpmhe.errors import InvalidInputError, ModelError, OptionError
+
+control = pytest.importorskip("control")
+
+A = np.array([[0.0, 1.0], [-2.0, -0.3]])
+B, C, D = np.array([[0.0], [1.5]]), np.array([[1.0, 0.2]]), np.array([[0.4]])
+POINTS = np.random.default_rng(0).standard_normal((7, 2))
+INPUTS = np.random.default_rng(1).standard_normal((7, 1))
+
+
+def swing(t, x, u, params):
+    return np.array([x[1], -np.sin(x[0]) - 0.1 * x[1] + u[0]])
+
+
+def angle(t, x, u, params):
+    return np.array([x[0]])
+
+
+def same(one, other, x=POINTS, u=INPUTS, tolerance=1e-12):
+    for name in ("f", "h", "f_jacobian", "h_jacobian"):
+        mine, theirs = getattr(one, name), getattr(other, name)
+        np.testing.assert_allclose(
+            mine.batch(x, u), theirs.batch(x, u), rtol=tolerance, atol=tolerance, err_msg=name
+        )
+        np.testing.assert_allclose(mine(x[0], u[0]), theirs(x[0], u[0]), atol=tolerance)
+
+
+def linear(a, b):
+    return System(
+        lambda x, u: x @ a.T + u @ b.T, lambda x, u: x @ C.T + u @ D.T, n=2, p=1, m=1
+    )
+
+
+def test_a_linear_system_in_continuous_time_is_sampled_exactly():
+    ad, bd, *_ = cont2discrete((A, B, C, D), 0.1, "zoh")
+    same(System.from_control(control.ss(A, B, C, D), dt=0.1), linear(ad, bd))
+
+
+@pytest.mark.parametrize("method", ["euler", "rk4"])
+def test_a_linear_system_is_discretised_like_any_rate(method):
+    plain = System.from_ode(
+        lambda x, u: x @ A.T + u @ B.T, lambda x, u: x @ C.T + u @ D.T, dt=0.1, n=2, p=1, m=1,
+        method=method,
+    )
+    same(System.from_control(control.ss(A, B, C, D), dt=0.1, method=method), plain)
+
+
+@pytest.mark.parametrize("dt", [True, 0.1])
+def test_a_linear_system_in_discrete_time_is_taken_as_it_is(dt):
+    same(System.from_control(control.ss(0.5 * A, B, C, D, dt)), linear(0.5 * A, B))
+
+
+def test_a_nonlinear_system_is_discretised():
+    theirs = control.NonlinearIOSystem(swing, angle, inputs=1, outputs=1, states=2)
+    plain = System.from_ode(
+        lambda x, u: np.stack(
+            (x[..., 1], -np.sin(x[..., 0]) - 0.1 * x[..., 1] + u[..., 0]), axis=-1
+        ),
+        lambda x, u: x[..., :1], dt=0.05, n=2, p=1, m=1,
+    )
+    same(System.from_control(theirs, dt=0.05), plain, tolerance=1e-8)
+
+
+def test_a_nonlinear_system_in_discrete_time_without_inputs():
+    theirs = control.NonlinearIOSystem(
+        lambda t, x, u, params: 0.9 * np.sin(x), lambda t, x, u, params: x[:1],
+        inputs=0, outputs=1, states=2, dt=True,
+    )
+    system = System.from_control(theirs)
+    assert system.m == 0
+    np.testing.assert_allclose(system.f.batch(POINTS, np.empty((7, 0))), 0.9 * np.sin(POINTS))
+
+
+def test_an_estimator_runs_on_it_and_it_pickles():
+    system = System.from_control(
+        control.ss(A, B, C, 0), dt=0.1, states=qpmhe.Box([-5, -5], [5, 5])
+    )
+    copy = pickle.loads(pickle.dumps(system))
+    same(copy, system)
+    assert repr(copy.states) == repr(system.states)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.3, 0.2]),
+        qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[1.0]]),
+        horizon=5, initial_state=[0, 0],
+    )
+    assert mhe.update([1.0], [0.0]).improved
+
+
+@pytest.mark.parametrize(
+    ("made", "options", "error", "words"),
+    [
+        (lambda: control.tf([1], [1, 1]), {}, ModelError, "control.ss"),
+        (lambda: control.ss([], [], [], [[1.0]]), {}, ModelError, "no states"),
+        (lambda: control.ss(A, B, C, D), {}, OptionError, "dt is missing"),
+        (lambda: control.ss(A, B, C, D), {"dt": -1.0}, InvalidInputError, "dt"),
+        (lambda: control.ss(A, B, C, D, 0.1), {"dt": 0.2}, OptionError, "leave it out"),
+        (lambda: control.ss(A, B, C, D, 0.1), {"method": "rk4"}, OptionError, "discrete"),
+        (lambda: control.ss(A, B, C, D), {"dt": 0.1, "method": "foo"}, OptionError, "foo"),
+    ],
+)
+def test_what_does_not_fit_is_refused(made, options, error, words):
+    with pytest.raises(error, match=words):
+        System.from_control(made(), **options)
+
+
+def test_without_python_control_there_is_a_remedy(monkeypatch):
+    monkeypatch.setitem(sys.modules, "control", None)
+    with pytest.raises(InvalidInputError, match="pip install control"):
+        System.from_control(object())
