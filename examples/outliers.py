@@ -66,11 +66,11 @@ def rmse(errors):
 def figure_of(states, measurements, hit, estimates):
     """States and estimates, and below them the output with its measurements."""
     times = scenario.dt * np.arange(len(states))
-    figure = trajectories(
+    axes = trajectories(
         times, with_output(states), {name: with_output(x) for name, x in estimates.items()},
         (*scenario.labels, "y (crosses: outliers)"), "time t (s)",
     )
-    panel = figure.axes[-1]
+    figure, panel = axes[0].figure, axes[-1]
     # The last state has no measurement.
     panel.plot(times[:-1], measurements, ".", color="0.7", markersize=3, zorder=1)
     at = hit[:, 0]

@@ -27,6 +27,6 @@ for label, iterations in {"i = 0": 0, "i = 2": 2, "i = 5": 5, "converged": None}
     print(f"{label:>9}: RMSE {rmse:.3f}, {run.share(qpmhe.Status.IMPROVED):.0%} of steps improved")
 
 times = scenario.dt * np.arange(len(states))
-figure = trajectories(times, states, estimates, scenario.labels, "time t (s)")
-for path in save(figure, arguments.out / "paper_figure"):
+axes = trajectories(times, states, estimates, scenario.labels, "time t (s)")
+for path in save(axes[0].figure, arguments.out / "paper_figure"):
     print("wrote", path)

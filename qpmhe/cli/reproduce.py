@@ -145,10 +145,10 @@ def _write(
     record, scenario = study.record(), study.model.scenario
     times = scenario.dt * np.arange(study.steps + 1, dtype=np.float64)
     drawn = {row.label: row.states for row in rows if row.label in _DRAWN}
-    figure = trajectories(
+    axes = trajectories(
         times, record.states, drawn, scenario.labels, f"time t ({scenario.time_unit})"
     )
-    paths = save(figure, out / "reproduce")
+    paths = save(axes[0].figure, out / "reproduce")
     columns = {"t": times}
     for j in range(record.states.shape[1]):
         columns[f"real_x{j + 1}"] = record.states[:, j]

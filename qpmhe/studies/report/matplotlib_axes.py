@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...plots.style import LIGHT
 from .answers import Case
 from .style import Style
 from .words import missing, time_tick
@@ -15,25 +16,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 __all__ = ["LIGHT", "error_axis", "legend", "limits", "panel", "plain", "time_axis", "title"]
-
-LIGHT: Any = {
-    "axes.axisbelow": True,
-    "axes.edgecolor": "0.6",
-    "axes.grid": True,
-    "axes.labelcolor": "0.2",
-    "axes.linewidth": 0.6,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "font.size": 9.0,
-    "grid.color": "0.92",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "svg.fonttype": "none",
-    "xtick.color": "0.4",
-    "xtick.labelcolor": "0.2",
-    "ytick.color": "0.4",
-    "ytick.labelcolor": "0.2",
-}
 
 
 def plain(value: float, _: Any = None) -> str:

@@ -166,4 +166,4 @@ def _run(runs: Runs) -> Any:
         np.asarray(first["times"]), np.asarray(first["states"])[:, :n],
         {words: np.asarray(one["estimates"])[:, :n] for words, one in runs.static[:6]},
         [str(one) for one in first["labels"]][:n], f"time t ({first['time_unit']})",
-    )
+    )[0].figure

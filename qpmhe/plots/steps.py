@@ -1,0 +1,146 @@
+"""What the steps of a run came to: costs, outcomes, times."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..estimate import Status
+from .style import STYLES, panels
+
+if TYPE_CHECKING:
+    from ..run import Run
+
+__all__ = ["costs", "outcomes", "step_times"]
+
+Array = NDArray[np.float64]
+
+# Below this many times the largest, a cost is drawn as this: a logarithm ends somewhere.
+_FLOOR = 1e-12
+_EVENTS = (
+    ("improved", Status.IMPROVED, "#0072B2", "|"),
+    ("kept", Status.CANDIDATE, "#D55E00", "x"),
+    ("missing data", Status.MISSING, "0.45", "."),
+    ("solver stopped or failed", Status.SOLVER_STOPPED, "#CC79A7", "v"),
+    ("model failed", Status.MODEL_FAILED, "#009E73", "D"),
+)
+
+
+def costs(
+    run: Run, *, dt: float = 1.0, time_label: str = "time t (samples)", axes: Any = None
+) -> Any:
+    """True cost J of estimates and candidates, on a logarithmic axis; kept steps are marked.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    dt : float
+        Time between samples, in the unit of ``time_label``.
+    time_label : str
+        Label of the time axis, with its unit.
+    axes : matplotlib Axes, optional
+        Where to draw; a figure is made if left out.
+
+    Returns
+    -------
+    Axes
+        The axes.
+    """
+    (panel,) = panels(1, axes, 2.6)
+    times = dt * np.arange(1, len(run) + 1)
+    finite = run.candidate_costs[np.isfinite(run.candidate_costs)]
+    floor = _FLOOR * max(finite.max(initial=0.0), 1e-300)
+    for values, label, style in (
+        (run.candidate_costs, "candidate", STYLES[1]), (run.costs, "estimate", STYLES[0]),
+    ):
+        panel.semilogy(times, np.maximum(values, floor), linewidth=1.3, label=label, **style)
+    kept = (run.flags & Status.CANDIDATE.value) != 0
+    if kept.any():
+        panel.semilogy(
+            times[kept], np.maximum(run.costs[kept], floor), "x", color="0.3", markersize=4.0,
+            label="candidate kept",
+        )
+    panel.set(xlabel=time_label, ylabel="true cost J")
+    panel.margins(x=0.01)
+    panel.legend(frameon=False)
+    return panel
+
+
+def outcomes(
+    run: Run, *, dt: float = 1.0, time_label: str = "time t (samples)", axes: Any = None
+) -> Any:
+    """Marks of what happened at each step: improved, kept, and why.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    dt : float
+        Time between samples, in the unit of ``time_label``.
+    time_label : str
+        Label of the time axis, with its unit.
+    axes : matplotlib Axes, optional
+        Where to draw; a figure is made if left out.
+
+    Returns
+    -------
+    Axes
+        The axes; a row for each kind of event that occurred.
+    """
+    (panel,) = panels(1, axes, 1.6)
+    times = dt * np.arange(1, len(run) + 1)
+    failed = Status.SOLVER_FAILED.value
+    rows: list[str] = []
+    for label, flag, color, marker in _EVENTS:
+        value = flag.value | (failed if flag is Status.SOLVER_STOPPED else 0)
+        there = (run.flags & value) != 0
+        if there.any():
+            panel.plot(
+                times[there], np.full(there.sum(), len(rows)), marker, color=color, markersize=5.0
+            )
+            rows.append(f"{label} ({there.mean():.0%})")
+    panel.set_yticks(range(len(rows)), rows)
+    panel.set_ylim(len(rows) - 0.5, -0.5)
+    panel.set_xlabel(time_label)
+    panel.margins(x=0.01)
+    return panel
+
+
+def step_times(run: Run, *, deadline: float | None = None, axes: Any = None) -> Any:
+    """Share of the steps that took longer than a time, with the solver's part beside.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    deadline : float, optional
+        Seconds, drawn as a line.
+    axes : matplotlib Axes, optional
+        Where to draw; a figure is made if left out.
+
+    Returns
+    -------
+    Axes
+        The axes, both logarithmic.
+    """
+    (panel,) = panels(1, axes, 2.6)
+    for seconds, label, style in (
+        (run.times, "whole step", STYLES[0]), (run.solve_times, "QP solver", STYLES[1]),
+    ):
+        known = np.sort(seconds[np.isfinite(seconds) & (seconds > 0.0)])
+        if known.size:
+            share = 1.0 - np.arange(known.size) / known.size
+            panel.loglog(known * 1e6, share, drawstyle="steps-post", label=label, **style)
+    if deadline is not None:
+        panel.axvline(deadline * 1e6, color="0.4", linewidth=1.0, linestyle=":")
+        late = float((run.times > deadline).mean())
+        panel.annotate(
+            f"deadline, {late:.1%} later", (deadline * 1e6, 1.0), xytext=(4, -2),
+            textcoords="offset points", va="top", color="0.3",
+        )
+    panel.set(xlabel="time (µs)", ylabel="share of steps that took longer")
+    panel.legend(loc="lower left", frameon=False)
+    return panel

@@ -1,0 +1,101 @@
+"""The look that all figures share: light ink, and colours that all colour vision tells apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["LIGHT", "REAL", "STYLES", "panels", "save"]
+
+# Okabe and Ito's palette; dashes tell the rest.
+STYLES: tuple[dict[str, Any], ...] = (
+    {"color": "#D55E00", "linestyle": "-"},
+    {"color": "#0072B2", "linestyle": "--"},
+    {"color": "#009E73", "linestyle": "-."},
+    {"color": "#CC79A7", "linestyle": ":"},
+    {"color": "#E69F00", "linestyle": "-"},
+    {"color": "#56B4E9", "linestyle": "--"},
+)
+#: How the truth is drawn.
+REAL: dict[str, Any] = {"color": "0.25", "linewidth": 2.2, "alpha": 0.5, "label": "real"}
+#: Parameters of matplotlib.
+LIGHT: Any = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "0.6",
+    "axes.grid": True,
+    "axes.labelcolor": "0.2",
+    "axes.linewidth": 0.6,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "font.size": 9.0,
+    "grid.color": "0.92",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "svg.fonttype": "none",
+    "xtick.color": "0.4",
+    "xtick.labelcolor": "0.2",
+    "ytick.color": "0.4",
+    "ytick.labelcolor": "0.2",
+}
+
+
+def panels(count: int, axes: Any, height: float = 2.1) -> list[Any]:
+    """Axes to draw into: those given, or panels one above the other in a figure of their own.
+
+    Parameters
+    ----------
+    count : int
+        How many are needed.
+    axes : matplotlib Axes, sequence of Axes, or None
+        Where to draw; None makes a figure.
+    height : float
+        Inches of a panel of a new figure.
+
+    Raises
+    ------
+    ShapeError
+        If other than ``count`` axes are given.
+    """
+    import numpy as np
+
+    from ..errors import ShapeError
+
+    if axes is None:
+        from matplotlib import rc_context
+        from matplotlib.figure import Figure
+
+        with rc_context(LIGHT):
+            figure = Figure(figsize=(6.4, 0.9 + height * count), layout="constrained")
+            return list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
+    given = list(np.ravel(np.asarray(axes, dtype=object)))
+    if len(given) != count:
+        raise ShapeError(f"axes are {len(given)}; expected {count}, one for each panel.")
+    return given
+
+
+def save(figure: Figure, stem: Path) -> list[Path]:
+    """Write a figure as PNG and SVG.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        The figure; of axes, ``axes.figure``.
+    stem : Path
+        Path without suffix; its folder is made.
+
+    Returns
+    -------
+    list of Path
+        The files.
+    """
+    from matplotlib import rc_context
+
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    paths = [stem.with_suffix(".png"), stem.with_suffix(".svg")]
+    with rc_context(LIGHT):
+        for path in paths:
+            figure.savefig(path, dpi=200)
+    return paths

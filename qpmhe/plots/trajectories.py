@@ -1,0 +1,172 @@
+"""States over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .style import REAL, STYLES, panels
+
+if TYPE_CHECKING:
+    from ..estimate import Estimate
+    from ..run import Run
+
+__all__ = ["states", "trajectories", "window"]
+
+Array = NDArray[np.float64]
+
+
+def trajectories(
+    times: Array,
+    truth: Array | None,
+    estimates: Mapping[str, Array],
+    labels: Sequence[str],
+    time_label: str,
+    axes: Any = None,
+) -> list[Any]:
+    """True states and estimates over time, one panel a state, as in the paper's figure.
+
+    Parameters
+    ----------
+    times : (T + 1,) array
+        Times of the states.
+    truth : (T + 1, n) array or None
+        The real states, where they are known.
+    estimates : mapping of label to (T + 1, n) array
+        At most six estimates, drawn in this order.
+    labels : sequence of str
+        Axis labels of the states, with units.
+    time_label : str
+        Label of the time axis, with its unit.
+    axes : sequence of n matplotlib Axes, optional
+        Where to draw; a figure is made if left out.
+
+    Returns
+    -------
+    list of Axes
+        One a state; ``axes[0].figure`` is the figure, see `save`.
+    """
+    drawn = panels(len(labels), axes)
+    for j, panel in enumerate(drawn):
+        if truth is not None:
+            panel.plot(times, truth[:, j], **REAL)
+        for style, (label, values) in zip(STYLES, estimates.items(), strict=False):
+            panel.plot(times, values[:, j], linewidth=1.3, label=label, **style)
+        panel.set_ylabel(labels[j])
+        panel.margins(x=0.01)
+    drawn[-1].set_xlabel(time_label)
+    _legend(drawn, axes)
+    return drawn
+
+
+def states(
+    run: Run,
+    *,
+    dt: float = 1.0,
+    labels: Sequence[str] | None = None,
+    time_label: str = "time t (samples)",
+    truth: Array | None = None,
+    sigmas: float = 2.0,
+    axes: Any = None,
+) -> list[Any]:
+    """The estimates of a run, with bands of their covariances where it has them.
+
+    Parameters
+    ----------
+    run : Run
+        Of `MovingHorizonEstimator.run`, with ``covariances=True`` for the bands.
+    dt : float
+        Time between samples, in the unit of ``time_label``.
+    labels : sequence of str, optional
+        Axis labels of the states, with units.
+    time_label : str
+        Label of the time axis, with its unit.
+    truth : (T + 1, n) array, optional
+        The real states.
+    sigmas : float
+        Half the width of a band, in standard deviations.
+    axes : sequence of n matplotlib Axes, optional
+        Where to draw; a figure is made if left out.
+
+    Returns
+    -------
+    list of Axes
+        One a state.
+    """
+    count, n = run.states.shape
+    times = dt * np.arange(count, dtype=np.float64)
+    drawn = trajectories(
+        times, truth, {"estimate": run.states}, labels or _names(n), time_label, axes
+    )
+    if run.covariances is not None:
+        half = sigmas * np.sqrt(np.diagonal(run.covariances, axis1=1, axis2=2))
+        for j, panel in enumerate(drawn):
+            panel.fill_between(
+                times[1:], run.states[1:, j] - half[:, j], run.states[1:, j] + half[:, j],
+                color=STYLES[0]["color"], alpha=0.18, linewidth=0.0,
+                label=f"± {sigmas:g} standard deviations",
+            )
+        _legend(drawn, axes)
+    return drawn
+
+
+def window(
+    estimate: Estimate,
+    *,
+    dt: float = 1.0,
+    labels: Sequence[str] | None = None,
+    time_label: str = "time t (samples)",
+    axes: Any = None,
+) -> list[Any]:
+    """The window of one estimate: the observer's candidate, and what became of it.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Of `MovingHorizonEstimator.update`.
+    dt : float
+        Time between samples, in the unit of ``time_label``.
+    labels : sequence of str, optional
+        Axis labels of the states, with units.
+    time_label : str
+        Label of the time axis, with its unit.
+    axes : sequence of n matplotlib Axes, optional
+        Where to draw; a figure is made if left out.
+
+    Returns
+    -------
+    list of Axes
+        One a state.
+    """
+    count, n = estimate.trajectory.shape
+    times = dt * np.arange(estimate.time + 2 - count, estimate.time + 2, dtype=np.float64)
+    lines = {
+        f"estimate, J = {estimate.cost:.3g}": estimate.trajectory,
+        f"candidate, J = {estimate.candidate_cost:.3g}": estimate.candidate,
+    }
+    drawn = trajectories(times, None, lines, labels or _names(n), time_label, axes)
+    for panel in drawn:
+        for line in panel.lines[-2:]:
+            line.set(marker="o", markersize=3.0)
+    return drawn
+
+
+def _names(n: int) -> list[str]:
+    return [f"x{j + 1}" for j in range(n)]
+
+
+def _legend(drawn: list[Any], axes: Any) -> None:
+    """One legend: above all panels of a figure of its own, else within the first panel."""
+    handles, names = drawn[0].get_legend_handles_labels()
+    if axes is not None:
+        drawn[0].legend(frameon=False)
+        return
+    figure = drawn[0].figure
+    for old in list(figure.legends):
+        old.remove()
+    figure.legend(
+        handles, names, loc="outside upper center", ncols=min(len(names), 5), frameon=False
+    )
