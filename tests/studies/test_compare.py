@@ -86,4 +86,4 @@ def test_an_interrupted_study_tells_how_to_go_on(tmp_path, console, monkeypatch)
     monkeypatch.setattr(commands, "run", interrupted)
     with pytest.raises(KeyboardInterrupt):
         commands.compare(console, store=tmp_path / "s.sqlite", out=tmp_path, backends=["banded"])
-    assert "the same command goes on" in console.file.getvalue()
+    assert "the same command goes on" in " ".join(console.file.getvalue().split())
