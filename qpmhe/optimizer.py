@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -43,11 +43,17 @@ _CORRECTIONS = 2
 _NONE = Status(0)
 
 
-@dataclass(slots=True)
 class Outcome:
     """What the sequence of QPs came to.
 
     Parameters
+    ----------
+    candidate : Trial
+        Where it begins.
+    deadline : float
+        Reading of the clock after which nothing is begun.
+
+    Attributes
     ----------
     reference : Trial
         The candidate, or its projection onto the sets.
@@ -67,12 +73,9 @@ class Outcome:
         Seconds in the solver.
     dropped : tuple of str
         Names of the sets that were left out.
-    deadline : float
-        Reading of the clock after which nothing is begun.
     """
 
-    reference: Trial
-    trial: Trial
+    # Of the class until they change, which in most steps few of them do.
     improved: bool = False
     events: Status = _NONE
     message: str = ""
@@ -81,7 +84,10 @@ class Outcome:
     solver_iterations: int | None = 0
     solve_time: float = 0.0
     dropped: tuple[str, ...] = ()
-    deadline: float = math.inf
+
+    def __init__(self, candidate: Trial, deadline: float = math.inf) -> None:
+        self.reference = self.trial = candidate
+        self.deadline = deadline
 
     def late(self) -> bool:
         """Whether the time is up, which is noted then."""
@@ -150,7 +156,7 @@ class Optimizer:
             Reading of ``time.perf_counter`` after which no QP is begun.
         """
         candidate = problem.candidate(window)
-        outcome = Outcome(candidate, candidate, deadline=deadline)
+        outcome = Outcome(candidate, deadline)
         if problem.constrained and not self._reconcile(problem, window, outcome):
             return outcome
         if self._limit == 0:

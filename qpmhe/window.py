@@ -217,11 +217,10 @@ class Window(Stages):
                 model, u = self._system.timed, self._u[k]
             joint = model.joint if self._jacobians else None
             if joint is None:
-                # Copied at once: a function may return one array every time, and derivatives
-                # by differences call it again.
+                # Copied at once: the functions may return one array every time.
                 following[:] = model.f(z, u)
-                np.subtract(y, model.h(z, u), out=error)
                 ahead = following
+                np.subtract(y, model.h(z, u), out=error)
                 if self._jacobians:
                     self._differentiate(linear, model, z, u)
             else:
