@@ -9,9 +9,11 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from .. import __version__
 from ..errors import QpmheError
+from .estimate_command import estimate
 
 __all__ = ["app", "main"]
 
@@ -59,6 +61,9 @@ def _common(
     ] = False,
 ) -> None:
     """Suboptimal moving horizon estimation by sequences of convex QPs."""
+
+
+app.command()(estimate)
 
 
 @app.command()
@@ -245,5 +250,7 @@ def main() -> None:
     try:
         app()
     except QpmheError as error:
-        Console(stderr=True).print(f"[bold red]Error:[/] {error}", highlight=False)
+        Console(stderr=True).print(
+            f"[bold red]Error:[/] {escape(str(error))}", highlight=False, soft_wrap=True
+        )
         sys.exit(2)

@@ -1,0 +1,60 @@
+"""Models of these tests, and records of them."""
+
+import numpy as np
+
+import qpmhe
+
+DT = 0.1
+A = np.array([[1.0, DT], [-DT, 1.0 - 0.5 * DT]])
+
+
+def rate(x, u):
+    return np.stack((x[..., 1], -x[..., 0] - 0.5 * x[..., 1] + u[..., 0]), axis=-1)
+
+
+def output(x):
+    return x[..., :1] + 0.1 * x[..., :1] ** 3
+
+
+def _rest():
+    observer = qpmhe.Luenberger([[0.3], [0.1]])
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=np.eye(2), disturbance=1e-4 * np.eye(2), noise=[[0.01]]
+    )
+    options = {
+        "horizon": 6, "initial_state": [0.5, 0.0], "states": ["position", "speed"], "max_qps": 2,
+    }
+    return observer, cost, options
+
+
+def continuous(bounded=True):
+    """Steps of any length; bounds that bind."""
+    states = qpmhe.Box([-0.5, -1.0], [0.7, 1.0]) if bounded else None
+    system = qpmhe.System.from_ode(rate, output, dt=DT, n=2, p=1, m=1, states=states)
+    return system, *_rest()
+
+
+def discrete(dt=None):
+    """Equal steps, two outputs, no inputs, nothing optional but what is needed."""
+    system = qpmhe.System(lambda x: x @ A.T, lambda x: x, n=2, p=2)
+    observer = qpmhe.Luenberger(0.3 * np.eye(2))
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=100 * np.eye(2), noise=np.eye(2))
+    options = {"horizon": 5, "initial_state": [0.0, 0.0]}
+    return system, observer, cost, options if dt is None else {**options, "dt": dt}
+
+
+def lines(samples, seed=0, irregular=True, gaps=0.03):
+    """A CSV record of the continuous model, line by line, with blanks and gaps."""
+    generator = np.random.default_rng(seed)
+    x, t, text = np.array([0.9, 0.0]), 0.0, ["time,y,u"]
+    for k in range(samples):
+        dt = DT * (generator.uniform(0.5, 1.4) if irregular else 1.0)
+        dt *= 3 if generator.random() < gaps else 1
+        u = float(np.sin(0.3 * k))
+        y = float(output(x)[0] + 0.1 * generator.standard_normal())
+        blank_y, blank_u = generator.random(2) < 0.1
+        text.append(f"{t},{'' if blank_y else y},{'' if blank_u and k else u}")
+        for _ in range(10):
+            x = x + dt / 10 * rate(x, np.array([u]))
+        t = round(t + dt, 6)
+    return text

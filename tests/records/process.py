@@ -1,0 +1,30 @@
+"""`qpmhe estimate` in a process of its own, to be talked to, interrupted and killed."""
+
+import subprocess
+import sys
+
+_CODE = """
+import sys
+from rich.console import Console
+from qpmhe.cli.estimate import run
+from qpmhe.errors import QpmheError
+
+try:
+    run(Console(stderr=True, width=1000), *sys.argv[1:4], **eval(sys.argv[4]))
+except QpmheError as error:
+    print(error, file=sys.stderr)
+    sys.exit(2)
+"""
+
+
+def start(model, record, out, **options):
+    return subprocess.Popen(
+        [sys.executable, "-c", _CODE, model, str(record), str(out), repr(options)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )
+
+
+def finish(process, text=""):
+    """What it answers: exit code, standard output and standard error."""
+    out, error = process.communicate(text.encode(), timeout=60)
+    return process.returncode, (out or b"").decode(), error.decode()
