@@ -208,7 +208,6 @@ class PythonEngine:
 
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt from measurements so far, as plain arrays and numbers."""
-        system = self._system
         # What a solver keeps is not written down: this estimator goes on without it, too.
         self._solver.forget()
         return {
@@ -218,9 +217,17 @@ class PythonEngine:
             "trajectory": None if self._trajectory is None else self._trajectory.copy(),
             "dropped": self._dropped,
             # How the model is called: another way of calling would round differently.
-            "modes": [function.mode for function in (system.f, system.h)],
-            "methods": [one.method for one in (system.f_jacobian, system.h_jacobian)],
+            "modes": [one.mode for system in self._systems() for one in (system.f, system.h)],
+            "methods": [
+                one.method for system in self._systems()
+                for one in (system.f_jacobian, system.h_jacobian)
+            ],
         }
+
+    def _systems(self) -> list[System]:
+        """The system, and that for steps of other lengths once it is in use."""
+        timed = self._system.__dict__.get("timed")
+        return [self._system] if timed is None else [self._system, timed]
 
     def _size(self) -> tuple[int, ...]:
         system = self._system
@@ -247,6 +254,10 @@ class PythonEngine:
             if trajectory is not None:
                 trajectory = np.array(trajectory, np.float64).reshape(-1, system.n)
             modes, methods = tuple(state["modes"]), tuple(state["methods"])
+            if len(modes) not in (2, 4) or len(methods) != len(modes):
+                raise ValueError("modes and methods are of other numbers of functions")
+            if len(modes) == 4 and system._timed is None:
+                raise ValueError("the system has no steps of other lengths")
         except (KeyError, IndexError, TypeError, ValueError) as error:
             if isinstance(error, InvalidInputError):
                 raise
@@ -259,12 +270,11 @@ class PythonEngine:
         self._window, self._trajectory, self._dropped = window, trajectory, dropped
         self._history.clear()
         self._history.extend(history)
-        for function, mode in zip((system.f, system.h), modes, strict=True):
-            function.mode = mode
-        for jacobian, method in zip(
-            (system.f_jacobian, system.h_jacobian), methods, strict=True
-        ):
-            jacobian.use(method)
+        systems = [system] if len(modes) == 2 else [system, system.timed]
+        for k, one in enumerate(systems):
+            one.f.mode, one.h.mode = modes[2 * k : 2 * k + 2]
+            one.f_jacobian.use(methods[2 * k])
+            one.h_jacobian.use(methods[2 * k + 1])
         if trajectory is not None:
             self._problem.bind(self._window)
             self._problem.leave_out(self._dropped)

@@ -176,3 +176,29 @@ def test_a_state_of_another_observer_is_refused():
     )
     with pytest.raises(qpmhe.errors.InvalidInputError, match="another observer"):
         other.load_state_dict(make().state_dict())
+
+
+def test_how_models_of_other_steps_are_called_goes_along():
+    def rate(x):
+        x = np.asarray(x.tolist())  # loses the batch axis
+        return -x * (1.0 if x[..., 0].max() < 8.5 else 1.001)
+
+    def make():
+        system = qpmhe.System.from_ode(rate, lambda x: x[..., :1], dt=0.1, n=2, p=1)
+        return qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([[0.3], [0.1]]),
+            qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(1)),
+            horizon=4, initial_state=[1.0, 1.0],
+        )
+
+    one, other = make(), make()
+    generator = np.random.default_rng(0)
+    for _ in range(40):
+        one.update(generator.uniform(0.0, 10.0, 1), dt=0.11)
+    one.system.timed.f.mode = "looped"
+    other.load_state_dict(one.state_dict())
+    assert other.system.timed.f.mode == "looped"
+    state = one.state_dict()
+    state["modes"] = state["modes"][:3]
+    with pytest.raises(qpmhe.errors.InvalidInputError, match="damaged"):
+        other.load_state_dict(state)
