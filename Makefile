@@ -35,7 +35,7 @@ examples: $(VENV)/.test
 	$(BIN)/python examples/benchmarks/batch.py --members 200 --steps 40 --out results
 	$(BIN)/python examples/benchmarks/backends.py --quick --out results
 	$(BIN)/qpmhe compare --seeds 2 --steps 40 --solver-iterations 2,none --store results/quick.sqlite --out results/compare
-	if [ -d "$(DATA)" ]; then $(BIN)/python examples/battery_soc.py --data "$(DATA)" --out results; \
+	if [ -d "$(DATA)" ]; then $(BIN)/python examples/battery_soc/study.py --quick --data "$(DATA)" --out results; \
 	else echo "no battery data at '$(DATA)': battery example left out"; fi
 
 # All benchmarks, beside all that PyPI has: an hour, most of it compiling; QUICK=--quick for minutes.
