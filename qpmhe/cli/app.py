@@ -202,6 +202,33 @@ def export(
     run(Console(), store, file)
 
 
+@app.command()
+def certify(
+    model: Annotated[
+        str, typer.Argument(help="Model of the zoo, package.module:function or file.py:function.")
+    ],
+    box: Annotated[
+        str | None, typer.Option(help="Set of states, such as 0.1:9,-1:9; the model's own, or one "
+                                 "about a simulated record, if left out."),
+    ] = None,
+    horizon: Annotated[
+        str | None, typer.Option(help="Horizons N, between commas; the model's own if left out.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="JSON file of everything; the picture goes beside it.")
+    ] = None,
+    input_box: Annotated[
+        str | None, typer.Option(help="Bounds on the inputs, in the form of --box.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated record.")] = 0,
+) -> None:
+    """What the theorem guarantees for a model: its assumptions checked, its constants computed."""
+    from .certify import certify as run
+
+    if not run(Console(), model, box, horizon, report, input_box=input_box, seed=seed):
+        raise typer.Exit(1)
+
+
 @app.command("solve-qp")
 def solve_qp(
     files: Annotated[

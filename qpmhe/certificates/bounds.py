@@ -1,0 +1,188 @@
+"""The bounds for one horizon: the paper's, and those beyond it, with the best free choices."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..costs import Cost, CostConstants, QuadraticCost
+from .choices import Sizes, level, tighten
+from .decay import DecayingSums
+from .results import Detectability, ObserverStability
+from .sharper import WindowBound
+from .summed import SummedBound
+from .theorem import TERMS, TheoremConstants, theorem
+from .weighted import WeightedBound, fit_weight, largest
+
+__all__ = ["HorizonBounds", "bounds_for"]
+
+Array = NDArray[np.float64]
+
+# Steps after which what is left of the initial error no longer matters for a comparison.
+_MOST_STEPS = 400
+# Derivatives by differences are that far off at most.
+_JACOBIAN_ERROR = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class HorizonBounds:
+    """What bounds the error for one horizon.
+
+    Parameters
+    ----------
+    paper : TheoremConstants
+        The theorem's constants as in the paper.
+    summed : SummedBound or None
+        Beyond the paper: its proof with the sums kept; None for an exponent below 1.
+    weighted : WeightedBound or None
+        Beyond the paper: with the norms kept as well; None unless the cost is quadratic and
+        detectability and observer were certified with matrices.
+    """
+
+    paper: TheoremConstants
+    summed: SummedBound | None
+    weighted: WeightedBound | None
+
+    def sharpest(self) -> WindowBound | None:
+        """The sharpest bound beyond the paper that there is."""
+        return self.summed if self.weighted is None else self.weighted
+
+    def to_dict(self, sizes: Sizes) -> dict[str, Any]:
+        """All constants in types that JSON knows.
+
+        Parameters
+        ----------
+        sizes : Sizes
+            For which the bounds' values are told.
+        """
+        c = self.paper
+        told: dict[str, Any] = {
+            "horizon": c.horizon,
+            "paper": {
+                "choices": {
+                    "eta": c.detectability.rate, "c": list(c.detectability.constants),
+                    "rho": c.observer.rate, "C": list(c.observer.constants),
+                },
+                "L_bar": c.L_bar, "c_bar": c.c_bar, "eta_bar": c.eta_bar,
+                "rho_bar_1": c.rho_bar_1, "rho_bar_2": c.rho_bar_2, "C_bar": list(c.C_bar),
+                "C_prime": list(c.C_prime), "C_double_prime": list(c.C_double_prime),
+                "C": list(c.C), "lambda": c.lam,
+                "terms": {
+                    "names": list(TERMS), "C_prime": c.terms().tolist(),
+                    "C_double_prime": c.terms(full=False).tolist(),
+                },
+                "dominating": list(c.dominating()),
+                "level": level(c.result, sizes),
+                "limit": c.result.limit(sizes.disturbance, sizes.noise),
+            },
+        }
+        for name, bound in (("summed", self.summed), ("weighted", self.weighted)):
+            if bound is not None:
+                result = bound.result()
+                told[name] = {
+                    "beyond_the_paper": True, "eta": bound.eta, "rho": bound.rho,
+                    "alpha": bound.alphas.tolist(), "C": list(result.constants),
+                    "lambda": result.rate, "level": window_level(bound, sizes),
+                    "limit": bound.limit(sizes.disturbance, sizes.noise),
+                }
+        return told
+
+
+def bounds_for(
+    horizon: int,
+    detectabilities: Sequence[Detectability],
+    observers: Sequence[ObserverStability],
+    cost: Cost,
+    constants: CostConstants,
+    *,
+    lipschitz: float,
+    sizes: Sizes,
+    output: Array | None = None,
+) -> HorizonBounds:
+    """The best bounds of each kind that follow from what was certified.
+
+    Parameters
+    ----------
+    horizon : int
+        N.
+    detectabilities, observers : sequence
+        What was certified, such as one result for each of several rates.
+    cost : Cost
+        The estimator's cost.
+    constants : CostConstants
+        Its constants.
+    lipschitz : float
+        L_h.
+    sizes : Sizes
+        For which errors the bounds are to be tight.
+    output : (p, n) array, optional
+        The Jacobian of h, if it is constant.
+    """
+    kappa = max(each.kappa for each in observers)
+    plain = [DecayingSums(d.eta, d.c_p, d.c_w, d.c_v) for d in detectabilities]
+    observing = [DecayingSums(o.rho, o.C_p, o.C_w, o.C_v) for o in observers]
+    paper = tighten(
+        plain, observing, constants, kappa=kappa, lipschitz=lipschitz, horizon=horizon,
+        sizes=sizes,
+    )
+    summed: list[SummedBound] = []
+    if constants.exponent >= 1.0:
+        summed = [
+            SummedBound(theorem(
+                one, other, constants, kappa=kappa, lipschitz=lipschitz, horizon=horizon
+            ))
+            for one in plain for other in observing
+        ]
+    weighted: list[WeightedBound] = []
+    if isinstance(cost, QuadraticCost) and cost.discount == 1.0:
+        weighted = [
+            bound
+            for one in detectabilities for other in observers
+            if (bound := _weighted(cost, one, other, lipschitz, horizon, output)) is not None
+        ]
+    return HorizonBounds(
+        paper,
+        min(summed, key=lambda bound: window_level(bound, sizes), default=None),
+        min(weighted, key=lambda bound: window_level(bound, sizes), default=None),
+    )
+
+
+def _weighted(
+    cost: QuadraticCost, detectability: Detectability, observer: ObserverStability,
+    lipschitz: float, horizon: int, output: Array | None,
+) -> WeightedBound | None:
+    P, V, O, gain = detectability.P, detectability.V, observer.P, observer.gain  # noqa: E741
+    if P is None or V is None or O is None or gain is None:
+        return None
+    fit = fit_weight(cost, gain)
+    if output is None:
+        # |h(x) - h(z)|_M <= sqrt(max eig M) L_h |x - z|, and |x - z| in the norm O.
+        top = float(np.linalg.eigvalsh(fit)[-1])
+        slope = math.sqrt(top * largest(np.eye(cost.n), O)) * lipschitz
+    else:
+        slope = math.sqrt(largest(output.T @ fit @ output, O)) * (1.0 + _JACOBIAN_ERROR)
+    return WeightedBound(
+        cost, horizon=horizon, P=P, eta=detectability.eta, noise_weight=V, observer_norm=O,
+        rho=observer.rho, gain=gain, slope=slope,
+    )
+
+
+def window_level(bound: WindowBound, sizes: Sizes) -> float:
+    """The largest value that the bound takes for errors of these sizes.
+
+    Parameters
+    ----------
+    bound : WindowBound
+        The bound.
+    sizes : Sizes
+        As for `level`.
+    """
+    settled = math.ceil(math.log(1e-3) / math.log(bound.rho))
+    steps = bound.horizon + min(_MOST_STEPS, settled)
+    funnel = bound.funnel(sizes.initial, sizes.disturbance, sizes.noise, steps)
+    return max(float(funnel.max()), bound.limit(sizes.disturbance, sizes.noise))

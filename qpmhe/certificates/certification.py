@@ -1,0 +1,231 @@
+"""From system, observer, cost and horizon to a certificate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import count
+from ..costs import Cost, CostConstants
+from ..errors import OptionError
+from ..models.scenario import Record
+from ..observers import Observer
+from ..sets import Box, ConvexSet
+from ..system import System
+from .audit import audit
+from .bounds import bounds_for
+from .certificate import Certificate
+from .choices import Sizes, level, tighten
+from .decay import DecayingSums
+from .detectability import certify_detectability
+from .errors import CertificateError, NotCertifiedError
+from .evidence import Evidence
+from .observer import certify_observer
+from .regions import Region, bounded_region
+from .results import Detectability, ObserverStability
+
+__all__ = ["certify", "cost_sizes"]
+
+Array = NDArray[np.float64]
+Result = TypeVar("Result", Detectability, ObserverStability)
+
+# Rates that are tried beside the first one found, by what is left to 1; and how many more
+# the search for the best one may ask for.
+_SHARES = (0.8, 0.55, 0.35)
+_EVALUATIONS = 4
+
+
+def certify(
+    system: System,
+    observer: Observer,
+    cost: Cost,
+    *,
+    horizon: int | Sequence[int],
+    region: ConvexSet | Region | None = None,
+    inputs: Box | None = None,
+    sizes: Sizes | None = None,
+    detectability: Detectability | None = None,
+    stability: ObserverStability | None = None,
+    run: Record | ArrayLike | None = None,
+    initial_state: ArrayLike | None = None,
+) -> Certificate:
+    """Check the theorem's assumptions on a set of states, and bound the estimator's error.
+
+    Parameters
+    ----------
+    system, observer, cost
+        What the estimator is made of.
+    horizon : int or sequence of int
+        N, or several of them.
+    region : Box, Polytope or Region, optional
+        A bounded set of states; that of the system if left out.
+    inputs : Box, optional
+        Bounds on the inputs, of a system that has any.
+    sizes : Sizes, optional
+        For which initial errors, disturbances and noises the bounds are to be tight; left
+        out, those of which each alone costs 1 in its cheapest direction.
+    detectability, stability : optional
+        Constants to take instead of looking for them, such as assumed ones.
+    run, initial_state : optional
+        A record along which the candidate is checked against the sets; see `audit`.
+
+    Returns
+    -------
+    Certificate
+
+    Raises
+    ------
+    SetError, ShapeError, OptionError, InvalidInputError, ModelError
+        If an argument does not fit.
+    CertificateError
+        If the cost has no constants, h no Lipschitz constant, or the observer no constant
+        gain and no assumed constants.
+    NotCertifiedError
+        If detectability or the observer's stability cannot be shown; the text tells what
+        may help.
+    """
+    horizons = _horizons(horizon)
+    place = bounded_region(system, region, inputs)
+    findings = audit(
+        system, observer, cost, place, run, initial_state=initial_state
+    )
+    constants, lipschitz = findings.constants, findings.lipschitz
+    if constants is None:
+        raise CertificateError(f"{findings['cost bounds'].text}; the theorem needs them.")
+    if lipschitz is None:
+        raise CertificateError("h has no Lipschitz constant on the region.")
+    wanted = cost_sizes(constants) if sizes is None else sizes
+    root = -1.0 / constants.exponent
+    weights = constants.disturbance[0] ** root, constants.noise[0] ** root
+    small = 1e-3 * max(wanted.disturbance, wanted.noise) or 1.0
+    noisy = max(wanted.disturbance, small), max(wanted.noise, small)
+
+    def detected_at(rate: float | None) -> Detectability:
+        return certify_detectability(system, place, eta=rate, weights=weights)
+
+    def observed_at(rate: float | None) -> ObserverStability:
+        return certify_observer(system, observer, place, rho=rate, weights=noisy)
+
+    # One of each before the others are sought: what cannot be certified is told soon.
+    detected = [detected_at(None) if detectability is None else detectability]
+    observing = [observed_at(None) if stability is None else stability]
+
+    def reached(one: Detectability, other: ObserverStability) -> float:
+        best = tighten(
+            [DecayingSums(one.eta, one.c_p, one.c_w, one.c_v)],
+            [DecayingSums(other.rho, other.C_p, other.C_w, other.C_v)],
+            constants, kappa=other.kappa, lipschitz=lipschitz, horizon=horizons[-1], sizes=wanted,
+        )
+        return level(best.result, wanted)
+
+    if detectability is None:
+        detected = _refined(
+            _family(detected[0], detected_at), detected_at,
+            lambda one: reached(one, observing[0]),
+        )
+    if stability is None:
+        first = min(detected, key=lambda one: reached(one, observing[0]))
+        observing = _refined(
+            _family(observing[0], observed_at), observed_at, lambda one: reached(first, one)
+        )
+    bounds = {
+        N: bounds_for(
+            N, detected, observing, cost, constants, lipschitz=lipschitz, sizes=wanted,
+            output=_constant_output(system, place, detected),
+        )
+        for N in horizons
+    }
+    return Certificate(
+        system, observer, cost, findings, tuple(detected), tuple(observing), bounds, wanted
+    )
+
+
+def cost_sizes(constants: CostConstants) -> Sizes:
+    """The errors of which each alone costs 1, in its cheapest direction.
+
+    Parameters
+    ----------
+    constants : CostConstants
+        The cost's.
+    """
+    root = -1.0 / constants.exponent
+    return Sizes(*(
+        each[0] ** root for each in (constants.prior, constants.disturbance, constants.noise)
+    ))
+
+
+def _horizons(horizon: int | Sequence[int]) -> list[int]:
+    given = [horizon] if isinstance(horizon, (int, np.integer)) else list(horizon)
+    if not given:
+        raise OptionError("horizon is empty; expected at least one integer >= 1.")
+    return sorted({count("horizon", each, 1) for each in given})
+
+
+def _rate(result: Detectability | ObserverStability) -> float:
+    return result.eta if isinstance(result, Detectability) else result.rho
+
+
+def _family(first: Result, certified: Callable[[float | None], Result]) -> list[Result]:
+    """Results at several rates, of which each is the best for something."""
+    found = [first]
+    for share in _SHARES:
+        try:
+            found.append(certified(1.0 - share * (1.0 - _rate(first))))
+        except NotCertifiedError:  # a larger rate may be beyond what the solver can do
+            continue
+    return _best_founded(found)
+
+
+def _refined(
+    found: list[Result],
+    certified: Callable[[float | None], Result],
+    value: Callable[[Result], float],
+) -> list[Result]:
+    """The same results, and others about the rate of the best of them."""
+    from scipy.optimize import minimize_scalar
+
+    order = sorted(found, key=_rate)
+    best = min(range(len(order)), key=lambda i: value(order[i]))
+    low = _rate(order[max(best - 1, 0)])
+    high = _rate(order[min(best + 1, len(order) - 1)])
+    if not low < high:
+        return found
+    more = list(found)
+
+    def tried(log_gap: float) -> float:
+        try:
+            result = certified(1.0 - math.exp(log_gap))
+        except NotCertifiedError:
+            return math.inf
+        more.append(result)
+        return value(result)
+
+    minimize_scalar(
+        tried, bounds=(math.log(1.0 - high), math.log(1.0 - low)), method="bounded",
+        options={"maxiter": _EVALUATIONS},
+    )
+    return _best_founded(more)
+
+
+def _best_founded(found: list[Result]) -> list[Result]:
+    """Those that are proved, if any is."""
+    proved = [each for each in found if each.evidence is Evidence.PROVED]
+    return proved or found
+
+
+def _constant_output(
+    system: System, region: Region, detected: list[Detectability]
+) -> Array | None:
+    """The Jacobian of h if it was found to be constant."""
+    if not any(each.form == "output weight" for each in detected):
+        return None
+    point = region.sample(1, np.random.default_rng(0))[:1]
+    jacobian: Array = np.asarray(
+        system.h_jacobian.batch(point[:, : system.n], point[:, system.n :]), np.float64
+    )
+    first: Array = jacobian.reshape(-1, system.p, system.n)[0]
+    return first

@@ -1,0 +1,159 @@
+"""Bounds by decaying sums: the shape of (eq:eIOSS), (eq:RGES) and (eq:RGES_result)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import numbers
+from ..errors import OptionError, ShapeError
+
+__all__ = ["DecayingSums"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DecayingSums:
+    r"""The four constants of a bound with decaying sums.
+
+    .. math::
+        |e(t)| \le c_p |e(0)| r^t + c_w \sum_{\tau=1}^t r^\tau |w(t-\tau)|
+        + c_v \sum_{\tau=1}^t r^\tau |v(t-\tau)|
+
+    With e the difference of two trajectories, w that of their disturbances and v that of
+    their outputs, this is detectability (eq:eIOSS); with e an estimator's error, it is
+    robust exponential stability (eq:RGES), and the theorem's result (eq:RGES_result).
+
+    Parameters
+    ----------
+    rate : float
+        r in (0, 1), per step: eta, rho or lambda of the paper.
+    initial : float
+        c_p >= 1 (without unit); less contradicts the bound at t = 0.
+    disturbance : float
+        c_w >= 0 (without unit).
+    noise : float
+        c_v >= 0, in units of the state per unit of the output.
+
+    Raises
+    ------
+    OptionError
+        If a constant is outside of its range. Infinite ones are allowed: they bound nothing.
+    """
+
+    rate: float
+    initial: float
+    disturbance: float
+    noise: float
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "initial", "disturbance", "noise"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+                raise OptionError(f"{name} is {value!r}; expected a number.")
+            object.__setattr__(self, name, float(value))
+        if not 0.0 < self.rate < 1.0:
+            raise OptionError(
+                f"rate is {self.rate!r}; expected a number in (0, 1): without decay there is "
+                "no bound by decaying sums."
+            )
+        if not self.initial >= 1.0:
+            raise OptionError(
+                f"initial is {self.initial!r}; expected at least 1, since at t = 0 the bound "
+                "says |e(0)| <= initial |e(0)|."
+            )
+        for name in ("disturbance", "noise"):
+            if not getattr(self, name) >= 0.0:
+                raise OptionError(f"{name} is {getattr(self, name)!r}; expected at least 0.")
+
+    @property
+    def constants(self) -> tuple[float, float, float]:
+        """c_p, c_w and c_v."""
+        return self.initial, self.disturbance, self.noise
+
+    def bound(self, initial: float, disturbances: ArrayLike, noises: ArrayLike) -> Array:
+        """The right-hand side at t = 0, ..., T.
+
+        Parameters
+        ----------
+        initial : float
+            |e(0)|.
+        disturbances, noises : (T,) array_like
+            |w(0)|, ..., |w(T-1)| and |v(0)|, ..., |v(T-1)|.
+
+        Returns
+        -------
+        (T + 1,) array
+
+        Raises
+        ------
+        ShapeError, InvalidInputError
+            If these are not nonnegative, finite and of one length.
+        """
+        start, w, v = lengths(initial, disturbances, noises)
+        if not all(math.isfinite(each) for each in self.constants):
+            return np.full(w.size + 1, np.inf)
+        sums = decaying_sums(self.rate, self.disturbance * w + self.noise * v)
+        decay: Array = self.rate ** np.arange(w.size + 1.0)
+        return self.initial * start * decay + self.rate * sums
+
+    def limit(self, disturbance: float, noise: float) -> float:
+        """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows."""
+        if not all(math.isfinite(each) for each in self.constants):
+            return math.inf
+        gain = self.rate / (1.0 - self.rate)
+        return gain * (self.disturbance * disturbance + self.noise * noise)
+
+    def slower(self, rate: float) -> DecayingSums:
+        r"""Constants of a slower bound that follows from this one.
+
+        Since :math:`\tau \ge 1` in the sums, :math:`c\, r^\tau \le (c\, r / s) s^\tau` for a
+        rate s >= r: the disturbance's and noise's constants become smaller.
+
+        Parameters
+        ----------
+        rate : float
+            s, at least the present one and below 1.
+
+        Raises
+        ------
+        OptionError
+            If it is not.
+        """
+        if not self.rate <= rate < 1.0:
+            raise OptionError(
+                f"rate is {rate!r}; expected at least {self.rate!r}, the proved one, and below 1."
+            )
+        share = self.rate / rate
+        return DecayingSums(rate, self.initial, share * self.disturbance, share * self.noise)
+
+
+def decaying_sums(rate: float, entering: Array) -> Array:
+    """s(t) = sum of rate^(tau - 1) entering(t - tau) over tau = 1, ..., t; at t = 0, ..., T."""
+    sums = np.zeros(entering.size + 1)
+    for t, value in enumerate(entering.tolist()):
+        sums[t + 1] = rate * sums[t] + value
+    return sums
+
+
+def lengths(
+    initial: float, disturbances: ArrayLike, noises: ArrayLike
+) -> tuple[float, Array, Array]:
+    """Insist on nonnegative lengths, as many of w as of v."""
+    start = float(numbers("initial", initial))
+    w, v = (
+        np.atleast_1d(numbers(name, value))
+        for name, value in (("disturbances", disturbances), ("noises", noises))
+    )
+    if w.ndim != 1 or w.shape != v.shape:
+        raise ShapeError(
+            f"disturbances have shape {w.shape} and noises {v.shape}; expected (T,) each, "
+            "their Euclidean lengths at one sample after another."
+        )
+    if start < 0.0 or (w < 0.0).any() or (v < 0.0).any():
+        raise OptionError("a length is negative; expected Euclidean lengths, all >= 0.")
+    return start, w, v

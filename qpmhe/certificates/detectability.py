@@ -1,0 +1,139 @@
+"""Exponential detectability (e-IOSS) of a system on a region."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sets import Box, ConvexSet
+from ..system import System
+from .constants import euclidean_constants
+from .errors import NotCertifiedError
+from .forms import OutputInjection, OutputWeight
+from .regions import Region, bounded_region
+from .results import Detectability
+from .search import Search, checked_rate, checked_weights
+
+__all__ = ["Detectability", "certify_detectability"]
+
+Array = NDArray[np.float64]
+
+_STAY = "it holds for trajectories that stay in the region, both of a pair, with equal inputs"
+
+
+def certify_detectability(
+    system: System,
+    region: ConvexSet | Region | None = None,
+    *,
+    eta: float | None = None,
+    inputs: Box | None = None,
+    weights: tuple[float, float] = (1.0, 1.0),
+) -> Detectability:
+    r"""Find and verify constants of e-IOSS, Definition def:eIOSS.
+
+    A constant P with one of the inequalities of `qpmhe.certificates.forms` is sought by
+    semidefinite programs at some states of the region, and then verified on all of it: the
+    Jacobians are enclosed cell by cell with outward rounding, and each cell's matrices shown
+    positive definite. The constants follow as in `euclidean_constants`. Proved is what f and
+    h are as written, in real arithmetic with the constants that they have in double precision;
+    how far their computed values are rounded belongs to the disturbance.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    region : Box, Polytope or Region, optional
+        A bounded set of states; that of the system if left out.
+    eta : float, optional
+        The rate; left out, one is chosen between the smallest feasible one and 1 for which
+        lasting disturbances are bounded best.
+    inputs : Box, optional
+        Bounds on the inputs, of a system that has any.
+    weights : (float, float)
+        How much the constants c_w and c_v matter, such as typical sizes of disturbance and
+        noise; the programs minimise the sum of squares of the products.
+
+    Returns
+    -------
+    Detectability
+        PROVED only if the verification passed; SAMPLED, with the reason, if the functions
+        cannot be run with intervals, or the region has too many cells.
+
+    Raises
+    ------
+    SetError
+        If the region is not a bounded set of the right dimension.
+    OptionError
+        If eta or the weights are out of range.
+    ModelError
+        If the Jacobians are not finite in the region.
+    NotCertifiedError
+        If there are no such constants, or none were found; it tells the smallest feasible
+        rate and what is not detected.
+    """
+    checked_rate("eta", eta)
+    search = Search(system, bounded_region(system, region, inputs), None, checked_weights(weights))
+    try:
+        found = search.find_best() if eta is None else search.find(eta)
+    except NotCertifiedError as error:
+        raise _explained(search, error, eta) from error
+    form = found.form
+    assert isinstance(form, (OutputWeight, OutputInjection))
+    c_p, c_w, c_v = euclidean_constants(form.P, form.R, form.rate)
+    notes = (*found.notes, _STAY)
+    if isinstance(form, OutputInjection):
+        notes = (
+            *notes,
+            "h is not affine on the region, where the inequality with an output weight does not "
+            "carry over from states to averages of Jacobians; that with output injection does",
+        )
+    return Detectability(
+        form.rate, c_p, c_w, c_v, found.evidence, search.region, notes, form.P, form.P, form.R,
+        search.kind, found.margin, found.cells,
+    )
+
+
+def _explained(
+    search: Search, error: NotCertifiedError, eta: float | None
+) -> NotCertifiedError:
+    smallest = search.smallest_rate()
+    if not np.isfinite(smallest):
+        mode = _undetected(search)
+        if mode is not None:
+            return NotCertifiedError(
+                f"the system is not exponentially detectable by any constant P: {mode}",
+                (
+                    "measure something that this mode acts on",
+                    "leave the mode out of the model if it is not to be estimated",
+                ),
+            )
+        return NotCertifiedError(
+            f"{error.args[0]}: no constant P shows detectability on the whole region, although "
+            "every single linearisation may be detectable",
+            ("a smaller region", "other coordinates of the state"),
+        )
+    asked = "" if eta is None else f"eta = {eta:.6g}; "
+    return NotCertifiedError(
+        f"{error.args[0]}. Asked for: {asked}feasible at the states tried: eta from "
+        f"{smallest:.4g} on",
+        ("a larger eta", "a smaller region"), smallest,
+    )
+
+
+def _undetected(search: Search) -> str | None:
+    """A mode that does not decay and is not seen, at one of the states."""
+    n = search.system.n
+    for point, jacobian in zip(search.points, search.jacobians, strict=True):
+        A, C = jacobian[:n], jacobian[n:]
+        for value in np.linalg.eigvals(A):
+            if abs(value) < 1.0 - 1e-9:
+                continue
+            test = np.vstack((A - value * np.eye(n), C))
+            _, sizes, vectors = np.linalg.svd(test)
+            if sizes[-1] <= 1e-9 * max(1.0, sizes[0]):
+                direction = np.round(np.real_if_close(vectors[-1].conj()), 4)
+                return (
+                    f"at {np.round(point, 4).tolist()} the mode with eigenvalue {value:.6g}, "
+                    f"along {direction.tolist()}, does not decay and is not in the output"
+                )
+    return None

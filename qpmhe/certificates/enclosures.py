@@ -1,0 +1,201 @@
+"""Where the Jacobians of f and h lie, cell by cell."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..system import System
+from .intervals import Interval, OutsideDomainError
+from .jets import Jet, variables
+from .regions import Region
+
+__all__ = ["Enclosure", "SmoothModel"]
+
+Array = NDArray[np.float64]
+
+# Beyond, corners would be many: what the other coordinates do is covered by the error.
+_MOST_ACTIVE = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Enclosure:
+    r"""The joint Jacobian :math:`J = [\partial f; \partial h]` over cells.
+
+    On a cell with middle c, by the mean value theorem for J,
+
+    .. math::
+        J(s) \in J(c) + \sum_j (s_j - c_j) H_j + [-E, E]
+
+    where H_j is the middle of an interval enclosure of the second derivatives over the cell
+    and E covers its radius and all rounding. The affine part has its extremes at corners of
+    the cell. E vanishes like the square of the cell's size, and is rounding alone where J is
+    affine.
+
+    Parameters
+    ----------
+    centre : (B, q, n) array
+        J(c), with q = n + p; NaN where the functions could not be enclosed.
+    slopes : (B, N, q, n) array
+        H_j times the half-width of the cell.
+    error : (B, q, n) array
+        E, rounded up.
+    excess : (B, N) array
+        How much each coordinate's width contributes to E.
+    """
+
+    centre: Array
+    slopes: Array
+    error: Array
+    excess: Array
+
+    def corners(self) -> tuple[Array, Array]:
+        """Matrices whose convex hull, widened by an error, holds J on each cell.
+
+        Returns
+        -------
+        corners : (B, K, q, n) array
+            The matrices.
+        error : (B, q, n) array
+            The error.
+        """
+        weight = np.abs(self.slopes).max(axis=(0, 2, 3), initial=0.0)
+        order = np.argsort(weight)[::-1]
+        active = order[: _MOST_ACTIVE][weight[order[:_MOST_ACTIVE]] > 0.0]
+        error = self.error
+        rest = np.setdiff1d(np.arange(weight.size), active)
+        if np.any(weight[rest] > 0.0):
+            error = (error + np.abs(self.slopes[:, rest]).sum(axis=1)) * (1.0 + 1e-12)
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=active.size)))
+        signs = signs.reshape(2**active.size, active.size)
+        moved = self.centre[:, None] + np.einsum(
+            "kj,bjqn->bkqn", signs, self.slopes[:, active]
+        )
+        rounding = 1e-15 * (active.size + 2) * (
+            np.abs(self.centre) + np.abs(self.slopes[:, active]).sum(axis=1)
+        )
+        return moved, error + rounding
+
+
+class SmoothModel:
+    """f and h of a system, to be enclosed over cells of states and inputs.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    region : Region
+        Where; used to try the functions.
+
+    Attributes
+    ----------
+    reason : str
+        Why f and h cannot be run with intervals; empty if they can.
+    affine_output : bool
+        Whether h is affine in the state on the region, so that its Jacobian is constant.
+    """
+
+    def __init__(self, system: System, region: Region) -> None:
+        self._system, self._graph = system, self._find_graph(system)
+        self.n, self.p = system.n, system.p
+        self.reason, self.affine_output = "", False
+        middle = 0.5 * (region.lower + region.upper)
+        try:
+            self._jets(middle[None], middle[None])
+        except Exception as error:  # whatever a user's function makes of unusual numbers
+            self.reason = f"{type(error).__name__}: {error}"
+            return
+        try:
+            outputs = self._jets(region.lower[None], region.upper[None])[self.n :]
+        except OutsideDomainError:
+            return
+        self.affine_output = all(
+            isinstance(jet, float) or not (jet.hessian.low.any() or jet.hessian.high.any())
+            for jet in outputs
+        )
+
+    @staticmethod
+    def _find_graph(system: System) -> Callable[[Any], list[Any]] | None:
+        if system.symbolic is None:
+            return None
+        from .graphs import model_graph
+
+        return model_graph(system.symbolic)
+
+    def _jets(self, lower: Array, upper: Array) -> list[Any]:
+        """Values of f and h over cells: a list of n + p jets, or floats where constant."""
+        made = variables(lower, upper)
+        with np.errstate(all="ignore"):
+            if self._graph is not None:
+                values = self._graph(list(made))
+            else:
+                x, u = made[: self.n], made[self.n :]
+                values = [
+                    entry
+                    for function, size in ((self._system.f, self.n), (self._system.h, self.p))
+                    for entry in np.asarray(function(x, u), dtype=object).reshape(size)
+                ]
+        return [value if isinstance(value, Jet) else float(value) for value in values]
+
+    def enclose(self, lower: Array, upper: Array) -> Enclosure:
+        """The joint Jacobian over cells.
+
+        Parameters
+        ----------
+        lower, upper : (B, n + m) array
+            Corners of the cells.
+        """
+        cells, N = lower.shape
+        q, n = self.n + self.p, self.n
+        centre = 0.5 * lower + 0.5 * upper
+        half = np.nextafter(np.maximum(upper - centre, centre - lower), np.inf)
+        half = np.where(upper == lower, 0.0, half)
+        centre = np.where(upper == lower, lower, centre)
+        at_centre = self._derivatives(centre, centre)[0]
+        second = self._derivatives(lower, upper)[1]
+        slopes = np.zeros((cells, N, q, n))
+        middle, radius = np.moveaxis(second.middle, -1, 0), np.moveaxis(second.radius, -1, 0)
+        slopes[...] = np.moveaxis(middle, -1, 1) * half[:, :, None, None]
+        spread = np.moveaxis(radius, -1, 1) * half[:, :, None, None]
+        jacobian, rounding = (
+            np.moveaxis(part, -1, 0) for part in (at_centre.middle, at_centre.radius)
+        )
+        error = (spread.sum(axis=1) + rounding + 1e-15 * np.abs(slopes).sum(axis=1)) * (
+            1.0 + 1e-14 * (N + 4)
+        )
+        return Enclosure(jacobian, slopes, error, spread.sum(axis=(2, 3)))
+
+    def _derivatives(self, lower: Array, upper: Array) -> tuple[Interval, Interval]:
+        """Gradients (q, n, B) and their derivatives (q, n, N, B); NaN where undefined."""
+        cells, N = lower.shape
+        q, n = self.n + self.p, self.n
+        try:
+            jets = self._jets(lower, upper)
+        except OutsideDomainError:
+            if cells == 1:
+                first, second = np.full((q, n, 1), np.nan), np.full((q, n, N, 1), np.nan)
+                return Interval(first, first), Interval(second, second)
+            half = cells // 2
+            parts = (
+                self._derivatives(lower[:half], upper[:half]),
+                self._derivatives(lower[half:], upper[half:]),
+            )
+            joined = [
+                Interval(
+                    np.concatenate([part[k].low for part in parts], axis=-1),
+                    np.concatenate([part[k].high for part in parts], axis=-1),
+                )
+                for k in range(2)
+            ]
+            return joined[0], joined[1]
+        gradient, hessian = np.zeros((2, q, n, cells)), np.zeros((2, q, n, N, cells))
+        for row, jet in enumerate(jets):
+            if isinstance(jet, Jet):
+                gradient[0, row], gradient[1, row] = jet.gradient.low[:n], jet.gradient.high[:n]
+                hessian[0, row], hessian[1, row] = jet.hessian.low[:n], jet.hessian.high[:n]
+        return Interval(*gradient), Interval(*hessian)

@@ -1,0 +1,91 @@
+"""CasADi functions carried out on other kinds of numbers."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from ..codegen.expressions import CasadiModel, import_casadi
+from .intervals import OutsideDomainError
+
+__all__ = ["model_graph"]
+
+
+def model_graph(model: CasadiModel) -> Callable[[Sequence[Any]], list[Any]]:
+    """The functions f and h of a CasADi model as a function of a list of n + m numbers of any kind.
+
+    Parameters
+    ----------
+    model : CasadiModel
+        The model.
+
+    Returns
+    -------
+    callable
+        From the entries of x and u to those of f and h; it raises OutsideDomainError for an
+        operation that is not smooth, or not known.
+    """
+    ca = import_casadi()
+    x, u = ca.SX.sym("x", model.n), ca.SX.sym("u", model.m)
+    step = model.step().expand()
+    column = ca.densify(ca.vertcat(step(x, u, model.dt or 0.0), model.h.expand()(x, u)))
+    function = ca.Function("model", [ca.vertcat(x, u)], [column])
+    known = _operations()
+    instructions = [
+        (
+            function.instruction_id(k), list(function.instruction_input(k)),
+            list(function.instruction_output(k)),
+            function.instruction_constant(k)
+            if function.instruction_id(k) == ca.OP_CONST else 0.0,
+        )
+        for k in range(function.n_instructions())
+    ]
+
+    def evaluate(values: Sequence[Any]) -> list[Any]:
+        work: dict[int, Any] = {}
+        results: list[Any] = [0.0] * (model.n + model.p)
+        for code, arguments, targets, constant in instructions:
+            if code == ca.OP_INPUT:
+                work[targets[0]] = values[arguments[1]]
+            elif code == ca.OP_CONST:
+                work[targets[0]] = float(constant)
+            elif code == ca.OP_OUTPUT:
+                results[targets[1]] = work[arguments[0]]
+            elif code in known:
+                work[targets[0]] = known[code](*(work[i] for i in arguments))
+            else:
+                raise OutsideDomainError(f"operation {code} of CasADi, which is not smooth")
+        return results
+
+    return evaluate
+
+
+def _method(name: str) -> Callable[[Any], Any]:
+    def apply(value: Any) -> Any:
+        return getattr(np, name)(value)
+
+    return apply
+
+
+@lru_cache(maxsize=1)
+def _operations() -> dict[int, Callable[..., Any]]:
+    ca = import_casadi()
+    known: dict[int, Callable[..., Any]] = {
+        ca.OP_ADD: operator.add, ca.OP_SUB: operator.sub, ca.OP_MUL: operator.mul,
+        ca.OP_DIV: operator.truediv, ca.OP_NEG: operator.neg, ca.OP_ASSIGN: operator.pos,
+        ca.OP_POW: operator.pow, ca.OP_CONSTPOW: operator.pow, ca.OP_FABS: operator.abs,
+        ca.OP_SQ: lambda s: s * s, ca.OP_TWICE: lambda s: 2.0 * s, ca.OP_INV: lambda s: 1.0 / s,
+    }
+    named = {
+        "SQRT": "sqrt", "SIN": "sin", "COS": "cos", "TAN": "tan", "EXP": "exp", "LOG": "log",
+        "TANH": "tanh", "ATAN": "arctan", "SINH": "sinh", "COSH": "cosh",
+        "EXPM1": "expm1", "LOG1P": "log1p",
+    }
+    for code, name in named.items():
+        if hasattr(ca, f"OP_{code}"):
+            known[getattr(ca, f"OP_{code}")] = _method(name)
+    return known

@@ -1,0 +1,266 @@
+"""At run time: which of the certificate's hypotheses hold at each step."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import fields
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import record
+from ..costs import ObserverPrior
+from ..errors import InvalidInputError, OptionError, ShapeError
+from ..estimate import Estimate, Status
+from ..estimator import MovingHorizonEstimator
+from ..run import Run
+from ..system import System
+from .certificate import Certificate
+from .hypotheses import Hypotheses, MonitorSummary
+
+__all__ = ["Monitor", "monitor", "monitored_run"]
+
+Array = NDArray[np.float64]
+
+_RELATIVE = 1e-6
+_FEASIBLE = 1e-8  # what the estimator itself takes for rounding on the sets' boundary
+_BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
+
+
+class Monitor:
+    """Checks a run's estimates, one after another from the first.
+
+    Parameters
+    ----------
+    certificate : Certificate
+        Of the estimator's system, observer and cost.
+    horizon : int
+        The estimator's.
+
+    Raises
+    ------
+    OptionError
+        If the certificate has no bounds for this horizon.
+    """
+
+    def __init__(self, certificate: Certificate, horizon: int) -> None:
+        certificate.of(horizon)
+        self.certificate = certificate
+        self._inputs: deque[Array] = deque(maxlen=horizon)
+        self._checks: list[Hypotheses] = []
+
+    @classmethod
+    def of(cls, certificate: Certificate, estimator: MovingHorizonEstimator) -> Monitor:
+        """A monitor for this estimator, before its first measurement.
+
+        Parameters
+        ----------
+        certificate : Certificate
+            The certificate.
+        estimator : MovingHorizonEstimator
+            The estimator.
+
+        Raises
+        ------
+        InvalidInputError
+            If the certificate is not of its system, observer and cost, or the estimator has
+            taken measurements already.
+        OptionError
+            If it has no bounds for its horizon, or the estimator takes another candidate.
+        """
+        mine = (certificate.system, certificate.observer, certificate.cost)
+        theirs = (estimator.system, estimator.observer, estimator.cost)
+        for name, one, other in zip(("system", "observer", "cost"), mine, theirs, strict=True):
+            if one is not other:
+                raise InvalidInputError(
+                    f"the certificate is of another {name} than the estimator's; certify the "
+                    "very objects that the estimator is made of."
+                )
+        if estimator.time:
+            raise InvalidInputError(
+                f"the estimator has taken {estimator.time} measurements; reset it first: the "
+                "certificate's bound starts with the first one."
+            )
+        if estimator.settings.candidate != "observer":
+            raise OptionError(
+                "the estimator's candidate is that of a reinitialized observer, which the "
+                "theorem does not cover; make it with candidate='observer'."
+            )
+        return cls(certificate, estimator.horizon)
+
+    def check(self, estimate: Estimate, u: ArrayLike | None = None) -> Hypotheses:
+        """Check the next estimate.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            What `MovingHorizonEstimator.update` returned.
+        u : (m,) array_like, optional
+            The input of that update.
+        """
+        m = self.certificate.system.m
+        given = np.zeros(0) if u is None else np.atleast_1d(np.asarray(u, np.float64))
+        if given.shape != (m,):
+            raise ShapeError(f"u has shape {given.shape}; expected ({m},).")
+        self._inputs.append(given)
+        found = monitor(self.certificate, estimate, np.array(self._inputs))
+        self._checks.append(found)
+        return found
+
+    @property
+    def applies(self) -> bool:
+        """Whether the bound follows at the last step: all needed hypotheses held so far."""
+        return all(check.held for check in self._checks)
+
+    def summary(self) -> MonitorSummary:
+        """For how many of the steps so far the certificate applied."""
+        held = [check.held for check in self._checks]
+        first = held.index(False) if False in held else None
+        counts = Counter({each.name: 0 for each in fields(Hypotheses)})
+        for check in self._checks:
+            counts.update(each.name for each in fields(check) if getattr(check, each.name))
+        return MonitorSummary(
+            len(held), len(held) if first is None else first, sum(held), dict(counts), first,
+            () if first is None else self._checks[first].failed,
+        )
+
+
+def monitor(
+    certificate: Certificate, estimate: Estimate, inputs: ArrayLike | None = None
+) -> Hypotheses:
+    """Which hypotheses held at one step.
+
+    Parameters
+    ----------
+    certificate : Certificate
+        Of the estimator's system, observer and cost.
+    estimate : Estimate
+        What the step returned.
+    inputs : (K, m) array_like, optional
+        The inputs of the window's K samples, of a system that has any.
+
+    Returns
+    -------
+    Hypotheses
+
+    Raises
+    ------
+    ShapeError
+        If the inputs do not fit the window.
+    """
+    system, region = certificate.system, certificate.region
+    stages = estimate.trajectory.shape[0] - 1
+    u = np.zeros((stages, 0)) if inputs is None else record("inputs", inputs, system.m)[-stages:]
+    if u.shape != (stages, system.m):
+        raise ShapeError(
+            f"inputs has shape {u.shape}; expected ({stages}, {system.m}), those of the window."
+        )
+    with np.errstate(all="ignore"):
+        w, outputs = _along(system, estimate.trajectory, u)
+        y = outputs + estimate.noises
+        corrections, candidate_outputs = _along(system, estimate.candidate, u)
+        fit = y - candidate_outputs
+        complete = not estimate.status & _BROKEN and bool(
+            np.isfinite(w).all() and np.isfinite(y).all() and np.isfinite(fit).all()
+        )
+        kappa = max(each.kappa for each in certificate.stabilities)
+        # What is missing is reported as that alone: the observer takes it for a fit.
+        told = np.nan_to_num(fit, nan=0.0)
+        allowed = kappa * np.linalg.norm(told, axis=1) * (1.0 + _RELATIVE)
+        rounding = 1e-12 * (1.0 + float(np.abs(estimate.candidate).max()))
+        bounded = bool((np.linalg.norm(corrections, axis=1) <= allowed + rounding).all())
+        cheaper = estimate.cost <= estimate.candidate_cost and (
+            not complete
+            or (_costs(certificate, estimate.trajectory, estimate, w, estimate.noises,
+                      estimate.cost)
+            and _costs(certificate, estimate.candidate, estimate, corrections, fit,
+                       estimate.candidate_cost))
+        )
+    low, high = region.lower[region.n :], region.upper[region.n :]
+    usual = bool(((u >= low) & (u <= high)).all())
+    return Hypotheses(
+        cost_decrease=cheaper,
+        complete=complete,
+        observer_candidate=Status.PROJECTED not in estimate.status,
+        kappa=bounded,
+        candidate_in_region=usual and bool(region.contains(estimate.candidate[:-1]).all()),
+        estimate_in_region=usual and bool(region.contains(estimate.trajectory[:-1]).all()),
+        candidate_in_sets=_in_sets(system, estimate.candidate, corrections, fit),
+        feasible=_in_sets(system, estimate.trajectory, w, estimate.noises),
+    )
+
+
+def monitored_run(
+    certificate: Certificate,
+    estimator: MovingHorizonEstimator,
+    measurements: ArrayLike,
+    inputs: ArrayLike | None = None,
+) -> tuple[Run, MonitorSummary]:
+    """Run an estimator over a record, and tell for how many steps the certificate applied.
+
+    Parameters
+    ----------
+    certificate : Certificate
+        Of the estimator's system, observer and cost.
+    estimator : MovingHorizonEstimator
+        Before its first measurement.
+    measurements : (T, p) array_like
+        y(0), ..., y(T-1).
+    inputs : (T, m) array_like, optional
+        u(0), ..., u(T-1), of a system that has any.
+
+    Returns
+    -------
+    run : Run
+        As `MovingHorizonEstimator.run` gives it.
+    summary : MonitorSummary
+        What the monitor saw.
+    """
+    watch = Monitor.of(certificate, estimator)
+    ys = record("measurements", measurements, estimator.system.p)
+    us = None if inputs is None else record("inputs", inputs, estimator.system.m)
+    if us is not None and len(us) != len(ys):
+        raise ShapeError(f"inputs has {len(us)} samples; expected {len(ys)}.")
+    start, estimates = estimator.state.copy(), []
+    for t, y in enumerate(ys):
+        u = None if us is None else us[t]
+        estimates.append(estimator.update(y, u))
+        watch.check(estimates[-1], u)
+    return Run.of(start, estimates), watch.summary()
+
+
+def _along(system: System, states: Array, u: Array) -> tuple[Array, Array]:
+    """Disturbances and outputs along a trajectory, NaN where the model fails."""
+    w, h = np.full((len(u), system.n), np.nan), np.full((len(u), system.p), np.nan)
+    for i, (x, ahead) in enumerate(pairwise(states)):
+        try:
+            w[i], h[i] = ahead - system.f(x, u[i]), system.h(x, u[i])
+        except Exception:  # a model that is not defined here: the hypothesis does not hold
+            continue
+    return w, h
+
+
+def _costs(
+    certificate: Certificate, states: Array, estimate: Estimate, w: Array, v: Array, told: float
+) -> bool:
+    """Whether a trajectory's cost is what was told, or no less where the prior's weight varies."""
+    cost, offset = certificate.cost, states[0] - estimate.candidate[0]
+    varies = isinstance(cost.prior, ObserverPrior)
+    weight = (
+        cost.prior.minimum * np.eye(offset.size) if isinstance(cost.prior, ObserverPrior)
+        else cost.prior
+    )
+    stages = cost.stage_costs(np.hstack((w, v)), cost.stage_weight)
+    total = cost.prior_cost(offset, weight) + float(np.sum(stages))
+    missed = total - told if varies else abs(total - told)
+    return bool(missed <= _RELATIVE * (abs(told) + 1e-9))
+
+
+def _in_sets(system: System, states: Array, w: Array, v: Array) -> bool:
+    pairs = (
+        (system.states, states[:-1]), (system.disturbances, w), (system.noises, v)
+    )
+    return all(
+        one is None or one.violation(values, rounding=_FEASIBLE) == 0.0 for one, values in pairs
+    )

@@ -1,0 +1,167 @@
+"""Robust exponential stability of an observer with constant gain on a region."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ShapeError
+from ..observers import Luenberger, Observer, OutputInjection, SteadyStateKalman
+from ..sets import Box, ConvexSet
+from ..system import System
+from .constants import euclidean_constants
+from .errors import CertificateError, NotCertifiedError
+from .forms import ErrorContraction
+from .regions import Region, bounded_region
+from .results import ObserverStability
+from .search import Found, Search, checked_rate, checked_weights
+from .verification import Matrices, norm_bound
+
+__all__ = ["ObserverStability", "certify_observer", "constant_gain"]
+
+Array = NDArray[np.float64]
+
+_STAY = "it holds while the states of system and observer stay in the region"
+
+
+def constant_gain(observer: Observer, system: System) -> Array:
+    """The gain L of an observer that corrects by L(z, v) = L v.
+
+    Parameters
+    ----------
+    observer : Observer
+        The observer.
+    system : System
+        The system that it is for.
+
+    Raises
+    ------
+    CertificateError
+        If it has none; the text says what can be done instead.
+    ShapeError
+        If it is for a system of other dimensions.
+    """
+    # A class derived from these may correct in another way.
+    plain = type(observer).correct in (Luenberger.correct, SteadyStateKalman.correct)
+    if plain and isinstance(observer, (Luenberger, SteadyStateKalman)):
+        shape = system.n, system.p
+        if observer.gain.shape != shape:
+            raise ShapeError(f"gain has shape {observer.gain.shape}; expected (n, p) = {shape}.")
+        return observer.gain
+    kind = type(observer).__name__
+    reason = (
+        "its correction is a function of the state as well"
+        if isinstance(observer, OutputInjection)
+        else "its gain follows from what was measured before"
+    )
+    raise CertificateError(
+        f"{kind} has no constant gain: {reason}. Detectability can be certified nevertheless; "
+        "for the observer, take a Luenberger observer (synthesise_gain finds one), or answer for "
+        "its constants yourself: ObserverStability.assumed(rho=..., C_p=..., C_w=..., C_v=..., "
+        "kappa=...)."
+    )
+
+
+def certify_observer(
+    system: System,
+    observer: Observer,
+    region: ConvexSet | Region | None = None,
+    *,
+    rho: float | None = None,
+    inputs: Box | None = None,
+    weights: tuple[float, float] = (1.0, 1.0),
+) -> ObserverStability:
+    r"""Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
+
+    A constant P with the inequality of `qpmhe.certificates.forms.ErrorContraction` is sought
+    and verified as in `certify_detectability`. It serves linear and nonlinear outputs.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    observer : Observer
+        A `Luenberger` observer or one of its kind, or a `SteadyStateKalman`.
+    region : Box, Polytope or Region, optional
+        A bounded set of states; that of the system if left out.
+    rho : float, optional
+        The rate; left out, it is chosen as for `certify_detectability`.
+    inputs : Box, optional
+        Bounds on the inputs, of a system that has any.
+    weights : (float, float)
+        How much the constants C_w and C_v matter.
+
+    Raises
+    ------
+    CertificateError
+        If the observer has no constant gain.
+    SetError, OptionError, ShapeError, ModelError
+        As for `certify_detectability`.
+    NotCertifiedError
+        If there are no such constants, or none were found; it tells the smallest feasible
+        rate, and what to try.
+    """
+    checked_rate("rho", rho)
+    gain = constant_gain(observer, system)
+    search = Search(
+        system, bounded_region(system, region, inputs), "observer", checked_weights(weights), gain
+    )
+    try:
+        return stability(search, search.find_best() if rho is None else search.find(rho))
+    except NotCertifiedError as error:
+        raise _explained(search, error, gain) from error
+
+
+def stability(search: Search, found: Found) -> ObserverStability:
+    """The constants that follow from a verified contraction of the error.
+
+    Parameters
+    ----------
+    search : Search
+        The search.
+    found : Found
+        What it found.
+    """
+    form = found.form
+    assert isinstance(form, ErrorContraction)
+    V, allowance = _noise_weight(form.P, form.gain)
+    c_p, c_w, c_v = euclidean_constants(form.P, V + allowance * np.eye(V.shape[0]), form.rate)
+    kappa = float(norm_bound(Matrices.exact(form.gain[None]))[0])
+    return ObserverStability(
+        form.rate, c_p, c_w, c_v, kappa, found.evidence, search.region,
+        (*found.notes, _STAY), form.P, form.P, V + allowance * np.eye(V.shape[0]), form.gain,
+        found.margin, found.cells,
+    )
+
+
+def _noise_weight(P: Array, gain: Array) -> tuple[Array, float]:
+    """The product L^T P L, and what must be added to its diagonal for rounding."""
+    exact = Matrices.exact(gain)
+    product = exact.T @ Matrices.exact(P) @ exact
+    symmetric = 0.5 * (product.middle + product.middle.T)
+    return symmetric, float(2.0 * product.radius.sum())
+
+
+def _explained(search: Search, error: NotCertifiedError, gain: Array) -> NotCertifiedError:
+    n = search.system.n
+    closed = search.jacobians[:, :n] - gain @ search.jacobians[:, n:]
+    radii = np.abs(np.linalg.eigvals(closed)).max(axis=1)
+    worst = int(radii.argmax())
+    if radii[worst] >= 1.0:
+        return NotCertifiedError(
+            f"the observer's error does not contract: A - L C has the spectral radius "
+            f"{radii[worst]:.6g} at {np.round(search.points[worst], 4).tolist()}, in the region",
+            ("another gain, such as that of synthesise_gain", "a smaller region"),
+        )
+    smallest = search.smallest_rate()
+    if np.isfinite(smallest):
+        return NotCertifiedError(
+            f"{error.args[0]}. Feasible at the states tried: rho from {smallest:.4g} on",
+            ("a larger rho", "another gain, such as that of synthesise_gain", "a smaller region"),
+            smallest,
+        )
+    return NotCertifiedError(
+        f"{error.args[0]}: no constant P shows contraction on the whole region, although A - L C "
+        f"is stable at each of {radii.size} states (spectral radius up to {radii[worst]:.6g})",
+        ("another gain, such as that of synthesise_gain", "a smaller region"),
+    )

@@ -1,0 +1,181 @@
+"""The semidefinite programs whose solutions are then verified."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Answer", "Kind", "Program", "Scales"]
+
+Array = NDArray[np.float64]
+Kind = Literal["output weight", "output injection", "observer", "synthesis"]
+
+_SOLVERS = ("CLARABEL", "SCS")
+# c_p beyond 1e4 would be a certificate of nothing, and spoils the conditioning.
+_MOST_CONDITION = 1e8
+
+
+@dataclass(frozen=True, eq=False)
+class Scales:
+    """Typical sizes of states and outputs, in which the programs are posed.
+
+    Parameters
+    ----------
+    states, outputs : (n,) and (p,) array
+        The sizes; the largest of the states' is 1.
+    """
+
+    states: Array
+    outputs: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What a program returned.
+
+    Parameters
+    ----------
+    status : str
+        ``solved``, ``infeasible``, or what stopped the solver.
+    objective : float
+        The optimal value.
+    P, Y, R, M, N : array or None
+        The unknowns, in the units of the system; Y is P K or P L.
+    """
+
+    status: str
+    objective: float = np.inf
+    P: Array | None = None
+    Y: Array | None = None
+    R: Array | None = None
+    M: Array | None = None
+    N: Array | None = None
+
+
+class Program:
+    r"""Minimise :math:`d^2 \kappa + v^2 r` over :math:`I \preceq P \preceq \kappa I` and a form.
+
+    r bounds the weight of the output: :math:`R \preceq r I`, or :math:`L^\top P L \preceq r I`.
+    Then :math:`\sqrt\kappa / \eta` and :math:`\sqrt r / \eta` are the constants of disturbance
+    and noise; d and v say how much each matters.
+
+    Parameters
+    ----------
+    kind : str
+        Which form.
+    jacobians : (K, n + p, n) array
+        Where it must hold.
+    scales : Scales
+        Sizes.
+    weights : (float, float)
+        d and v.
+    gain : (n, p) array, optional
+        L, of a given observer.
+    """
+
+    def __init__(
+        self,
+        kind: Kind,
+        jacobians: Array,
+        scales: Scales,
+        weights: tuple[float, float],
+        gain: Array | None = None,
+    ) -> None:
+        cp: Any = importlib.import_module("cvxpy")
+
+        n = jacobians.shape[2]
+        p = jacobians.shape[1] - n
+        self._d, self._s, self._kind = scales.states, scales.outputs, kind
+        d, s = self._d, self._s
+        self._rate2, self._margin = cp.Parameter(nonneg=True), cp.Parameter(nonneg=True)
+        self._rest = cp.Parameter(nonneg=True)
+        self._P = P = cp.Variable((n, n), symmetric=True)
+        self._Y = Y = cp.Variable((n, p))
+        self._R = R = cp.Variable((p, p), symmetric=True)
+        self._M, self._N = M, N = cp.Variable((p, n)), cp.Variable((p, p))
+        condition, output = cp.Variable(), cp.Variable()
+        square, output_square = np.diag(d**2), np.diag(s**2)
+        constraints: list[Any] = [
+            P - square >> 0, condition * square - P >> 0, condition <= _MOST_CONDITION,
+        ]
+        if kind == "synthesis":
+            constraints.append(cp.bmat([[P, Y], [Y.T, output * output_square]]) >> 0)
+        elif kind == "observer":
+            assert gain is not None
+            scaled = gain / d[:, None] * s
+            constraints.append(output * output_square - scaled.T @ P @ scaled >> 0)
+        else:
+            constraints += [R >> 0, output * output_square - R >> 0]
+        top = P - self._margin * P
+        for jacobian in jacobians:
+            A = jacobian[:n] * d / d[:, None]
+            C = jacobian[n:] * d / s[:, None]
+            low = self._rest * P
+            if kind == "output weight":
+                rows = [[top, P @ A], [A.T @ P, low + C.T @ R @ C]]
+            elif kind == "output injection":
+                side, mixed = P @ A + Y @ C, C.T @ N - M.T
+                rows = [
+                    [top, side, -Y], [side.T, low + C.T @ M + M.T @ C, mixed],
+                    [-Y.T, mixed.T, R - N - N.T - self._margin * R],
+                ]
+            else:
+                side = P @ A - (Y @ C if gain is None else P @ ((gain / d[:, None] * s) @ C))
+                rows = [[top, side], [side.T, low]]
+            matrix = cp.bmat(rows)
+            constraints.append(0.5 * (matrix + matrix.T) >> 0)
+        first, second = weights
+        self._problem = cp.Problem(
+            cp.Minimize(first**2 * condition + second**2 * output), constraints
+        )
+
+    def solve(self, rate: float, margin: float, *, thorough: bool = True) -> Answer:
+        """Solve for a rate.
+
+        Parameters
+        ----------
+        rate : float
+            eta or rho.
+        margin : float
+            How much room to leave in the inequality, relative to P.
+        thorough : bool
+            Whether to ask a second solver where the first one stops early.
+        """
+        self._rate2.value, self._margin.value = rate * rate, margin
+        self._rest.value = max(rate * rate - margin, 0.0)
+        status = "no solver"
+        for solver in _SOLVERS if thorough else _SOLVERS[:1]:
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    self._problem.solve(solver=solver)
+                status = str(self._problem.status)
+            except Exception as error:  # a solver may raise anything, and the next may not
+                status = f"{solver} raised {type(error).__name__}"
+                continue
+            if status in ("infeasible", "infeasible_inaccurate"):
+                return Answer("infeasible")
+            if self._P.value is not None and np.isfinite(self._P.value).all():
+                return self._answer(status)
+        return Answer(status)
+
+    def _answer(self, status: str) -> Answer:
+        d, s = self._d, self._s
+        P = np.asarray(self._P.value) / np.outer(d, d)
+        P = 0.5 * (P + P.T)
+        Y = R = M = N = None
+        if self._kind in ("output injection", "synthesis"):
+            Y = np.asarray(self._Y.value) / np.outer(d, s)
+        if self._kind in ("output weight", "output injection"):
+            R = np.asarray(self._R.value) / np.outer(s, s)
+            R = 0.5 * (R + R.T)
+        if self._kind == "output injection":
+            M = np.asarray(self._M.value) / np.outer(s, d)
+            N = np.asarray(self._N.value) / np.outer(s, s)
+        objective = float(self._problem.value)
+        return Answer("solved" if status == "optimal" else status, objective, P, Y, R, M, N)

@@ -1,0 +1,291 @@
+"""The search for a matrix inequality that holds on a region, and its verification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .._checks import positive
+from ..errors import OptionError
+from ..system import System
+from .cover import Cover, cover
+from .enclosures import SmoothModel
+from .errors import NotCertifiedError
+from .evidence import Evidence
+from .forms import ErrorContraction, Form, OutputInjection, OutputWeight
+from .programs import Answer, Kind, Program
+from .regions import Region
+from .samples import between_samples, far_apart, joint_jacobians, typical_scales
+from .verification import Matrices, definite
+
+__all__ = ["Found", "Search", "checked_rate", "checked_weights"]
+
+Array = NDArray[np.float64]
+
+_SAMPLES = 400
+_ROUNDS = 8
+_MARGINS = (1e-6, 1e-4, 1e-3, 1e-2)
+_TOLERANCE = 1e-3  # of the smallest rate
+_LARGEST_RATE = 0.9999
+# Above the smallest feasible rate, at which constants may grow without bound, and how often
+# to go three times as far.
+_ABOVE, _ATTEMPTS = 0.01, 4
+# Between the smallest rate, where constants grow without bound, and 1, where they last.
+_SHARES = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
+_SEED = 20210829
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """An inequality and how far it was shown.
+
+    Parameters
+    ----------
+    form : Form
+        The inequality, filled in.
+    evidence : Evidence
+        Whether it is proved on the region, or holds at samples.
+    margin, cells
+        As in `Cover`.
+    notes : tuple of str
+        What there is to say.
+    """
+
+    form: Form
+    evidence: Evidence
+    margin: float
+    cells: int
+    notes: tuple[str, ...]
+
+
+class Search:
+    """Programs at some states, verification at all of them, and more states where it fails.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    region : Region
+        Where.
+    kind : str
+        Which form; None for that of detectability which the output allows.
+    weights : (float, float)
+        How much disturbance and noise matter.
+    gain : (n, p) array, optional
+        That of a given observer.
+
+    Raises
+    ------
+    ModelError
+        If the Jacobians are not finite at the samples.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        region: Region,
+        kind: Kind | None,
+        weights: tuple[float, float],
+        gain: Array | None = None,
+    ) -> None:
+        self.system, self.region, self.gain, self._weights = system, region, gain, weights
+        self.model = SmoothModel(system, region)
+        self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
+        self.jacobians = joint_jacobians(system, self.points)
+        if kind is None:
+            outputs = self.jacobians[:, system.n :]
+            same = self.model.affine_output or (
+                bool(self.model.reason) and np.ptp(outputs, axis=0).max() == 0.0
+            )
+            kind = "output weight" if same else "output injection"
+        self.kind: Kind = kind
+        self._chosen = far_apart(self.jacobians)
+        self._scales = typical_scales(region, self.jacobians, system.n)
+        self._program: Program | None = None
+
+    @property
+    def program(self) -> Program:
+        """The program at the states chosen so far."""
+        if self._program is None:
+            self._program = Program(
+                self.kind, self.jacobians[self._chosen], self._scales, self._weights, self.gain
+            )
+        return self._program
+
+    def smallest_rate(self) -> float:
+        """The smallest feasible rate at the chosen states, infinite if none below 1 is."""
+        low, high = 0.0, _LARGEST_RATE
+        if self._feasible(high).P is None:
+            return np.inf
+        while high - low > _TOLERANCE * (1.0 - low):
+            middle = 0.5 * (low + high)
+            if self._feasible(middle).P is None:
+                low = middle
+            else:
+                high = middle
+        return high
+
+    def _feasible(self, rate: float) -> Answer:
+        return self.program.solve(rate, _MARGINS[0] * min(1.0, rate * rate), thorough=False)
+
+    def best_rate(self, smallest: float) -> float:
+        r"""The rate with the smallest :math:`\sqrt{d^2 \kappa + v^2 r} / (1 - \rho)`.
+
+        That is what lasting disturbances and noise of sizes d and v make, up to a factor.
+
+        Parameters
+        ----------
+        smallest : float
+            The smallest feasible rate.
+        """
+        rates = [smallest + share * (1.0 - smallest) for share in _SHARES]
+        lasting = [
+            np.sqrt(max(self._feasible(rate).objective, 0.0)) / (1.0 - rate) for rate in rates
+        ]
+        return rates[int(np.argmin(lasting))]
+
+    def find_best(self, criterion: str = "trade") -> Found:
+        """An inequality with a rate of its own choice.
+
+        Parameters
+        ----------
+        criterion : {"trade", "rate"}
+            As for `synthesise_gain`.
+
+        Raises
+        ------
+        NotCertifiedError
+            If there is no rate below 1, or none is verified.
+        """
+        share, refused = _ABOVE, NotCertifiedError("no rate was tried")
+        for _ in range(_ATTEMPTS):
+            smallest = self.smallest_rate()
+            if not np.isfinite(smallest):
+                raise NotCertifiedError(
+                    "the semidefinite program is infeasible for every rate below 1"
+                )
+            rate = smallest + share * (1.0 - smallest)
+            if criterion == "trade":
+                rate = max(rate, self.best_rate(smallest))
+            try:
+                return self.find(rate)
+            except NotCertifiedError as error:
+                # What failed has left more states in the program, and moves the smallest rate.
+                refused, share = error, 3.0 * share
+        raise refused
+
+    def find(self, rate: float) -> Found:
+        """An inequality with this rate, verified as far as can be.
+
+        Parameters
+        ----------
+        rate : float
+            eta or rho.
+
+        Raises
+        ------
+        NotCertifiedError
+            If the program is infeasible or not solved, or what it returns fails.
+        """
+        level, size = 0, min(1.0, rate * rate)
+        best: Found | None = None
+        status = "no round was left"
+        for turn in range(1, _ROUNDS + 1):
+            answer = self.program.solve(rate, _MARGINS[level] * size)
+            if answer.P is None:
+                status = answer.status
+                break
+            form = self._form(answer, rate)
+            outcome = self._verified(form)
+            if isinstance(outcome, Found):
+                if outcome.evidence is Evidence.PROVED or self.model.reason:
+                    return outcome
+                best = outcome
+            elif self._added(outcome) and turn % 2:
+                continue
+            if level + 1 == len(_MARGINS):
+                break
+            level += 1
+        if best is not None:
+            return best
+        raise NotCertifiedError(
+            f"the semidefinite program for the rate {rate:.6g} is {status}"
+            if status == "infeasible"
+            else f"no matrix that passes the verification was found for the rate {rate:.6g} "
+            f"(the solver's last word: {status})"
+        )
+
+    def _form(self, answer: Answer, rate: float) -> Form:
+        P, Y, R, M, N = answer.P, answer.Y, answer.R, answer.M, answer.N
+        assert P is not None
+        if self.gain is not None:
+            return ErrorContraction(P, self.gain, rate)
+        if R is not None and Y is None:
+            return OutputWeight(P, R, rate)
+        assert Y is not None
+        if R is not None and M is not None and N is not None:
+            return OutputInjection(P, R, Y, M, N, rate)
+        return ErrorContraction(P, np.asarray(np.linalg.solve(P, Y), np.float64), rate)
+
+    def _verified(self, form: Form) -> Found | Cover:
+        """What was shown, or the cover with the states where the inequality fails."""
+        if not definite(Matrices.exact(form.P[None]))[0].all():
+            return Cover(False, 0, 0.0, *(np.empty((0, 0)), np.empty((0, 0, 0))))
+        if self.model.reason:
+            return self._sampled(
+                form, f"f and h cannot be run with intervals ({self.model.reason})"
+            )
+        found = cover(self.model, self.region, form)
+        if found.proved:
+            return Found(form, Evidence.PROVED, found.margin, found.cells, ())
+        if found.violations.shape[0]:
+            return found
+        return self._sampled(
+            form, f"the proof was given up after dividing the region into {found.cells} cells"
+        )
+
+    def _sampled(self, form: Form, why: str) -> Found | Cover:
+        shown, least = definite(form.matrices(Matrices.exact(self.jacobians)))
+        if not shown.all():
+            broken = ~shown
+            return Cover(
+                False, 0, float(least.min()), self.points[broken], self.jacobians[broken]
+            )
+        note = (
+            f"{why}; the inequality holds at {self.points.shape[0]} states of the region, and "
+            f"{between_samples(form, self.points, self.jacobians)}"
+        )
+        return Found(form, Evidence.SAMPLED, float(least.min()), 0, (note,))
+
+    def _added(self, outcome: Cover) -> bool:
+        """Take states where the inequality fails into the program; False if there are none."""
+        if not outcome.violations.shape[0]:
+            return False
+        chosen = far_apart(outcome.jacobians, 6)
+        count = self.jacobians.shape[0]
+        self.points = np.vstack((self.points, outcome.violations[chosen]))
+        self.jacobians = np.concatenate((self.jacobians, outcome.jacobians[chosen]))
+        self._chosen = np.append(self._chosen, np.arange(count, count + len(chosen)))
+        self._program = None
+        return True
+
+
+def checked_rate(name: str, value: float | None) -> float | None:
+    """Insist on a rate in (0, 1), or none."""
+    if value is None:
+        return None
+    rate = positive(name, value)
+    if rate >= 1.0:
+        raise OptionError(f"{name} is {value!r}; expected a number in (0, 1).")
+    return rate
+
+
+def checked_weights(value: tuple[float, float]) -> tuple[float, float]:
+    """Insist on two positive numbers."""
+    try:
+        first, second = value
+    except (TypeError, ValueError) as error:
+        raise OptionError(f"weights is {value!r}; expected two numbers > 0.") from error
+    return positive("weights[0]", first), positive("weights[1]", second)

@@ -1,0 +1,316 @@
+"""Bounds beyond the paper: its proof with the sums kept, and with the norms kept."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import count, numbers, positive
+from ..errors import OptionError, ShapeError
+from .decay import DecayingSums, decaying_sums
+
+__all__ = ["Parts", "WindowBound"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Initial error, disturbances and noises, in the norms in which they enter a bound.
+
+    Parameters
+    ----------
+    observer_start, window_start : float
+        The initial error as it enters the observer's bound, and detectability's.
+    entering : (T,) array
+        What enters the observer's error at each sample.
+    misfit : (T,) array
+        The noises as they enter the candidate's cost.
+    disturbances, noises : (T,) array
+        As they enter detectability.
+    """
+
+    observer_start: float
+    window_start: float
+    entering: Array
+    misfit: Array
+    disturbances: Array
+    noises: Array
+
+
+class WindowBound(ABC):
+    r"""A bound of the estimator's error along the theorem's proof, with all sums kept.
+
+    With k = min(t, N) the window's length, E the bound of the observer's error, and the
+    norms of `Parts`,
+
+    .. math::
+        \begin{aligned}
+        E(t+1) &= \rho E(t) + \text{entering}(t) \\
+        \hat J(t)^{1/a} &\le j(t) = \Big(\sum_{i=t-k}^{t-1}
+            (\ell E(i) + \text{misfit}(i))^a\Big)^{1/a} \\
+        |x(t) - \hat x(t)| &\le s\,(\alpha_k\, j(t) + G_k(t))
+        \end{aligned}
+
+    where G_k is what detectability makes of the true disturbances and noises of the window,
+    step by step from p E(t-N), or from the initial error itself as long as t <= N, and
+    :math:`\alpha_k` the most that it makes of estimated ones that cost 1. See the page "What
+    is guaranteed, and what is not" for the derivation.
+
+    Parameters
+    ----------
+    horizon : int
+        N >= 1.
+    rho, eta : float
+        Rates of the observer and of detectability.
+    exponent : float
+        a >= 1.
+    slope : float
+        l, from the observer's error to the root of the candidate's cost.
+    entry : float
+        p, from the observer's error to the norm of detectability.
+    scales : (1 + n,) array
+        s, from the norm of detectability to the Euclidean one, and to each component.
+    """
+
+    def __init__(
+        self,
+        *,
+        horizon: int,
+        rho: float,
+        eta: float,
+        exponent: float,
+        slope: float,
+        entry: float,
+        scales: Array,
+    ) -> None:
+        self.horizon = count("horizon", horizon, 1)
+        if not exponent >= 1.0:
+            raise OptionError(
+                f"the cost's exponent is {exponent!r}; expected at least 1: below, norms of "
+                "sums do not add up, and only the theorem's own constants are there."
+            )
+        for name, value in (("rho", rho), ("eta", eta)):
+            if not 0.0 < value < 1.0:
+                raise OptionError(f"{name} is {value!r}; expected a number in (0, 1).")
+        self.rho, self.eta, self.exponent = rho, eta, exponent
+        self.slope, self.entry, self.scales = slope, entry, scales
+        #: alpha_k for k = 0, ..., N: from the root of the cost to the norm of detectability.
+        self.alphas: Array = np.array([self._alpha(k) for k in range(horizon + 1)])
+
+    @abstractmethod
+    def _advance(self, difference: Array, disturbance: Array, noise: Array) -> Array:
+        """One step of detectability, in its norms."""
+
+    @abstractmethod
+    def _alpha(self, length: int) -> float:
+        """The largest sum of a window's estimated parts whose cost is 1."""
+
+    @abstractmethod
+    def parts(self, initial: Array, disturbances: Array, noises: Array) -> Parts:
+        """The norms of an initial error, disturbances and noises.
+
+        Parameters
+        ----------
+        initial : (n,) or () array
+            The initial error, or its Euclidean length.
+        disturbances, noises : (T, n) and (T, p), or (T,) arrays
+            The vectors, or their Euclidean lengths.
+        """
+
+    def bound(
+        self,
+        initial: ArrayLike,
+        disturbances: ArrayLike,
+        noises: ArrayLike,
+        *,
+        costs: ArrayLike | None = None,
+    ) -> Array:
+        """The bound of |x(t) - x_hat(t)| at t = 0, ..., T.
+
+        Parameters
+        ----------
+        initial : (n,) array_like or float
+            x_0 - z_0, or a bound of its length.
+        disturbances, noises : (T, n) and (T, p), or (T,) array_like
+            w(t) and v(t), or bounds of their lengths.
+        costs : (T,) array_like, optional
+            Costs J of the estimates of x(1), ..., x(T), where they are known: they replace
+            their bound where they are smaller.
+
+        Returns
+        -------
+        (T + 1,) array
+
+        Raises
+        ------
+        ShapeError, OptionError
+            If shapes do not fit, or a length is negative.
+        """
+        value: Array = self.scales[0] * self._evaluate(initial, disturbances, noises, costs)
+        return value
+
+    def components(
+        self,
+        initial: ArrayLike,
+        disturbances: ArrayLike,
+        noises: ArrayLike,
+        *,
+        costs: ArrayLike | None = None,
+    ) -> Array:
+        """The bound of each component's error, (T + 1, n); arguments as of `bound`.
+
+        Parameters
+        ----------
+        initial, disturbances, noises, costs
+            As of `bound`.
+        """
+        norm = self._evaluate(initial, disturbances, noises, costs)
+        return np.multiply.outer(norm, self.scales[1:])
+
+    def _evaluate(
+        self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike,
+        costs: ArrayLike | None,
+    ) -> Array:
+        start = numbers("initial", initial)
+        w, v = numbers("disturbances", disturbances), numbers("noises", noises)
+        if w.shape[:1] != v.shape[:1] or not 1 <= w.ndim <= 2 or not 1 <= v.ndim <= 2:
+            raise ShapeError(
+                f"disturbances have shape {w.shape} and noises {v.shape}; expected (T, n) and "
+                "(T, p), or their lengths (T,)."
+            )
+        for lengths in (start, w, v):
+            if lengths.ndim < (1 if lengths is start else 2) and (lengths < 0.0).any():
+                raise OptionError("a length is negative; expected Euclidean lengths, all >= 0.")
+        return self.along(self.parts(start, w, v), costs)
+
+    def along(self, parts: Parts, costs: ArrayLike | None = None) -> Array:
+        """The bound in the norm of detectability, at t = 0, ..., T.
+
+        Parameters
+        ----------
+        parts : Parts
+            What enters.
+        costs : (T,) array_like, optional
+            As of `bound`.
+        """
+        N, a = self.horizon, self.exponent
+        steps = parts.disturbances.size
+        lengths = np.minimum(np.arange(steps + 1), N)
+        decay: Array = self.rho ** np.arange(steps + 1.0)
+        error = parts.observer_start * decay + decaying_sums(self.rho, parts.entering)
+        fit = (self.slope * error[:-1] + parts.misfit) ** a
+        roots: Array = _window_sums(fit, N) ** (1.0 / a)
+        if costs is not None:
+            known = numbers("costs", costs, finite=False)
+            if known.shape != (steps,):
+                raise ShapeError(f"costs have shape {known.shape}; expected ({steps},).")
+            # NaN is no cost: fmin leaves the bound in its place.
+            roots[1:] = np.fmin(roots[1:], np.maximum(known, 0.0) ** (1.0 / a))
+        entry = np.full(steps + 1, parts.window_start)
+        entry[N + 1 :] = self.entry * error[1 : max(1, steps + 1 - N)]
+        padded = np.zeros((2, N + steps))
+        padded[:, N:] = parts.disturbances, parts.noises
+        own = np.where(lengths == 0, entry, 0.0)
+        for j in range(N):  # a shorter window begins later
+            own = np.where(lengths == N - j, entry, own)
+            own = self._advance(own, *padded[:, j : j + steps + 1])
+        own[0] = parts.window_start
+        total: Array = self.alphas[lengths] * roots + own
+        return total
+
+    def funnel(self, initial: float, disturbance: float, noise: float, steps: int) -> Array:
+        """The bound at t = 0, ..., steps for all |w| <= disturbance and |v| <= noise.
+
+        Parameters
+        ----------
+        initial : float
+            Bound of |x_0 - z_0|.
+        disturbance, noise : float
+            Bounds of |w(t)| and |v(t)|.
+        steps : int
+            How far.
+        """
+        return self.bound(initial, np.full(steps, disturbance), np.full(steps, noise))
+
+    def limit(self, disturbance: float, noise: float) -> float:
+        """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows.
+
+        Parameters
+        ----------
+        disturbance, noise : float
+            As above.
+        """
+        parts = self.parts(np.zeros(()), np.array([disturbance]), np.array([noise]))
+        error = parts.entering / (1.0 - self.rho)
+        fit = self.slope * error + parts.misfit
+        own = self.entry * error
+        for _ in range(self.horizon):
+            own = self._advance(own, parts.disturbances, parts.noises)
+        root = self.horizon ** (1.0 / self.exponent) * fit
+        return float(self.scales[0] * (self.alphas[-1] * root + own)[0])
+
+    def result(self, rate: float | None = None) -> DecayingSums:
+        """The smallest constants C_1, C_2, C_3 with which (eq:RGES_result) follows.
+
+        The bound is sublinear, so its value for a sum of impulses is below the sum of its
+        values for each. Impulses are tried at each time before the window is full, and until
+        they have left it; from then on their effect decays with rho.
+
+        Parameters
+        ----------
+        rate : float, optional
+            lambda, at least rho; max(eta, rho) as in the paper if left out.
+
+        Raises
+        ------
+        OptionError
+            If the rate is below rho, or not below 1.
+        """
+        lam = max(self.eta, self.rho) if rate is None else positive("rate", rate)
+        if not self.rho <= lam < 1.0:
+            raise OptionError(f"rate is {lam!r}; expected at least rho = {self.rho!r}, below 1.")
+        N = self.horizon
+        # At N + 1 the observer's bound takes the place of the initial error.
+        nothing = np.zeros(N + 1)
+        first = _over_powers(self.bound(1.0, nothing, nothing), lam, 0)
+        second, third = 0.0, 0.0
+        for start in range(N + 1):
+            impulse = np.zeros(start + N + 1)
+            nothing = np.zeros_like(impulse)
+            impulse[start] = 1.0
+            of_w = self.bound(0.0, impulse, nothing)[start + 1 :]
+            of_v = self.bound(0.0, nothing, impulse)[start + 1 :]
+            second = max(second, _over_powers(of_w, lam, 1))
+            third = max(third, _over_powers(of_v, lam, 1))
+        return DecayingSums(lam, max(1.0, first), second, third)
+
+
+def _over_powers(values: Array, rate: float, first: int) -> float:
+    """The largest of values[i] / rate^(first + i); infinite where the power vanishes."""
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        shares = values / rate ** np.arange(first, first + float(values.size))
+    return float(np.where(values > 0.0, shares, 0.0).max())
+
+
+def _window_sums(values: Array, width: int) -> Array:
+    """Sums over the last values before t = 0, ..., T."""
+    padded = np.concatenate((np.zeros(width), values))
+    sums: Array = sliding_window_view(padded, width).sum(axis=1)
+    return sums
+
+
+def holder(values: Array, exponent: float) -> float:
+    """The largest sum of values[i] s[i] with the sum of s[i]^a up to 1, for a >= 1."""
+    if exponent == 1.0:
+        return float(values.max())
+    dual = exponent / (exponent - 1.0)
+    top = float(values.max())
+    if top == 0.0 or not math.isfinite(top):
+        return top
+    return float(top * np.sum((values / top) ** dual) ** (1.0 / dual))

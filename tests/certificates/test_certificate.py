@@ -1,0 +1,291 @@
+"""The certificate as a whole: what it is made of, what it bounds, and what it says."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.certificates.bounds import window_level
+from qpmhe.certificates.certification import certify, cost_sizes
+from qpmhe.certificates.choices import level
+from qpmhe.certificates.decay import DecayingSums
+from qpmhe.certificates.errors import CertificateError, NotCertifiedError
+from qpmhe.certificates.evidence import Evidence
+from qpmhe.certificates.figures import LABELS, error_and_bounds
+from qpmhe.certificates.results import Detectability, ObserverStability
+from qpmhe.certificates.theorem import theorem
+from qpmhe.errors import OptionError, SetError, ShapeError
+
+SLACK = 1 + 1e-9
+KINDS = ("paper", "summed", "weighted", "measured")
+
+
+def test_the_reactors_constants_are_the_theorems(reactor):
+    certificate, _ = reactor
+    assert certificate.evidence is Evidence.PROVED
+    detected, observed = certificate.detectabilities[0], certificate.stabilities[0]
+    assert (detected.eta, observed.rho) == (0.9, 0.95)
+    assert observed.C_p == pytest.approx(1.0, abs=1e-6)  # it contracts with P = I
+    for N in (1, 5, 10):
+        paper = certificate.of(N).paper
+        again = theorem(
+            DecayingSums(0.9, detected.c_p, detected.c_w, detected.c_v), paper.observer,
+            certificate.audit.constants, kappa=np.sqrt(0.005), lipschitz=np.sqrt(2.0), horizon=N,
+        )
+        assert pytest.approx(again.C, rel=1e-9) == paper.C
+        # The free choices follow from what was certified.
+        allowed = DecayingSums(0.95, observed.C_p, observed.C_w, observed.C_v).slower(
+            paper.observer.rate
+        )
+        assert paper.observer.initial == allowed.initial
+        assert paper.observer.disturbance == allowed.disturbance
+        assert paper.observer.noise >= allowed.noise * (1 - 1e-12)
+
+
+def test_each_kind_is_sharper_than_the_one_before(reactor):
+    certificate, _ = reactor
+    assert certificate.kinds == KINDS
+    for N in certificate.horizons:
+        bounds = certificate.of(N)
+        levels = [
+            level(bounds.paper.result, certificate.sizes),
+            window_level(bounds.summed, certificate.sizes),
+            window_level(bounds.weighted, certificate.sizes),
+        ]
+        assert levels[0] > 5 * levels[1] > 5 * levels[2]
+
+
+def test_growth_with_the_horizon_is_that_of_the_observers_rate(reactor):
+    certificate, _ = reactor
+    grown = [certificate.of(N).paper.C[0] for N in certificate.horizons]
+    assert grown == sorted(grown)
+    limits = [certificate.limit(0.3, 0.6, horizon=N, kind="weighted") for N in (5, 10)]
+    # Beyond the paper, lasting noise costs no power of 1 / rho.
+    assert limits[1] < 1.2 * limits[0]
+
+
+def test_the_paper_bound_is_called_vacuous_and_the_measured_one_is_not(reactor):
+    certificate, scenario = reactor
+    assert all(certificate.vacuous(horizon=N) for N in certificate.horizons)
+    assert not certificate.vacuous(0.0, 0.0, horizon=10)
+    assert "vacuous" in certificate.summary()
+    states, _ = scenario.simulate(0)
+    run, w, v = played(certificate, scenario, 0, 10)
+    measured = certificate.bound(
+        run, w, v, initial_error=states[0] - run.states[0], horizon=10, kind="measured"
+    )
+    assert measured.max() < certificate.diameter
+
+
+def played(certificate, scenario, seed, horizon, **options):
+    states, measurements = scenario.simulate(seed)
+    mhe = qpmhe.MovingHorizonEstimator(
+        certificate.system, certificate.observer, certificate.cost, horizon=horizon,
+        initial_state=scenario.initial_estimate, **options,
+    )
+    run = mhe.run(measurements)
+    w = states[1:] - certificate.system.f.batch(states[:-1], np.zeros((len(states) - 1, 0)))
+    return run, w, measurements - states[:-1].sum(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("max_qps", [0, 2])
+def test_no_bound_is_below_the_error(reactor, kind, max_qps):
+    certificate, scenario = reactor
+    for seed in range(3):
+        states, _ = scenario.simulate(seed)
+        run, w, v = played(certificate, scenario, seed, 5, max_qps=max_qps)
+        error = np.linalg.norm(states - run.states, axis=1)
+        bound = certificate.bound(
+            run, w, v, initial_error=states[0] - run.states[0], horizon=5, kind=kind
+        )
+        assert (error <= bound).all()
+
+
+def test_bounded_disturbances_give_the_funnel(reactor):
+    certificate, scenario = reactor
+    run, w, v = played(certificate, scenario, 0, 5)
+    w_max, v_max = np.linalg.norm(w, axis=1).max(), np.abs(v).max()
+    for kind in KINDS[:3]:
+        funnel = certificate.funnel(
+            w_max, v_max, initial_error=np.sqrt(8.0), steps=len(run), horizon=5, kind=kind
+        )
+        same = certificate.bound(
+            run, w_max, v_max, initial_error=np.sqrt(8.0), horizon=5, kind=kind
+        )
+        np.testing.assert_array_equal(funnel, same)
+        along = certificate.bound(run, w, v, initial_error=[2.0, 2.0], horizon=5, kind=kind)
+        assert (along <= SLACK * funnel).all()
+        late = certificate.funnel(
+            w_max, v_max, initial_error=0.0, steps=900, horizon=5, kind=kind
+        )[-1]
+        assert certificate.limit(w_max, v_max, horizon=5, kind=kind) == pytest.approx(late)
+
+
+def test_the_paper_bound_is_the_right_hand_side(reactor):
+    certificate, scenario = reactor
+    run, w, v = played(certificate, scenario, 0, 5)
+    C, lam = certificate.of(5).paper.C, certificate.of(5).paper.lam
+    found = certificate.bound(run, w, v, initial_error=[2.0, 2.0], horizon=5)
+    for t in (0, 3, 60):
+        expected = C[0] * np.sqrt(8.0) * lam**t + sum(
+            lam**tau * (C[1] * np.linalg.norm(w[t - tau]) + C[2] * abs(v[t - tau, 0]))
+            for tau in range(1, t + 1)
+        )
+        assert found[t] == pytest.approx(expected, rel=1e-8)
+
+
+def test_a_linear_system_with_free_rates(linear):
+    assert linear.evidence is Evidence.PROVED
+    assert len(linear.detectabilities) > 1
+    assert len(linear.stabilities) > 1
+    assert linear.sizes == cost_sizes(linear.audit.constants)
+    sizes = linear.sizes.initial, linear.sizes.disturbance, linear.sizes.noise
+    assert sizes == pytest.approx((1.0, 0.5, 1 / np.sqrt(3.0)))
+    only = linear.of()
+    assert only is linear.of(4)
+    # Several rates are never worse than each alone.
+    for one, other in ((0, 0), (1, 0), (0, 1)):
+        single = certify(
+            linear.system, linear.observer, linear.cost, horizon=4,
+            detectability=linear.detectabilities[one], stability=linear.stabilities[other],
+        )
+        for kind in ("summed", "weighted"):
+            assert window_level(getattr(only, kind), linear.sizes) <= SLACK * window_level(
+                getattr(single.of(), kind), linear.sizes
+            )
+        # The search within a pair stops at a percent.
+        assert level(only.paper.result, linear.sizes) <= 1.01 * level(
+            single.of().paper.result, linear.sizes
+        )
+
+
+def test_assumed_constants_give_the_plain_bounds_and_say_so():
+    system = qpmhe.System(
+        lambda x: 0.8 * x, lambda x: x, n=1, p=1, states=qpmhe.Box([-1.0], [1.0])
+    )
+    cost = qpmhe.RobustCost(
+        prior=qpmhe.Power(1.0, 1.5), disturbance=qpmhe.Power(1.0, 1.5),
+        noise=qpmhe.Power(1.0, 1.5),
+    )
+    observer = qpmhe.OutputInjection(lambda z, v: 0.3 * v)
+    certificate = certify(
+        system, observer, cost, horizon=3,
+        detectability=Detectability.assumed(eta=0.8, c_p=1.0, c_w=1.25, c_v=0.1),
+        stability=ObserverStability.assumed(rho=0.5, C_p=1.0, C_w=2.0, C_v=0.6, kappa=0.3),
+    )
+    assert certificate.evidence is Evidence.ASSUMED
+    assert certificate.kinds == ("paper", "summed", "measured")
+    with pytest.raises(OptionError, match="weighted"):
+        certificate.limit(1.0, 1.0, kind="weighted")
+    assert certificate.of().paper.cost.exponent == 1.5
+
+
+def test_json_holds_everything(reactor):
+    certificate, _ = reactor
+    told = json.loads(json.dumps(certificate.to_dict(), allow_nan=False))
+    assert told["evidence"] == "proved"
+    assert [each["horizon"] for each in told["horizons"]] == [1, 5, 10]
+    for each in told["horizons"]:
+        paper = certificate.of(each["horizon"]).paper
+        assert each["paper"]["C"] == list(paper.C)
+        assert each["paper"]["lambda"] == paper.lam
+        terms = np.array(each["paper"]["terms"]["C_prime"])
+        np.testing.assert_allclose(terms.sum(axis=0), each["paper"]["C_prime"])
+        assert each["weighted"]["beyond_the_paper"] is True
+    assert told["vacuous"]["paper"]["10"] is True
+    assert told["detectability"][0]["evidence"] == "proved"
+    assert len(told["assumed"]) == 2
+
+
+def test_infinite_constants_are_vacuous_and_fit_into_json(reactor):
+    certificate, _ = reactor
+    system, observer, cost = certificate.system, certificate.observer, certificate.cost
+    far = certify(
+        system, observer, cost, horizon=80, region=certificate.region,
+        detectability=Detectability.assumed(eta=1e-5, c_p=1.0, c_w=1.0, c_v=1.0),
+        stability=ObserverStability.assumed(rho=1e-5, C_p=1.0, C_w=1.0, C_v=1.0, kappa=0.1),
+    )
+    # The best choice is a larger rate, whose powers are finite; as given, they are not.
+    assert math.isinf(theorem(
+        DecayingSums(1e-5, 1.0, 1.0, 1.0), DecayingSums(1e-5, 1.0, 1.0, 1.0),
+        certificate.audit.constants, kappa=0.1, lipschitz=1.0, horizon=80,
+    ).C[0])
+    assert math.isfinite(far.of().paper.C[0])
+    told = json.loads(json.dumps(far.to_dict(), allow_nan=False))
+    assert told["horizons"][0]["summed"]["C"][0] is None
+    assert math.isfinite(told["horizons"][0]["summed"]["limit"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"horizon": 0}, OptionError, "horizon"),
+        ({"horizon": ()}, OptionError, "horizon"),
+        ({"region": None}, SetError, "region"),
+        ({"region": qpmhe.Box([0.1, -np.inf], [9.0, np.inf])}, SetError, "unbounded"),
+        ({"cost": qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=1.0,
+                                      discount=0.9)}, CertificateError, "discount"),
+        ({"cost": qpmhe.RobustCost(prior=np.eye(2), disturbance=np.eye(2),
+                                   noise=qpmhe.Huber(1.0))}, CertificateError, "no constants"),
+        ({"observer": qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=np.eye(2), noise=1.0)},
+         CertificateError, "constant gain"),
+        ({"observer": qpmhe.Luenberger([[-0.5], [0.5]])}, NotCertifiedError, "gain"),
+    ],
+)
+def test_what_cannot_be_certified_is_told(reactor, arguments, error, words):
+    certificate, _ = reactor
+    given = {
+        "system": certificate.system, "observer": certificate.observer,
+        "cost": certificate.cost, "horizon": 5, "region": certificate.region,
+        "detectability": certificate.detectabilities[0],
+    } | arguments
+    with pytest.raises(error, match=words):
+        certify(given.pop("system"), given.pop("observer"), given.pop("cost"), **given)
+
+
+def test_an_undetectable_system_is_named_with_its_mode():
+    system = qpmhe.System(
+        lambda x: x * np.array([0.5, 1.1]), lambda x: x[..., :1], n=2, p=1,
+        states=qpmhe.Box([-1.0, -1.0], [1.0, 1.0]),
+    )
+    with pytest.raises(NotCertifiedError, match=r"1\.1.*not in the output"):
+        certify(
+            system, qpmhe.Luenberger([[0.2], [0.0]]),
+            qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=1.0), horizon=3,
+        )
+
+
+def test_bad_arguments_of_a_bound_are_named(reactor):
+    certificate, _ = reactor
+    with pytest.raises(OptionError, match="horizon"):
+        certificate.of(7)
+    with pytest.raises(OptionError, match="horizon"):
+        certificate.of()
+    with pytest.raises(ShapeError, match="run"):
+        certificate.bound(None, 0.1, 0.1, initial_error=1.0, horizon=5)
+    with pytest.raises(ShapeError, match="noises"):
+        certificate.bound(None, np.zeros(4), np.zeros((4, 2)), initial_error=1.0, horizon=5)
+    with pytest.raises(ShapeError, match="initial_error"):
+        certificate.bound(None, np.zeros(4), 0.1, initial_error=np.zeros(3), horizon=5)
+    with pytest.raises(OptionError, match="kind"):
+        certificate.bound(None, np.zeros(4), 0.1, initial_error=1.0, horizon=5, kind="best")
+    with pytest.raises(qpmhe.errors.InvalidInputError, match="run"):
+        certificate.bound(None, np.zeros(4), 0.1, initial_error=1.0, horizon=5, kind="measured")
+
+
+def test_figure_shows_error_and_bounds():
+    times = np.arange(5.0)
+    axes = error_and_bounds(
+        times, np.array([1.0, 0.5, 0.0, 0.2, 0.1]),
+        {LABELS["paper"]: np.full(5, 30.0), LABELS["weighted"]: np.full(5, np.inf)},
+        diameter=3.0, time_label="t (s)",
+    )
+    assert axes.get_yscale() == "log"
+    labels = [text.get_text() for text in axes.get_figure().legends[0].get_texts()]
+    assert labels == ["error", LABELS["paper"], LABELS["weighted"]]
+    assert axes.get_ylim()[1] > 30.0
+    with pytest.raises(ShapeError, match="error"):
+        error_and_bounds(times, np.ones(4), {})

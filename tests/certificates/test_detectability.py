@@ -1,0 +1,235 @@
+"""Detectability: known constants, the paper's reactor, pairs of trajectories, refusals."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.certificates import search as search_module
+from qpmhe.certificates.detectability import Detectability, certify_detectability
+from qpmhe.certificates.errors import CertificateError, NotCertifiedError
+from qpmhe.certificates.evidence import Evidence, weakest
+from qpmhe.certificates.forms import OutputWeight
+from qpmhe.certificates.programs import Answer, Program
+from qpmhe.certificates.verification import Matrices, definite
+from qpmhe.errors import OptionError
+
+REACTOR = qpmhe.Box([0.1, 0.0], [9.0, 9.0])
+
+
+def linear(A, C):
+    A, C = np.atleast_2d(A), np.atleast_2d(C)
+    return qpmhe.System(
+        lambda x: x @ A.T, lambda x: x @ C.T, n=A.shape[0], p=C.shape[0]
+    )
+
+
+def unit_box(n):
+    return qpmhe.Box(-np.ones(n), np.ones(n))
+
+
+def test_scalar_system_has_the_known_constants():
+    a, c, eta = 1.1, 0.5, 0.8
+    found = certify_detectability(linear(a, c), unit_box(1), eta=eta)
+    assert found.evidence is Evidence.PROVED
+    assert found.form == "output weight"
+    sharp = math.sqrt(a * a - eta * eta) / c / eta
+    np.testing.assert_allclose([found.c_p, found.c_w], [1.0, 1.0 / eta], rtol=1e-4)
+    assert sharp < found.c_v < sharp * (1 + 1e-4)
+
+
+def test_normal_system_needs_no_output_above_its_spectral_radius():
+    found = certify_detectability(linear(np.diag([0.7, 0.5]), [[1.0, 1.0]]), unit_box(2), eta=0.75)
+    assert found.evidence is Evidence.PROVED
+    np.testing.assert_allclose([found.c_p, found.c_w], [1.0, 1 / 0.75], rtol=1e-4)
+    assert found.c_v < 1e-2
+
+
+@pytest.mark.parametrize("eta", [0.9, 0.95])
+def test_reactor_is_detectable(eta):
+    system = qpmhe.models.batch_reactor()[0]
+    found = certify_detectability(system, REACTOR, eta=eta)
+    assert found.evidence is Evidence.PROVED
+    assert found.eta == eta
+    assert found.cells == 1
+    assert 1.0 <= found.c_p < 1.1
+    A = np.array(
+        [np.eye(2) + 0.1 * np.array([[-0.64 * x, 1.28], [0.32 * x, -0.64]]) for x in (0.1, 9.0)]
+    )
+    slack = eta**2 * found.P + found.V.sum() * np.ones((2, 2)) - A.swapaxes(1, 2) @ found.P @ A
+    assert np.linalg.eigvalsh(slack).min() > 0.0
+
+
+def test_reactor_is_refused_at_a_rate_that_is_too_fast():
+    system = qpmhe.models.batch_reactor()[0]
+    with pytest.raises(NotCertifiedError, match="infeasible") as caught:
+        certify_detectability(system, REACTOR, eta=0.5)
+    assert 0.6 < caught.value.smallest_rate < 0.75
+    assert "a larger eta" in str(caught.value)
+
+
+def simulate_pairs(system, box, steps, count, generator, u=None):
+    """Pairs of trajectories that disturbances keep within a box, and their differences."""
+    low, high = box.lower, box.upper
+    x = generator.uniform(low, high, (2, count, system.n))
+    states, moved, outputs = [x], [], []
+    for _ in range(steps):
+        inputs = np.zeros((count, 0)) if u is None else generator.uniform(*u, (count, system.m))
+        f = np.stack([system.f.batch(one, inputs) for one in x])
+        h = np.stack([system.h.batch(one, inputs) for one in x])
+        w = 0.02 * (high - low) * generator.standard_normal(f.shape)
+        following = np.clip(f + w, low, high)
+        moved.append(np.diff(following - f, axis=0)[0])
+        outputs.append(np.diff(h, axis=0)[0])
+        x = following
+        states.append(x)
+    return np.diff(np.array(states), axis=1)[:, 0], np.array(moved), np.array(outputs)
+
+
+SYSTEMS = {
+    "batch_reactor": (REACTOR, None),
+    "pendulum": (qpmhe.Box([-3.0, -10.0], [3.0, 10.0]), None),
+    "van_der_pol": (qpmhe.Box([-2.0, -2.0], [2.0, 2.0]), None),
+    "cstr": (qpmhe.Box([0.4, 345.0], [0.6, 355.0]), (290.0, 310.0)),
+}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_pairs_of_trajectories_keep_to_the_bound(name):
+    box, u = SYSTEMS[name]
+    system = getattr(qpmhe.models, name)()[0]
+    inputs = u and qpmhe.Box([u[0]], [u[1]])
+    found = certify_detectability(system, box, eta=0.9, inputs=inputs)
+    assert found.evidence is Evidence.PROVED
+    dx, dw, dh = simulate_pairs(system, box, 15, 400, np.random.default_rng(8), u)
+    bound = found.bound(dx[0], dw, dh)
+    assert np.all(np.linalg.norm(dx, axis=2) <= bound)
+
+    def norm(values, weight):
+        return np.sqrt(np.einsum("...i,ij,...j->...", values, weight, values))
+
+    # The contraction behind it, in one step and in squares.
+    following, now = norm(dx[1:], found.P), norm(dx[:-1], found.P)
+    right = found.eta * now + norm(dw, found.W) + norm(dh, found.V)
+    assert np.all(following <= right * (1 + 1e-9))
+    rate2, W2, V2 = found.squared(0.95)
+    assert np.all(
+        following**2
+        <= (rate2 * now**2 + norm(dw, W2) ** 2 + norm(dh, V2) ** 2) * (1 + 1e-9)
+    )
+
+
+def test_default_rate_lies_between_the_smallest_and_one():
+    found = certify_detectability(qpmhe.models.pendulum()[0], qpmhe.Box([-3, -10], [3, 10]))
+    assert found.evidence is Evidence.PROVED
+    assert 0.1 < found.eta < 0.99
+    assert found.cells > 1
+    assert any("stay in the region" in note for note in found.notes)
+
+
+def test_nonlinear_output_takes_output_injection():
+    # C in [0.7, 1.3]: with multipliers any rate is feasible, and R = (1 - eta^2) / 0.7^2.
+    system = qpmhe.System(lambda x: 1.0 * x, lambda x: x + 0.3 * np.sin(x), n=1, p=1)
+    found = certify_detectability(system, qpmhe.Box([-5.0], [5.0]), eta=0.6)
+    assert found.evidence is Evidence.PROVED
+    assert found.form == "output injection"
+    assert any("not affine" in note for note in found.notes)
+    sharp = 0.8 / 0.7 / 0.6
+    assert sharp < found.c_v < 1.05 * sharp
+    dx, dw, dh = simulate_pairs(
+        system, qpmhe.Box([-5.0], [5.0]), 12, 500, np.random.default_rng(9)
+    )
+    assert np.all(np.linalg.norm(dx, axis=2) <= found.bound(dx[0], dw, dh))
+
+
+def test_what_holds_at_every_state_need_not_hold_for_averages():
+    # |C| = 1 everywhere, but x and x + 2 pi have one output, and x grows.
+    system = qpmhe.System(
+        lambda x: 1.05 * x, lambda x: np.concatenate((np.sin(x), np.cos(x)), -1), n=1, p=2
+    )
+    weight = OutputWeight(np.eye(1), 2.0 * np.eye(2), 0.9)
+    x = np.linspace(0.0, 2.0 * np.pi, 50)
+    J = np.stack((1.05 + 0.0 * x, np.cos(x), -np.sin(x)), 1)[..., None]
+    assert definite(weight.matrices(Matrices.exact(J)))[0].all()
+    with pytest.raises(NotCertifiedError, match="no constant P"):
+        certify_detectability(system, qpmhe.Box([0.0], [2.0 * np.pi]), eta=0.9)
+    half = certify_detectability(system, qpmhe.Box([0.0], [1.5]), eta=0.9)
+    assert half.evidence is Evidence.PROVED
+
+
+def test_polytope_asks_for_less_than_its_box():
+    # f grows with x1 where x1 + x2 is large, beyond the triangle.
+    system = qpmhe.System(
+        lambda x: np.stack((0.5 * x[..., 0] + 0.6 * x[..., 0] * x[..., 1], 0.5 * x[..., 1]), -1),
+        lambda x: 0.0 * x[..., :1], n=2, p=1,
+    )
+    triangle = qpmhe.Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 2.0]], [0.0, 0.0, 1.0])
+    assert certify_detectability(system, triangle, eta=0.9).evidence is Evidence.PROVED
+    with pytest.raises(NotCertifiedError):
+        certify_detectability(system, qpmhe.Box([0.0, 0.0], [1.0, 1.0]), eta=0.9)
+
+
+def test_undetectable_system_is_told_its_mode():
+    system = linear(np.diag([1.1, 0.5]), [[0.0, 1.0]])
+    with pytest.raises(NotCertifiedError, match=r"eigenvalue 1\.1.*not in the output") as caught:
+        certify_detectability(system, unit_box(2))
+    assert "measure something" in str(caught.value)
+
+
+def test_what_intervals_cannot_run_is_sampled_with_the_reason():
+    system = qpmhe.System(
+        lambda x: np.array([0.5 * math.sin(x[0])]), lambda x: x[:1], n=1, p=1
+    )
+    found = certify_detectability(system, unit_box(1), eta=0.8)
+    assert found.evidence is Evidence.SAMPLED
+    assert "cannot be run with intervals" in found.notes[0]
+    assert "covers what lies between" in found.notes[0]
+    assert found.cells == 0
+
+
+def test_too_many_cells_are_sampled(monkeypatch):
+    full = search_module.cover
+    monkeypatch.setattr(
+        search_module, "cover", lambda model, region, form: full(model, region, form, 3)
+    )
+    box = qpmhe.Box([-3.0, -10.0], [3.0, 10.0])
+    found = certify_detectability(qpmhe.models.pendulum()[0], box, eta=0.9)
+    assert found.evidence is Evidence.SAMPLED
+    assert "given up" in found.notes[0]
+
+
+def test_solvers_that_lie_prove_nothing(monkeypatch):
+    """A matrix that does not satisfy the inequality is never called proved."""
+    system = qpmhe.models.batch_reactor()[0]
+    for P in (np.eye(2), -np.eye(2), np.full((2, 2), np.nan)):
+        wrong = Answer("solved", 1.0, P, None, 1e-3 * np.eye(1))
+        monkeypatch.setattr(Program, "solve", lambda *_, wrong=wrong, **__: wrong)
+        with pytest.raises(NotCertifiedError, match="no matrix that passes"):
+            certify_detectability(system, REACTOR, eta=0.9)
+
+
+def test_solver_that_stops_early_is_named(monkeypatch):
+    monkeypatch.setattr(Program, "solve", lambda *_, **__: Answer("user_limit"))
+    with pytest.raises(NotCertifiedError, match="user_limit"):
+        certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=0.9)
+
+
+@pytest.mark.parametrize("eta", [0.0, 1.0, -0.5, math.nan, True, "fast"])
+def test_rate_out_of_range(eta):
+    with pytest.raises(OptionError, match="eta is"):
+        certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=eta)
+
+
+def test_assumed_constants_are_labelled():
+    assumed = Detectability.assumed(eta=0.9, c_p=2.0, c_w=3.0, c_v=4.0)
+    assert assumed.evidence is Evidence.ASSUMED
+    assert weakest([Evidence.PROVED, assumed.evidence]) is Evidence.ASSUMED
+    bound = assumed.bound([3.0, 4.0], [[1.0, 0.0]], [[2.0]])
+    np.testing.assert_allclose(bound, [10.0, 0.9 * (10.0 + 3.0 + 8.0)])
+    with pytest.raises(CertificateError, match="no dissipation"):
+        assumed.squared(0.95)
+    with pytest.raises(OptionError, match="eta"):
+        Detectability.assumed(eta=1.0, c_p=2.0, c_w=3.0, c_v=4.0)

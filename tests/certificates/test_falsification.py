@@ -1,0 +1,187 @@
+"""Attempts to refute what is certified, and proof that they catch what is wrong."""
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.certificates.certification import certify
+from qpmhe.certificates.closed_runs import NOISES, attack_estimator
+from qpmhe.certificates.decay import DecayingSums
+from qpmhe.certificates.detectability import certify_detectability
+from qpmhe.certificates.evidence import Evidence
+from qpmhe.certificates.falsification import attack_detectability, attack_observer, inside
+from qpmhe.certificates.observer import certify_observer
+from qpmhe.certificates.regions import bounded_region
+from qpmhe.certificates.synthesis import synthesise_gain
+
+# The numbers of the full campaign, by the environment; small ones otherwise.
+FULL = os.environ.get("QPMHE_FULL_FALSIFICATION", "") == "1"
+PAIRS, RUNS = (10_000, 2_000) if FULL else (500, 60)
+
+
+def scalar():
+    """|0.8 - 0.15 * 2| = 0.5: all constants for the rate 0.5 are sharp."""
+    system = qpmhe.System(lambda x: 0.8 * x, lambda x: 2.0 * x, n=1, p=1)
+    return system, bounded_region(system, qpmhe.Box([-1.0], [1.0]))
+
+
+EXACT = DecayingSums(0.5, 1.0, 2.0, 0.3)
+
+
+def test_exact_constants_of_a_linear_system_are_reached_and_not_exceeded():
+    system, region = scalar()
+    for attack in (
+        attack_detectability(system, region, EXACT, trials=PAIRS),
+        attack_observer(system, region, np.array([[0.15]]), EXACT, trials=PAIRS),
+    ):
+        assert not attack.refuted
+        assert attack.trials == PAIRS
+        assert attack.ratio == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("which", ["disturbance", "noise"])
+def test_a_constant_reduced_by_a_fifth_is_caught(which):
+    system, region = scalar()
+    wrong = replace(EXACT, **{which: 0.8 * getattr(EXACT, which)})
+    pairs = attack_detectability(system, region, wrong, trials=PAIRS)
+    runs = attack_observer(system, region, np.array([[0.15]]), wrong, trials=PAIRS)
+    for attack in (pairs, runs):
+        assert attack.refuted
+        assert attack.ratio == pytest.approx(1.25, rel=1e-2)
+        # The example speaks for itself.
+        assert (attack.example["error"] > 1.2 * attack.example["bound"]).any()
+
+
+def test_a_rate_that_is_too_small_is_caught():
+    system, region = scalar()
+    wrong = DecayingSums(0.45, 1.0, 1.0 / 0.45, 0.15 / 0.45)
+    assert attack_observer(system, region, np.array([[0.15]]), wrong, trials=PAIRS).refuted
+
+
+def test_the_initial_constant_is_caught_where_it_is_sharp():
+    # In this system the error first grows by 3: c_p must be at least 3 / 0.5.
+    A = np.array([[0.0, 3.0], [0.0, 0.0]])
+    system = qpmhe.System(lambda x: x @ A.T, lambda x: 0.0 * x[..., :1], n=2, p=1)
+    region = bounded_region(system, qpmhe.Box([-9.0, -1.0], [9.0, 1.0]))
+    right, wrong = DecayingSums(0.5, 6.0, 12.0, 0.0), DecayingSums(0.5, 4.8, 12.0, 0.0)
+    assert not attack_detectability(system, region, right, trials=PAIRS).refuted
+    assert attack_detectability(system, region, wrong, trials=PAIRS).refuted
+
+
+def test_the_reactors_detectability_and_observer_are_not_refuted(reactor):
+    certificate, _ = reactor
+    detected, observed = certificate.detectabilities[0], certificate.stabilities[0]
+    pairs = attack_detectability(
+        certificate.system, certificate.region,
+        DecayingSums(detected.eta, detected.c_p, detected.c_w, detected.c_v), trials=PAIRS,
+    )
+    runs = attack_observer(
+        certificate.system, certificate.region, certificate.observer.gain,
+        DecayingSums(observed.rho, observed.C_p, observed.C_w, observed.C_v), trials=PAIRS,
+    )
+    assert not pairs.refuted
+    assert not runs.refuted
+    # P = I makes the disturbance's constant sharp, and the attack finds that.
+    assert runs.ratio > 0.99
+
+
+def constrained(name):
+    """A model of the zoo within its region, so that the QPs have inequalities."""
+    if name == "reactor":
+        _, observer, cost, _ = qpmhe.models.batch_reactor()
+        region, rates = qpmhe.Box([0.1, -1.0], [9.0, 9.0]), (0.9, 0.95)
+        system = qpmhe.System.from_ode(
+            lambda x: (0.16 * x[..., :1] ** 2 - 0.64 * x[..., 1:]) * np.array([-2.0, 1.0]),
+            lambda x: x[..., :1] + x[..., 1:], dt=0.1, method="euler", n=2, p=1, states=region,
+        )
+    else:
+        A = np.array([[0.9, 0.2], [-0.1, 0.7]])
+        region, rates = qpmhe.Box([-3.0, -3.0], [3.0, 3.0]), (0.85, 0.85)
+        system = qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1, states=region)
+        observer = qpmhe.Luenberger([[0.4], [0.1]])
+        cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=4.0 * np.eye(2), noise=3.0)
+    return certify(
+        system, observer, cost, horizon=4,
+        detectability=certify_detectability(system, region, eta=rates[0]),
+        stability=certify_observer(system, observer, region, rho=rates[1]),
+    )
+
+
+@pytest.mark.parametrize("name", ["reactor", "linear"])
+def test_no_closed_run_exceeds_a_bound(name):
+    certificate = constrained(name)
+    attempt = attack_estimator(certificate, trials=RUNS, seed=1)
+    assert set(attempt.attacks) == set(certificate.kinds)
+    assert not attempt.refuted
+    assert set(attempt.by_backend) == set(qpmhe.solvers.available())
+    assert attempt.lost < 0.8 * RUNS
+    comparisons = {attack.comparisons for attack in attempt.attacks.values()}
+    assert len(comparisons) == 1
+    assert comparisons.pop() > 4 * RUNS
+    # The sharper, the closer: otherwise the attack would be of little use.
+    ratios = [attempt.attacks[kind].ratio for kind in certificate.kinds]
+    assert ratios == sorted(ratios)
+    assert ratios[-1] > 0.1
+
+
+def test_a_wrong_certificate_is_caught_by_closed_runs():
+    certificate = constrained("linear")
+    attempt = attack_estimator(certificate, trials=20, backends=["auto"], seed=2)
+    weighted = certificate.of().weighted
+    # Below what was reached, no factor may pass.
+    weighted.scales = weighted.scales * 0.8 * attempt.attacks["weighted"].ratio
+    again = attack_estimator(certificate, trials=20, backends=["auto"], seed=2)
+    assert again.attacks["weighted"].refuted
+    assert not again.attacks["summed"].refuted
+    assert again.attacks["weighted"].run.startswith("auto, cap")
+
+
+def test_noises_have_their_shape_and_size():
+    rng = np.random.default_rng(0)
+    for name, noise in NOISES.items():
+        values = noise(rng, 200, 3)
+        assert values.shape == (200, 3), name
+        assert np.isfinite(values).all()
+        assert np.abs(values).max() <= 30.0
+
+
+def test_points_are_drawn_into_a_polytope():
+    system = qpmhe.System(lambda x: x, lambda x: x, n=2, p=2)
+    triangle = qpmhe.Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]], [0.0, 0.0, 1.0])
+    region = bounded_region(system, triangle)
+    points = np.random.default_rng(0).uniform(-3.0, 3.0, (50, 4, 2))
+    drawn = inside(region, points)
+    assert region.contains(drawn).all()
+    stays = region.contains(points)
+    assert stays.any()
+    np.testing.assert_array_equal(drawn[stays], points[stays])
+
+
+@pytest.mark.parametrize("name", ["pendulum", "van_der_pol"])
+def test_models_of_the_zoo_are_certified_and_not_refuted(name):
+    system, observer, cost, _ = qpmhe.models.catalogue()[name]()
+    if name == "pendulum":
+        region, rates = qpmhe.Box([-4.4, -15.6], [4.8, 15.1]), (0.9, 0.955)
+    else:
+        # The model's own gain contracts on no such box; this one was synthesised for it.
+        region, rates = qpmhe.Box([-2.5, -3.0], [2.5, 3.0]), (0.85, 0.95)
+        observer = synthesise_gain(system, region, rho=0.9).observer
+    certificate = certify(
+        system, observer, cost, horizon=5, region=region,
+        detectability=certify_detectability(system, region, eta=rates[0]),
+        stability=certify_observer(system, observer, region, rho=rates[1]),
+    )
+    assert certificate.evidence is Evidence.PROVED
+    detected = certificate.detectabilities[0]
+    pairs = attack_detectability(
+        system, certificate.region,
+        DecayingSums(detected.eta, detected.c_p, detected.c_w, detected.c_v), trials=PAIRS,
+    )
+    assert not pairs.refuted
+    assert pairs.ratio > 0.1
+    attempt = attack_estimator(certificate, trials=max(20, RUNS // 3), backends=["auto"])
+    assert not attempt.refuted
+    assert attempt.lost < attempt.attacks["paper"].trials

@@ -1,0 +1,189 @@
+"""Interval enclosures against exact rational and extended-precision values."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.certificates.enclosures import SmoothModel
+from qpmhe.certificates.errors import CertificateError
+from qpmhe.certificates.intervals import Interval, OutsideDomainError
+from qpmhe.certificates.regions import bounded_region
+from qpmhe.errors import SetError
+
+BOXES = {
+    "batch_reactor": ([0.1, 0.0], [9.0, 9.0], None),
+    "van_der_pol": ([-2.5, -3.0], [2.5, 3.0], None),
+    "pendulum": ([-3.0, -10.0], [3.0, 10.0], None),
+    "cstr": ([0.4, 345.0], [0.6, 355.0], ([290.0], [310.0])),
+    "vehicle": ([-1.0, 2.0, -0.3], [1.0, 4.0, 0.3], ([0.5, -0.2], [1.0, 0.2])),
+}
+
+
+def random_intervals(generator, count, low=-3.0, high=3.0):
+    ends = np.sort(generator.uniform(low, high, (2, count)), axis=0)
+    return Interval(ends[0], ends[1]), generator.uniform(ends[0], ends[1])
+
+
+@pytest.mark.parametrize("operation", ["add", "sub", "mul", "div", "square", "cube"])
+def test_arithmetic_holds_the_exact_result(operation):
+    generator = np.random.default_rng(1)
+    a, x = random_intervals(generator, 300)
+    b, y = random_intervals(generator, 300, 0.2, 3.0)
+    result = {
+        "add": lambda: a + b, "sub": lambda: a - b, "mul": lambda: a * b, "div": lambda: a / b,
+        "square": lambda: a * a, "cube": lambda: a.power(3),
+    }[operation]()
+    exact = {
+        "add": lambda s, t: s + t, "sub": lambda s, t: s - t, "mul": lambda s, t: s * t,
+        "div": lambda s, t: s / t, "square": lambda s, t: s * s, "cube": lambda s, t: s**3,
+    }[operation]
+    for i in range(300):
+        value = exact(Fraction(float(x[i])), Fraction(float(y[i])))
+        assert Fraction(float(result.low[i])) <= value <= Fraction(float(result.high[i]))
+    if operation in ("add", "sub", "mul"):
+        # Sharp: single numbers give intervals of two neighbouring floats at most each side.
+        point = {"add": lambda s, t: s + t, "sub": lambda s, t: s - t, "mul": lambda s, t: s * t}
+        narrow = point[operation](Interval.of(x), Interval.of(y))
+        assert np.all(narrow.high - narrow.low <= 4 * np.spacing(np.abs(narrow.low) + 1e-300))
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [("sin", -20, 20), ("cos", -20, 20), ("exp", -5, 5), ("tanh", -4, 4), ("arctan", -9, 9),
+     ("sqrt", 0.01, 9), ("log", 0.01, 9)],
+)
+def test_functions_hold_extended_precision_values(name, low, high):
+    generator = np.random.default_rng(2)
+    a, _ = random_intervals(generator, 200, low, high)
+    result = getattr(a, name)()
+    for share in np.linspace(0.0, 1.0, 41):
+        x = np.clip(a.low + share * (a.high - a.low), a.low, a.high)
+        value = getattr(np, name)(x.astype(np.longdouble))
+        assert np.all(result.low <= value)
+        assert np.all(value <= result.high)
+
+
+def test_extrema_inside_an_interval_are_found():
+    wave = Interval([0.0, 3.0, -1.0], [4.0, 6.0, 1.0]).sin()
+    assert wave.high[0] == 1.0
+    assert wave.low[1] == -1.0
+    np.testing.assert_allclose([wave.low[2], wave.high[2]], [-math.sin(1.0), math.sin(1.0)])
+    assert Interval(-2.0, 1.0).square().low == 0.0
+
+
+def test_undefined_operations_are_named():
+    with pytest.raises(OutsideDomainError, match="division"):
+        1.0 / Interval(-1.0, 1.0)
+    with pytest.raises(OutsideDomainError, match="square root"):
+        Interval(-1.0, 1.0).sqrt()
+    with pytest.raises(OutsideDomainError, match="logarithm"):
+        Interval(0.0, 1.0).log()
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_jacobians_of_models_lie_in_their_enclosures(name):
+    low, high, u = BOXES[name]
+    system = getattr(qpmhe.models, name)()[0]
+    region = bounded_region(system, qpmhe.Box(low, high), u and qpmhe.Box(*u))
+    model = SmoothModel(system, region)
+    assert model.reason == ""
+    generator = np.random.default_rng(3)
+    corner = region.lower + 0.9 * generator.random((20, region.lower.size)) * (
+        region.upper - region.lower
+    )
+    upper = corner + 0.1 * generator.random(corner.shape) * (region.upper - region.lower)
+    corners, error = model.enclose(corner, upper).corners()
+    least, most = corners.min(axis=1) - error, corners.max(axis=1) + error
+    for _ in range(20):
+        point = corner + generator.random(corner.shape) * (upper - corner)
+        x, v = point[:, : system.n], point[:, system.n :]
+        J = np.concatenate((system.f_jacobian.batch(x, v), system.h_jacobian.batch(x, v)), axis=1)
+        slack = 1e-9 * np.abs(J).max()
+        assert np.all(least - slack <= J)
+        assert np.all(most + slack >= J)
+        assert np.abs(most - least).max() < 100 * (np.abs(J).max() + 1.0)
+
+
+def test_affine_jacobian_has_no_error_but_rounding():
+    system = qpmhe.models.batch_reactor()[0]
+    region = bounded_region(system, qpmhe.Box([0.1, 0.0], [9.0, 9.0]))
+    model = SmoothModel(system, region)
+    assert model.affine_output
+    corners, error = model.enclose(region.lower[None], region.upper[None]).corners()
+    assert corners.shape[1] == 2  # x1 alone matters
+    assert error.max() < 1e-13
+    found = {round(float(matrix[0, 0]), 12) for matrix in corners[0]}
+    assert found == {round(1 - 0.4 * 0.16 * x, 12) for x in (0.1, 9.0)}
+
+
+def test_casadi_model_has_the_enclosure_of_its_numpy_twin():
+    pytest.importorskip("casadi")
+    from qpmhe.models.batch_reactor import casadi_output, casadi_rate
+
+    twin = qpmhe.System.from_casadi(
+        casadi_rate, casadi_output, dt=0.1, method="rk4", n=2, compiled=False
+    )
+    plain = qpmhe.models.batch_reactor("rk4")[0]
+    region = bounded_region(plain, qpmhe.Box([0.1, 0.0], [3.0, 3.0]))
+    ours, theirs = (
+        SmoothModel(system, region).enclose(region.lower[None], region.upper[None])
+        for system in (plain, twin)
+    )
+    np.testing.assert_allclose(ours.centre, theirs.centre, rtol=1e-12)
+    np.testing.assert_allclose(ours.slopes, theirs.slopes, atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    "f", [lambda x: np.abs(x), lambda x: np.array([math.sin(x[0])]),
+          lambda x: np.where(x > 1.0, x, 0.5 * x)],
+)
+def test_functions_that_intervals_cannot_run_say_why(f):
+    system = qpmhe.System(f, lambda x: x, n=1, p=1)
+    region = bounded_region(system, qpmhe.Box([-1.0], [3.0]))
+    model = SmoothModel(system, region)
+    if model.reason:
+        assert "OutsideDomainError" in model.reason
+    else:  # the middle is on one side of a kink, cells across it are not enclosed
+        assert np.isnan(model.enclose(region.lower[None], region.upper[None]).centre).any() or (
+            np.isnan(model.enclose(region.lower[None], region.upper[None]).error).any()
+        )
+
+
+def test_unbounded_missing_and_misfit_regions():
+    system = qpmhe.models.van_der_pol()[0]
+    with pytest.raises(SetError, match=r"unbounded in x\[1\]"):
+        bounded_region(system, qpmhe.Box([0.0, 0.0], [1.0, np.inf]))
+    with pytest.raises(SetError, match="there is no region"):
+        bounded_region(system, None)
+    with pytest.raises(SetError, match="dimension 3"):
+        bounded_region(system, qpmhe.Box([0, 0, 0], [1, 1, 1]))
+    with pytest.raises(SetError, match="unbounded"):
+        bounded_region(system, qpmhe.Polytope([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]], [1, 1, 1]))
+    with pytest.raises(SetError, match="empty"):
+        qpmhe.Polytope([[1.0, 0.0], [-1.0, 0.0]], [-1.0, -1.0])
+    with pytest.raises(SetError, match="system has none"):
+        bounded_region(system, qpmhe.Box([0, 0], [1, 1]), qpmhe.Box([0.0], [1.0]))
+    with pytest.raises(SetError, match="has inputs"):
+        bounded_region(qpmhe.models.cstr()[0], qpmhe.Box([0.4, 345.0], [0.6, 355.0]))
+    assert issubclass(CertificateError, ValueError)
+
+
+def test_polytope_is_boxed_outward_and_sampled_inside():
+    system = qpmhe.models.van_der_pol()[0]
+    triangle = qpmhe.Polytope([[-1.0, 0.0], [0.0, -1.0], [3.0, 1.0]], [0.0, 0.0, 1.0])
+    region = bounded_region(system, triangle)
+    assert np.all(region.lower <= 0.0)
+    assert region.upper[0] >= 1.0 / 3.0
+    assert region.upper[1] >= 1.0
+    np.testing.assert_allclose(region.upper, [1.0 / 3.0, 1.0], rtol=1e-9)
+    np.testing.assert_allclose(region.lower, 0.0, atol=1e-9)
+    points = region.sample(200, np.random.default_rng(4))
+    assert len(points) > 100
+    assert region.contains(points).all()
+    away = region.outside(np.array([[0.3, 0.3], [0.1, 0.1]]), np.array([[0.4, 0.4], [0.2, 0.2]]))
+    assert away.tolist() == [True, False]
