@@ -126,7 +126,9 @@ def compare(
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 20,
     steps: Annotated[
-        int | None, typer.Option(min=1, help="Samples of each record; the model's own if left out.")
+        int | None,
+        typer.Option(min=1, help="Samples of each record; if left out, the model's own, and 100 "
+                     "where no model is named."),
     ] = None,
     measure: Annotated[
         Measure, typer.Option(help="What to measure; times alone run one cell at a time.")
@@ -149,6 +151,8 @@ def compare(
     """Which QP backend, at which cap, gives which accuracy in which time: table and report."""
     from .compare import compare as run
 
+    if model is None and steps is None:
+        steps = 100  # all backends at all caps are to be done within ten minutes
     run(
         Console(), store=store, out=out, models=model or ("batch_reactor",), backends=backend,
         qps=qps, solver_iterations=solver_iterations, horizons=horizons,
