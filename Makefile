@@ -6,7 +6,7 @@ ARGS ?=
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: reproduce test lint types examples benchmarks comparison docs wheel clean
+.PHONY: reproduce test lint types examples benchmarks comparison docs wheel release-check minimal-versions clean
 
 # One stamp for each set of extras, renewed when the project's requirements change.
 $(VENV)/.%: pyproject.toml
@@ -34,6 +34,7 @@ examples: $(VENV)/.test
 	$(BIN)/python examples/benchmarks/constrained.py --steps 60 --out results
 	$(BIN)/python examples/benchmarks/batch.py --members 200 --steps 40 --out results
 	$(BIN)/python examples/benchmarks/backends.py --quick --out results
+	$(BIN)/python examples/closed_loop.py --steps 60 --seeds 1 --out results
 	$(BIN)/qpmhe compare --seeds 2 --steps 40 --solver-iterations 2,none --store results/quick.sqlite --out results/compare
 	if [ -d "$(DATA)" ]; then $(BIN)/python examples/battery_soc/study.py --quick --data "$(DATA)" --out results; \
 	else echo "no battery data at '$(DATA)': battery example left out"; fi
@@ -58,6 +59,21 @@ docs: $(VENV)/.docs
 wheel: $(VENV)/.dev
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
+
+# What a release would carry: the archives hold what they must, and nothing else.
+release-check: $(VENV)/.dev
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/python tests/check_dist.py dist
+
+# The lowest versions that pyproject.toml promises, in an environment of their own.
+minimal-versions:
+	rm -rf $(VENV)/minimal
+	$(PYTHON) -m venv $(VENV)/minimal
+	$(VENV)/minimal/bin/pip install --quiet --disable-pip-version-check -c tests/minimal-versions.txt ".[all]" pytest hypothesis
+	cd tests && $(abspath $(VENV))/minimal/bin/python smoke.py
+	$(VENV)/minimal/bin/python -m pytest -q -W default::DeprecationWarning tests/oracles/test_kalman.py tests/oracles/test_dense.py tests/test_package.py
 
 clean:
 	rm -rf $(VENV) dist results site .mypy_cache .pytest_cache .ruff_cache .hypothesis

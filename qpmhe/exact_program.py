@@ -213,7 +213,11 @@ class _Term:
         # The scale keeps the cones near 1, without which Clarabel gives up on large powers.
         value, share = cp.Variable(factors.size), cp.Variable(factors.size)
         self._scale, self._power = cp.Parameter(nonneg=True), cp.Parameter(nonneg=True)
-        cone = cp.PowCone3D(value, np.ones(factors.size), share, 1.0 / loss.exponent)
+        power = 1.0 / loss.exponent
+        if factors.size == 1:  # a column of one row is refused by cvxpy before 1.8
+            cone = cp.PowCone3D(value[0], 1.0, share[0], power)
+        else:
+            cone = cp.PowCone3D(value, np.ones(factors.size), share, power)
         self.constraints = [cp.abs(size) <= self._scale * share, cone]
         self.value = self._power * (factors @ value)
 

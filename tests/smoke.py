@@ -21,4 +21,5 @@ for backend in qpmhe.solvers.available():
     run = mhe.run(measurements)
     assert run.states.shape == (41, 2)
     assert np.all(run.costs <= run.candidate_costs)
+    assert run.share(qpmhe.Status.IMPROVED) > 0.5, backend
     print(f"{backend}: {run.share(qpmhe.Status.IMPROVED):.0%} of the steps improved")

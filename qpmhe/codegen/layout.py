@@ -91,45 +91,45 @@ class Layout:
         ]
         for name, size, (_, rows) in zip(SET_NAMES, (n, n, p), self.sets, strict=True):
             space = max(rows, 1)
-            fields.append((name, np.dtype([
+            fields.append((name, _struct([
                 ("lower", r, size), ("upper", r, size), ("rows", r, space * size),
                 ("row_lower", r, space), ("row_upper", r, space),
-            ], align=True)))
+            ])))
         options = ("max_qps", "max_iterations", "outside", "start_at_best", "reinitialize", "delay")
         fields += [(name, np.int32) for name in options]
-        return np.dtype(fields, align=True)
+        return _struct(fields)
 
     def estimate_type(self) -> np.dtype[Any]:
         """``mhe_estimate``."""
         r, n, p, count = self.number, self.nx, self.ny, self.horizon
-        return np.dtype([
+        return _struct([
             ("cost", r), ("candidate_cost", r), ("trajectory", r, (count + 1, n)),
             ("candidate", r, (count + 1, n)), ("disturbances", r, (count, n)),
             ("noises", r, (count, p)), ("time", np.int64), ("length", np.int32),
             ("status", np.int32), ("qps", np.int32), ("iterations", np.int32),
             ("corrections", np.int32), ("dropped", np.int32),
-        ], align=True)
+        ])
 
     def estimator_type(self) -> np.dtype[Any]:
         """``mhe_estimator``."""
         r, n, p, count = self.number, self.nx, self.ny, self.horizon
-        terms = np.dtype([
+        terms = _struct([
             ("f_jacobian", r, (n, n)), ("h_jacobian", r, (p, n)), ("hessian", r, (n, n)),
             ("coupling", r, (n, n)), ("own", r, n), ("following", r, n),
-        ], align=True)
-        stage = np.dtype([
+        ])
+        stage = _struct([
             ("z", r, n), ("y", r, p), ("u", r, max(self.nu, 1)), ("step", r), ("w", r, n),
             ("v", r, p), ("noise_weight", r, (p, p)), ("own_noise_weight", r, (p, p)),
             ("cost", r), ("has_own_noise", np.int32), ("is_irregular", np.int32),
             ("is_complete", np.int32), ("is_observed", np.uint8, p), ("terms", terms),
-        ], align=True)
-        return np.dtype([
+        ])
+        return _struct([
             ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
             ("length", np.int32), ("newest", np.int32), ("has_trajectory", np.int32),
             ("dropped", np.int32), ("unused", np.int32), ("last_good", r, n), ("z_end", r, n),
             ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
             ("stages", stage, count),
-        ], align=True)
+        ])
 
 
 def settings_record(
@@ -200,3 +200,14 @@ def _filled(
     record["reinitialize"] = settings.candidate == "reinitialized"
     record["delay"] = settings.delay
     return record
+
+
+def _struct(fields: list[Any]) -> np.dtype[Any]:
+    """The type of a C struct. Before NumPy 2, a size of 1 that is no tuple means a scalar."""
+    return np.dtype(
+        [
+            (name, kind, *((size,) if isinstance(size, int) else size for size in shape))
+            for name, kind, *shape in fields
+        ],
+        align=True,
+    )

@@ -25,7 +25,7 @@ def residuals(flat, prior, Y):
 
 
 def dense_minimum(candidate, Y, **options):
-    tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "jac": "3-point"}
+    tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "jac": "2-point"}
     start = candidate.ravel()
     found = least_squares(residuals, start, args=(candidate[0], Y), **tight, **options)
     return 2.0 * found.cost, found
