@@ -7,7 +7,7 @@ from .choices import Sizes, tighten
 from .closed_runs import attack_estimator
 from .decay import DecayingSums
 from .detectability import certify_detectability
-from .errors import CertificateError, NotCertifiedError
+from .errors import CertificateError, NotCertifiedError, OutOfTimeError
 from .evidence import Evidence
 from .falsification import attack_detectability, attack_observer
 from .figures import error_and_bounds
@@ -31,6 +31,7 @@ __all__ = [
     "MonitorSummary",
     "NotCertifiedError",
     "ObserverStability",
+    "OutOfTimeError",
     "Region",
     "Sizes",
     "Synthesis",

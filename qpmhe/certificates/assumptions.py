@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..costs import Cost, CostConstants, ObserverPrior, QuadraticCost
 from ..observers import Observer, Sample
 from ..system import System
+from .deadline import PART_SECONDS, Deadline
 from .errors import CertificateError
 from .evidence import Evidence
 from .lipschitz import output_lipschitz
@@ -69,19 +70,29 @@ class Finding:
     counterexample: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """The finding in types that JSON knows."""
+        """The finding in types that JSON knows; numbers that are not finite as text."""
         return {
             "name": self.name, "label": self.label, "holds": self.holds,
             "evidence": None if self.evidence is None else self.evidence.value,
-            "text": self.text, "value": self.value,
+            "text": self.text, "value": _plain(self.value),
             "counterexample": {
-                key: value.tolist() if isinstance(value, np.ndarray) else value
-                for key, value in self.counterexample.items()
+                key: _plain(value) for key, value in self.counterexample.items()
             },
         }
 
 
-def lipschitz_finding(system: System, region: Region) -> Finding:
+def _plain(value: Any) -> Any:
+    """Numbers that JSON knows, and the names of those that it does not."""
+    if isinstance(value, np.ndarray):
+        return [_plain(each) for each in value.tolist()]
+    if isinstance(value, list):
+        return [_plain(each) for each in value]
+    return str(value) if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def lipschitz_finding(
+    system: System, region: Region, seconds: float | Deadline = PART_SECONDS
+) -> Finding:
     """The output's Lipschitz constant.
 
     Parameters
@@ -90,8 +101,10 @@ def lipschitz_finding(system: System, region: Region) -> Finding:
         The system.
     region : Region
         Where.
+    seconds : float or Deadline
+        How long this may take, about.
     """
-    found = output_lipschitz(system, region)
+    found = output_lipschitz(system, region, seconds=seconds)
     return Finding(
         "output Lipschitz", "ass:lipschitz", True, found.evidence,
         f"L_h = {found.value:.6g} ({found.note}); the gradient has the norm {found.attained:.6g} "
@@ -195,7 +208,8 @@ def _steepest(
     generator = np.random.default_rng(_SEED)
     points = region.sample(_SAMPLES, generator)
     states, u = points[:, : system.n], points[:, system.n :]
-    size = np.ptp(system.h.batch(states, u), axis=0)
+    with np.errstate(all="ignore"):
+        size = np.ptp(system.h.batch(states, u), axis=0)
     size = np.where(size > 0.0, size, 1.0)
     worst = 0.0, states[0], size
     for z in states:
@@ -268,7 +282,8 @@ def invariance_finding(system: System, region: Region) -> Finding:
     x, u = points[:, : system.n], points[:, system.n :]
     if not x.shape[0]:
         return Finding(name, label, None, None, "the region and X have no sample in common")
-    following = np.asarray(system.f.batch(x, u), np.float64)
+    with np.errstate(all="ignore"):
+        following = np.asarray(system.f.batch(x, u), np.float64)
     missed = np.array([system.states.violation(one) for one in following])
     worst = int(missed.argmax())
     if missed[worst] == 0.0:

@@ -24,6 +24,7 @@ from .assumptions import (
     lipschitz_finding,
     no_correction_finding,
 )
+from .deadline import PART_SECONDS, Deadline
 from .regions import Region, bounded_region
 from .simulation import ObserverRun, observe
 
@@ -85,6 +86,7 @@ def audit(
     *,
     initial_state: ArrayLike | None = None,
     inputs: Box | None = None,
+    seconds: float | Deadline = PART_SECONDS,
 ) -> Audit:
     r"""Look at each assumption of the theorem, and show where it fails.
 
@@ -101,17 +103,20 @@ def audit(
         z(0) of that run; needed with it.
     inputs : Box, optional
         Bounds on the inputs, of a system that has any.
+    seconds : float or Deadline
+        How long the output's Lipschitz constant may take, about.
 
     Raises
     ------
     SetError, ShapeError, InvalidInputError, ModelError
         If an argument does not fit. An assumption that does not hold raises nothing.
     """
+    deadline = Deadline.of(seconds)
     place = bounded_region(system, region, inputs)
     observed = _observed(system, observer, run, initial_state)
     constants, about_cost = cost_finding(cost)
     findings = (
-        lipschitz_finding(system, place),
+        lipschitz_finding(system, place, deadline),
         no_correction_finding(system, observer, place),
         kappa_finding(system, observer, place, observed),
         about_cost,

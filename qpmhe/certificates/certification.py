@@ -20,11 +20,12 @@ from .audit import audit
 from .bounds import bounds_for
 from .certificate import Certificate
 from .choices import Sizes, level, tighten
+from .deadline import DEFAULT_SECONDS, Deadline
 from .decay import DecayingSums
 from .detectability import certify_detectability
 from .errors import CertificateError, NotCertifiedError
 from .evidence import Evidence
-from .observer import certify_observer
+from .observer import certify_observer, constant_gain
 from .regions import Region, bounded_region
 from .results import Detectability, ObserverStability
 
@@ -37,6 +38,8 @@ Result = TypeVar("Result", Detectability, ObserverStability)
 # the search for the best one may ask for.
 _SHARES = (0.8, 0.55, 0.35)
 _EVALUATIONS = 4
+# How much of the time left the audit, the first search of each kind, and every later one take.
+_AUDIT, _FIRST, _LATER = 0.25, 0.4, 0.25
 
 
 def certify(
@@ -52,6 +55,7 @@ def certify(
     stability: ObserverStability | None = None,
     run: Record | ArrayLike | None = None,
     initial_state: ArrayLike | None = None,
+    seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Certificate:
     """Check the theorem's assumptions on a set of states, and bound the estimator's error.
 
@@ -72,6 +76,9 @@ def certify(
         Constants to take instead of looking for them, such as assumed ones.
     run, initial_state : optional
         A record along which the candidate is checked against the sets; see `audit`.
+    seconds : float or Deadline
+        How long all of it may take, about. What is not proved when its share is over rests on
+        samples, and says so; better rates are sought in what is left.
 
     Returns
     -------
@@ -88,10 +95,14 @@ def certify(
         If detectability or the observer's stability cannot be shown; the text tells what
         may help.
     """
+    deadline = Deadline.of(seconds)
     horizons = _horizons(horizon)
     place = bounded_region(system, region, inputs)
+    if stability is None:
+        constant_gain(observer, system)  # without one, all else would be in vain
     findings = audit(
-        system, observer, cost, place, run, initial_state=initial_state
+        system, observer, cost, place, run, initial_state=initial_state,
+        seconds=deadline.part(_AUDIT),
     )
     constants, lipschitz = findings.constants, findings.lipschitz
     if constants is None:
@@ -105,10 +116,14 @@ def certify(
     noisy = max(wanted.disturbance, small), max(wanted.noise, small)
 
     def detected_at(rate: float | None) -> Detectability:
-        return certify_detectability(system, place, eta=rate, weights=weights)
+        share = deadline.part(_FIRST if rate is None else _LATER)
+        return certify_detectability(system, place, eta=rate, weights=weights, seconds=share)
 
     def observed_at(rate: float | None) -> ObserverStability:
-        return certify_observer(system, observer, place, rho=rate, weights=noisy)
+        share = deadline.part(_FIRST if rate is None else _LATER)
+        return certify_observer(
+            system, observer, place, rho=rate, weights=noisy, seconds=share
+        )
 
     # One of each before the others are sought: what cannot be certified is told soon.
     detected = [detected_at(None) if detectability is None else detectability]

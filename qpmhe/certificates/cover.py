@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .enclosures import Enclosure, SmoothModel
+from .deadline import PART_SECONDS, Deadline
+from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel
 from .forms import Form
 from .regions import Region
 from .verification import Matrices, definite
@@ -18,6 +19,9 @@ Array = NDArray[np.float64]
 
 _CHUNK = 256
 _MOST_CELLS = 40_000
+# Operations on one chunk, about: large systems take fewer cells at a time, so that the clock
+# is looked at often enough.
+_WORK = 4e7
 # Cells are split by what their width adds to the error; what it adds to the corners counts
 # a little, for cells that reach out of a polytope.
 _CORNER_SHARE = 1e-3
@@ -39,6 +43,8 @@ class Cover:
         States and inputs at which it does not hold.
     jacobians : (V, n + p, n) array
         The Jacobians there.
+    late : bool
+        Whether it ended because the time was over.
     """
 
     proved: bool
@@ -46,10 +52,12 @@ class Cover:
     margin: float
     violations: Array
     jacobians: Array
+    late: bool = False
 
 
 def cover(
-    model: SmoothModel, region: Region, form: Form, most_cells: int = _MOST_CELLS
+    model: SmoothModel, region: Region, form: Form, most_cells: int = _MOST_CELLS,
+    seconds: float | Deadline = PART_SECONDS,
 ) -> Cover:
     """Show an inequality on a region by dividing it until each cell is shown.
 
@@ -63,14 +71,20 @@ def cover(
         The inequality.
     most_cells : int
         After so many cells the search is given up.
+    seconds : float or Deadline
+        After so much time, too.
     """
+    deadline = Deadline.of(seconds)
+    chunk = _chunk(model.n, model.p, region.lower.size)
     lower, upper = region.lower[None], region.upper[None]
     width = np.where(region.upper > region.lower, region.upper - region.lower, np.inf)
     cells, margin = 0, np.inf
     nowhere = np.empty((0, region.lower.size)), np.empty((0, model.n + model.p, model.n))
     while lower.shape[0]:
-        taken = lower[-_CHUNK:], upper[-_CHUNK:]
-        lower, upper = lower[:-_CHUNK], upper[:-_CHUNK]
+        if cells and deadline.passed:
+            return Cover(False, cells, margin, *nowhere, late=True)
+        taken = lower[-chunk:], upper[-chunk:]
+        lower, upper = lower[:-chunk], upper[:-chunk]
         cells += taken[0].shape[0]
         enclosure = model.enclose(*taken)
         shown, least = _shown(form, enclosure)
@@ -95,15 +109,22 @@ def cover(
     return Cover(True, cells, margin, *nowhere)
 
 
+def _chunk(n: int, p: int, coordinates: int) -> int:
+    """How many cells to look at at once."""
+    corners = 2 ** min(coordinates, MOST_ACTIVE)
+    return int(np.clip(_WORK / (corners * (2 * n + p) ** 3), 1, _CHUNK))
+
+
 def _shown(form: Form, enclosure: Enclosure) -> tuple[NDArray[np.bool_], Array]:
     corners, error = enclosure.corners()
     cells, count = corners.shape[:2]
-    matrices = form.matrices(
-        Matrices(
-            corners.reshape(cells * count, *corners.shape[2:]), np.repeat(error, count, axis=0)
+    with np.errstate(all="ignore"):
+        matrices = form.matrices(
+            Matrices(
+                corners.reshape(cells * count, *corners.shape[2:]), np.repeat(error, count, axis=0)
+            )
         )
-    )
-    proved, least = definite(matrices)
+        proved, least = definite(matrices)
     every: NDArray[np.bool_] = np.all(proved.reshape(cells, count), axis=1)
     smallest: Array = least.reshape(cells, count).min(axis=1)
     return every, smallest

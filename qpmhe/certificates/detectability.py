@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from ..sets import Box, ConvexSet
 from ..system import System
 from .constants import euclidean_constants
-from .errors import NotCertifiedError
+from .deadline import PART_SECONDS, Deadline
+from .errors import NotCertifiedError, OutOfTimeError
 from .forms import OutputInjection, OutputWeight
 from .regions import Region, bounded_region
 from .results import Detectability
@@ -18,6 +19,9 @@ __all__ = ["Detectability", "certify_detectability"]
 
 Array = NDArray[np.float64]
 
+# Of an output in its own size, for a state in the region's.
+_UNSEEN = 1e-9
+_STEEP = 1e6
 _STAY = "it holds for trajectories that stay in the region, both of a pair, with equal inputs"
 
 
@@ -28,6 +32,7 @@ def certify_detectability(
     eta: float | None = None,
     inputs: Box | None = None,
     weights: tuple[float, float] = (1.0, 1.0),
+    seconds: float | Deadline = PART_SECONDS,
 ) -> Detectability:
     r"""Find and verify constants of e-IOSS, Definition def:eIOSS.
 
@@ -52,27 +57,33 @@ def certify_detectability(
     weights : (float, float)
         How much the constants c_w and c_v matter, such as typical sizes of disturbance and
         noise; the programs minimise the sum of squares of the products.
+    seconds : float or Deadline
+        How long this may take, about; what is known then is told, or that nothing is.
 
     Returns
     -------
     Detectability
         PROVED only if the verification passed; SAMPLED, with the reason, if the functions
-        cannot be run with intervals, or the region has too many cells.
+        cannot be run with intervals, or the region has too many cells for the time.
 
     Raises
     ------
     SetError
         If the region is not a bounded set of the right dimension.
     OptionError
-        If eta or the weights are out of range.
+        If eta, the weights or the seconds are out of range.
     ModelError
         If the Jacobians are not finite in the region.
     NotCertifiedError
         If there are no such constants, or none were found; it tells the smallest feasible
-        rate and what is not detected.
+        rate and what is not detected. An `OutOfTimeError` says that it is not known which.
     """
     checked_rate("eta", eta)
-    search = Search(system, bounded_region(system, region, inputs), None, checked_weights(weights))
+    deadline = Deadline.of(seconds)
+    search = Search(
+        system, bounded_region(system, region, inputs), None, checked_weights(weights),
+        seconds=deadline,
+    )
     try:
         found = search.find_best() if eta is None else search.find(eta)
     except NotCertifiedError as error:
@@ -96,7 +107,12 @@ def certify_detectability(
 def _explained(
     search: Search, error: NotCertifiedError, eta: float | None
 ) -> NotCertifiedError:
-    smallest = search.smallest_rate()
+    if isinstance(error, OutOfTimeError):
+        return error
+    try:
+        smallest = search.smallest_rate()
+    except OutOfTimeError:
+        return error
     if not np.isfinite(smallest):
         mode = _undetected(search)
         if mode is not None:
@@ -109,7 +125,7 @@ def _explained(
             )
         return NotCertifiedError(
             f"{error.args[0]}: no constant P shows detectability on the whole region, although "
-            "every single linearisation may be detectable",
+            f"every single linearisation may be detectable{_steepest(search)}",
             ("a smaller region", "other coordinates of the state"),
         )
     asked = "" if eta is None else f"eta = {eta:.6g}; "
@@ -120,20 +136,39 @@ def _explained(
     )
 
 
+def _steepest(search: Search) -> str:
+    """Where f grows so fast that rounding alone may spoil a program; empty if nowhere."""
+    n = search.system.n
+    radii = np.abs(np.linalg.eigvals(search.jacobians[:, :n])).max(axis=1)
+    worst = int(radii.argmax())
+    if radii[worst] < _STEEP:
+        return ""
+    return (
+        f"; f's Jacobian has an eigenvalue of size {radii[worst]:.3g} at "
+        f"{np.round(search.points[worst], 4).tolist()}, where the model may not be meant to hold"
+    )
+
+
 def _undetected(search: Search) -> str | None:
     """A mode that does not decay and is not seen, at one of the states."""
     n = search.system.n
+    states, outputs = search.scales.states, search.scales.outputs
     for point, jacobian in zip(search.points, search.jacobians, strict=True):
-        A, C = jacobian[:n], jacobian[n:]
+        A = jacobian[:n] * states / states[:, None]
+        C = jacobian[n:] * states / outputs[:, None]
         for value in np.linalg.eigvals(A):
             if abs(value) < 1.0 - 1e-9:
                 continue
-            test = np.vstack((A - value * np.eye(n), C))
-            _, sizes, vectors = np.linalg.svd(test)
-            if sizes[-1] <= 1e-9 * max(1.0, sizes[0]):
-                direction = np.round(np.real_if_close(vectors[-1].conj()), 4)
+            # Large rows are scaled down, so that no size of A can hide what C sees.
+            rest = A - value * np.eye(n)
+            rest = rest / np.maximum(1.0, np.abs(rest).max(axis=1, keepdims=True))
+            _, sizes, vectors = np.linalg.svd(np.vstack((rest, C)))
+            if sizes[-1] <= _UNSEEN:
+                direction = states * vectors[-1].conj()
+                direction = np.real_if_close(direction / np.linalg.norm(direction))
                 return (
                     f"at {np.round(point, 4).tolist()} the mode with eigenvalue {value:.6g}, "
-                    f"along {direction.tolist()}, does not decay and is not in the output"
+                    f"along {np.round(direction, 4).tolist()}, does not decay and is not in the "
+                    "output"
                 )
     return None

@@ -15,17 +15,17 @@ from .intervals import Interval, OutsideDomainError
 from .jets import Jet, variables
 from .regions import Region
 
-__all__ = ["Enclosure", "SmoothModel"]
+__all__ = ["MOST_ACTIVE", "Enclosure", "SmoothModel"]
 
 Array = NDArray[np.float64]
 
 # Beyond, corners would be many: what the other coordinates do is covered by the error.
-_MOST_ACTIVE = 6
+MOST_ACTIVE = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Enclosure:
-    r"""The joint Jacobian :math:`J = [\partial f; \partial h]` over cells.
+    r"""The joint Jacobian :math:`J = [\partial f; \partial h]` over cells, or that of h alone.
 
     On a cell with middle c, by the mean value theorem for J,
 
@@ -40,11 +40,11 @@ class Enclosure:
     Parameters
     ----------
     centre : (B, q, n) array
-        J(c), with q = n + p; NaN where the functions could not be enclosed.
+        J(c), with q = n + p, or p; NaN where the functions could not be enclosed.
     slopes : (B, N, q, n) array
         H_j times the half-width of the cell.
     error : (B, q, n) array
-        E, rounded up.
+        E, rounded up; NaN where the functions could not be enclosed.
     excess : (B, N) array
         How much each coordinate's width contributes to E.
     """
@@ -62,11 +62,13 @@ class Enclosure:
         corners : (B, K, q, n) array
             The matrices.
         error : (B, q, n) array
-            The error.
+            The error; NaN on cells of which nothing is known.
         """
-        weight = np.abs(self.slopes).max(axis=(0, 2, 3), initial=0.0)
+        # Cells of which nothing is known must not hide how the others vary.
+        known = np.isfinite(self.error).all(axis=(1, 2))
+        weight = np.abs(self.slopes[known]).max(axis=(0, 2, 3), initial=0.0)
         order = np.argsort(weight)[::-1]
-        active = order[: _MOST_ACTIVE][weight[order[:_MOST_ACTIVE]] > 0.0]
+        active = order[:MOST_ACTIVE][weight[order[:MOST_ACTIVE]] > 0.0]
         error = self.error
         rest = np.setdiff1d(np.arange(weight.size), active)
         if np.any(weight[rest] > 0.0):
@@ -96,22 +98,24 @@ class SmoothModel:
     ----------
     reason : str
         Why f and h cannot be run with intervals; empty if they can.
+    output_reason : str
+        The same for h alone.
     affine_output : bool
         Whether h is affine in the state on the region, so that its Jacobian is constant.
     """
 
     def __init__(self, system: System, region: Region) -> None:
-        self._system, self._graph = system, self._find_graph(system)
+        self._system = system
+        self._graph, self._output_graph = self._find_graphs(system)
         self.n, self.p = system.n, system.p
-        self.reason, self.affine_output = "", False
-        middle = 0.5 * (region.lower + region.upper)
-        try:
-            self._jets(middle[None], middle[None])
-        except Exception as error:  # whatever a user's function makes of unusual numbers
-            self.reason = f"{type(error).__name__}: {error}"
+        self.affine_output = False
+        middle = 0.5 * (region.lower + region.upper)[None]
+        self.output_reason = self._refused(middle, output_only=True)
+        self.reason = self.output_reason or self._refused(middle, output_only=False)
+        if self.output_reason:
             return
         try:
-            outputs = self._jets(region.lower[None], region.upper[None])[self.n :]
+            outputs = self._jets(region.lower[None], region.upper[None], output_only=True)
         except OutsideDomainError:
             return
         self.affine_output = all(
@@ -120,44 +124,64 @@ class SmoothModel:
         )
 
     @staticmethod
-    def _find_graph(system: System) -> Callable[[Any], list[Any]] | None:
+    def _find_graphs(
+        system: System,
+    ) -> tuple[Callable[[Any], list[Any]] | None, Callable[[Any], list[Any]] | None]:
         if system.symbolic is None:
-            return None
+            return None, None
         from .graphs import model_graph
 
-        return model_graph(system.symbolic)
+        return model_graph(system.symbolic), model_graph(system.symbolic, output_only=True)
 
-    def _jets(self, lower: Array, upper: Array) -> list[Any]:
-        """Values of f and h over cells: a list of n + p jets, or floats where constant."""
+    def _refused(self, point: Array, *, output_only: bool) -> str:
+        """Why the functions cannot be run with intervals; empty if they can."""
+        try:
+            self._jets(point, point, output_only=output_only)
+        except Exception as error:  # whatever a user's function makes of unusual numbers
+            return f"{type(error).__name__}: {error}"
+        return ""
+
+    def _jets(self, lower: Array, upper: Array, *, output_only: bool) -> list[Any]:
+        """Values of f and h, or h, over cells: a list of jets, or floats where constant."""
         made = variables(lower, upper)
+        graph = self._output_graph if output_only else self._graph
         with np.errstate(all="ignore"):
-            if self._graph is not None:
-                values = self._graph(list(made))
+            if graph is not None:
+                values = graph(list(made))
             else:
                 x, u = made[: self.n], made[self.n :]
+                functions = ((self._system.f, self.n), (self._system.h, self.p))
                 values = [
                     entry
-                    for function, size in ((self._system.f, self.n), (self._system.h, self.p))
+                    for function, size in functions[output_only:]
                     for entry in np.asarray(function(x, u), dtype=object).reshape(size)
                 ]
         return [value if isinstance(value, Jet) else float(value) for value in values]
 
-    def enclose(self, lower: Array, upper: Array) -> Enclosure:
+    def enclose(
+        self, lower: Array, upper: Array, *, output_only: bool = False
+    ) -> Enclosure:
         """The joint Jacobian over cells.
 
         Parameters
         ----------
         lower, upper : (B, n + m) array
             Corners of the cells.
+        output_only : bool
+            Whether to enclose the Jacobian of h alone; f is then not looked at.
         """
+        with np.errstate(all="ignore"):
+            return self._enclosed(lower, upper, output_only)
+
+    def _enclosed(self, lower: Array, upper: Array, output_only: bool) -> Enclosure:
         cells, N = lower.shape
-        q, n = self.n + self.p, self.n
+        q, n = self.p if output_only else self.n + self.p, self.n
         centre = 0.5 * lower + 0.5 * upper
         half = np.nextafter(np.maximum(upper - centre, centre - lower), np.inf)
         half = np.where(upper == lower, 0.0, half)
         centre = np.where(upper == lower, lower, centre)
-        at_centre = self._derivatives(centre, centre)[0]
-        second = self._derivatives(lower, upper)[1]
+        at_centre = self._derivatives(centre, centre, output_only)[0]
+        second = self._derivatives(lower, upper, output_only)[1]
         slopes = np.zeros((cells, N, q, n))
         middle, radius = np.moveaxis(second.middle, -1, 0), np.moveaxis(second.radius, -1, 0)
         slopes[...] = np.moveaxis(middle, -1, 1) * half[:, :, None, None]
@@ -168,22 +192,31 @@ class SmoothModel:
         error = (spread.sum(axis=1) + rounding + 1e-15 * np.abs(slopes).sum(axis=1)) * (
             1.0 + 1e-14 * (N + 4)
         )
+        unknown = ~(
+            np.isfinite(jacobian).all(axis=(1, 2)) & np.isfinite(error).all(axis=(1, 2))
+            & np.isfinite(slopes).all(axis=(1, 2, 3))
+        )
+        # NaN alone: infinities would make invalid operations later on.
+        slopes[unknown], error[unknown] = np.nan, np.nan
+        jacobian = np.where(np.isfinite(jacobian).all(axis=(1, 2), keepdims=True), jacobian, np.nan)
         return Enclosure(jacobian, slopes, error, spread.sum(axis=(2, 3)))
 
-    def _derivatives(self, lower: Array, upper: Array) -> tuple[Interval, Interval]:
+    def _derivatives(
+        self, lower: Array, upper: Array, output_only: bool
+    ) -> tuple[Interval, Interval]:
         """Gradients (q, n, B) and their derivatives (q, n, N, B); NaN where undefined."""
         cells, N = lower.shape
-        q, n = self.n + self.p, self.n
+        q, n = self.p if output_only else self.n + self.p, self.n
         try:
-            jets = self._jets(lower, upper)
+            jets = self._jets(lower, upper, output_only=output_only)
         except OutsideDomainError:
             if cells == 1:
                 first, second = np.full((q, n, 1), np.nan), np.full((q, n, N, 1), np.nan)
                 return Interval(first, first), Interval(second, second)
             half = cells // 2
             parts = (
-                self._derivatives(lower[:half], upper[:half]),
-                self._derivatives(lower[half:], upper[half:]),
+                self._derivatives(lower[:half], upper[:half], output_only),
+                self._derivatives(lower[half:], upper[half:], output_only),
             )
             joined = [
                 Interval(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ..errors import InvalidInputError, QpmheError
 
-__all__ = ["CertificateError", "NotCertifiedError"]
+__all__ = ["CertificateError", "NotCertifiedError", "OutOfTimeError"]
 
 
 class CertificateError(InvalidInputError):
@@ -41,3 +41,7 @@ class NotCertifiedError(QpmheError):
         self.smallest_rate = smallest_rate
         advice = f" What may help: {'; '.join(self.suggestions)}." if self.suggestions else ""
         super().__init__(message + advice)
+
+
+class OutOfTimeError(NotCertifiedError):
+    """A search that was stopped before it found anything: nothing is known of the property."""

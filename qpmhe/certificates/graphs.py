@@ -15,24 +15,30 @@ from .intervals import OutsideDomainError
 __all__ = ["model_graph"]
 
 
-def model_graph(model: CasadiModel) -> Callable[[Sequence[Any]], list[Any]]:
-    """The functions f and h of a CasADi model as a function of a list of n + m numbers of any kind.
+def model_graph(
+    model: CasadiModel, *, output_only: bool = False
+) -> Callable[[Sequence[Any]], list[Any]]:
+    """A CasADi model's f and h as a function of a list of n + m numbers of any kind.
 
     Parameters
     ----------
     model : CasadiModel
         The model.
+    output_only : bool
+        Whether to leave f out.
 
     Returns
     -------
     callable
-        From the entries of x and u to those of f and h; it raises OutsideDomainError for an
-        operation that is not smooth, or not known.
+        From the entries of x and u to those of f and h, or of h; it raises OutsideDomainError
+        for an operation that is not smooth, or not known.
     """
     ca = import_casadi()
     x, u = ca.SX.sym("x", model.n), ca.SX.sym("u", model.m)
-    step = model.step().expand()
-    column = ca.densify(ca.vertcat(step(x, u, model.dt or 0.0), model.h.expand()(x, u)))
+    column = model.h.expand()(x, u)
+    if not output_only:
+        column = ca.vertcat(model.step().expand()(x, u, model.dt or 0.0), column)
+    column, size = ca.densify(column), column.numel()
     function = ca.Function("model", [ca.vertcat(x, u)], [column])
     known = _operations()
     instructions = [
@@ -47,7 +53,7 @@ def model_graph(model: CasadiModel) -> Callable[[Sequence[Any]], list[Any]]:
 
     def evaluate(values: Sequence[Any]) -> list[Any]:
         work: dict[int, Any] = {}
-        results: list[Any] = [0.0] * (model.n + model.p)
+        results: list[Any] = [0.0] * size
         for code, arguments, targets, constant in instructions:
             if code == ca.OP_INPUT:
                 work[targets[0]] = values[arguments[1]]

@@ -10,7 +10,8 @@ from ..observers import Luenberger, Observer, OutputInjection, SteadyStateKalman
 from ..sets import Box, ConvexSet
 from ..system import System
 from .constants import euclidean_constants
-from .errors import CertificateError, NotCertifiedError
+from .deadline import PART_SECONDS, Deadline
+from .errors import CertificateError, NotCertifiedError, OutOfTimeError
 from .forms import ErrorContraction
 from .regions import Region, bounded_region
 from .results import ObserverStability
@@ -70,6 +71,7 @@ def certify_observer(
     rho: float | None = None,
     inputs: Box | None = None,
     weights: tuple[float, float] = (1.0, 1.0),
+    seconds: float | Deadline = PART_SECONDS,
 ) -> ObserverStability:
     r"""Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
 
@@ -90,6 +92,8 @@ def certify_observer(
         Bounds on the inputs, of a system that has any.
     weights : (float, float)
         How much the constants C_w and C_v matter.
+    seconds : float or Deadline
+        How long this may take, about; what is known then is told, or that nothing is.
 
     Raises
     ------
@@ -99,17 +103,20 @@ def certify_observer(
         As for `certify_detectability`.
     NotCertifiedError
         If there are no such constants, or none were found; it tells the smallest feasible
-        rate, and what to try.
+        rate, and what to try. An `OutOfTimeError` says that it is not known which.
     """
+    deadline = Deadline.of(seconds)
     checked_rate("rho", rho)
     gain = constant_gain(observer, system)
     search = Search(
-        system, bounded_region(system, region, inputs), "observer", checked_weights(weights), gain
+        system, bounded_region(system, region, inputs), "observer", checked_weights(weights), gain,
+        deadline,
     )
+    _insist_on_stability(search)
     try:
         return stability(search, search.find_best() if rho is None else search.find(rho))
     except NotCertifiedError as error:
-        raise _explained(search, error, gain) from error
+        raise _explained(search, error) from error
 
 
 def stability(search: Search, found: Found) -> ObserverStability:
@@ -142,26 +149,43 @@ def _noise_weight(P: Array, gain: Array) -> tuple[Array, float]:
     return symmetric, float(2.0 * product.radius.sum())
 
 
-def _explained(search: Search, error: NotCertifiedError, gain: Array) -> NotCertifiedError:
+def _radii(search: Search) -> Array:
+    """The spectral radii of A - L C at the samples."""
     n = search.system.n
-    closed = search.jacobians[:, :n] - gain @ search.jacobians[:, n:]
-    radii = np.abs(np.linalg.eigvals(closed)).max(axis=1)
+    assert search.gain is not None
+    closed = search.jacobians[:, :n] - search.gain @ search.jacobians[:, n:]
+    radii: Array = np.abs(np.linalg.eigvals(closed)).max(axis=1)
+    return radii
+
+
+def _insist_on_stability(search: Search) -> None:
+    """Spare the search for what cannot be: no P is for an A - L C that is not stable."""
+    radii = _radii(search)
     worst = int(radii.argmax())
     if radii[worst] >= 1.0:
-        return NotCertifiedError(
+        raise NotCertifiedError(
             f"the observer's error does not contract: A - L C has the spectral radius "
             f"{radii[worst]:.6g} at {np.round(search.points[worst], 4).tolist()}, in the region",
             ("another gain, such as that of synthesise_gain", "a smaller region"),
         )
-    smallest = search.smallest_rate()
+
+
+def _explained(search: Search, error: NotCertifiedError) -> NotCertifiedError:
+    if isinstance(error, OutOfTimeError):
+        return error
+    try:
+        smallest = search.smallest_rate()
+    except OutOfTimeError:
+        return error
     if np.isfinite(smallest):
         return NotCertifiedError(
             f"{error.args[0]}. Feasible at the states tried: rho from {smallest:.4g} on",
             ("a larger rho", "another gain, such as that of synthesise_gain", "a smaller region"),
             smallest,
         )
+    radii = _radii(search)
     return NotCertifiedError(
         f"{error.args[0]}: no constant P shows contraction on the whole region, although A - L C "
-        f"is stable at each of {radii.size} states (spectral radius up to {radii[worst]:.6g})",
+        f"is stable at each of {radii.size} states (spectral radius up to {radii.max():.6g})",
         ("another gain, such as that of synthesise_gain", "a smaller region"),
     )

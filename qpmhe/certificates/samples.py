@@ -12,11 +12,11 @@ from .programs import Scales
 from .regions import Region
 from .verification import Matrices, definite
 
-__all__ = ["between_samples", "far_apart", "joint_jacobians", "typical_scales"]
+__all__ = ["MOST_POINTS", "between_samples", "far_apart", "joint_jacobians", "typical_scales"]
 
 Array = NDArray[np.float64]
 
-_MOST_POINTS = 24  # Jacobians that a program starts with
+MOST_POINTS = 24  # Jacobians that a program starts with
 
 
 def joint_jacobians(system: System, points: Array) -> Array:
@@ -48,7 +48,7 @@ def joint_jacobians(system: System, points: Array) -> Array:
     return np.asarray(joint, np.float64)
 
 
-def far_apart(jacobians: Array, count: int = _MOST_POINTS) -> NDArray[np.intp]:
+def far_apart(jacobians: Array, count: int = MOST_POINTS) -> NDArray[np.intp]:
     """Indices of Jacobians that lie far apart from each other.
 
     Parameters

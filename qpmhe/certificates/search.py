@@ -11,13 +11,14 @@ from .._checks import positive
 from ..errors import OptionError
 from ..system import System
 from .cover import Cover, cover
+from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel
-from .errors import NotCertifiedError
+from .errors import NotCertifiedError, OutOfTimeError
 from .evidence import Evidence
 from .forms import ErrorContraction, Form, OutputInjection, OutputWeight
-from .programs import Answer, Kind, Program
+from .programs import Answer, Kind, Program, expected_seconds
 from .regions import Region
-from .samples import between_samples, far_apart, joint_jacobians, typical_scales
+from .samples import MOST_POINTS, between_samples, far_apart, joint_jacobians, typical_scales
 from .verification import Matrices, definite
 
 __all__ = ["Found", "Search", "checked_rate", "checked_weights"]
@@ -35,6 +36,10 @@ _ABOVE, _ATTEMPTS = 0.01, 4
 # Between the smallest rate, where constants grow without bound, and 1, where they last.
 _SHARES = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
 _SEED = 20210829
+# How much of the time the choice of a rate may take, and one verification; how many programs
+# the former solves; how far off the time that a program is expected to take may be.
+_CHOICE, _VERIFICATION = 0.5, 0.6
+_PROGRAMS, _MISJUDGED = 20, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +80,13 @@ class Search:
         How much disturbance and noise matter.
     gain : (n, p) array, optional
         That of a given observer.
+    seconds : float or Deadline
+        How long all of it may take.
+
+    Attributes
+    ----------
+    scales : Scales
+        Typical sizes of states and outputs.
 
     Raises
     ------
@@ -89,7 +101,9 @@ class Search:
         kind: Kind | None,
         weights: tuple[float, float],
         gain: Array | None = None,
+        seconds: float | Deadline = PART_SECONDS,
     ) -> None:
+        self._deadline = Deadline.of(seconds)
         self.system, self.region, self.gain, self._weights = system, region, gain, weights
         self.model = SmoothModel(system, region)
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
@@ -101,8 +115,10 @@ class Search:
             )
             kind = "output weight" if same else "output injection"
         self.kind: Kind = kind
-        self._chosen = far_apart(self.jacobians)
-        self._scales = typical_scales(region, self.jacobians, system.n)
+        each = expected_seconds(system.n, system.p, kind)
+        affordable = _CHOICE * self._deadline.left / (_PROGRAMS * each)
+        self._chosen = far_apart(self.jacobians, int(np.clip(affordable, 1, MOST_POINTS)))
+        self.scales = typical_scales(region, self.jacobians, system.n)
         self._program: Program | None = None
 
     @property
@@ -110,25 +126,64 @@ class Search:
         """The program at the states chosen so far."""
         if self._program is None:
             self._program = Program(
-                self.kind, self.jacobians[self._chosen], self._scales, self._weights, self.gain
+                self.kind, self.jacobians[self._chosen], self.scales, self._weights, self.gain
             )
         return self._program
 
     def smallest_rate(self) -> float:
-        """The smallest feasible rate at the chosen states, infinite if none below 1 is."""
+        """The smallest feasible rate at the chosen states, infinite if none below 1 is.
+
+        Where the time is over before, the smallest one that was tried and is.
+
+        Raises
+        ------
+        OutOfTimeError
+            If there was no time to try a single one.
+        """
+        return self._smallest_rate(self._deadline.part(_CHOICE))
+
+    def _smallest_rate(self, deadline: Deadline) -> float:
         low, high = 0.0, _LARGEST_RATE
-        if self._feasible(high).P is None:
+        if self._feasible(high, deadline).P is None:
             return np.inf
         while high - low > _TOLERANCE * (1.0 - low):
             middle = 0.5 * (low + high)
-            if self._feasible(middle).P is None:
+            try:
+                answer = self._feasible(middle, deadline)
+            except OutOfTimeError:
+                break
+            if answer.P is None:
                 low = middle
             else:
                 high = middle
         return high
 
-    def _feasible(self, rate: float) -> Answer:
-        return self.program.solve(rate, _MARGINS[0] * min(1.0, rate * rate), thorough=False)
+    def _feasible(self, rate: float, deadline: Deadline) -> Answer:
+        return self._solved(rate, _MARGINS[0] * min(1.0, rate * rate), deadline, thorough=False)
+
+    def _solved(
+        self, rate: float, margin: float, deadline: Deadline, *, thorough: bool
+    ) -> Answer:
+        """What the program returns; an error if there is no time for it, or not enough."""
+        if deadline.passed:
+            raise self._out_of_time("it was over while matrices were sought and verified")
+        if self.program.expected_seconds > _MISJUDGED * deadline.left:
+            raise self._out_of_time(
+                f"a semidefinite program for {self.system.n} states takes about "
+                f"{self.program.expected_seconds:.2g} s, and {deadline.left:.2g} s were left"
+            )
+        answer = self.program.solve(rate, margin, thorough=thorough, seconds=deadline.left)
+        if answer.status == "user_limit" and deadline.passed:
+            raise self._out_of_time(
+                f"a semidefinite program for {self.system.n} states was not solved in time"
+            )
+        return answer
+
+    def _out_of_time(self, what: str) -> OutOfTimeError:
+        return OutOfTimeError(
+            f"the time for this search ({self._deadline.seconds:.3g} s) was too short: {what}",
+            ("more seconds", "a given rate, which spares the search for one", "a smaller model"),
+        )
 
     def best_rate(self, smallest: float) -> float:
         r"""The rate with the smallest :math:`\sqrt{d^2 \kappa + v^2 r} / (1 - \rho)`.
@@ -140,11 +195,16 @@ class Search:
         smallest : float
             The smallest feasible rate.
         """
-        rates = [smallest + share * (1.0 - smallest) for share in _SHARES]
-        lasting = [
-            np.sqrt(max(self._feasible(rate).objective, 0.0)) / (1.0 - rate) for rate in rates
-        ]
-        return rates[int(np.argmin(lasting))]
+        deadline = self._deadline.part(_CHOICE)
+        best = np.inf, smallest
+        for share in _SHARES:
+            rate = smallest + share * (1.0 - smallest)
+            try:
+                objective = self._feasible(rate, deadline).objective
+            except OutOfTimeError:
+                break
+            best = min(best, (np.sqrt(max(objective, 0.0)) / (1.0 - rate), rate))
+        return best[1]
 
     def find_best(self, criterion: str = "trade") -> Found:
         """An inequality with a rate of its own choice.
@@ -164,13 +224,15 @@ class Search:
             smallest = self.smallest_rate()
             if not np.isfinite(smallest):
                 raise NotCertifiedError(
-                    "the semidefinite program is infeasible for every rate below 1"
+                    "no rate below 1 was found for which the semidefinite program is feasible"
                 )
             rate = smallest + share * (1.0 - smallest)
             if criterion == "trade":
                 rate = max(rate, self.best_rate(smallest))
             try:
                 return self.find(rate)
+            except OutOfTimeError:
+                raise
             except NotCertifiedError as error:
                 # What failed has left more states in the program, and moves the smallest rate.
                 refused, share = error, 3.0 * share
@@ -188,12 +250,21 @@ class Search:
         ------
         NotCertifiedError
             If the program is infeasible or not solved, or what it returns fails.
+        OutOfTimeError
+            If nothing was found before the time was over.
         """
         level, size = 0, min(1.0, rate * rate)
         best: Found | None = None
         status = "no round was left"
         for turn in range(1, _ROUNDS + 1):
-            answer = self.program.solve(rate, _MARGINS[level] * size)
+            try:
+                answer = self._solved(
+                    rate, _MARGINS[level] * size, self._deadline, thorough=True
+                )
+            except OutOfTimeError:
+                if best is None:
+                    raise
+                break
             if answer.P is None:
                 status = answer.status
                 break
@@ -237,13 +308,16 @@ class Search:
             return self._sampled(
                 form, f"f and h cannot be run with intervals ({self.model.reason})"
             )
-        found = cover(self.model, self.region, form)
+        found = cover(
+            self.model, self.region, form, seconds=self._deadline.part(_VERIFICATION)
+        )
         if found.proved:
             return Found(form, Evidence.PROVED, found.margin, found.cells, ())
         if found.violations.shape[0]:
             return found
+        end = ", when its time was over" if found.late else ""
         return self._sampled(
-            form, f"the proof was given up after dividing the region into {found.cells} cells"
+            form, f"the proof was given up after dividing the region into {found.cells} cells{end}"
         )
 
     def _sampled(self, form: Form, why: str) -> Found | Cover:

@@ -11,7 +11,8 @@ from ..errors import OptionError
 from ..observers import Luenberger
 from ..sets import Box, ConvexSet
 from ..system import System
-from .errors import NotCertifiedError
+from .deadline import DEFAULT_SECONDS, Deadline
+from .errors import NotCertifiedError, OutOfTimeError
 from .observer import certify_observer, stability
 from .regions import Region, bounded_region
 from .results import ObserverStability
@@ -20,6 +21,8 @@ from .search import Search, checked_rate, checked_weights
 __all__ = ["Synthesis", "synthesise_gain"]
 
 Criterion = Literal["trade", "rate"]
+
+_SEARCH = 0.7  # of the time; the rest is for smaller constants of the gain that was found
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +49,7 @@ def synthesise_gain(
     rho: float | None = None,
     inputs: Box | None = None,
     weights: tuple[float, float] = (1.0, 1.0),
+    seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Synthesis:
     r"""Find a constant gain L whose observer contracts on a region, and verify it.
 
@@ -76,6 +80,8 @@ def synthesise_gain(
         Bounds on the inputs, of a system that has any.
     weights : (float, float)
         d and v, such as typical sizes of disturbance and noise.
+    seconds : float or Deadline
+        How long this may take, about; what is known then is told, or that nothing is.
 
     Raises
     ------
@@ -93,14 +99,21 @@ def synthesise_gain(
         )
     checked_rate("rho", rho)
     first, second = checked_weights(weights)
+    deadline = Deadline.of(seconds)
     search = Search(
-        system, bounded_region(system, region, inputs), "synthesis", (first, second)
+        system, bounded_region(system, region, inputs), "synthesis", (first, second),
+        seconds=deadline.part(_SEARCH),
     )
     try:
         found = search.find_best(criterion) if rho is None else search.find(rho)
         made = stability(search, found)
+    except OutOfTimeError:
+        raise
     except NotCertifiedError as error:
-        smallest = search.smallest_rate()
+        try:
+            smallest = search.smallest_rate()
+        except OutOfTimeError:
+            raise error from None
         if np.isfinite(smallest):
             raise NotCertifiedError(
                 f"{error.args[0]}. Feasible at the states tried: rho from {smallest:.4g} on",
@@ -115,7 +128,9 @@ def synthesise_gain(
     observer = Luenberger(made.gain)
     try:
         # For the gain as it is now, another P may give smaller constants.
-        again = certify_observer(system, observer, search.region, rho=made.rho, weights=weights)
+        again = certify_observer(
+            system, observer, search.region, rho=made.rho, weights=weights, seconds=deadline
+        )
     except NotCertifiedError:
         again = made
 

@@ -225,11 +225,17 @@ def certify(
         str | None, typer.Option(help="Bounds on the inputs, in the form of --box.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated record.")] = 0,
+    seconds: Annotated[
+        float, typer.Option(help="After about this long, what was found is told.")
+    ] = 60.0,
 ) -> None:
     """What the theorem guarantees for a model: its assumptions checked, its constants computed."""
     from .certify import certify as run
 
-    if not run(Console(), model, box, horizon, report, input_box=input_box, seed=seed):
+    certified = run(
+        Console(), model, box, horizon, report, input_box=input_box, seed=seed, seconds=seconds
+    )
+    if not certified:
         raise typer.Exit(1)
 
 

@@ -15,6 +15,7 @@ from ..certificates.audit import audit
 from ..certificates.certificate import Certificate
 from ..certificates.certification import certify as make
 from ..certificates.choices import Sizes
+from ..certificates.deadline import Deadline
 from ..certificates.detectability import certify_detectability
 from ..certificates.errors import CertificateError, NotCertifiedError
 from ..certificates.figures import LABELS, error_and_bounds
@@ -52,6 +53,7 @@ def certify(
     *,
     input_box: str | None = None,
     seed: int = 0,
+    seconds: float = 60.0,
 ) -> bool:
     """Audit a model, certify what can be, and show it.
 
@@ -72,6 +74,8 @@ def certify(
         Bounds on the inputs, in the same form; left out, those of the simulated record.
     seed : int
         Of the simulated record.
+    seconds : float
+        After about this long, what was found is told.
 
     Returns
     -------
@@ -83,7 +87,7 @@ def certify(
     QpmheError
         If an option, the model or the set does not fit.
     """
-    horizons = _horizons(horizon)
+    horizons, deadline = _horizons(horizon), Deadline(seconds)
     if report is not None:
         _make_folder(report.parent)  # before any work
     example = load(find(model))
@@ -99,9 +103,10 @@ def certify(
                 example.system, example.observer, example.cost,
                 horizon=horizons or [example.scenario.horizon], region=region, sizes=sizes,
                 run=record, initial_state=example.scenario.initial_estimate,
+                seconds=deadline.part(0.5),
             )
     except (NotCertifiedError, CertificateError) as error:
-        _not_certified(console, example, region, record, error, told)
+        _not_certified(console, example, region, record, error, told, deadline)
         _write_json(console, report, told)
         return False
     console.print(assumptions_table(certificate.audit))
@@ -118,18 +123,18 @@ def certify(
 
 def _not_certified(
     console: Console, example: Example, region: Region, record: Record, error: QpmheError,
-    told: dict[str, Any],
+    told: dict[str, Any], deadline: Deadline,
 ) -> None:
     """What can be said all the same: the assumptions, and the part that could be shown."""
     findings = audit(
         example.system, example.observer, example.cost, region, record,
-        initial_state=example.scenario.initial_estimate,
+        initial_state=example.scenario.initial_estimate, seconds=deadline.part(0.2),
     )
     failures: list[str] = []
     detected = _attempt(failures, "detectability", lambda: certify_detectability(
-        example.system, region))
+        example.system, region, seconds=deadline.part(0.5)))
     observed = _attempt(failures, "the observer", lambda: certify_observer(
-        example.system, example.observer, region))
+        example.system, example.observer, region, seconds=deadline))
     console.print(assumptions_table(findings))
     if detected is not None or observed is not None:
         console.print(ingredients_table(detected, observed))

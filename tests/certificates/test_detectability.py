@@ -193,7 +193,8 @@ def test_what_intervals_cannot_run_is_sampled_with_the_reason():
 def test_too_many_cells_are_sampled(monkeypatch):
     full = search_module.cover
     monkeypatch.setattr(
-        search_module, "cover", lambda model, region, form: full(model, region, form, 3)
+        search_module, "cover",
+        lambda model, region, form, **options: full(model, region, form, 3, **options),
     )
     box = qpmhe.Box([-3.0, -10.0], [3.0, 10.0])
     found = certify_detectability(qpmhe.models.pendulum()[0], box, eta=0.9)
