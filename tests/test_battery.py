@@ -16,8 +16,8 @@ DATA = Path(os.environ.get("QPMHE_BATTERY_DATA", ROOT.parent / "shared" / "data"
 sys.path.insert(0, str(FOLDER))
 
 import identify  # noqa: E402
+import measurements  # noqa: E402
 import model  # noqa: E402
-import records  # noqa: E402
 import study  # noqa: E402
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no battery data at {DATA}")
@@ -60,7 +60,7 @@ def test_the_parameter_file_is_small_and_tells_where_it_comes_from():
     found = json.loads(text)
     assert len(text) < 10_000
     assert found["provenance"]["doi"] == "10.17632/9xyvy2njj3"
-    assert found["provenance"]["files"] == [records.C20, records.HPPC]
+    assert found["provenance"]["files"] == [measurements.C20, measurements.HPPC]
     assert (ROOT / found["provenance"]["script"]).is_file()
     assert 2.8 < found["capacity_Ah"] < 3.2
     assert np.all(np.diff(found["ocv"]["V"]) > 0.0)
@@ -172,8 +172,8 @@ def test_means_keep_the_charge():
     charge = np.concatenate(
         [[0.0], np.cumsum(0.5 * (current[1:] + current[:-1]) * np.diff(time))]
     ) / 3600.0
-    raw = records.Raw(time, 3.0 + 0.1 * current, current, charge, np.full(4000, 25.0))
-    record = records.resample(raw, 2.0)
+    raw = measurements.Raw(time, 3.0 + 0.1 * current, current, charge, np.full(4000, 25.0))
+    record = measurements.resample(raw, 2.0)
     counted = 2.0 * np.cumsum(record.current[:, 0]) / 3600.0
     np.testing.assert_allclose(counted, record.charge[1:], atol=1e-9)
     np.testing.assert_allclose(record.voltage, 3.0 + 0.1 * record.current, rtol=1e-9)

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from records import C20, DOI, HPPC, Array, DataError, load, resample
+from measurements import C20, DOI, HPPC, Array, DataError, load, resample
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import lsq_linear, minimize_scalar
 from scipy.signal import lfilter

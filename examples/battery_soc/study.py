@@ -19,6 +19,7 @@ from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
+from measurements import DOI, DataError, drive_cycles, load, resample
 from model import (
     PRIOR,
     START,
@@ -30,7 +31,6 @@ from model import (
     noise,
     system_of,
 )
-from records import DOI, DataError, drive_cycles, load, resample
 from report import draw, starts_table, stress_table, table
 from rich.console import Console
 from rich.progress import Progress
