@@ -6,7 +6,7 @@ ARGS ?=
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: reproduce test lint types examples benchmarks comparison docs wheel release-check minimal-versions clean
+.PHONY: reproduce test lint types examples benchmarks comparison docs release-check minimal-versions clean
 
 # One stamp for each set of extras, renewed when the project's requirements change.
 $(VENV)/.%: pyproject.toml
@@ -55,10 +55,6 @@ comparison: $(VENV)/.test
 
 docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict
-
-wheel: $(VENV)/.dev
-	rm -rf dist
-	$(BIN)/python -m build --outdir dist .
 
 # What a release would carry: the archives hold what they must, and nothing else.
 release-check: $(VENV)/.dev
