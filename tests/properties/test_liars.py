@@ -267,3 +267,23 @@ def test_an_iterate_in_a_buffer_that_changes_later_is_copied():
 def test_interrupts_get_through():
     with registered(raising(KeyboardInterrupt())), pytest.raises(KeyboardInterrupt):
         estimator("liar", False).update(Y[0])
+
+
+def test_a_solver_that_cannot_follow_the_window_does_not_stop_a_step():
+    shifts = []
+
+    class Stuck(Solver):
+        def _solve(self, qp, start):
+            return qpmhe.solvers.create("banded")._solve(qp, start)
+
+        def shift(self):
+            shifts.append(1)
+            raise RuntimeError("stuck")
+
+    qpmhe.solvers.register(Backend("stuck", Stuck, "stuck"))
+    try:
+        estimates = run(estimator("stuck", False))
+    finally:
+        qpmhe.solvers.unregister("stuck")
+    assert len(shifts) == len(Y) - HORIZON
+    assert estimates[-1].improved
