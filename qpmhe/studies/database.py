@@ -115,6 +115,8 @@ def check(connection: sqlite3.Connection, path: Path, empty: bool) -> None:
 def reading(path: Path) -> Iterator[sqlite3.Connection]:
     """A connection that changes nothing, also while another process writes.
 
+    All that is read through it is of one moment.
+
     Parameters
     ----------
     path : Path
@@ -128,6 +130,7 @@ def reading(path: Path) -> Iterator[sqlite3.Connection]:
     if not path.is_file():
         raise StoreError(f"there is no store {path}; run a study first, or check the name.")
     with told(path), closing(_reader(path)) as connection:
+        connection.execute("BEGIN")
         check(connection, path, empty=False)
         yield connection
 

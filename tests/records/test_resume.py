@@ -34,7 +34,9 @@ def test_killed_at_random_moments(here):
     generator = np.random.default_rng(5)
     resumed_from = []
     for target in (120, 300):
-        running = process.start(CONTINUOUS, "record.csv", out, resume=True, **OPTIONS)
+        running = process.start(CONTINUOUS, "-", out, resume=True, **OPTIONS)
+        running.stdin.write("\n".join([*text[:451], ""]).encode())
+        running.stdin.flush()  # and not closed: it cannot come to its end before it is killed
         while running.poll() is None and rows(out) < target:
             time.sleep(0.01)
         time.sleep(generator.uniform(0.0, 0.05))
@@ -48,8 +50,7 @@ def test_killed_at_random_moments(here):
     assert out.read_bytes() == Path("whole.csv").read_bytes()
     assert told.before == resumed_from[-1]
     assert told.before + told.samples == 500
-    assert 0 < resumed_from[0] < 500
-    assert sorted(resumed_from) == resumed_from
+    assert 0 < resumed_from[0] <= resumed_from[1] < 500
 
 
 def test_interrupted_by_the_user(here):

@@ -19,12 +19,25 @@ import pandas as pd
 from qpmhe.studies.errors import StoreError
 from qpmhe.studies.store import Store
 
+# From so many rows on it waits for a file: however fast the machine, it is met in the middle.
 _CODE = """
-import sys
+import os, sys, time
 from qpmhe.studies.grid import Study
 from qpmhe.studies.runner import run
+from qpmhe.studies.writer import Writer
 
-run(Study(**eval(sys.argv[1])), sys.argv[2], jobs=2, progress=False)
+options, path, rows, release = sys.argv[1:]
+put = Writer.put
+
+
+def held(writer, result):
+    while len(writer.present(False)) >= int(rows) and not os.path.exists(release):
+        time.sleep(0.01)
+    put(writer, result)
+
+
+Writer.put = held
+run(Study(**eval(options)), path, jobs=2, progress=False)
 """
 
 
@@ -47,10 +60,13 @@ class Killed:
     kept: bool
 
 
-def start(options: dict[str, object], path: Path) -> subprocess.Popen[bytes]:
-    """A study in a process of its own."""
+def start(
+    options: dict[str, object], path: Path, rows: int, release: Path
+) -> subprocess.Popen[bytes]:
+    """A study in a process of its own, which goes beyond so many rows once a file is there."""
     return subprocess.Popen(
-        [sys.executable, "-c", _CODE, repr(options), str(path)], stderr=subprocess.DEVNULL
+        [sys.executable, "-c", _CODE, repr(options), str(path), str(rows), str(release)],
+        stderr=subprocess.DEVNULL,
     )
 
 
@@ -70,8 +86,9 @@ def kill_and_finish(
     rows: list[int] = []
     known: dict[str, tuple[str, bytes]] = {}
     kept = True
+    release = path.with_name("release")
     for target in targets:
-        process = start(options, path)
+        process = start(options, path, cells - 1, release)
         while process.poll() is None and len(_seen(path)) < target:
             time.sleep(0.02)
         time.sleep(generator.uniform(0.0, 0.5))
@@ -82,7 +99,9 @@ def kill_and_finish(
         kept &= all(now.get(key) == value for key, value in known.items())
         known = now
         rows.append(len(frame))
-    code = start(options, path).wait()
+    release.touch()
+    code = start(options, path, cells - 1, release).wait()
+    release.unlink()
     assert code == 0
     frame = _seen(path)
     now = {row.key: (row.finished, row.times.tobytes()) for row in frame.itertuples()}

@@ -19,6 +19,8 @@ while rows < int(sys.argv[2]):
         continue
     assert found >= rows
     rows, reads = found, reads + 1
+    if reads == 1:
+        print("reading", flush=True)
 print(reads)
 """
 
@@ -39,7 +41,8 @@ def test_a_study_killed_at_random_loses_and_repeats_nothing(tmp_path):
 def test_two_processes_read_while_one_writes(tmp_path):
     path = tmp_path / "store.sqlite"
     options = {"backends": ["banded"], "qps": [0, 1], "seeds": 20, "steps": 20}
-    writer = start(options, path)
+    release = tmp_path / "release"
+    writer = start(options, path, 20, release)
     readers = [
         subprocess.Popen(
             [sys.executable, "-c", _READ, str(path), "40"],
@@ -47,8 +50,11 @@ def test_two_processes_read_while_one_writes(tmp_path):
         )
         for _ in range(2)
     ]
+    for reader in readers:
+        assert reader.stdout.readline() == "reading\n", reader.communicate()
+    release.touch()  # both have read what was written so far
     assert writer.wait(timeout=60) == 0
     for reader in readers:
-        answer, error = reader.communicate(timeout=20)
+        answer, error = reader.communicate(timeout=60)
         assert reader.returncode == 0, error
         assert int(answer) > 1

@@ -107,11 +107,14 @@ def test_search_and_numeric_order(opened):
     page.fill("#table input[type=search]", "osqp")
     assert page.evaluate(ROWS) == 2
     page.fill("#table input[type=search]", "")
+    assert page.evaluate(ROWS) == 7
     head = page.locator("#table thead th", has_text="J / converged")
-    head.locator(".dt-column-title").first.click()
     place = page.evaluate(
         "window.configurationTable.columns().titles().toArray().indexOf('J / converged')"
     )
+    page.evaluate("() => { window.configurationTable.one('draw', () => { window.drawn = 1; }); }")
+    head.locator(".dt-column-title").first.click()
+    page.wait_for_function("window.drawn")  # by a task of its own, after the click
     order = "{search: 'applied', order: 'applied'}"
     shown = page.evaluate(f"window.configurationTable.column({place}, {order}).data().toArray()")
     # As texts, 10 would come before 2.

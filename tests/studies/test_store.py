@@ -1,6 +1,6 @@
 import json
 import sqlite3
-from contextlib import suppress
+from contextlib import closing, suppress
 
 import numpy as np
 import pandas as pd
@@ -63,6 +63,24 @@ def test_a_row_comes_back_as_it_was_put(path):
         np.testing.assert_array_equal(found.pop(name), result["trajectory"].pop(name))
     assert found == result["trajectory"]
     assert store.trajectory("no such key") is None
+
+
+def test_a_reader_sees_one_moment(path, monkeypatch):
+    """The writer makes its tables while a reader asks whether there are any."""
+    with closing(sqlite3.connect(path)) as connection:  # or the reader's lock holds it up
+        connection.execute("PRAGMA journal_mode = WAL")
+    tables = database._tables
+
+    def written_meanwhile(connection):
+        monkeypatch.undo()
+        found = tables(connection)
+        stored(path)
+        return found
+
+    monkeypatch.setattr(database, "_tables", written_meanwhile)
+    with pytest.raises(StoreError, match="is empty"):
+        Store(path).frame()
+    assert Store(path).frame().empty
 
 
 def test_meta_tells_settings_and_environments(path):
