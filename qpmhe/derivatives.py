@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,7 @@ class Jacobian:
         inputs: int,
         probes: Probes,
     ) -> None:
-        self._function = function
+        self._function, self._inputs = function, inputs
         self.method = "finite differences"
         self.batch: Callable[[Array, Array], Array] = self._differences
         self._given: BatchedFunction | None = None
@@ -72,6 +73,13 @@ class Jacobian:
             return self._given(x, u)
         value: Array = self.batch(x[None], u[None])[0]
         return value
+
+    @property
+    def direct(self) -> Callable[..., Any]:
+        """A function of one state, and of the input where there are any."""
+        if self._given is not None:
+            return self._given.direct
+        return self if self._inputs else partial(self, u=np.zeros(0))
 
     def _complex(self, x: Array, u: Array) -> Array:
         n = x.shape[-1]

@@ -73,18 +73,19 @@ class PythonEngine:
             exact = ExactStep(system, cost)
             exact.prepare(settings.horizon)
         self._optimizer = Optimizer(self._subproblem, solver, settings, exact)
-        self.reset(initial_state)
-
-    def reset(self, initial_state: Array) -> None:
-        """Forget all measurements and start at this state."""
-        self._solver.forget()
         self._window = self._fresh_window(initial_state)
         self._trajectory: Array | None = None  # the last estimate's
         self._dropped: tuple[str, ...] = ()
         # Estimates of x(t-N), ..., x(t), each made at its own time.
-        self._history: deque[Array] = deque(
-            [initial_state.copy()], maxlen=self._settings.horizon + 1
-        )
+        self._history: deque[Array] = deque([initial_state.copy()], maxlen=settings.horizon + 1)
+
+    def reset(self, initial_state: Array) -> None:
+        """Forget all measurements and start at this state."""
+        self._solver.forget()
+        self._window.reset(initial_state, self._observer.initial_covariance())
+        self._trajectory, self._dropped = None, ()
+        self._history.clear()
+        self._history.append(initial_state.copy())
 
     def _fresh_window(self, initial_state: Array) -> Window:
         settings = self._settings

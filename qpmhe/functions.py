@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,8 @@ class BatchedFunction:
 
     def batch(self, x: Array, u: Array) -> Array:
         """The values at states x (..., n) and inputs u (..., m): shape (..., *shape)."""
+        if x.ndim == 2 and self.mode == "batched" and not self._short:
+            return np.asarray(self._function(x, u) if self._takes_input else self._function(x))
         lead = x.shape[:-1]
         if len(lead) != 1:
             # Functions that pass for batched on (B, n) may still mix axes up beyond.
@@ -85,8 +88,6 @@ class BatchedFunction:
         if self.mode == "batched":
             value = self._function(x, u) if self._takes_input else self._function(x)
             value = np.asarray(value)
-            if len(lead) == 1 and not self._short:
-                return value
         elif self.mode == "columns":
             value = self._function(x.T, u.T) if self._takes_input else self._function(x.T)
             value = np.moveaxis(np.asarray(value), -1, 0)
@@ -188,6 +189,13 @@ class BatchedFunction:
             pass
         self.mode = "looped"
         return False
+
+    @property
+    def direct(self) -> Callable[..., Any]:
+        """A function of one state, and of the input where there are any: the user's if it may."""
+        if not self._short and self._takes_input == (self._inputs > 0):
+            return self._function
+        return self if self._inputs else partial(self, u=np.zeros(0))
 
     @property
     def plain(self) -> bool:

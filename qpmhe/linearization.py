@@ -7,9 +7,66 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.qp import band_index
 
-__all__ = ["StageTerms"]
+__all__ = ["Span", "Stage", "StageTerms"]
 
 Array = NDArray[np.float64]
+
+
+class Stage:
+    """Views of one stage of `StageTerms`, made once: making them takes as long as using them.
+
+    Attributes
+    ----------
+    linear, transposed : array
+        :math:`[r, -G]` (n + p, 1 + n), and its transpose.
+    disturbance, noise : array
+        The parts w (n,) and v (p,) of r.
+    minus_f, minus_h : array
+        The parts -A (n, n) and -C (p, n) of -G.
+    panel, own, following : array
+        The stage's terms.
+    """
+
+    __slots__ = (
+        "disturbance", "following", "linear", "minus_f", "minus_h", "noise", "own", "panel",
+        "transposed",
+    )
+
+    def __init__(self, terms: StageTerms, k: int) -> None:
+        self.linear = linear = terms.linear[k]
+        self.transposed = linear.T
+        n = linear.shape[1] - 1
+        self.disturbance, self.noise = linear[:n, 0], linear[n:, 0]
+        self.minus_f, self.minus_h = linear[:n, 1:], linear[n:, 1:]
+        self.panel, self.own, self.following = terms.panel[k], terms.own[k], terms.following[k]
+
+
+class Span:
+    """Views of some successive stages of `StageTerms`, as a QP takes them in.
+
+    Attributes
+    ----------
+    minus_jacobian : (count, n + p, n) array
+        The :math:`-G_i`.
+    panel : (count, n, 2n) array
+        The panels.
+    own_first, own_rest : array
+        ``own`` of the first stage, and of all behind it.
+    following_rest, following_last : array
+        ``following`` of all stages but the last, and of the last.
+    """
+
+    __slots__ = (
+        "following_last", "following_rest", "minus_jacobian", "own_first", "own_rest", "panel",
+    )
+
+    def __init__(self, terms: StageTerms, first: int, count: int) -> None:
+        last = first + count
+        self.minus_jacobian = terms.linear[first:last, :, 1:]
+        self.panel = terms.panel[first:last]
+        self.own_first, self.own_rest = terms.own[first], terms.own[first + 1 : last]
+        self.following_rest = terms.following[first : last - 1]
+        self.following_last = terms.following[last - 1]
 
 
 class StageTerms:
@@ -44,7 +101,7 @@ class StageTerms:
     """
 
     __slots__ = (
-        "_first", "_flat", "_index", "_square", "_weighted", "_zeros",
+        "_first", "_flat", "_index", "_own", "_square", "_weighted", "_zeros",
         "following", "linear", "own", "panel", "residuals",
     )
 
@@ -60,8 +117,8 @@ class StageTerms:
         self._square = self._flat[: (1 + n) ** 2].reshape(1 + n, 1 + n)
         self._weighted = self._flat[(1 + n) ** 2 : -1].reshape(q, 1 + n)
         self._zeros = np.zeros(self._flat.size)
-        # W r of the disturbances, W M's first column.
-        self._first = self._weighted[:n, 0]
+        # -G^T W r, and W r of the disturbances, W M's first column.
+        self._own, self._first = self._square[1:, 0], self._weighted[:n, 0]
         self._index = _places(n, p)
 
     @property
@@ -69,20 +126,27 @@ class StageTerms:
         """The Jacobians G_i (stages, n + p, n), a copy."""
         return -self.linear[:, :, 1:]
 
-    def set_stage(self, k: int, weight: Array) -> float:
-        """Compute the terms of stage k from its linear map, which is in place already.
+    def set_stage(self, stage: Stage, weight: Array) -> float:
+        """Compute the terms of a stage from its linear map, which is in place already.
+
+        Parameters
+        ----------
+        stage : Stage
+            One of these.
+        weight : (n + p, n + p) array
+            Its weight.
 
         Returns
         -------
         float
             :math:`|r|_W^2`; NaN or infinite where some number of the stage is.
         """
-        linear, flat = self.linear[k], self._flat
-        np.dot(weight, linear, out=self._weighted)
-        np.dot(linear.T, self._weighted, out=self._square)
-        flat.take(self._index, out=self.panel[k], mode="clip")
-        self.own[k] = self._square[1:, 0]
-        self.following[k] = self._first
+        flat, weighted = self._flat, self._weighted
+        weight.dot(stage.linear, weighted)
+        stage.transposed.dot(weighted, self._square)
+        flat.take(self._index, None, stage.panel, "clip")
+        stage.own[...] = self._own
+        stage.following[...] = self._first
         # 0 times what is not finite is NaN, and no square overflows on the way.
         return float(flat[0] + flat.dot(self._zeros))
 

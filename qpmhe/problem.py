@@ -18,6 +18,7 @@ from .window import Window
 
 if TYPE_CHECKING:
     from .adapters.fused import Fused
+    from .stages import Frame
 
 __all__ = ["Problem", "Trial"]
 
@@ -86,6 +87,7 @@ class Problem:
         self._candidate: Trial | None = None
         self._fused: Fused | None = None
         self._first = 0
+        self._frame: Frame
         self.model = system
         self.prior: Array = np.zeros(system.n)
         self.inputs: Array = np.zeros((0, system.m))
@@ -113,14 +115,14 @@ class Problem:
     def bind(self, window: Window) -> None:
         """Take over the window's data, all sets, and the prior z(t-N) as in (eq:prior)."""
         self._candidate = None
-        self.prior = window.candidate[0]
-        self.measurements = window.measurements
+        self._frame = frame = window.frame
+        self.prior, self.measurements = frame.prior, frame.measurements
         if window.unusual:
             self.inputs, self.model = window.inputs, window.model
             self.stage_weights = window.stage_weights
             self.observed = window.observed if window.has_special_weights else None
         else:
-            self.inputs, self.model = window.usual_inputs, self._system
+            self.inputs, self.model = frame.inputs, self._system
             self.stage_weights, self.observed = self._cost.stage_weight, None
         self._fused, self._first = None if window.unusual else window.fused, window.start
         if self._discounted:
@@ -264,8 +266,9 @@ class Problem:
             weights = self.stage_weights if self._quadratic else window.majorising_weights
             if self.discounts is not None:
                 weights = weights * self.discounts[1:, None, None]
+            frame = self._frame
             self._candidate = Trial(
-                window.candidate, window.residuals, weights, window.candidate_cost
+                frame.candidate, frame.residuals, weights, window.candidate_cost
             )
         return self._candidate
 

@@ -8,11 +8,65 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .linearization import StageTerms
+from .linearization import Span, Stage, StageTerms
 
-__all__ = ["Stages"]
+__all__ = ["Frame", "Place", "Stages"]
 
 Array = NDArray[np.float64]
+
+
+class Place:
+    """Views of one stage's entries in all arrays: making them takes as long as using them.
+
+    Attributes
+    ----------
+    z, following : (n,) array
+        State of the observer, and the one after it.
+    arguments : tuple
+        What the functions of the usual model take: z, and the inputs if there are any.
+    y, u : array
+        The measurement (p,), and the input (m,).
+    weight : (n + p, n + p) array
+        The stage's.
+    terms : Stage
+        Its linear map and terms.
+    """
+
+    __slots__ = ("arguments", "following", "terms", "u", "weight", "y", "z")
+
+    def __init__(self, stages: Stages, k: int) -> None:
+        self.z, self.following = stages._z[k], stages._z[k + 1]
+        self.y, self.u = stages._y[k], stages._u[k, :-1]
+        self.arguments = (self.z, self.u) if self.u.size else (self.z,)
+        self.weight = stages._weight[k]
+        self.terms = Stage(stages.terms, k)
+
+
+class Frame:
+    """Views of a whole window.
+
+    Attributes
+    ----------
+    candidate : (K + 1, n) array
+        The observer's trajectory.
+    prior : (n,) array
+        Its first state.
+    residuals, measurements, inputs : array
+        (K, n + p), (K, p) and (K, m).
+    costs : (K,) array
+        The stages' costs.
+    span : Span
+        The stages' terms.
+    """
+
+    __slots__ = ("candidate", "costs", "inputs", "measurements", "prior", "residuals", "span")
+
+    def __init__(self, stages: Stages, first: int, last: int) -> None:
+        self.candidate, self.prior = stages._z[first : last + 1], stages._z[first]
+        self.residuals = stages.terms.residuals[first:last]
+        self.measurements, self.inputs = stages._y[first:last], stages._u[first:last, :-1]
+        self.costs = stages._stage_cost[first:last]
+        self.span = Span(stages.terms, first, last - first)
 
 
 class Stages:
@@ -68,19 +122,50 @@ class Stages:
         self._stage_cost = np.zeros(room)
         self.terms = StageTerms(room, n, p)
         self._covariance = None if covariance is None else np.zeros((room + 1, n, n))
+        self._places = [Place(self, k) for k in range(room)]
+        # Of the full windows, by their first stage.
+        self._frames = [Frame(self, k, k + horizon) for k in range(room + 1 - horizon)]
+        self.reset(initial_state, covariance)
+
+    def reset(self, initial_state: Array, covariance: Array | None) -> None:
+        """Forget all samples.
+
+        Parameters
+        ----------
+        initial_state : (n,) array
+            z(0).
+        covariance : (n, n) array or None
+            The observer's, of z(0).
+        """
+        self.time = 0  # samples ever pushed: the window ends at x(time)
+        self.start = self.end = 0
+        self._last_special = self._last_irregular = -self.horizon - 1
         # The last state at which the model worked, of the stages that are no longer here.
         self._earlier, self._earlier_covariance = initial_state, covariance
         self._z[0] = initial_state
         if self._covariance is not None:
             self._covariance[0] = covariance
-        self.time = 0  # samples ever pushed: the window ends at x(time)
-        self.start = self.end = 0
-        self._last_special = self._last_irregular = -horizon - 1
+        self._own_noise.clear()
+        if self.unusual:
+            self._make_usual(0)
+            self.unusual = False
+
+    def _make_usual(self, first: int) -> None:
+        """Make the places from one on those of usual stages."""
+        self._observed[first:], self._special[first:], self._irregular[first:] = True, False, False
+        self._weight[first:] = self._stage_weight
 
     @property
     def length(self) -> int:
         """N_t, the number of stages in the window."""
         return self.end - self.start
+
+    @property
+    def frame(self) -> Frame:
+        """The views of the present window, which has at least one stage."""
+        if self.end - self.start < self.horizon:
+            return Frame(self, self.start, self.end)
+        return self._frames[self.start]
 
     @property
     def newest_is_held(self) -> bool:
@@ -113,8 +198,7 @@ class Stages:
             if states is not None:
                 states[: keep + 1] = states[end - keep : end + 1]
         if self.unusual:
-            self._observed[keep:], self._special[keep:], self._irregular[keep:] = True, False, False
-            self._weight[keep:] = self._stage_weight
+            self._make_usual(keep)
             self.unusual = bool(self._special[:keep].any() or self._irregular[:keep].any())
         self.start, self.end = 0, keep
 

@@ -11,7 +11,7 @@ from qpmhe_solvers import QP
 from qpmhe_solvers.qp import band_of
 
 from .costs import Cost
-from .linearization import StageTerms
+from .linearization import Span, StageTerms
 from .problem import Problem, Trial
 from .sets import ConvexSet
 from .system import System
@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 # A second-order correction goes this share of itself further, to land inside.
 _BEYOND = 0.1
+
+_NO_BAND: Array = np.zeros(0)
 
 
 class Subproblem:
@@ -61,14 +63,18 @@ class Subproblem:
         ends = np.cumsum([0, *(len(rows) for rows in (self._w_rows, self._v_rows, self._x_rows))])
         self._w, self._v, self._x = (slice(a, b) for a, b in pairwise(ends))
         self._qp: QP | None = None
+        # What is added to the stages' panels: the bands of the prior, and of each Q_i behind it;
+        # whether the latter are those of one weight, and the prior's as it was given.
+        self._added: Array
+        self._uniform, self._prior_band = False, _NO_BAND
 
     def at_candidate(self, problem: Problem, window: Window) -> QP:
         """The QP around the candidate, from what the window has kept."""
-        first, count, terms = window.start, window.length, window.terms
-        if self._scaled is not None:
-            self._scaled.copy_scaled(terms, first, window.discounts[1:])
-            terms, first = self._scaled, 0
-        return self._assemble(problem, problem.candidate(window), terms, first, count, True)
+        trial = problem.candidate(window)
+        if self._scaled is None:
+            return self._assemble(problem, trial, window.frame.span, True)
+        self._scaled.copy_scaled(window.terms, window.start, window.discounts[1:])
+        return self._assemble(problem, trial, Span(self._scaled, 0, window.length), True)
 
     def at(self, problem: Problem, trial: Trial) -> QP | None:
         """The QP around any trajectory; None where the model has no Jacobians there."""
@@ -84,7 +90,7 @@ class Subproblem:
             return None
         linear[:, :, 0] = trial.residuals
         terms.set_all(count, trial.weights)
-        return self._assemble(problem, trial, terms, 0, count, False)
+        return self._assemble(problem, trial, Span(terms, 0, count), False)
 
     @property
     def jacobian(self) -> Array:
@@ -127,43 +133,47 @@ class Subproblem:
         qp.row_lower += inwards
         qp.row_upper -= inwards
 
-    def _assemble(
-        self,
-        problem: Problem,
-        trial: Trial,
-        terms: StageTerms,
-        first: int,
-        count: int,
-        at_candidate: bool,
-    ) -> QP:
-        n = self._n
+    def _assemble(self, problem: Problem, trial: Trial, span: Span, at_candidate: bool) -> QP:
+        count = len(span.panel)
         qp = self._qp
         if qp is None or qp.stages != count + 1:
-            qp = self._qp = QP(count + 1, n, self._rows)
-            qp.row_next[:-1, self._w] = self._w_rows
-            qp.row_own[:, self._x] = self._x_rows
-        last, band, gradient = first + count, qp.band, qp.gradient
+            qp = self._fresh(count + 1)
         weights = trial.weights
-        if weights.ndim == 2:
-            disturbance_band = self._disturbance_band
-            band[count] = disturbance_band
-        else:
-            disturbance_band = np.array([band_of(w[:n, :n]) for w in weights])
-            band[count] = disturbance_band[-1]
-            disturbance_band = disturbance_band[:-1]
-        np.add(terms.panel[first + 1 : last], disturbance_band, out=band[1:count])
-        np.add(terms.own[first + 1 : last], terms.following[first : last - 1],
-               out=gradient[1:count])
+        uniform = weights.ndim == 2
+        if not (uniform and self._uniform):
+            n = self._n
+            self._added[1:] = (
+                self._disturbance_band if uniform
+                else [band_of(weight[:n, :n]) for weight in weights]
+            )
+            self._uniform = uniform
         # The candidate starts at the prior.
         offset = self._nothing if at_candidate else trial.trajectory[0] - problem.prior
-        np.add(terms.panel[first], problem.prior_band_at(offset), out=band[0])
-        gradient[0] = terms.own[first]
+        prior_band = problem.prior_band_at(offset)
+        if prior_band is not self._prior_band:
+            self._added[0] = self._prior_band = prior_band
+        own_first, own_rest, last, band_rest, band_last = self._views
+        np.add(span.panel, self._added[:-1], band_rest)
+        band_last[...] = self._added[-1]
+        np.add(span.own_rest, span.following_rest, own_rest)
+        own_first[...] = span.own_first
         if not at_candidate:
-            gradient[0] += problem.prior_weight_at(offset).dot(offset)
-        gradient[count] = terms.following[last - 1]
-        self._minus_jacobian = terms.linear[first:last, :, 1:]
+            own_first += problem.prior_weight_at(offset).dot(offset)
+        last[...] = span.following_last
+        self._minus_jacobian = span.minus_jacobian
         if problem.constrained:
             self._bound(qp, problem, trial)
+        return qp
+
+    def _fresh(self, stages: int) -> QP:
+        """A QP of so many stages in place of the present one."""
+        self._qp = qp = QP(stages, self._n, self._rows)
+        qp.row_next[:-1, self._w] = self._w_rows
+        qp.row_own[:, self._x] = self._x_rows
+        band, gradient = qp.band, qp.gradient
+        self._views = gradient[0], gradient[1:-1], gradient[-1], band[:-1], band[-1]
+        self._added = np.empty_like(band)
+        self._uniform, self._prior_band = False, _NO_BAND
         return qp
 
     def _bound(self, qp: QP, problem: Problem, trial: Trial) -> None:

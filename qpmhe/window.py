@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .costs import Cost, ObserverPrior
+from .linearization import Stage
 from .observers import HighGain, Luenberger, Observer, Sample
 from .stages import Stages
-from .system import System
+from .system import Function, System
 
 if TYPE_CHECKING:
     from .adapters.fused import Fused
@@ -56,12 +57,15 @@ class Window(Stages):
         n, p, m = system.n, system.p, system.m
         self._system, self._observer, self._cost = system, observer, cost
         self._n, self._m, self._linearized = n, m, linearized
+        self._quadratic = cost.quadratic
         self._jacobians = linearized or observer.needs_jacobians
         super().__init__(
             n, p, m, horizon, initial_state, observer.initial_covariance(), cost.stage_weight,
             cost.quadratic,
         )
         self._sample = Sample(system, np.zeros(m))
+        self._read = system.f.direct, system.h.direct
+        self._slopes = system.f_jacobian.direct, system.h_jacobian.direct
         self._linear = True  # whether the stage that enters has Jacobians
         self._no_jacobian = -np.eye(n + p, n)  # what stands in for them, with the minus of `linear`
         #: Whole stages and trajectories by one call each, where the model offers that.
@@ -108,9 +112,10 @@ class Window(Stages):
         if self.end == self._room:
             self._move_to_front()
         k, m = self.end, self._m
-        self._y[k] = y
+        place = self._places[k]
+        place.y[...] = y
         if m:
-            self._u[k, :m] = u
+            place.u[...] = u
         if dt is not None:
             self._irregular[k] = self.unusual = True
             self._u[k, m] = dt
@@ -208,37 +213,40 @@ class Window(Stages):
 
     def _advance(self, k: int, time: int, observed: NDArray[np.bool_] | None) -> float:
         """Evaluate stage k at z and step the observer; the stage's cost, or infinity."""
-        n, z, following, m = self._n, self._z[k], self._z[k + 1], self._m
-        model, u, y, sample = self._system, self._u[k, :m], self._y[k], self._sample
-        linear = self.terms.linear[k]
-        error = linear[n:, 0]
+        place = self._places[k]
+        z, following, u, terms = place.z, place.following, place.u, place.terms
+        model, error, sample = self._system, terms.noise, self._sample
         try:
             if self.unusual and self._irregular[k]:
                 model, u = self._system.timed, self._u[k]
             joint = model.joint if self._jacobians else None
             if joint is None:
+                usual = model is self._system
+                arguments = place.arguments if usual else (z, u)
+                f, h = self._read if usual else (model.f, model.h)
                 # Copied at once: the functions may return one array every time.
-                following[:] = model.f(z, u)
+                following[...] = f(*arguments)
                 ahead = following
-                np.subtract(y, model.h(z, u), out=error)
+                np.subtract(place.y, h(*arguments), error)
                 if self._jacobians:
-                    self._differentiate(linear, model, z, u)
+                    slopes = self._slopes if usual else (model.f_jacobian, model.h_jacobian)
+                    self._differentiate(terms, slopes, arguments)
             else:
-                ahead, output, slopes = joint.stage(z, u)
-                np.subtract(y, output, out=error)
-                np.negative(slopes, out=linear[:, 1:])
+                ahead, output, slope = joint.stage(z, u)
+                np.subtract(place.y, output, error)
+                np.negative(slope, terms.linear[:, 1:])
             if observed is not None:
                 error[~observed] = 0.0
             sample.system, sample.u, sample.observed = model, u, observed
             if self._observer.needs_jacobians:
-                sample.f_jacobian, sample.h_jacobian = -linear[:n, 1:], -linear[n:, 1:]
+                sample.f_jacobian, sample.h_jacobian = -terms.minus_f, -terms.minus_h
             if self._own_noise or sample.noise_weight is not None:
                 sample.noise_weight = self._own_noise.get(time)
             if self._covariance is not None:
                 sample.covariance = self._covariance[k]
             correction, posterior = self._observer.correct(z, error, sample)
-            linear[:n, 0] = correction
-            np.add(ahead, correction, out=following)
+            terms.disturbance[...] = correction
+            np.add(ahead, correction, following)
         except Exception:  # a model function outside its domain: bad luck, not bad input
             return math.inf
         if self._covariance is not None:
@@ -247,41 +255,45 @@ class Window(Stages):
             self._covariance[k + 1] = posterior
         if not math.isfinite(following.dot(following)):
             return math.inf
+        self._linear = True
+        if self._quadratic:
+            # Even where no terms are wanted: so the cost is the same to the last digit.
+            cost = self.terms.set_stage(terms, place.weight)
+            if math.isfinite(cost):
+                return cost
         return self._weigh(k)
 
     @staticmethod
-    def _differentiate(linear: Array, model: System, z: Array, u: Array) -> None:
-        n = z.size
+    def _differentiate(
+        terms: Stage, slopes: tuple[Function, Function], arguments: tuple[Array, ...]
+    ) -> None:
+        f_jacobian, h_jacobian = slopes
         try:
-            np.negative(model.f_jacobian(z, u), out=linear[:n, 1:])
-            np.negative(model.h_jacobian(z, u), out=linear[n:, 1:])
+            np.negative(f_jacobian(*arguments), terms.minus_f)
+            np.negative(h_jacobian(*arguments), terms.minus_h)
         except Exception:  # a user's Jacobian outside its domain
             # An observer that never reads it goes on; `_weigh` sees the NaN.
-            linear[:, 1:] = np.nan
+            terms.linear[:, 1:] = np.nan
 
     def _weigh(self, k: int) -> float:
-        """The cost of stage k, or infinity, and its Gauss-Newton terms."""
-        terms, weight = self.terms, self._weight[k]
-        self._linear = True
-        if self._cost.quadratic:
-            # Even where no terms are wanted: so the cost is the same to the last digit.
-            cost = terms.set_stage(k, weight)
-            if math.isfinite(cost):
-                return cost
+        """The cost of stage k, or infinity, and its Gauss-Newton terms; where they are unusual."""
+        place, weight = self._places[k], self._weight[k]
+        terms, stage = self.terms, place.terms
         residual = terms.residuals[k]
         cost = float(self._cost.stage_costs(residual[None], weight)[0])
         if not math.isfinite(cost):
             return math.inf
         if self._linearized:
-            if not self._cost.quadratic:
+            if not self._quadratic:
                 weight = self._majorising[k]
                 weight[...] = self._cost.majorise(residual[None], self._weight[k])[0]
-            slopes = terms.linear[k, :, 1:].ravel()
+            slopes = stage.linear[:, 1:].ravel()
             # Terms that overflow otherwise are left to the QP, whose data are then not finite.
-            if not (math.isfinite(terms.set_stage(k, weight)) or math.isfinite(slopes.dot(slopes))):
+            cost_of_terms = terms.set_stage(stage, weight)
+            if not (math.isfinite(cost_of_terms) or math.isfinite(slopes.dot(slopes))):
                 self._linear = False
-                terms.linear[k, :, 1:] = self._no_jacobian
-                terms.set_stage(k, weight)
+                stage.linear[:, 1:] = self._no_jacobian
+                terms.set_stage(stage, weight)
         return cost
 
     def _hold(self, k: int) -> None:
@@ -292,11 +304,11 @@ class Window(Stages):
         self._z[k + 1], covariance = self._last_good(k)
         if self._covariance is not None:
             self._covariance[k + 1] = covariance
-        linear = self.terms.linear[k]
-        linear[:, 0], linear[:, 1:] = 0.0, self._no_jacobian
+        stage = self._places[k].terms
+        stage.linear[:, 0], stage.linear[:, 1:] = 0.0, self._no_jacobian
         self._majorising[k] = self._weight[k]
         if self._linearized:
-            self.terms.set_stage(k, self._weight[k])
+            self.terms.set_stage(stage, self._weight[k])
 
     def restart(self, state: Array) -> None:
         """Go on from another state after a failed stage, whose correction is void anyway."""
@@ -322,7 +334,7 @@ class Window(Stages):
     @property
     def candidate_cost(self) -> float:
         """J of the candidate; its prior term is 0 exactly."""
-        costs = self._stage_cost[self.start : self.end]
+        costs = self.frame.costs
         if self._ages is None:
             return float(costs.dot(self._ones[: costs.size]))
         return float(costs.dot(self.discounts[1:]))
