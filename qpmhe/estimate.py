@@ -184,8 +184,8 @@ class Estimate:
         self.status, self.message = status, message
         self.qps, self.solver_iterations = qps, solver_iterations
         self.corrections, self.dropped = corrections, dropped
-        self.delayed: Array | None = None
-        if delay < trajectory.shape[0]:
+        self.delayed: Array | None = self.state if delay == 0 else None
+        if 0 < delay < trajectory.shape[0]:
             self.delayed = trajectory[trajectory.shape[0] - 1 - delay]
         self.solve_time, self.step_time = solve_time, float("nan")
 

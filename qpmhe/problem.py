@@ -87,7 +87,8 @@ class Problem:
         self._candidate: Trial | None = None
         self._fused: Fused | None = None
         self._first = 0
-        self._frame: Frame
+        #: Views of the bound window.
+        self.frame: Frame
         self.model = system
         self.prior: Array = np.zeros(system.n)
         self.inputs: Array = np.zeros((0, system.m))
@@ -115,7 +116,7 @@ class Problem:
     def bind(self, window: Window) -> None:
         """Take over the window's data, all sets, and the prior z(t-N) as in (eq:prior)."""
         self._candidate = None
-        self._frame = frame = window.frame
+        self.frame = frame = window.frame
         self.prior, self.measurements = frame.prior, frame.measurements
         if window.unusual:
             self.inputs, self.model = window.inputs, window.model
@@ -214,11 +215,11 @@ class Problem:
             weights = self.stage_weights
         if not math.isfinite(cost):
             return Trial(trajectory, residuals, weights, math.inf, math.inf)
-        violation = 0.0
-        if self.constrained:
-            violation = self.violation(trajectory, residuals)
-            if violation > _FEASIBLE:
-                cost = math.inf
+        if not self.constrained:
+            return Trial(trajectory, residuals, weights, cost)
+        violation = self.violation(trajectory, residuals)
+        if violation > _FEASIBLE:
+            cost = math.inf
         return Trial(trajectory, residuals, weights, cost, violation)
 
     def _call(self, fused: Fused, trajectory: Array) -> tuple[Array, float]:
@@ -266,9 +267,9 @@ class Problem:
             weights = self.stage_weights if self._quadratic else window.majorising_weights
             if self.discounts is not None:
                 weights = weights * self.discounts[1:, None, None]
-            frame = self._frame
+            frame = self.frame
             self._candidate = Trial(
-                frame.candidate, frame.residuals, weights, window.candidate_cost
+                frame.candidate, frame.residuals, weights, window.cost_over(frame)
             )
         return self._candidate
 

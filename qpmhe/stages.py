@@ -103,7 +103,7 @@ class Stages:
         quadratic: bool,
     ) -> None:
         self.horizon = horizon
-        room = horizon + max(horizon, 64)
+        room = horizon + max(horizon // 4, 32)
         self._room = room
         self._z = np.zeros((room + 1, n))
         # The input of each stage, and behind it the length of its step where that is unusual.

@@ -72,7 +72,7 @@ class Subproblem:
         """The QP around the candidate, from what the window has kept."""
         trial = problem.candidate(window)
         if self._scaled is None:
-            return self._assemble(problem, trial, window.frame.span, True)
+            return self._assemble(problem, trial, problem.frame.span, True)
         self._scaled.copy_scaled(window.terms, window.start, window.discounts[1:])
         return self._assemble(problem, trial, Span(self._scaled, 0, window.length), True)
 

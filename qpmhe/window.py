@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .costs import Cost, ObserverPrior
 from .linearization import Stage
 from .observers import HighGain, Luenberger, Observer, Sample
-from .stages import Stages
+from .stages import Frame, Stages
 from .system import Function, System
 
 if TYPE_CHECKING:
@@ -224,9 +224,7 @@ class Window(Stages):
                 usual = model is self._system
                 arguments = place.arguments if usual else (z, u)
                 f, h = self._read if usual else (model.f, model.h)
-                # Copied at once: the functions may return one array every time.
-                following[...] = f(*arguments)
-                ahead = following
+                # Used up at once: the functions may return one array every time.
                 np.subtract(place.y, h(*arguments), error)
                 if self._jacobians:
                     slopes = self._slopes if usual else (model.f_jacobian, model.h_jacobian)
@@ -246,7 +244,7 @@ class Window(Stages):
                 sample.covariance = self._covariance[k]
             correction, posterior = self._observer.correct(z, error, sample)
             terms.disturbance[...] = correction
-            np.add(ahead, correction, following)
+            np.add(f(*arguments) if joint is None else ahead, correction, following)
         except Exception:  # a model function outside its domain: bad luck, not bad input
             return math.inf
         if self._covariance is not None:
@@ -334,7 +332,11 @@ class Window(Stages):
     @property
     def candidate_cost(self) -> float:
         """J of the candidate; its prior term is 0 exactly."""
-        costs = self.frame.costs
+        return self.cost_over(self.frame)
+
+    def cost_over(self, frame: Frame) -> float:
+        """The same, of the window's present frame."""
+        costs = frame.costs
         if self._ages is None:
             return float(costs.dot(self._ones[: costs.size]))
         return float(costs.dot(self.discounts[1:]))

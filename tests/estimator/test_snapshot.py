@@ -65,6 +65,20 @@ def test_a_restored_estimator_continues_bit_for_bit(name, stop):
     assert whole.covariances().tolist() == restored.covariances().tolist()
 
 
+@pytest.mark.parametrize("stop", [1, 8, 12, 60, 75])
+@pytest.mark.parametrize("name", OPTIONS)
+def test_after_a_reset_it_is_as_new(name, stop):
+    measurements, used, new = record(80), make(**OPTIONS[name]), make(**OPTIONS[name])
+    feed(used, measurements[:stop])
+    used.reset()
+    # Shorter than before, and without any unusual sample.
+    first = measurements[:6]
+    assert_equal([used.update(y) for y in first], [new.update(y) for y in first])
+    used.reset()
+    new.reset()
+    assert_equal(feed(used, measurements), feed(new, measurements))
+
+
 def test_covariances_are_known_after_a_restart():
     whole = make()
     feed(whole, record(12))
@@ -86,6 +100,11 @@ def test_a_kalman_type_observer_and_a_robust_cost_are_restored():
     feed(whole, measurements[:14])
     restored = pickle.loads(pickle.dumps(whole))
     assert_equal(feed(restored, measurements[14:], 14), feed(whole, measurements[14:], 14))
+    restored.reset()
+    new = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=6, initial_state=scenario.initial_estimate
+    )
+    assert_equal(feed(restored, measurements), feed(new, measurements))
 
 
 def test_a_state_is_a_copy():

@@ -4,7 +4,8 @@ import subprocess
 import sys
 
 _CODE = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
 from rich.console import Console
 from qpmhe.cli.estimate import run
 from qpmhe.errors import QpmheError
