@@ -4,9 +4,11 @@ import contextlib
 import importlib
 import io
 import re
+import subprocess
 import sys
 import types
 import warnings
+from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -146,3 +148,91 @@ def test_the_reference_holds_every_public_name(module):
         name for name in module.__all__ if isinstance(getattr(module, name), types.ModuleType)
     }
     assert set(module.__all__) - modules - {"__version__"} <= names
+
+
+FETCHED = {"src", "srcset", "data", "poster"}
+
+
+class Built(HTMLParser):
+    """What a page of the site makes a browser fetch, its formulas, and the text around its code."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.fetched, self.text, self.formulas, self.inside = [], "", 0, []
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        self.formulas += tag == "math"
+        self.fetched += [value for name, value in attrs if name in FETCHED]
+        if tag == "link":
+            self.fetched.append(dict(attrs)["href"])
+        if tag in ("code", "script", "style"):
+            self.inside.append(tag)
+
+    def handle_endtag(self, tag):
+        if self.inside[-1:] == [tag]:
+            self.inside.pop()
+
+    def handle_data(self, data):
+        if self.inside[-1:] == ["style"]:
+            self.fetched += fetched_by_styles(data)
+        if not self.inside:
+            self.text += data
+
+
+def fetched_by_styles(text):
+    found = re.findall(r"""(?:url\(|@import)\s*["']?([^"')]+)""", text)
+    return [target for target in found if not target.startswith("data:")]
+
+
+# A command, a delimiter of arithmatex, or one of those that docstrings have.
+RAW = re.compile(r"\\[a-zA-Z(\[]|\$\S|:math:|\.\. math::")
+
+
+def test_the_site_needs_no_network_and_leaves_no_formula_raw(tmp_path):
+    pytest.importorskip("mkdocs")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    formulas = 0
+    for path in tmp_path.rglob("*.html"):
+        page = Built(path)
+        formulas += page.formulas
+        for target in page.fetched:
+            assert not urlsplit(target).netloc, f"{path} fetches {target}"
+        assert not RAW.search(page.text), f"{path}: {RAW.findall(page.text)}"
+        assert "arithmatex" not in path.read_text(encoding="utf-8")
+    assert formulas > 200
+    for style in tmp_path.rglob("*.css"):
+        for target in fetched_by_styles(style.read_text(encoding="utf-8")):
+            assert not urlsplit(target).netloc, f"{style} fetches {target}"
+            assert style.parent.joinpath(target).is_file(), f"{style} names {target}"
+
+
+@pytest.fixture
+def mathematics(monkeypatch):
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("math_core")
+    monkeypatch.syspath_prepend(DOCS)
+    return importlib.import_module("mathematics")
+
+
+@pytest.mark.parametrize(
+    ("latex", "parts"),
+    [
+        (r"a, \quad b \qquad c", ["a,", "b", "c"]),
+        (r"\{a\} \quad \frac{b \quad c}{d}", [r"\{a\}", r"\frac{b \quad c}{d}"]),
+        (r"\begin{aligned} a \quad b \end{aligned}", [r"\begin{aligned} a \quad b \end{aligned}"]),
+    ],
+)
+def test_displayed_formulas_are_split_where_they_have_space(mathematics, latex, parts):
+    assert mathematics.parts(latex) == parts
+
+
+def test_a_formula_that_cannot_be_typeset_stops_the_build(mathematics):
+    from mkdocs.exceptions import PluginError
+
+    page = types.SimpleNamespace(file=types.SimpleNamespace(src_uri="some/page.md"))
+    text = r'<p><span class="arithmatex">\(\nothing x\)</span></p>'
+    with pytest.raises(PluginError, match=r"some/page\.md.*nothing"):
+        mathematics.on_page_content(text, page)

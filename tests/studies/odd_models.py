@@ -43,7 +43,7 @@ def is_killed() -> Example:
 
 
 def is_slow() -> Example:
-    return _odd(lambda: time.sleep(1.1))
+    return _odd(lambda: time.sleep(3.1))
 
 
 def hangs() -> Example:

@@ -61,7 +61,7 @@ def test_results_are_those_of_this_machine(address, tmp_path):
     [
         ("raises", "ZeroDivisionError", 60.0),
         ("is_killed", "the process that ran it died, twice", 60.0),
-        ("hangs", "out of time: the process that ran it was ended", 3.0),
+        ("hangs", "out of time: the process that ran it was ended", 6.0),
     ],
 )
 def test_a_cell_that_ends_its_worker_is_a_row(address, tmp_path, model, words, timeout):

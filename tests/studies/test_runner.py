@@ -106,7 +106,7 @@ def test_cells_that_are_timed_side_by_side_are_marked(path):
     [
         ("crashes", "died, twice (Segmentation fault), in", 60.0),
         ("is_killed", "the process that ran it died, twice", 60.0),
-        ("hangs", "out of time: the process that ran it was ended", 3.0),
+        ("hangs", "out of time: the process that ran it was ended", 6.0),
     ],
 )
 def test_a_cell_that_ends_its_process_is_a_row(path, model, words, timeout):
@@ -123,7 +123,7 @@ def test_a_cell_that_ends_its_process_is_a_row(path, model, words, timeout):
 def test_cells_that_fail_stop_nothing_and_can_be_tried_again(path, monkeypatch):
     study = Study(
         models=[f"{ODD}:is_slow", f"{ODD}:raises"], backends=["banded"], qps=[1], seeds=2,
-        steps=12, cell_timeout=1.0,
+        steps=12, cell_timeout=3.0,
     )
     out = console()
     frame = run(study, path, progress=out).frame()
