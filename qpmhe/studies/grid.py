@@ -26,7 +26,7 @@ Measure = Literal["both", "accuracy", "time"]
 @tell_unknown_options
 @dataclass(frozen=True)
 class Study:
-    r"""A grid of estimators, each run on records of many seeds.
+    """A grid of estimators, each run on records of many seeds.
 
     Cells that would be the same are one: with ``qps=0`` no QP is solved, so that there is one
     cell, whose backend is called ``observer``; a backend without a cap has one cell for all
@@ -71,9 +71,8 @@ class Study:
     --------
     >>> from qpmhe.studies import Study
     >>> study = Study(backends=["banded"], qps=[0, 1], seeds=3)
-    >>> [cell.key for cell in study.cells()][:2]
-    ['batch_reactor/observer/i=0/cap=none/N=10/candidate/T=150/seed=0', \
-'batch_reactor/banded/i=1/cap=none/N=10/candidate/T=150/seed=0']
+    >>> study.cells()[0].key
+    'batch_reactor/observer/i=0/cap=none/N=10/candidate/T=150/seed=0'
     """
 
     models: Sequence[str] = ("batch_reactor",)

@@ -1,0 +1,53 @@
+"""The docstrings as the reference shows them: mathematics as Markdown, groups of arguments."""
+
+import re
+from typing import Any
+
+import griffe
+
+_ROLE = re.compile(r":math:`([^`]+)`")
+_DIRECTIVE = re.compile(r"^( *)\.\. math::[ ]*\n((?:\1 +.*\n|\s*\n)+)", re.MULTILINE)
+# Arguments that are named together, without a type: griffe takes that of the first for all.
+_GROUP = re.compile(r"^\s*(\w+(?:, \w+)+)$", re.MULTILINE)
+
+
+def _block(found: re.Match[str]) -> str:
+    lines = (line.strip() for line in found[2].strip().splitlines())
+    body = "\n".join(f"{found[1]}{line}" for line in lines if line)
+    return f"{found[1]}$$\n{body}\n{found[1]}$$\n\n"
+
+
+class RstMath(griffe.Extension):
+    """Turns ``:math:`` roles and ``.. math::`` directives into what arithmatex reads."""
+
+    def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
+        """Rewrite an object's docstring before it is parsed."""
+        if obj.docstring:
+            text = _DIRECTIVE.sub(_block, obj.docstring.value + "\n")
+            obj.docstring.value = _ROLE.sub(r"$\1$", text).rstrip()
+
+
+class Groups(griffe.Extension):
+    """Gives each of several arguments that are named together its own type and default."""
+
+    def on_package(self, *, pkg: griffe.Module, **kwargs: Any) -> None:
+        """Correct what was parsed of all docstrings of a package."""
+        _correct(pkg)
+
+
+def _correct(owner: griffe.Object) -> None:
+    for member in owner.members.values():
+        if isinstance(member, griffe.Object):
+            if isinstance(member, (griffe.Class, griffe.Function)) and member.docstring:
+                _correct_groups(member, member.docstring)
+            _correct(member)
+
+
+def _correct_groups(owner: griffe.Class | griffe.Function, docstring: griffe.Docstring) -> None:
+    named = {name for group in _GROUP.findall(docstring.value) for name in group.split(", ")}
+    for section in docstring.parsed if named else ():
+        if isinstance(section, griffe.DocstringSectionParameters):
+            for one in section.value:
+                if one.name in named and one.name in owner.parameters:
+                    signature = owner.parameters[one.name]
+                    one.annotation, one.value = signature.annotation, signature.default
