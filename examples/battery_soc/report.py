@@ -56,23 +56,22 @@ def stress_table(rows: Sequence[Row]) -> Table:
     """Outliers and wrong prior covariances."""
     return _crossed(
         "RMSE % (worst %) with outliers and wrong priors", "condition",
-        [row for row in rows if row["condition"] and row["condition"] != "start"
-         and not row["condition"].startswith("tuned")],
+        [row for row in rows if row["condition"]
+         and not row["condition"].startswith(("start", "tuned"))],
     )
 
 
-def starts_table(rows: Sequence[Row]) -> Table:
-    """Initial states of charge."""
-    names = "EKF", "MHE, i=1"
-    chosen = [
-        row for row in rows
-        if row["condition"] == "start" or (not row["condition"] and row["estimator"] in names)
-    ]
-    return _crossed("RMSE % (worst %) over initial SOC", "start",
-                    sorted(chosen, key=lambda row: (row["cycle"], row["start"])))
+def starts_table(rows: Sequence[Row], condition: str) -> Table:
+    """Initial states of charge, under one condition."""
+    return _crossed(
+        f"{condition.replace('start', 'Over initial SOC')}: RMSE % (worst %), RMSE % from 0 s, "
+        "below 5 % from s", "start",
+        [row for row in rows if row["condition"] == condition], whole=True,
+    )
 
 
-def _crossed(title: str, by: str, rows: Sequence[Row]) -> Table:
+def _crossed(title: str, by: str, rows: Sequence[Row], whole: bool = False) -> Table:
+    """A row for each value; with ``whole``, the first 300 s and the time to settle as well."""
     result = _table(title)
     names = _unique(rows, "estimator")
     for column in ("cycle", by):
@@ -83,11 +82,16 @@ def _crossed(title: str, by: str, rows: Sequence[Row]) -> Table:
         mine = [row for row in rows if row["cycle"] == cycle]
         for value in _unique(mine, by):
             cells = {row["estimator"]: row for row in mine if row[by] == value}
-            result.add_row(cycle, str(value), *(
-                f"{cells[name]['rmse_percent']:.2f} ({cells[name]['max_percent']:.1f})"
-                for name in names
-            ))
+            result.add_row(cycle, str(value), *(_figures(cells[name], whole) for name in names))
     return result
+
+
+def _figures(row: Row, whole: bool) -> str:
+    text = f"{row['rmse_percent']:.2f} ({row['max_percent']:.1f})"
+    if whole:
+        settled = "-" if row["settled_s"] is None else f"{row['settled_s']:.0f}"
+        text += f", {row['rmse_from_0_s_percent']:.2f}, {settled}"
+    return text
 
 
 def _table(title: str) -> Table:

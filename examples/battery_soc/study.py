@@ -78,6 +78,7 @@ class Result(NamedTuple):
             "estimator": self.estimator,
             "rmse_percent": round(float(np.sqrt(np.mean(late**2))), 3),
             "max_percent": round(float(np.abs(late).max()), 3),
+            "rmse_from_0_s_percent": round(float(np.sqrt(np.mean(self.error**2))), 3),
             "settled_s": float(DT * np.argmax(within)) if within.any() else None,
             "step_us": round(1e6 * float(np.mean(self.times)), 1),
         }
@@ -190,11 +191,12 @@ class Bench:
             yield self.mhe("MHE, i=1", 1, record, condition, prior=prior)
 
     def starts(self, cycle: Cycle) -> Iterator[Result]:
-        """Other initial estimates than the usual one."""
-        for soc in STARTS:
-            if soc != self.start:
-                yield self.alone("EKF", kalman(self.cell, PRIOR), cycle, "start", soc)
-                yield self.mhe("MHE, i=1", 1, cycle, "start", soc)
+        """Several initial estimates, with outliers as well."""
+        spoilt = cycle._replace(voltage=spoil(cycle.voltage, 1))
+        for condition, record in (("start", cycle), ("start, 2 % read 0 V", spoilt)):
+            for soc in STARTS:
+                yield self.alone("EKF", kalman(self.cell, PRIOR), record, condition, soc)
+                yield self.mhe("MHE, i=1", 1, record, condition, soc)
 
 
 def start_at(soc: float) -> Array:
@@ -246,7 +248,8 @@ def main() -> int:
     rows = [result.figures() for result in bench.results]
     console.print(table(rows), stress_table(rows))
     if not arguments.quick:
-        console.print(starts_table(rows))
+        for condition in ("start", "start, 2 % read 0 V"):
+            console.print(starts_table(rows, condition))
     for cycle in cycles:
         console.print(f"{cycle.name}: {DT * len(cycle.voltage):.0f} s, down to SOC "
                       f"{cycle.soc[-1]:.2f}, at most {cycle.warmest:.1f} degC")
