@@ -44,6 +44,8 @@ DISTURBANCE = np.array([1e-3] * 3 + [0.05] * 3 + [1e-3] * 2)
 PRIOR = np.array([0.5] * 3 + [1.0] * 3 + [0.5] * 2)
 GUESS, GUESS_SPREAD = 1.0, 1.0  # of the inertia in 1e-4 kg m^2
 BOUNDS = 0.1, 10.0
+EARLY = slice(2 * HORIZON, 50)  # the inertia is being found; no errors before
+LATER = slice(EARLY.stop, None)
 
 
 class Record(NamedTuple):
@@ -164,12 +166,41 @@ def with_do_mpc(record: Record) -> Result:
     return Result(np.array(states), np.array(inertias), np.array(times))
 
 
+def error_table(steps: int, seeds: int) -> tuple[Table, list[slice]]:
+    """The table without its rows, and the samples of which it holds errors."""
+    parts = [EARLY, LATER] if steps > EARLY.stop else [EARLY]
+    early = f"early: samples {EARLY.start} to {min(steps, EARLY.stop) - 1}"
+    rest = (
+        f"{early}, then the rest" if LATER in parts
+        else f"{early}; none from {EARLY.stop} on, whose columns are left out"
+    )
+    table = Table(
+        title=f"Root mean square errors, {seeds} records, N = {HORIZON}",
+        caption=f"x(t) with y(t); {rest};\n"
+        "inertia in 1e-4 kg m²; time: median step, in units of the last row's",
+        box=box.SIMPLE, collapse_padding=True, pad_edge=False,
+    )
+    headings = "angle\nrad", "speed\nrad/s", "inertia\n"
+    table.add_column("", no_wrap=True)
+    later = headings if LATER in parts else ()
+    for heading in (*(f"{name}\nearly" for name in headings), *later, "time\n"):
+        table.add_column(heading, justify="right")
+    return table, parts
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=200, help="samples of a record")
     parser.add_argument("--seeds", type=int, default=5, help="number of records")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder for the figure")
     arguments, console = parser.parse_args(), Console()
+    if arguments.steps <= EARLY.start:
+        parser.error(
+            f"--steps is {arguments.steps}; expected more than {EARLY.start}: errors are taken "
+            f"from sample {EARLY.start} on."
+        )
+    if arguments.seeds < 1:
+        parser.error(f"--seeds is {arguments.seeds}; expected at least 1.")
     ways: dict[str, Callable[[Record], Result]] = {
         "observer": lambda record: with_qpmhe(record, 0),
         "qpmhe, 1 QP": lambda record: with_qpmhe(record, 1),
@@ -187,16 +218,7 @@ def main() -> None:
         console.print("do-mpc is not installed (pip install do-mpc): its row is left out.")
     results = {name: [way(record) for record in records] for name, way in ways.items()}
 
-    table = Table(
-        title=f"Root mean square errors, {arguments.seeds} records, N = {HORIZON}",
-        caption="x(t) with y(t); early: samples 20 to 49, then the rest;\n"
-        "inertia in 1e-4 kg m²; time: median step, in units of the last row's",
-        box=box.SIMPLE, collapse_padding=True, pad_edge=False,
-    )
-    headings = "angle\nrad", "speed\nrad/s", "inertia\n"
-    table.add_column("", no_wrap=True)
-    for heading in (*(f"{name}\nearly" for name in headings), *headings, "time\n"):
-        table.add_column(heading, justify="right")
+    table, parts = error_table(arguments.steps, arguments.seeds)
     unit = np.median([run.times for run in results[list(results)[-1]]])
     for name, runs in results.items():
         squares = np.array([
@@ -205,7 +227,7 @@ def main() -> None:
         ])
         rmse = [
             np.sqrt(np.mean(squares[:, when, part]))
-            for when in (slice(2 * HORIZON, 50), slice(50, None))
+            for when in parts
             for part in (slice(3), slice(3, 6), slice(8, 9))
         ]
         times = np.median([run.times for run in runs]) / unit

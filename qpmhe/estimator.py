@@ -418,7 +418,9 @@ class MovingHorizonEstimator:
             estimates.append(self.update(y, u))
             if covariances:
                 collected.append(self._newest_covariance())
-        return Run.of(start, estimates, np.array(collected) if covariances else None)
+        n = self.system.n
+        found = np.array(collected).reshape(-1, n, n) if covariances else None
+        return Run.of(start, estimates, found)
 
     def _newest_covariance(self) -> Array:
         try:

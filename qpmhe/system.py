@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -291,8 +291,8 @@ class System:
         Parameters
         ----------
         system : control.StateSpace or control.NonlinearIOSystem
-            In discrete time as it is; in continuous time it is discretised. Functions that
-            depend on time are taken at time 0.
+            In discrete time as it is; in continuous time it is discretised. A system that
+            depends on time is refused.
         dt : float, optional
             Sampling time of a system in continuous time.
         method : {"zoh", "rk4", "euler"}, optional
@@ -320,8 +320,8 @@ class System:
         cls,
         f: Any,
         h: Any,
-        x: Sequence[Any],
-        u: Sequence[Any] = (),
+        x: Any,
+        u: Any = (),
         *,
         dt: float | None = None,
         method: str = "rk4",
@@ -335,8 +335,8 @@ class System:
         ----------
         f, h : sequence of expressions, or a matrix
             Entries of the next state (or of its rate, with dt) and of the output.
-        x, u : sequence of symbols
-            The states and the inputs.
+        x, u : symbol, or sequence of symbols or functions of time
+            The states and the inputs; taken as real.
         dt : float, optional
             If given, f is the right-hand side of an ODE, which is discretised with this
             sampling time; u is held over the step.

@@ -1,12 +1,14 @@
 """What the figures show, read from their lines."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 import qpmhe
 from qpmhe import Status, plots
-from qpmhe.errors import ShapeError
+from qpmhe.errors import InvalidInputError, OptionError, ShapeError
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +105,133 @@ def test_given_axes_must_be_as_many_as_states(case):
 def test_figures_are_written(case, tmp_path):
     for path in plots.save(plots.costs(case[1]).figure, tmp_path / "new" / "costs"):
         assert path.stat().st_size > 1000
+
+
+@pytest.fixture(scope="module")
+def empty():
+    system, observer, cost, scenario = qpmhe.models.batch_reactor()
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=10, initial_state=scenario.initial_estimate
+    )
+    return mhe.run(np.empty((0, 1)), covariances=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"labels": ["a"]}, ShapeError, r"labels are \['a'\]; expected 2"),
+        ({"labels": ["a", "b", "c"]}, ShapeError, "expected 2, one a state"),
+        ({"labels": []}, ShapeError, r"labels are \[\]; expected 2"),
+        ({"labels": "ab"}, InvalidInputError, r"labels are 'ab'; expected a sequence"),
+        ({"labels": [1, 2]}, InvalidInputError, "sequence of strings"),
+        ({"truth": np.zeros((30, 2))}, ShapeError, r"truth has shape \(30, 2\).*\(31, 2\), a row"),
+        ({"truth": np.zeros((31, 3))}, ShapeError, r"truth has shape \(31, 3\).*\(31, 2\)"),
+        ({"truth": "none"}, InvalidInputError, "truth is 'none'"),
+        ({"dt": 0}, OptionError, "dt is 0; expected a finite number > 0"),
+        ({"dt": -1.0}, OptionError, "dt is -1.0"),
+        ({"sigmas": -2.0}, OptionError, "sigmas is -2.0"),
+        ({"axes": 3}, InvalidInputError, "axes contain 3; expected matplotlib Axes, 2"),
+        ({"axes": Figure()}, InvalidInputError, "axes contain .*Figure"),
+    ],
+)
+def test_states_refuse_what_does_not_fit(case, options, error, words):
+    with pytest.raises(error, match=words):
+        plots.states(case[1], **options)
+
+
+@pytest.mark.parametrize("options", [{"labels": ["a"]}, {"dt": 0.0}, {"axes": [3, 4]}])
+def test_the_window_refuses_what_does_not_fit(case, options):
+    with pytest.raises(InvalidInputError, match="expected"):
+        plots.window(case[2], **options)
+
+
+@pytest.mark.parametrize("draw", [plots.costs, plots.outcomes])
+@pytest.mark.parametrize("dt", [0.0, -0.1, float("nan"), "1"])
+def test_steps_refuse_times_that_do_not_rise(case, draw, dt):
+    with pytest.raises(OptionError, match=r"dt is .*> 0"):
+        draw(case[1], dt=dt)
+
+
+@pytest.mark.parametrize("deadline", [-0.001, 0.0, float("inf")])
+def test_a_deadline_is_above_zero(case, deadline):
+    with pytest.raises(OptionError, match=r"deadline is .*> 0"):
+        plots.step_times(case[1], deadline=deadline)
+
+
+@pytest.mark.parametrize("draw", [plots.states, plots.costs, plots.outcomes, plots.step_times])
+def test_one_estimate_is_no_run(case, draw):
+    with pytest.raises(InvalidInputError, match=r"run is of type Estimate; .*plots\.window"):
+        draw(case[2])
+    with pytest.raises(InvalidInputError, match="axes contain 3"):
+        draw(case[1], axes=3)
+
+
+def test_a_run_is_no_estimate(case):
+    with pytest.raises(InvalidInputError, match=r"estimate is of type Run; .*plots\.states"):
+        plots.window(case[1])
+
+
+@pytest.mark.parametrize("draw", [plots.costs, plots.outcomes, plots.step_times])
+def test_a_run_without_steps_is_an_empty_picture(empty, draw, tmp_path):
+    options = {"deadline": 0.001} if draw is plots.step_times else {}
+    panel = Figure(layout="constrained").subplots()
+    assert draw(empty, axes=panel, **options) is panel
+    # Warnings are errors here, those of writing included.
+    plots.save(panel.figure, tmp_path / "empty")
+
+
+def test_states_of_a_run_without_steps_are_its_start(empty, tmp_path):
+    axes = plots.states(empty)
+    assert lines(axes[0])["estimate"].tolist() == [[0.0, empty.states[0, 0]]]
+    plots.save(axes[0].figure, tmp_path / "empty")
+
+
+def test_trajectories_take_what_is_an_array():
+    (panel,) = plots.trajectories(
+        [0, 1, 2], [3, 4, 5], {"estimate": [3.0, 4.0, np.nan]}, ["x"], "time"
+    )
+    assert lines(panel)["real"].tolist() == [[0, 3], [1, 4], [2, 5]]
+
+
+@pytest.mark.parametrize(
+    ("times", "estimates", "error", "words"),
+    [
+        (np.zeros((3, 1)), {}, ShapeError, r"times have shape \(3, 1\)"),
+        (np.arange(3), {"mine": np.zeros((2, 1))}, ShapeError, r"estimates\['mine'\] has shape"),
+        (np.arange(3), np.zeros((3, 1)), InvalidInputError, "expected a mapping"),
+        (
+            np.arange(3), {f"number {k}": np.zeros(3) for k in range(7)}, InvalidInputError,
+            "estimates are 7: .*at most 6",
+        ),
+    ],
+)
+def test_trajectories_refuse_what_does_not_fit(times, estimates, error, words):
+    with pytest.raises(error, match=words):
+        plots.trajectories(times, None, estimates, ["x"], "time")
+
+
+@pytest.mark.parametrize(
+    ("stem", "written"),
+    [
+        ("run_0.5", "run_0.5"),
+        ("v1.2", "v1.2"),
+        ("states.png", "states"),
+        ("states.SVG", "states"),
+        ("new/states", "new/states"),
+    ],
+)
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_dot_belongs_to_the_name(tmp_path, monkeypatch, stem, written, kind):
+    monkeypatch.chdir(tmp_path)
+    paths = plots.save(Figure(), kind(stem))
+    assert paths == [Path(f"{written}.png"), Path(f"{written}.svg")]
+    assert all(path.is_file() for path in paths)
+
+
+def test_save_refuses_what_does_not_fit(case):
+    with pytest.raises(InvalidInputError, match=r"figure is of type Axes; .*axes\.figure"):
+        plots.save(plots.costs(case[1]), "costs")
+    with pytest.raises(InvalidInputError, match="stem is 3; expected a path"):
+        plots.save(Figure(), 3)
+    with pytest.raises(InvalidInputError, match="a folder"):
+        plots.save(Figure(), "..")

@@ -8,15 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import positive
+from .._checks import numbers, positive
 from ..errors import InvalidInputError, ModelError, OptionError
 from ..sets import ConvexSet
-from ..system import System
+from ..system import System, probe_points
 
 __all__ = ["control_system"]
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
+
+_FRACTIONS = np.array([0.1, 1.0 / 3.0, 0.5, np.sqrt(0.5), np.pi, 10.0 * np.sqrt(2.0)])
 
 
 def control_system(
@@ -59,9 +61,10 @@ def control_system(
         length = None
     sets = {"states": states, "disturbances": disturbances, "noises": noises}
     if linear:
-        matrices = {name: np.array(getattr(system, name), np.float64) for name in "ABCD"}
+        matrices = {name: _real(name, getattr(system, name)) for name in "ABCD"}
         return _linear(**matrices, dt=length, method=method, sets=sets)
     made = _nonlinear(system, length, method, sets)
+    _refuse_time(system, made, dt)
     made._recipe = (
         control_system, {"system": system, "dt": dt, "method": method, **sets}
     )
@@ -77,6 +80,15 @@ def _import_control() -> Any:
             "qpmhe.System as functions."
         ) from error
     return control
+
+
+def _real(name: str, matrix: Any) -> Array:
+    if np.iscomplexobj(matrix):
+        raise ModelError(
+            f"{name} of the system is {np.asarray(matrix).tolist()}; expected real numbers. "
+            "Transform the system to real states: real and imaginary parts, say."
+        )
+    return numbers(f"{name} of the system", matrix)
 
 
 def _linear(
@@ -161,3 +173,36 @@ def _nonlinear(
             raise OptionError(f"method is {method!r}, but the system is in discrete time.")
         return System(update, output, **options)
     return System.from_ode(update, output, dt=dt, method=method or "rk4", **options)
+
+
+def _refuse_time(system: Any, made: System, dt: float | None) -> None:
+    """Insist that dynamics and output are the same at all times, as a `System` has none."""
+    unit = float(dt or (1.0 if system.dt in (None, True) else system.dt) or 1.0)
+    steps = np.unique(np.geomspace(1.0, 1e6, 25).round())
+    times = [unit * steps]
+    if system.isctime():
+        times.append(unit * _FRACTIONS)  # what has the sampling time as its period, too
+    for name, function in (("dynamics", system.dynamics), ("output", system.output)):
+        for x, u in probe_points(made.states, made.n, made.m):
+            first = _value(function, 0.0, x, u)
+            if first is None:
+                continue
+            for time in np.concatenate(times).tolist():
+                then = _value(function, time, x, u)
+                if then is None or not np.array_equal(first, then, equal_nan=True):
+                    raise ModelError(
+                        f"the {name} of the system at x = {x.tolist()}, u = {u.tolist()} is "
+                        f"{first.tolist()} at time 0 and "
+                        f"{'an error' if then is None else then.tolist()} at time {time:g}; "
+                        "expected a system that does not depend on time. Make what does an "
+                        "input, whose value is known at each sample."
+                    )
+
+
+def _value(function: Function, time: float, x: Array, u: Array) -> Array | None:
+    try:
+        with np.errstate(all="ignore"):
+            # A copy: a function may return one and the same array every time.
+            return np.array(function(time, x.copy(), u.copy()), dtype=np.float64)
+    except Exception:  # outside its domain
+        return None

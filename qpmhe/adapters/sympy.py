@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import builtins
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dis import get_instructions
 from typing import Any
 
 import numpy as np
@@ -44,22 +47,25 @@ def sympy_system(
             "SymPy is not installed; pip install sympy, or give f and h to qpmhe.System as "
             "functions."
         ) from error
-    state, given = list(x), list(u)
+    state, given = _symbols(sympy, "x", x), _symbols(sympy, "u", u)
+    _check_symbols(state, given)
     rates, outputs = _column(sympy, "f", f), _column(sympy, "h", h)
     if len(rates) != len(state):
         raise ModelError(f"f has {len(rates)} entries; expected one for each of {state}.")
-    unknown = (rates.free_symbols | outputs.free_symbols) - set(state) - set(given)
-    if unknown:
-        raise ModelError(
-            f"f and h contain {', '.join(sorted(map(str, unknown)))}, which is neither among "
-            f"the states {state} nor the inputs {given}; put numbers in place of parameters."
-        )
-    symbols = [*state, *given]
+    real = _real_symbols(sympy, [*state, *given])
+    rates, outputs = (
+        _in_real_symbols(sympy, name, column, real, state, given)
+        for name, column in (("f", rates), ("h", outputs))
+    )
+    state, given = [real[one] for one in state], [real[one] for one in given]
+    symbols, names = [*state, *given], {mine: theirs for theirs, mine in real.items()}
     n, p = len(state), len(outputs)
     functions = [
-        _numeric(sympy, symbols, expression, shape) for expression, shape in (
-            (rates, (n,)), (outputs, (p,)),
-            (rates.jacobian(state), (n, n)), (outputs.jacobian(state), (p, n)),
+        _numeric(sympy, name, symbols, expression, shape, names)
+        for name, expression, shape in (
+            ("f", rates, (n,)), ("h", outputs, (p,)),
+            ("f", _jacobian(sympy, "f", rates, state, names), (n, n)),
+            ("h", _jacobian(sympy, "h", outputs, state, names), (p, n)),
         )
     ]
     step, output, step_jacobian, output_jacobian = (
@@ -83,20 +89,144 @@ def sympy_system(
     return system
 
 
+def _flat(value: Any) -> Iterator[Any]:
+    """Entries of a matrix, or of lists within lists; what is neither, as it is."""
+    if isinstance(value, str) or not np.iterable(value):
+        yield value
+    else:
+        for entry in value:
+            yield from _flat(entry)
+
+
+def _symbols(sympy: Any, name: str, value: Any) -> list[Any]:
+    entries = list(_flat(value))
+    for entry in entries:
+        # SymPy's own mark of what can be differentiated by: symbols, functions of time.
+        if not (isinstance(entry, sympy.Expr) and getattr(entry, "_diff_wrt", False)):
+            raise ModelError(
+                f"{name} contains {entry!r}; expected symbols such as "
+                f"{name} = sympy.symbols('a b')."
+            )
+    return entries
+
+
+def _check_symbols(state: list[Any], given: list[Any]) -> None:
+    if not state:
+        raise ModelError("x is empty; expected the symbols of the states, at least one.")
+    for name, symbols in (("x", state), ("u", given)):
+        for one, times in Counter(symbols).items():
+            if times > 1:
+                raise ModelError(
+                    f"{name} contains {one} {times} times; expected each symbol once."
+                )
+    for one in given:
+        if one in state:
+            raise ModelError(
+                f"{one} is among the states x and the inputs u; leave it in one of them."
+            )
+
+
+def _real_symbols(sympy: Any, symbols: list[Any]) -> dict[Any, Any]:
+    """A real symbol in place of each: of a complex one, |a| has no derivative."""
+    real = {}
+    for i, symbol in enumerate(symbols):
+        assumptions = {**symbol.assumptions0, "real": True}
+        try:
+            real[symbol] = sympy.Dummy(f"s{i}", **assumptions)
+        except ValueError as error:  # InconsistentAssumptions
+            raise ModelError(
+                f"{symbol} is declared as not real; states and inputs are real numbers. Declare "
+                "it with real=True."
+            ) from error
+    return real
+
+
+def _in_real_symbols(
+    sympy: Any, name: str, column: Any, real: dict[Any, Any], state: list[Any], given: list[Any]
+) -> Any:
+    """The column in the symbols of `_real_symbols`, and in nothing else."""
+    # A rate dX/dt that is a state goes first: with X replaced, it would be the rate of a constant.
+    found = column.xreplace(
+        {theirs: mine for theirs, mine in real.items() if isinstance(theirs, sympy.Derivative)}
+    )
+    undefined = sympy.core.function.AppliedUndef
+    for rate in found.atoms(sympy.Derivative):
+        if rate.atoms(undefined):
+            raise ModelError(
+                f"{name} contains {rate}, which is neither among the states {state} nor the "
+                f"inputs {given}; make it one, or solve the equations for the rates."
+            )
+    found = found.xreplace(real)
+    unknown = (found.free_symbols - set(real.values())) | found.atoms(undefined)
+    if unknown:
+        words = ", ".join(sorted(map(str, unknown)))
+        namesakes = {str(one) for one in real} & {str(one) for one in unknown}
+        raise ModelError(
+            f"{name} contains {words}, which is neither among the states {state} nor the inputs "
+            f"{given}; " + (
+                f"{', '.join(sorted(namesakes))} has the name of one, but not its assumptions, "
+                "such as real=True: make each symbol once, and use it throughout."
+                if namesakes else
+                "put numbers in place of parameters, expressions in place of unknown functions, "
+                "and make what depends on time an input."
+            )
+        )
+    if found.has(sympy.I, sympy.zoo, sympy.nan):
+        raise ModelError(f"{name} is {list(column)}; expected expressions of finite real value.")
+    return found
+
+
 def _column(sympy: Any, name: str, value: Any) -> Any:
     try:
-        entries = list(value) if hasattr(value, "__iter__") else [value]
-        column = sympy.Matrix([sympy.sympify(entry) for entry in entries])
+        entries = [sympy.sympify(entry) for entry in _flat(value)]
     except (TypeError, ValueError, sympy.SympifyError) as error:
         raise ModelError(f"{name} is {value!r}; expected SymPy expressions.") from error
-    return column
+    for entry in entries:
+        if not isinstance(entry, sympy.Expr):
+            raise ModelError(f"{name} contains {entry!r}; expected SymPy expressions.")
+    if not entries:
+        raise ModelError(f"{name} is empty; expected SymPy expressions, at least one.")
+    return sympy.Matrix(entries)
+
+
+def _jacobian(
+    sympy: Any, name: str, column: Any, state: list[Any], names: dict[Any, Any]
+) -> Any:
+    # The derivative of sign(a) is zero but at a jump, where there is none.
+    found = column.jacobian(state).replace(sympy.DiracDelta, lambda *_: sympy.Integer(0))
+    for entry in found.atoms(sympy.Derivative, sympy.Subs):
+        raise ModelError(
+            f"{name} has the derivative {entry.xreplace(names)}, for which SymPy has no "
+            f"expression; write {name} without it (sympy.Piecewise will do), or give f and h to "
+            "qpmhe.System as Python functions."
+        )
+    return found
 
 
 def _numeric(
-    sympy: Any, symbols: list[Any], matrix: Any, shape: tuple[int, ...]
+    sympy: Any, name: str, symbols: list[Any], matrix: Any, shape: tuple[int, ...],
+    names: dict[Any, Any],
 ) -> Callable[[Array, Array], Array]:
     """A matrix of expressions as a function over leading dimensions of x and u."""
-    entries = sympy.lambdify(symbols, list(matrix), modules="numpy", cse=True)
+    remedy = (
+        f"write {name} with functions that they have, or give f and h to qpmhe.System as Python "
+        "functions."
+    )
+    try:
+        entries = sympy.lambdify(symbols, list(matrix), modules=["scipy", "numpy"], cse=True)
+    except Exception as error:  # SymPy's printers raise what they like
+        raise ModelError(
+            f"{name} contains {list(matrix.xreplace(names))}, which NumPy and SciPy cannot "
+            f"evaluate ({error}); {remedy}"
+        ) from error
+    # What a printer does not know, it prints as it is, and only the call would tell.
+    called = {one.argval for one in get_instructions(entries) if one.opname == "LOAD_GLOBAL"}
+    absent = called - {*entries.__globals__, *dir(builtins)}
+    if absent:
+        raise ModelError(
+            f"{name} or its derivative contains {', '.join(sorted(absent))}, which NumPy and "
+            f"SciPy do not have; {remedy}"
+        )
 
     def evaluate(x: Array, u: Array) -> Array:
         columns = [x[..., i] for i in range(x.shape[-1])]
@@ -104,6 +234,8 @@ def _numeric(
         values = np.stack(
             [np.broadcast_to(entry, x.shape[:-1]) for entry in entries(*columns)], axis=-1
         )
+        if values.dtype.kind == "c":  # of Lambert's W, say, real as it may be
+            values = np.where(values.imag == 0.0, values.real, np.nan)
         return values.reshape(*x.shape[:-1], *shape)
 
     return evaluate

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import positive
 from ..estimate import Status
+from .checks import check_run
 from .style import STYLES, panels
 
 if TYPE_CHECKING:
@@ -48,7 +50,18 @@ def costs(
     -------
     Axes
         The axes.
+
+    Raises
+    ------
+    InvalidInputError
+        If run is no `Run`, or axes are no axes.
+    ShapeError
+        If axes are more than one.
+    OptionError
+        If dt is not above zero.
     """
+    check_run(run)
+    dt = positive("dt", dt)
     (panel,) = panels(1, axes, 2.6)
     times = dt * np.arange(1, len(run) + 1)
     finite = run.candidate_costs[np.isfinite(run.candidate_costs)]
@@ -89,7 +102,18 @@ def outcomes(
     -------
     Axes
         The axes; a row for each kind of event that occurred.
+
+    Raises
+    ------
+    InvalidInputError
+        If run is no `Run`, or axes are no axes.
+    ShapeError
+        If axes are more than one.
+    OptionError
+        If dt is not above zero.
     """
+    check_run(run)
+    dt = positive("dt", dt)
     (panel,) = panels(1, axes, 1.6)
     times = dt * np.arange(1, len(run) + 1)
     failed = Status.SOLVER_FAILED.value
@@ -103,7 +127,7 @@ def outcomes(
             )
             rows.append(f"{label} ({there.mean():.0%})")
     panel.set_yticks(range(len(rows)), rows)
-    panel.set_ylim(len(rows) - 0.5, -0.5)
+    panel.set_ylim(max(len(rows), 1) - 0.5, -0.5)
     panel.set_xlabel(time_label)
     panel.margins(x=0.01)
     return panel
@@ -125,7 +149,19 @@ def step_times(run: Run, *, deadline: float | None = None, axes: Any = None) -> 
     -------
     Axes
         The axes, both logarithmic.
+
+    Raises
+    ------
+    InvalidInputError
+        If run is no `Run`, or axes are no axes.
+    ShapeError
+        If axes are more than one.
+    OptionError
+        If the deadline is not above zero.
     """
+    check_run(run)
+    if deadline is not None:
+        deadline = positive("deadline", deadline)
     (panel,) = panels(1, axes, 2.6)
     for seconds, label, style in (
         (run.times, "whole step", STYLES[0]), (run.solve_times, "QP solver", STYLES[1]),
@@ -136,11 +172,12 @@ def step_times(run: Run, *, deadline: float | None = None, axes: Any = None) -> 
             panel.loglog(known * 1e6, share, drawstyle="steps-post", label=label, **style)
     if deadline is not None:
         panel.axvline(deadline * 1e6, color="0.4", linewidth=1.0, linestyle=":")
-        late = float((run.times > deadline).mean())
+        late = float((run.times > deadline).sum()) / max(1, len(run))
         panel.annotate(
             f"deadline, {late:.1%} later", (deadline * 1e6, 1.0), xytext=(4, -2),
             textcoords="offset points", va="top", color="0.3",
         )
     panel.set(xlabel="time (µs)", ylabel="share of steps that took longer")
-    panel.legend(loc="lower left", frameon=False)
+    if panel.get_legend_handles_labels()[0]:
+        panel.legend(loc="lower left", frameon=False)
     return panel

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import InvalidInputError, ShapeError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -56,46 +61,75 @@ def panels(count: int, axes: Any, height: float = 2.1) -> list[Any]:
 
     Raises
     ------
+    InvalidInputError
+        If something else than axes is given.
     ShapeError
         If other than ``count`` axes are given.
     """
-    import numpy as np
-
-    from ..errors import ShapeError
+    from matplotlib import rc_context
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     if axes is None:
-        from matplotlib import rc_context
-        from matplotlib.figure import Figure
-
         with rc_context(LIGHT):
             figure = Figure(figsize=(6.4, 0.9 + height * count), layout="constrained")
             return list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
     given = list(np.ravel(np.asarray(axes, dtype=object)))
+    for one in given:
+        if not isinstance(one, Axes):
+            raise InvalidInputError(
+                f"axes contain {one!r}; expected matplotlib Axes, {count} of them, such as "
+                "plt.subplots makes; leave axes out for a figure of its own."
+            )
     if len(given) != count:
         raise ShapeError(f"axes are {len(given)}; expected {count}, one for each panel.")
     return given
 
 
-def save(figure: Figure, stem: Path) -> list[Path]:
+def save(figure: Figure, stem: str | PathLike[str]) -> list[Path]:
     """Write a figure as PNG and SVG.
 
     Parameters
     ----------
     figure : matplotlib.figure.Figure
         The figure; of axes, ``axes.figure``.
-    stem : Path
-        Path without suffix; its folder is made.
+    stem : str or Path
+        Path without suffix; its folder is made. ``.png`` or ``.svg`` at its end is taken off,
+        any other dot belongs to the name: of ``run_0.5`` comes ``run_0.5.png``.
 
     Returns
     -------
     list of Path
         The files.
+
+    Raises
+    ------
+    InvalidInputError
+        If the figure is none, or the path names no file.
     """
     from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    paths = [stem.with_suffix(".png"), stem.with_suffix(".svg")]
+    if not isinstance(figure, Figure):
+        raise InvalidInputError(
+            f"figure is of type {type(figure).__name__}; expected a matplotlib Figure: of axes, "
+            "axes.figure."
+        )
+    try:
+        path = Path(stem)
+    except TypeError as error:
+        raise InvalidInputError(
+            f"stem is {stem!r}; expected a path without suffix, such as 'results/states'."
+        ) from error
+    name = path.stem if path.suffix.lower() in (".png", ".svg") else path.name
+    if name in ("", ".."):
+        raise InvalidInputError(
+            f"stem is {str(stem)!r}, a folder; expected the file's name without suffix as well, "
+            "such as 'results/states'."
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    paths = [path.with_name(name + suffix) for suffix in (".png", ".svg")]
     with rc_context(LIGHT):
-        for path in paths:
-            figure.savefig(path, dpi=200)
+        for one in paths:
+            figure.savefig(one, dpi=200)
     return paths

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import positive
+from .checks import check_estimate, check_run, curve, label_list, named_curves, sample_times
 from .style import REAL, STYLES, panels
 
 if TYPE_CHECKING:
@@ -48,14 +50,25 @@ def trajectories(
     -------
     list of Axes
         One a state; ``axes[0].figure`` is the figure, see `save`.
+
+    Raises
+    ------
+    ShapeError
+        If labels, curves and axes are not of the same states, or curves not of these times.
+    InvalidInputError
+        If something is no array, labels no strings, axes no axes, or the estimates too many.
     """
-    drawn = panels(len(labels), axes)
+    names, when = label_list(labels), sample_times(times)
+    length, n = when.size, len(names)
+    curves = named_curves(estimates, length, n, len(STYLES))
+    real = None if truth is None else curve("truth", truth, length, n)
+    drawn = panels(n, axes)
     for j, panel in enumerate(drawn):
-        if truth is not None:
-            panel.plot(times, truth[:, j], **REAL)
-        for style, (label, values) in zip(STYLES, estimates.items(), strict=False):
-            panel.plot(times, values[:, j], linewidth=1.3, label=label, **style)
-        panel.set_ylabel(labels[j])
+        if real is not None:
+            panel.plot(when, real[:, j], **REAL)
+        for style, (label, values) in zip(STYLES, curves.items(), strict=False):
+            panel.plot(when, values[:, j], linewidth=1.3, label=label, **style)
+        panel.set_ylabel(names[j])
         panel.margins(x=0.01)
     drawn[-1].set_xlabel(time_label)
     _legend(drawn, axes)
@@ -95,13 +108,24 @@ def states(
     -------
     list of Axes
         One a state.
+
+    Raises
+    ------
+    InvalidInputError
+        If run is no `Run`, labels are no strings or axes no axes.
+    ShapeError
+        If labels, truth or axes are not of the run's states and times.
+    OptionError
+        If dt or sigmas is not above zero.
     """
+    check_run(run)
     count, n = run.states.shape
-    times = dt * np.arange(count, dtype=np.float64)
+    times = positive("dt", dt) * np.arange(count, dtype=np.float64)
+    sigmas = positive("sigmas", sigmas)
     drawn = trajectories(
-        times, truth, {"estimate": run.states}, labels or _names(n), time_label, axes
+        times, truth, {"estimate": run.states}, _names(labels, n), time_label, axes
     )
-    if run.covariances is not None:
+    if run.covariances is not None and len(run):
         half = sigmas * np.sqrt(np.diagonal(run.covariances, axis1=1, axis2=2))
         for j, panel in enumerate(drawn):
             panel.fill_between(
@@ -140,22 +164,33 @@ def window(
     -------
     list of Axes
         One a state.
+
+    Raises
+    ------
+    InvalidInputError
+        If estimate is no `Estimate`, labels are no strings or axes no axes.
+    ShapeError
+        If labels or axes are not as many as states.
+    OptionError
+        If dt is not above zero.
     """
+    check_estimate(estimate)
     count, n = estimate.trajectory.shape
-    times = dt * np.arange(estimate.time + 2 - count, estimate.time + 2, dtype=np.float64)
+    step, last = positive("dt", dt), estimate.time + 1
+    times = step * np.arange(last + 1 - count, last + 1, dtype=np.float64)
     lines = {
         f"estimate, J = {estimate.cost:.3g}": estimate.trajectory,
         f"candidate, J = {estimate.candidate_cost:.3g}": estimate.candidate,
     }
-    drawn = trajectories(times, None, lines, labels or _names(n), time_label, axes)
+    drawn = trajectories(times, None, lines, _names(labels, n), time_label, axes)
     for panel in drawn:
         for line in panel.lines[-2:]:
             line.set(marker="o", markersize=3.0)
     return drawn
 
 
-def _names(n: int) -> list[str]:
-    return [f"x{j + 1}" for j in range(n)]
+def _names(labels: Sequence[str] | None, n: int) -> list[str]:
+    return [f"x{j + 1}" for j in range(n)] if labels is None else label_list(labels, n)
 
 
 def _legend(drawn: list[Any], axes: Any) -> None:

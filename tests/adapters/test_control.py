@@ -97,11 +97,20 @@ def test_an_estimator_runs_on_it_and_it_pickles():
     assert mhe.update([1.0], [0.0]).improved
 
 
+def rotating():
+    """With a complex matrix, which python-control takes in an existing system only."""
+    plant = control.ss(A, B, C, D)
+    plant.A = A + 1j
+    return plant
+
+
 @pytest.mark.parametrize(
     ("made", "options", "error", "words"),
     [
         (lambda: control.tf([1], [1, 1]), {}, ModelError, "control.ss"),
         (lambda: control.ss([], [], [], [[1.0]]), {}, ModelError, "no states"),
+        (rotating, {"dt": 0.1}, ModelError, "A of the .*imaginary"),
+        (lambda: control.ss(A, B, C, np.inf), {"dt": 0.1}, InvalidInputError, "D of the system"),
         (lambda: control.ss(A, B, C, D), {}, OptionError, "dt is missing"),
         (lambda: control.ss(A, B, C, D), {"dt": -1.0}, InvalidInputError, "dt"),
         (lambda: control.ss(A, B, C, D, 0.1), {"dt": 0.2}, OptionError, "leave it out"),
@@ -112,6 +121,57 @@ def test_an_estimator_runs_on_it_and_it_pickles():
 def test_what_does_not_fit_is_refused(made, options, error, words):
     with pytest.raises(error, match=words):
         System.from_control(made(), **options)
+
+
+def in_time(change, where):
+    """The swing with an update or output that change(t) is added to."""
+
+    def changed(function):
+        return lambda t, x, u, params: function(t, x, u, params) + change(t)
+
+    functions = {"dynamics": swing, "output": angle}
+    functions[where] = changed(functions[where])
+    return functions["dynamics"], functions["output"]
+
+
+def table(t):
+    return [0.0, 0.0, 0.0][int(t / 0.125)]
+
+
+@pytest.mark.parametrize("where", ["dynamics", "output"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda t: 1e-9 * t,
+        lambda t: float(t % 0.125 > 0.03),
+        lambda t: float(t > 12.0),
+        table,
+    ],
+    ids=["slowly", "periodic", "once", "table"],
+)
+def test_a_system_that_depends_on_time_is_refused(change, where):
+    theirs = control.NonlinearIOSystem(
+        *in_time(change, where), inputs=1, outputs=1, states=2
+    )
+    with pytest.raises(ModelError, match=rf"the {where} of .*at time 0 and .*an input"):
+        System.from_control(theirs, dt=0.125)
+
+
+def test_a_map_that_depends_on_time_is_refused():
+    theirs = control.NonlinearIOSystem(
+        *in_time(lambda t: float(t > 0.0), "dynamics"), inputs=1, outputs=1, states=2, dt=0.1
+    )
+    with pytest.raises(ModelError, match=r"dynamics of .*at time 0\.1"):
+        System.from_control(theirs)
+
+
+def test_a_map_is_asked_at_its_own_times_only():
+    def update(t, x, u, params):
+        assert t == pytest.approx(round(t))
+        return 0.5 * np.sqrt(x - 0.7)  # not a number at some probes, at all times
+
+    theirs = control.NonlinearIOSystem(update, angle, inputs=1, outputs=1, states=2, dt=True)
+    assert System.from_control(theirs).n == 2
 
 
 def test_without_python_control_there_is_a_remedy(monkeypatch):

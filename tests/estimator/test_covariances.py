@@ -247,6 +247,10 @@ def test_there_are_none_without_an_estimate():
         mhe.covariances()
 
 
+def test_an_empty_record_has_them_in_their_shape():
+    assert Case().mhe.run(np.empty((0, 1)), covariances=True).covariances.shape == (0, 2, 2)
+
+
 @pytest.mark.parametrize(
     ("jacobian", "text"),
     [

@@ -41,8 +41,44 @@ def test_the_program_prints_its_table_and_draws(tmp_path):
         capture_output=True, text=True, check=True, timeout=300,
     )
     assert "qpmhe, 2 QPs" in answer.stdout
+    # Nothing from sample 50 on: three errors and the time, and words for what is not there.
+    row = next(line for line in answer.stdout.splitlines() if "qpmhe, 2 QPs" in line)
+    assert len(re.findall(r"\d+\.\d+", row)) == 4
+    assert "nan" not in answer.stdout
+    words = " ".join(answer.stdout.split())
+    assert "samples 20 to 24; none from 50 on, whose columns are left out" in words
     assert ("not installed" in answer.stdout) == (find_spec("do_mpc") is None)
     assert (tmp_path / "do_mpc_masses.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("steps", "columns", "words"),
+    [
+        (21, 5, "samples 20 to 20; none from 50 on"),
+        (50, 5, "samples 20 to 49; none from 50 on"),
+        (51, 8, "samples 20 to 49, then the rest"),
+    ],
+)
+def test_every_column_has_samples(example, steps, columns, words):
+    table, parts = example.error_table(steps, 1)
+    assert len(table.columns) == columns
+    assert words in table.caption
+    assert all(np.arange(steps)[part].size for part in parts)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--steps", "20"], "--steps is 20; expected more than 20"),
+        (["--steps", "-5"], "--steps is -5"),
+        (["--seeds", "0"], "--seeds is 0; expected at least 1"),
+    ],
+)
+def test_too_short_a_record_is_refused(example, monkeypatch, capsys, options, words):
+    monkeypatch.setattr(sys, "argv", [str(PROGRAM), *options])
+    with pytest.raises(SystemExit, match="2"):
+        example.main()
+    assert words in " ".join(capsys.readouterr().err.split())
 
 
 def test_two_qps_find_speeds_and_inertia(example):

@@ -1,0 +1,174 @@
+"""Checks of what is to be drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._checks import numbers
+from ..errors import InvalidInputError, ShapeError
+from ..estimate import Estimate
+from ..run import Run
+
+__all__ = ["check_estimate", "check_run", "curve", "label_list", "named_curves", "sample_times"]
+
+Array = NDArray[np.float64]
+
+
+def check_run(run: Any) -> None:
+    """Insist on a run.
+
+    Parameters
+    ----------
+    run : Run
+        What was given as one.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is none.
+    """
+    if not isinstance(run, Run):
+        raise InvalidInputError(
+            f"run is of type {type(run).__name__}; expected a qpmhe.Run, as "
+            "MovingHorizonEstimator.run returns it. plots.window draws one Estimate, "
+            "plots.trajectories any arrays."
+        )
+
+
+def check_estimate(estimate: Any) -> None:
+    """Insist on an estimate.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        What was given as one.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is none.
+    """
+    if not isinstance(estimate, Estimate):
+        raise InvalidInputError(
+            f"estimate is of type {type(estimate).__name__}; expected a qpmhe.Estimate, as "
+            "MovingHorizonEstimator.update returns it. plots.states draws a Run."
+        )
+
+
+def label_list(labels: Sequence[str], n: int | None = None) -> list[str]:
+    """The labels, one a state.
+
+    Parameters
+    ----------
+    labels : sequence of str
+        What was given.
+    n : int, optional
+        How many are expected; at least one if left out.
+
+    Raises
+    ------
+    InvalidInputError
+        If they are no sequence of strings.
+    ShapeError
+        If they are too few or too many.
+    """
+    given = list(labels) if np.iterable(labels) and not isinstance(labels, str) else None
+    if given is None or not all(isinstance(label, str) for label in given):
+        raise InvalidInputError(
+            f"labels are {labels!r}; expected a sequence of strings, one a state."
+        )
+    if len(given) != n if n is not None else not given:
+        raise ShapeError(
+            f"labels are {given}; expected {'at least 1' if n is None else n}, one a state."
+        )
+    return given
+
+
+def sample_times(times: ArrayLike) -> NDArray[Any]:
+    """The times of samples, (T + 1,).
+
+    Parameters
+    ----------
+    times : array_like
+        What was given: numbers, or dates.
+
+    Raises
+    ------
+    ShapeError
+        If they are no vector.
+    """
+    given = np.asarray(times)
+    if given.ndim != 1:
+        raise ShapeError(f"times have shape {given.shape}; expected (T + 1,), one a state.")
+    return given
+
+
+def curve(name: str, values: ArrayLike, length: int, n: int) -> Array:
+    """A row of n states at each of the times.
+
+    Parameters
+    ----------
+    name : str
+        What the error's text calls it.
+    values : array_like
+        What was given; (length,) will do where n is 1.
+    length, n : int
+        Numbers of times and of states.
+
+    Raises
+    ------
+    InvalidInputError
+        If these are no real numbers.
+    ShapeError
+        If the shape is another.
+    """
+    array = numbers(name, values, finite=False)
+    if array.ndim == 1 and n == 1:
+        array = array[:, None]
+    if array.shape != (length, n):
+        raise ShapeError(
+            f"{name} has shape {array.shape}; expected ({length}, {n}), a row for each of the "
+            "times x(0), ..., x(T) and a column for each state with a label."
+        )
+    return array
+
+
+def named_curves(
+    estimates: Mapping[str, ArrayLike], length: int, n: int, most: int
+) -> dict[str, Array]:
+    """Some `curve` of each label.
+
+    Parameters
+    ----------
+    estimates : mapping of label to array_like
+        What was given.
+    length, n : int
+        Numbers of times and of states.
+    most : int
+        How many can be told apart.
+
+    Raises
+    ------
+    InvalidInputError
+        If this is no mapping, or one of too many.
+    ShapeError
+        If a shape is another.
+    """
+    if not isinstance(estimates, Mapping):
+        raise InvalidInputError(
+            f"estimates are of type {type(estimates).__name__}; expected a mapping of labels to "
+            "arrays, such as {'estimate': run.states}."
+        )
+    if len(estimates) > most:
+        raise InvalidInputError(
+            f"estimates are {len(estimates)}: {', '.join(map(str, estimates))}; expected at most "
+            f"{most}, which can be told apart. Draw the others into axes of their own."
+        )
+    return {
+        label: curve(f"estimates[{label!r}]", values, length, n)
+        for label, values in estimates.items()
+    }
