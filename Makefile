@@ -6,7 +6,7 @@ ARGS ?=
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: reproduce test lint types examples benchmarks comparison docs release-check minimal-versions clean
+.PHONY: reproduce test lint types examples benchmarks comparison choice docs release-check minimal-versions clean
 
 # One stamp for each set of extras, renewed when the project's requirements change.
 $(VENV)/.%: pyproject.toml
@@ -52,6 +52,10 @@ benchmarks: $(VENV)/.test
 comparison: $(VENV)/.test
 	$(BIN)/qpmhe compare --store results/comparison.sqlite --out results/comparison
 	$(BIN)/python examples/studies/comparison_page.py results/comparison.sqlite results/comparison
+
+# The figures of docs/how-to-choose.md: about ten minutes on two cores; after a new comparison, too.
+choice: $(VENV)/.test
+	$(BIN)/python examples/studies/choice_page.py
 
 docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict
