@@ -118,7 +118,7 @@ class PythonEngine:
             if window.length == self._settings.horizon:
                 try:  # noqa: SIM105 - `suppress` would cost every step more than the call
                     self._solver.shift()
-                except Exception:  # a user's solver: what it keeps is its own affair
+                except (Exception, SystemExit):  # what a user's solver keeps is its own affair
                     pass
             missing, held, flat = window.push(y, u, dt, noise_weight)
             if self._settings.candidate == "reinitialized":

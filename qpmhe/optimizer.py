@@ -224,7 +224,8 @@ class Optimizer:
         solution: Solution
         try:
             solution = self._solver.solve(qp)
-        except Exception as error:  # a user's solver that overrides the contained `solve`
+        # A user's solver that overrides the contained `solve`.
+        except (Exception, SystemExit) as error:
             message = f"{type(error).__name__}: {error}"
             solution = Solution(None, SolveStatus.FAILED, message=message)
         outcome.count(solution.iterations, perf_counter() - began)

@@ -168,6 +168,7 @@ class Subproblem:
     def _fresh(self, stages: int) -> QP:
         """A QP of so many stages in place of the present one."""
         self._qp = qp = QP(stages, self._n, self._rows)
+        qp.bounded = False  # until there are bounds
         qp.row_next[:-1, self._w] = self._w_rows
         qp.row_own[:, self._x] = self._x_rows
         band, gradient = qp.band, qp.gradient

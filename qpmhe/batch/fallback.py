@@ -40,6 +40,7 @@ def member_qp(
     n, count = prior.shape[0], len(slots)
     factors = np.ones(count + 1) if discounts is None else discounts
     qp, index = QP(count + 1, n), band_index(n)
+    qp.bounded = False
     flat = np.zeros(2 * n * n + 1)
     for i, slot in enumerate(slots):
         flat[: n * n] = terms.square[slot, :, :, member].ravel()

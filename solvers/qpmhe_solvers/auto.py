@@ -57,6 +57,11 @@ class AutoSolver(Solver):
             The problem.
         start : (K, n) array, optional
             Handed to the QP solver, where one is needed.
+
+        Raises
+        ------
+        InvalidInputError
+            If ``qp`` is no `QP`.
         """
         solution = self._banded.solve(qp, start)
         if solution.status is SolveStatus.SOLVED:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .options import SolverOptions
 from .qp import QP
 from .solution import RawSolution, Residuals, Solution, SolveStatus
-from .solver import Solver
+from .solver import Solver, expect_qp
 
 __all__ = ["BandedSolver"]
 
@@ -62,7 +62,13 @@ class BandedSolver(Solver):
         Solution
             SOLVED, UNCONSTRAINED, or FAILED where H is not positive definite or not finite.
             The iterate lives in this solver's workspace until its next solve.
+
+        Raises
+        ------
+        InvalidInputError
+            If ``qp`` is no `QP`.
         """
+        expect_qp(qp)
         row_duals = _NO_ROWS
         if qp.rows and (qp.row_lower == qp.row_upper).any():
             step, multipliers = self._with_equalities(qp)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .capabilities import CAPS, PATIENCE, Capabilities, all_kinds, tight
 from .options import SolverOptions
-from .qp import QP
+from .qp import ARRAYS, QP
 from .registry import create
 from .samples import Bounds, Sides, contradiction, sample
 from .solution import SolveStatus
@@ -22,9 +22,6 @@ Array = NDArray[np.float64]
 
 # Error in d that counts as the same solution.
 _SAME = 1e-4
-_ARRAYS = (
-    "band", "gradient", "lower", "upper", "row_own", "row_next", "row_lower", "row_upper"
-)
 
 
 def run_battery(name: str, can: Capabilities) -> Iterator[tuple[str, str]]:
@@ -54,14 +51,18 @@ def _wrong(solver: Solver, qp: QP, what: str) -> Iterator[str]:
 
 def _judged(solver: Solver, qp: QP, what: str) -> tuple[Array | None, list[str]]:
     """The solution of a QP that has one, and what is wrong with it."""
-    before = [getattr(qp, array).copy() for array in _ARRAYS]
+    before = [getattr(qp, array).copy() for array in ARRAYS]
     solution = solver.solve(qp)
     faults = []
     if solution.status is not SolveStatus.SOLVED:
         faults.append(f"{what}: {solution.status.name}, {solution.message or solution.residuals}")
-    for array, values in zip(_ARRAYS, before, strict=True):
+    for array, values in zip(ARRAYS, before, strict=True):
         if not np.array_equal(getattr(qp, array), values):
             faults.append(f"{what}: it wrote into {array}")
+    faults += [
+        f"{what}: it wrote into {array}, which is to be read only; copy before scaling in place"
+        for array in solver._wrote
+    ]
     return solution.d, faults
 
 
@@ -199,12 +200,11 @@ def _shifted(name: str, _: Capabilities) -> Iterator[str]:
     qps = []
     for first in range(10):
         qp, stages = QP(6, 2, 1), slice(first, first + 6)
-        for array in _ARRAYS:
+        for array in ARRAYS:
             getattr(qp, array)[...] = getattr(long, array)[stages]
         # Nothing couples to what is beyond.
         qp.band[-1, 0, 2:], qp.band[-1, 1, 1:] = 0.0, 0.0
         qp.row_lower[-1], qp.row_upper[-1] = -np.inf, np.inf
-        qp.bounded = True
         qps.append(qp)
     yield from _as_fresh(name, qps, "window", shift=True)
     solver = create(name, tight())

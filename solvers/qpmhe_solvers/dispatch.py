@@ -41,6 +41,8 @@ class Translation:
         Whether a primal start is used by the solver and does it good.
     default_cap : int or None
         Cap where none is asked for and the solver's own would let it run for minutes.
+    beyond_cap : int
+        What is added to a cap, where the solver ends before the iteration of that number.
     needs_row : bool
         Whether a QP without any inequality row goes wrong, so that a void row is added.
     tells_infeasible : bool
@@ -60,6 +62,7 @@ class Translation:
     keep_empty: bool = False
     tells_infeasible: bool = False
     default_cap: int | None = None
+    beyond_cap: int = 0
 
 
 # Caps, tolerances and traps as measured (qpsolvers 4.13). cvxopt is harmed by its start; the
@@ -75,7 +78,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
     "cvxopt": Translation("csc", "rows", "maxiters", ("abstol", "feastol"), ("reltol",)),
     "daqp": Translation(
         "dense", "box", "iter_limit", ("primal_tol", "dual_tol"), time_limit="time_limit",
-        start=True,
+        start=True, beyond_cap=1,
     ),
     "ecos": Translation(
         "dense", "rows", "max_iters", ("abstol", "feastol", "reltol"), needs_row=True
@@ -177,7 +180,7 @@ def _keywords(how: Translation, options: SolverOptions) -> dict[str, Any]:
     words.update(dict.fromkeys(how.relative, options.relative_tolerance))
     cap = how.default_cap if options.max_iterations is None else options.max_iterations
     if cap is not None and how.cap is not None:
-        words[how.cap] = int(cap)
+        words[how.cap] = int(cap) + how.beyond_cap
     if options.time_limit is not None and how.time_limit is not None:
         words[how.time_limit] = options.time_limit
     return words

@@ -42,7 +42,7 @@ class UnknownOptionError(OptionError, TypeError):
 
 
 class BackendError(InvalidInputError):
-    """A QP backend that is not known here, or whose package is not installed."""
+    """A QP backend that is unknown, not installed, described wrongly, or makes no solver."""
 
 
 def tell_unknown_options(cls: type[T]) -> type[T]:

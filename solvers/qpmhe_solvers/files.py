@@ -271,7 +271,11 @@ def _stored(source: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]
         setattr(qp, name, np.ascontiguousarray(arrays[name]))
     if not isinstance(header["bounded"], bool):
         raise TypeError(f"bounded is {header['bounded']!r}")
-    qp.bounded = header["bounded"]
+    # The numbers have the last word: a promise that they break was made by mistake, for example
+    # by QPs of earlier versions, which made it on their own.
+    qp.bounded = header["bounded"] or not (
+        bool((qp.lower == -np.inf).all()) and bool((qp.upper == np.inf).all())
+    )
     options = header["options"]
     return StoredQP(
         source, qp, _answer(header["answer"], arrays), str(header["backend"]),

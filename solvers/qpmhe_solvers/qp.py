@@ -15,9 +15,12 @@ from .patterns import Pattern, hessian_pattern, rows_pattern
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
-__all__ = ["QP", "band_index", "band_of"]
+__all__ = ["ARRAYS", "QP", "band_index", "band_of"]
 
 Array = NDArray[np.float64]
+
+#: Names of the arrays that hold a QP's numbers.
+ARRAYS = ("band", "gradient", "lower", "upper", "row_own", "row_next", "row_lower", "row_upper")
 
 
 @lru_cache(maxsize=256)
@@ -88,7 +91,9 @@ class QP:
     row_lower, row_upper : (K, rows) array
         a and b; equal entries make an equality row.
     bounded : bool
-        False promises that no entry of ``lower`` and ``upper`` is finite.
+        Whether bounds are looked at, True in a new QP. False is a promise that no entry of
+        ``lower`` and ``upper`` is finite, and saves the look; where it is broken, some backends
+        leave the bounds out.
 
     Raises
     ------
@@ -125,7 +130,15 @@ class QP:
         self.row_next: Array = np.zeros((stages, rows, n))
         self.row_lower: Array = np.full((stages, rows), -np.inf)
         self.row_upper: Array = np.full((stages, rows), np.inf)
-        self.bounded = False
+        self.bounded = True
+
+    def copy(self) -> QP:
+        """The same problem in arrays of its own."""
+        twin = object.__new__(QP)
+        for name in QP.__slots__:
+            value = getattr(self, name)
+            setattr(twin, name, value.copy() if isinstance(value, np.ndarray) else value)
+        return twin
 
     @property
     def lapack_band(self) -> Array:

@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from .entry import make_solver
 from .errors import InvalidInputError, OptionError
 from .files import dump
 from .options import SolverOptions
@@ -21,7 +22,7 @@ from .qp import QP
 from .registry import backend as registered_backend
 from .registry import backends, register, unregister
 from .solution import RawSolution, Solution, SolveStatus
-from .solver import Solver
+from .solver import Solver, expect_qp
 
 __all__ = ["Recording", "RecordingWarning"]
 
@@ -160,7 +161,7 @@ class Recording:
         )
 
     def _make(self, options: SolverOptions) -> Solver:
-        return _Recorder(self._entry.factory(options), options, self)
+        return _Recorder(make_solver(self._entry, options), options, self)
 
     def _take(
         self, qp: QP, start: Array | None, solution: Solution, options: SolverOptions
@@ -221,17 +222,13 @@ class _Held(NamedTuple):
 
     def copied(self) -> _Held:
         """The same in arrays of its own: those of problem and iterate are used again."""
-        qp = QP(self.qp.stages, self.qp.n, self.qp.rows)
-        for name in QP.__slots__:
-            value = getattr(self.qp, name)
-            setattr(qp, name, value.copy() if isinstance(value, np.ndarray) else value)
         told = self.solution
         d, start = (None if x is None else np.array(x) for x in (told.d, self.start))
         solution = Solution(
             d, told.status, told.iterations, told.residuals, told.bound_duals, told.row_duals,
             told.message,
         )
-        return self._replace(qp=qp, start=start, solution=solution)
+        return self._replace(qp=self.qp.copy(), start=start, solution=solution)
 
 
 class _Recorder(Solver):
@@ -254,6 +251,7 @@ class _Recorder(Solver):
         self._solver.shift()
 
     def solve(self, qp: QP, start: Array | None = None) -> Solution:
+        expect_qp(qp)
         try:
             solution = self._solver.solve(qp, start)
         except Exception as error:  # a user's solver that overrides the contained `solve`

@@ -58,8 +58,8 @@ def sample(
     qp.gradient[...] = push * rng.standard_normal((stages, n))
     qp.row_own[...], qp.row_next[...] = rng.standard_normal((2, stages, rows, n))
     inside = around * rng.standard_normal((stages, n))
-    if bounds != "none":
-        qp.bounded = True
+    qp.bounded = bounds != "none"
+    if qp.bounded:
         qp.lower[...] = inside - rng.uniform(0.05, 0.5, (stages, n))
         qp.upper[...] = inside + rng.uniform(0.05, 0.5, (stages, n))
         if bounds == "part":

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 import warnings
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import InvalidInputError
 from .flat import FlatQP
 from .options import SolverOptions
-from .qp import QP
+from .qp import ARRAYS, QP
 from .solution import RawSolution, Residuals, Solution, SolveStatus, residuals
 
-__all__ = ["Solver"]
+__all__ = ["Solver", "expect_qp"]
 
 Array = NDArray[np.float64]
 
@@ -37,13 +38,35 @@ class Solver(ABC):
     _flat: FlatQP | None = None  # kept while the sizes of the QPs stay
     # Whether Python code may warn during a solve: to keep that inside takes as long as a small QP.
     _warns: ClassVar[bool] = True
+    # Whether it is one of this package's, which are tested to read only: all others are lent a
+    # copy, since who scales the caller's QP in place would be judged by what is left of it.
+    _own: ClassVar[bool] = False
+    # What the last solve wrote into of what it was lent.
+    _wrote: tuple[str, ...] = ()
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        cls._own = cls.__module__.startswith(f"{__package__}.")
 
     def __init__(self, options: SolverOptions) -> None:
         self.options = options
 
     @abstractmethod
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
-        """Solve qp. May raise, hang on to nothing, and lie: `solve` contains all of it."""
+        """Solve qp. May raise, hang on to nothing, and lie: `solve` contains all of it.
+
+        Parameters
+        ----------
+        qp : QP
+            The problem, with arrays of its own for this solve. It is to be read: what is written
+            into it is lost, and `check` objects.
+        start : (K, n) array or None
+            As given to `solve`, if it is finite and of the right shape.
+
+        Returns
+        -------
+        RawSolution
+        """
 
     def _solve_flat(self, qp: QP, flat: FlatQP, start: Array | None) -> RawSolution:
         """Solve qp, whose numbers are gathered already; for those who want them so."""
@@ -87,7 +110,16 @@ class Solver(ABC):
         Solution
             The iterate, if it is finite and of the right shape, with its recomputed
             residuals; otherwise FAILED with the reason in its message.
+
+        Raises
+        ------
+        InvalidInputError
+            If ``qp`` is no `QP`.
+        KeyboardInterrupt
+            If the user interrupts. Nothing else gets out: a solver that wants to end the process
+            with SystemExit has failed, too.
         """
+        expect_qp(qp)
         try:
             if not self._warns:
                 with np.errstate(all="ignore"):
@@ -95,7 +127,7 @@ class Solver(ABC):
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
                 return self._checked(qp, start)
-        except (KeyboardInterrupt, SystemExit, GeneratorExit):
+        except KeyboardInterrupt:
             raise
         except BaseException as error:  # the wall; a panic of compiled code is no Exception
             message = f"{type(error).__name__}: {error}"
@@ -110,7 +142,26 @@ class Solver(ABC):
         fault = flat.fault()
         if fault:
             return Solution(None, SolveStatus.FAILED, message=fault)
-        return self._judged(qp, flat, self._solve_flat(qp, flat, self._usable(start, qp)))
+        usable = self._usable(start, qp)
+        if self._own:
+            return self._judged(qp, flat, self._solve_flat(qp, flat, usable))
+        solution = self._judged(qp, flat, self._solve_lent(qp, usable))
+        if self._wrote and solution.status is not SolveStatus.SOLVED:
+            told = f"it wrote into {', '.join(self._wrote)} of the QP, which is to be read only"
+            solution.message = f"{solution.message}; {told}" if solution.message else told
+        return solution
+
+    def _solve_lent(self, qp: QP, start: Array | None) -> RawSolution:
+        """Solve with copies, and see what was written into them."""
+        self._wrote = ()
+        lent = qp.copy()
+        try:
+            return self._solve(lent, None if start is None else start.copy())
+        finally:
+            self._wrote = tuple(
+                name for name in ARRAYS
+                if not np.array_equal(getattr(lent, name), getattr(qp, name))
+            )
 
     def _usable(self, start: Array | None, qp: QP) -> Array | None:
         if start is None or not self.options.warm_start:
@@ -160,6 +211,26 @@ class Solver(ABC):
                 found.gap <= limit
                 or found.gap <= limit * (1.0 + abs(float(np.vdot(d, qp.gradient))))
             )
+        )
+
+
+def expect_qp(qp: object) -> None:
+    """Refuse what is no QP.
+
+    Parameters
+    ----------
+    qp : object
+        What a solver was given.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is none.
+    """
+    if not isinstance(qp, QP):
+        raise InvalidInputError(
+            f"qp is {qp!r}; expected a qpmhe.solvers.QP: make one by its sizes and fill its "
+            "arrays, or load one by qpmhe.solvers.load."
         )
 
 

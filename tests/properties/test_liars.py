@@ -82,6 +82,8 @@ NO_ITERATE = {
     "StopIteration": raising(StopIteration()),
     "a qpmhe error": raising(qpmhe.QpmheError("mine")),
     "a warning": raising(UserWarning("inaccurate")),
+    "an exit": raising(SystemExit(3)),
+    "the exit of a generator": raising(GeneratorExit()),
     "a panic": raising(Panic("called `Option::unwrap()` on a `None` value")),
 }
 
@@ -269,7 +271,8 @@ def test_interrupts_get_through():
         estimator("liar", False).update(Y[0])
 
 
-def test_a_solver_that_cannot_follow_the_window_does_not_stop_a_step():
+@pytest.mark.parametrize("error", [RuntimeError("stuck"), SystemExit(3)], ids=repr)
+def test_a_solver_that_cannot_follow_the_window_does_not_stop_a_step(error):
     shifts = []
 
     class Stuck(Solver):
@@ -278,7 +281,7 @@ def test_a_solver_that_cannot_follow_the_window_does_not_stop_a_step():
 
         def shift(self):
             shifts.append(1)
-            raise RuntimeError("stuck")
+            raise error
 
     qpmhe.solvers.register(Backend("stuck", Stuck, "stuck"))
     try:
@@ -287,3 +290,20 @@ def test_a_solver_that_cannot_follow_the_window_does_not_stop_a_step():
         qpmhe.solvers.unregister("stuck")
     assert len(shifts) == len(Y) - HORIZON
     assert estimates[-1].improved
+
+
+def test_a_solver_that_leaves_from_a_solve_of_its_own_does_not_stop_a_step():
+    class Leaving(Solver):
+        def _solve(self, qp, start):
+            raise NotImplementedError
+
+        def solve(self, qp, start=None):
+            raise SystemExit(3)
+
+    qpmhe.solvers.register(Backend("leaving", Leaving, "leaving"))
+    try:
+        estimate = estimator("leaving", False).update(Y[0])
+    finally:
+        qpmhe.solvers.unregister("leaving")
+    assert estimate.status == Status.CANDIDATE | Status.SOLVER_FAILED
+    assert "SystemExit" in estimate.message

@@ -157,8 +157,8 @@ def make(stages, n, rows=0, *, seed=0, bounds="none", sides="none", decades=0.0)
                     matrix[k * rows + r, (k + 1) * n + c] = qp.row_next[k, r, c]
 
     inside = 0.2 * rng.standard_normal(qp.size)
-    if bounds != "none":
-        qp.bounded = True
+    qp.bounded = bounds != "none"
+    if qp.bounded:
         around = inside.reshape(stages, n)
         qp.lower[:] = around - rng.uniform(0.05, 0.5, (stages, n))
         qp.upper[:] = around + rng.uniform(0.05, 0.5, (stages, n))

@@ -66,6 +66,31 @@ def test_solves_to_optimality(case, name):
             np.testing.assert_array_equal(getattr(qp, array), values)
 
 
+@pytest.mark.parametrize("cap", [None, 1])
+@pytest.mark.parametrize("name", EVERY)
+def test_every_backend_only_reads(name, cap):
+    # These are lent the caller's arrays; all others are lent copies.
+    solver = create(name, SolverOptions(cap, absolute_tolerance=1e-9))
+    qps = [make(**case)[0] for case in CASES.values()]
+    crossed, spoilt = make(**ALL_KINDS)[0], make(**ALL_KINDS)[0]
+    crossed.lower[2, 0] = crossed.upper[2, 0] = 0.0
+    crossed.lower[2, 0] += 1.0
+    spoilt.gradient[1, 1] = np.nan
+    if cap is not None:  # without a cap, some take minutes to give up
+        qps.append(contradiction())
+    for qp in (*qps, crossed, spoilt):
+        start = np.full((qp.stages, qp.n), 0.1)
+        before = {array: values.tobytes() for array, values in numbers(qp).items()}
+        for array in ARRAYS:  # what NumPy sees written raises; compiled code may write unseen
+            getattr(qp, array).flags.writeable = False
+        start.flags.writeable = False
+        solution = solver.solve(qp, start)
+        assert "read-only" not in solution.message
+        assert (start == 0.1).all()
+        for array, values in before.items():
+            assert getattr(qp, array).tobytes() == values, array
+
+
 @pytest.mark.parametrize("name", WITH_INEQUALITIES)
 @pytest.mark.parametrize("case", CASES)
 def test_the_recomputed_gap_closes_at_a_solution(case, name):

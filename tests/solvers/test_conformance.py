@@ -95,6 +95,21 @@ class Raising(Faulty):
         return raw
 
 
+class InPlace(Faulty):
+    """It scales its QP in place, does nothing, and has nothing left to do."""
+
+    def _solve(self, qp, start):
+        qp.gradient *= 1e-12
+        qp.band *= 1e-12
+        zeros = np.zeros(qp.size), np.zeros(qp.stages * qp.rows)
+        return RawSolution(zeros[0], True, 1, *zeros)
+
+
+class Leaving(Faulty):
+    def spoilt(self, qp, raw):
+        sys.exit(3)
+
+
 class Dead(Faulty):
     """After a failure it never recovers."""
 
@@ -126,6 +141,9 @@ class NoRows(Faulty):
     [
         (Stale, "20 QPs in turn", "INACCURATE"),
         (Writing, "20 QPs in turn", "wrote into upper"),
+        (InPlace, "no inequality", "it wrote into band, gradient of the QP"),
+        (InPlace, "20 QPs in turn", "wrote into gradient"),
+        (Leaving, "no inequality", "SystemExit: 3"),
         (Lying, "no inequality", "INACCURATE"),
         (Raising, "no inequality", "KeyError"),
         (Dead, "an infeasible QP, then a good one", "after contradicting rows: FAILED"),
@@ -217,6 +235,10 @@ def nothing():
     return 3
 def taken():
     return Backend("osqp", Zero, "none")
+def mixed():
+    return [3]
+def leaving():
+    raise SystemExit(3)
 """
 SCRIPT = """
 import warnings
@@ -243,7 +265,7 @@ def test_entry_points(tmp_path, lookup):
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plugin\nVersion: 1.0\n")
     points = {
         "one": "plugin:one", "two": "plugin:two", "odd": "plugin:nothing", "gone": "nosuch:x",
-        "clash": "plugin:taken",
+        "clash": "plugin:taken", "mixed": "plugin:mixed", "leaves": "plugin:leaving",
     }
     lines = [f"{name} = {value}" for name, value in points.items()]
     (info / "entry_points.txt").write_text("[qpmhe.backends]\n" + "\n".join(lines) + "\n")
@@ -256,9 +278,10 @@ def test_entry_points(tmp_path, lookup):
     assert early == "False"  # importing the package loads nobody's entry points
     assert names == "['zero', 'zero2', 'zero3']"
     assert status == "STOPPED"
-    assert len(warned) == 3
+    assert len(warned) == 5
     for name, words in (
         ("odd", "TypeError"), ("gone", "ModuleNotFoundError"), ("clash", "registered already"),
+        ("mixed", "cannot register 3"), ("leaves", "SystemExit: 3"),
     ):
         (line,) = (one for one in warned if f"the entry point {name!r}" in one)
         assert words in line

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 import qpmhe_solvers.registry
 from qpmhe_solvers import (
     Backend,
+    InvalidInputError,
     RawSolution,
     Residuals,
     Solution,
@@ -16,8 +17,9 @@ from qpmhe_solvers import (
     SolveStatus,
     create,
 )
+from qpmhe_solvers.dispatch import DispatchSolver
 
-from .problems import CASES, make, registered
+from .problems import ARRAYS, CASES, EVERY, make, numbers, registered
 
 FAILED, SOLVED = SolveStatus.FAILED, SolveStatus.SOLVED
 STOPPED, INACCURATE = SolveStatus.STOPPED, SolveStatus.INACCURATE
@@ -99,6 +101,8 @@ def test_stopped_where_no_success_is_claimed():
         Exception("all of it"), KeyError("all of it"), ValueError("all of it"),
         MemoryError("all of it"), RecursionError("all of it"), StopIteration("all of it"),
         FloatingPointError("all of it"), ImportError("all of it"), Warning("all of it"),
+        # To leave is to fail: an estimator must not end with the solver that it tried.
+        SystemExit("all of it"), GeneratorExit("all of it"),
     ],
     ids=lambda error: type(error).__name__,
 )
@@ -110,10 +114,98 @@ def test_an_exception_is_a_failure_with_its_words(error):
     assert "all of it" in solution.message
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
-def test_the_user_can_still_interrupt(error):
-    with pytest.raises(error):
-        ask(raising(error()), problem()[0])
+def test_the_user_can_still_interrupt():
+    with pytest.raises(KeyboardInterrupt):
+        ask(raising(KeyboardInterrupt()), problem()[0])
+
+
+def scribbling(answer):
+    """A behaviour that overwrites all that it was lent, then answers."""
+
+    def behaviour(qp):
+        for name in ARRAYS:
+            getattr(qp, name)[...] = 1e-12
+        qp.bounded = False
+        return answer(qp)
+
+    return behaviour
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_a_claim_is_not_judged_by_what_the_solver_left_of_the_problem(name):
+    qp, _ = problem()
+    before = numbers(qp)
+
+    def scale(lent):
+        getattr(lent, name)[...] *= 1e-12
+        lent.gradient *= 1e-12  # at zero, without multipliers, there is now nothing left to do
+        return RawSolution(np.zeros(21), True, 1, np.zeros(21), np.zeros(14))
+
+    solution = ask(scale, qp)
+    assert solution.status is INACCURATE
+    assert solution.residuals.dual == np.abs(qp.gradient).max()
+    assert solution.message.startswith("it wrote into ")
+    assert name in solution.message
+    assert "read only" in solution.message
+    for array, values in before.items():
+        np.testing.assert_array_equal(getattr(qp, array), values)
+
+
+def test_who_scribbles_and_is_right_all_the_same_is_believed():
+    qp, _ = problem()
+    before = numbers(qp)
+    solution = ask(scribbling(answer()), qp)
+    assert (solution.status, solution.message) == (SOLVED, "")
+    for array, values in before.items():
+        np.testing.assert_array_equal(getattr(qp, array), values)
+    assert qp.bounded
+
+
+def test_the_words_of_a_solver_that_scribbles_are_kept():
+    solution = ask(scribbling(answer(claimed=False, message="gave up")), problem()[0])
+    assert solution.status is STOPPED
+    assert solution.message.startswith("gave up; it wrote into band, gradient, ")
+
+
+def test_the_start_is_lent_as_a_copy():
+    class Greedy(Scripted):
+        def _solve(self, qp, start):
+            start[...] = 7.0
+            return super()._solve(qp, start)
+
+    qp, _ = problem()
+    start = np.ones((7, 3))
+    assert Greedy(answer()).solve(qp, start).status is SOLVED
+    assert (start == 1.0).all()
+
+
+def test_who_only_reads_is_not_accused():
+    solver = Scripted(answer(claimed=False))
+    assert solver.solve(problem()[0]).message == ""
+    assert solver._wrote == ()
+
+
+def test_a_solver_derived_from_one_of_ours_is_lent_copies():
+    pytest.importorskip("quadprog")
+
+    class Derived(DispatchSolver):
+        def _solve(self, qp, start):
+            qp.gradient[...] = 0.0
+            return RawSolution(np.zeros(qp.size), True, 1, np.zeros(qp.size), np.zeros(14))
+
+    qp, _ = problem()
+    solution = Derived("quadprog", SolverOptions()).solve(qp)
+    assert solution.status is INACCURATE
+    assert qp.gradient.all()
+
+
+@pytest.mark.parametrize("thing", [None, 3, "a QP", np.zeros(3)], ids=repr)
+@pytest.mark.parametrize("name", EVERY)
+def test_what_is_no_qp_is_refused(name, thing):
+    with pytest.raises(InvalidInputError, match=r"qp is .*; expected a qpmhe.solvers.QP"):
+        create(name).solve(thing)
+    with pytest.raises(InvalidInputError, match=r"qp is .*; expected a qpmhe.solvers.QP"):
+        Scripted(answer()).solve(thing)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
+from qpmhe.cli import solve_qp
 from qpmhe_solvers import (
     QP,
     InvalidInputError,
@@ -83,13 +84,36 @@ def test_any_bits_come_back(seed, tmp_path):
     rng = np.random.default_rng(seed)
     stages, n, rows = rng.integers(1, 5), rng.integers(1, 5), rng.integers(0, 3)
     qp = QP(int(stages), int(n), int(rows))
-    qp.bounded = bool(seed % 2)
     for name in ARRAYS:
         array = getattr(qp, name)
         bits = rng.integers(0, 2**64, array.shape, dtype=np.uint64)
         array[...] = bits.view(np.float64)  # NaNs with payloads, denormals, infinities
     qp.gradient[0, 0] = -0.0
     same_bits(load(dump(qp, tmp_path / "qp.npz")).qp, qp)
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_a_promise_that_is_kept_comes_back(bounded, tmp_path):
+    qp, _ = make(3, 2)
+    qp.bounded = bounded
+    same_bits(load(dump(qp, tmp_path / "qp.npz")).qp, qp)
+
+
+@pytest.mark.parametrize("limit", [-5.0, np.nan, -np.inf])
+def test_a_promise_that_the_numbers_break_is_not_believed(limit, tmp_path):
+    # QPs of earlier versions promised by default that there are no bounds.
+    qp, _ = make(3, 2)
+    qp.upper[1, 1] = limit
+    path = rewritten(dump(qp, tmp_path / "qp.npz"), {"bounded": False})
+    found = load(path)
+    assert found.qp.bounded
+    replayed = solve_qp.replay(found, "auto", SolverOptions(absolute_tolerance=1e-9))
+    if limit == -5.0:
+        assert replayed.solution.status is SolveStatus.SOLVED
+        assert replayed.solution.d[1, 1] == pytest.approx(-5.0)
+        assert replayed.solution.bound_duals[3] > 1.0
+    else:
+        assert replayed.solution.status is not SolveStatus.SOLVED
 
 
 def test_all_that_was_said_of_it_comes_back(stored):

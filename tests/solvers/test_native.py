@@ -403,6 +403,24 @@ def test_a_wrong_active_set_does_not_stop_daqp():
         np.testing.assert_allclose(solver.solve(qp, start).d, best, atol=1e-6)
 
 
+@pytest.mark.parametrize("cap", [1, 2, 3, 5, 8])
+@pytest.mark.parametrize("bounds", ["none", "part", "all"])
+@pytest.mark.parametrize("sides", ["none", "two", "mixed"])
+def test_both_forms_of_daqp_stop_behind_the_same_iteration(sides, bounds, cap):
+    # From limits that do not bind to those that mostly do.
+    pytest.importorskip("daqp")
+    capped = SolverOptions(cap)
+    for seed, push in enumerate((0.0, 0.1, 0.5, 1.0, 3.0)):
+        qp = sample(4, 2, 1, bounds=bounds, sides=sides, push=push, seed=seed)
+        needed = create("daqp").solve(qp).iterations
+        native, generic = (
+            create(name, capped).solve(qp) for name in ("daqp", "qpsolvers:daqp")
+        )
+        expected = SolveStatus.SOLVED if needed <= cap else SolveStatus.FAILED
+        assert (native.status, generic.status) == (expected, expected)
+        assert native.iterations == min(needed, cap)
+
+
 OPTIONS = SolverOptions(
     max_iterations=17, absolute_tolerance=3e-6, relative_tolerance=4e-7, time_limit=2.5
 )
@@ -414,7 +432,7 @@ SETTINGS = {
     ),
     "daqp": (
         lambda handle: handle.settings,
-        {"iter_limit": 17, "primal_tol": 3e-6, "dual_tol": 3e-6, "time_limit": 2.5},
+        {"iter_limit": 18, "primal_tol": 3e-6, "dual_tol": 3e-6, "time_limit": 2.5},
     ),
     "osqp": (
         lambda handle: handle.settings,

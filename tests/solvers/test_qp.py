@@ -3,9 +3,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qpmhe_solvers import QP, InvalidInputError, ShapeError, band_index
+import qpmhe
+from qpmhe_solvers import (
+    QP,
+    Backend,
+    InvalidInputError,
+    RawSolution,
+    ShapeError,
+    Solver,
+    SolverOptions,
+    SolveStatus,
+    backend,
+    band_index,
+    create,
+)
 
-from .problems import ARRAYS, make
+from .problems import ARRAYS, EVERY, make, registered
 
 # stages, n, rows
 SIZES = [
@@ -132,9 +145,9 @@ def test_band_index_fills_a_panel(n):
             assert panel[column, offset] == (block[column + offset, column] if inside else 0.0)
 
 
-def test_a_new_qp_has_no_inequality():
+def test_a_new_qp_has_no_inequality_and_looks_for_some():
     qp = QP(3, 2, 1)
-    assert (qp.stages, qp.n, qp.rows, qp.size, qp.bounded) == (3, 2, 1, 6, False)
+    assert (qp.stages, qp.n, qp.rows, qp.size, qp.bounded) == (3, 2, 1, 6, True)
     assert qp.band.shape == (3, 2, 4)
     assert qp.row_own.shape == qp.row_next.shape == (3, 1, 2)
     assert qp.finite()
@@ -162,7 +175,6 @@ def test_violation_sees_every_side(name, index, value, missed):
 
 def test_violation_is_zero_on_the_edge():
     qp = QP(2, 2)
-    qp.bounded = True
     d = np.array([[1.0, -2.0], [0.5, 3.0]])
     qp.lower[...] = qp.upper[...] = d
     assert qp.violation(d) == 0.0
@@ -214,3 +226,57 @@ def test_sizes_out_of_range(arguments, message):
 def test_sizes_that_are_not_integers(arguments, message):
     with pytest.raises(ShapeError, match=message):
         QP(*arguments)
+
+
+def pushed():
+    """Each unknown wants to be 5 and may be 1; nothing else is said of it."""
+    qp = QP(3, 2)
+    qp.band[:, :, 0], qp.gradient[...] = 1.0, -5.0
+    qp.lower[...], qp.upper[...] = -1.0, 1.0
+    return qp
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_bounds_that_are_filled_in_are_met(name):
+    qp = pushed()
+    solution = create(name, SolverOptions(absolute_tolerance=1e-9)).solve(qp)
+    if not backend(name).inequalities:
+        assert solution.status is SolveStatus.UNCONSTRAINED
+        assert solution.residuals.primal == pytest.approx(4.0)
+        return
+    assert solution.status.usable
+    np.testing.assert_allclose(solution.d, 1.0, atol=1e-4)
+
+
+def test_a_copy_shares_nothing():
+    qp, _ = make(3, 2, 1, bounds="all", sides="two")
+    for bounded in (True, False):
+        qp.bounded = bounded
+        twin = qp.copy()
+        for name in QP.__slots__:
+            np.testing.assert_array_equal(getattr(twin, name), getattr(qp, name))
+            assert type(getattr(twin, name)) is type(getattr(qp, name))
+        for name in ARRAYS:
+            assert not np.shares_memory(getattr(twin, name), getattr(qp, name))
+
+
+@pytest.mark.parametrize("boxed", [False, True])
+def test_the_estimator_promises_that_there_are_no_bounds_where_there_are_none(boxed):
+    seen = []
+
+    class Spy(Solver):
+        def _solve(self, qp, start):
+            seen.append(qp.bounded)
+            return RawSolution(np.zeros(qp.size), False)
+
+    box = {"states": qpmhe.Box([-1.0], [1.0])} if boxed else {}
+    system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1, **box)
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
+    with registered(Backend("spy", Spy, "looks")):
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([0.8]), cost, horizon=3, initial_state=[0.5], backend="spy",
+            max_qps=1,
+        )
+        for _ in range(5):
+            mhe.update([0.4])
+    assert seen == [boxed] * 5

@@ -10,6 +10,7 @@ from qpmhe_solvers import (
     Backend,
     BackendError,
     InvalidInputError,
+    OptionError,
     RawSolution,
     Solver,
     SolverOptions,
@@ -60,6 +61,119 @@ def test_a_name_is_registered_once():
         with pytest.raises(BackendError, match=r"backend 'mine' is registered already.*unregister"):
             register(Backend("mine", Nothing, "another"))
         assert backend("mine") is entry
+
+
+@pytest.mark.parametrize(
+    "name", ["", " ", "a b", "a,b", "-a", "a\n", "a/b", None, 3, ["a"]], ids=repr
+)
+def test_a_name_that_cannot_be_written_is_refused(name):
+    with pytest.raises(BackendError, match=r"the name of a backend is .*; expected letters") as it:
+        Backend(name, Nothing, "none at all")
+    assert repr(name) in str(it.value)
+
+
+@pytest.mark.parametrize("name", ["mine", "my_solver-2.0", "qpsolvers:mine", "c++", "2x2"])
+def test_names_that_can_be_written(name):
+    with registered(Backend(name, Nothing, "none at all")):
+        assert isinstance(create(name), Nothing)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("factory", None, "expected a callable"),
+        ("factory", Nothing(SolverOptions()), "give the class itself"),
+        ("factory", "Nothing", "expected a callable"),
+        ("matrices", "weird", "expected one of 'banded', 'csc', 'dense'"),
+        ("matrices", None, "expected one of 'banded', 'csc', 'dense'"),
+        ("matrices", ["csc"], "expected one of 'banded', 'csc', 'dense'"),
+        ("method", "", "expected a text"),
+        ("method", 3, "expected a text"),
+        ("module", 3, "or None if it needs no package"),
+        ("module", "", "or None if it needs no package"),
+        ("distribution", b"daqp", "or None if it needs no package"),
+        ("iteration_cap", "yes", "expected True or False"),
+        ("inequalities", None, "expected True or False"),
+    ],
+)
+def test_an_entry_that_can_never_work_is_refused(field, value, words):
+    with pytest.raises(BackendError) as caught:
+        Backend(**{"name": "mine", "factory": Nothing, "method": "none", field: value})
+    message = str(caught.value)
+    assert field in message
+    assert repr(value) in message
+    assert "'mine'" in message
+    assert words in message
+
+
+def test_a_field_that_there_is_not_is_named():
+    with pytest.raises(OptionError, match="Did you mean inequalities"):
+        Backend("mine", Nothing, "none", inequality=False)
+
+
+@pytest.mark.parametrize(
+    "thing", [3, None, "mine", Nothing, Nothing(SolverOptions())],
+    ids=["number", "none", "name", "class", "solver"],
+)
+def test_only_a_backend_can_be_registered(thing):
+    with pytest.raises(BackendError, match=r"expected a qpmhe\.solvers\.Backend") as caught:
+        register(thing)
+    assert repr(thing) in str(caught.value)
+    assert [entry.name for entry in backends()] == NAMES
+
+
+class Abstract(Solver):
+    pass
+
+
+class Without(Nothing):
+    def __init__(self, options):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("factory", "words"),
+    [
+        (dict, "TypeError: .*; mend the factory"),
+        (Abstract, "TypeError: .*abstract.*; mend the factory"),
+        (lambda: None, "TypeError: .*; mend the factory"),
+        (lambda options: sys.exit(3), "SystemExit: 3; mend the factory"),
+        (lambda options: None, "made None; expected an instance of a subclass"),
+        (lambda options: Nothing, "made <class .*; expected an instance of a subclass"),
+        (Without, r"has no options; call super\(\).__init__\(options\)"),
+    ],
+)
+def test_a_factory_that_makes_no_solver_is_told(factory, words):
+    with registered(Backend("mine", factory, "none at all")):
+        for ask in (create, qpmhe.solvers.check):
+            with pytest.raises(BackendError, match=f"backend 'mine' .*{words}"):
+                ask("mine")
+
+
+def test_a_package_that_does_not_load_is_told():
+    def factory(options):
+        raise ImportError("broken")
+
+    entry = Backend("mine", factory, "none", "numpy", "numpy")
+    words = "ImportError: broken; reinstall numpy"
+    with registered(entry), pytest.raises(BackendError, match=words) as caught:
+        create("mine")
+    assert isinstance(caught.value.__cause__, ImportError)
+
+
+def test_our_own_errors_leave_a_factory_as_they_are():
+    def factory(options):
+        raise OptionError("mine")
+
+    with registered(Backend("mine", factory, "none")), pytest.raises(OptionError, match=r"^mine$"):
+        create("mine")
+
+
+@pytest.mark.parametrize("options", [3, {"max_iterations": 3}, "fast", SolverOptions], ids=repr)
+@pytest.mark.parametrize("name", ["auto", "banded"])
+def test_options_that_are_none_are_refused(name, options):
+    with pytest.raises(OptionError, match=r"options is .*; expected qpmhe\.solvers\.SolverOptions"):
+        create(name, options)
 
 
 def test_the_factory_gets_the_options():

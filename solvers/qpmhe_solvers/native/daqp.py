@@ -24,7 +24,8 @@ _WORDS = {
     -3: "unbounded", -4: "iteration limit", -5: "not convex", -6: "overdetermined start",
     -7: "time limit",
 }
-_STOPPED = (-4, -7)
+_AT_CAP = -4
+_STOPPED = (_AT_CAP, -7)
 
 
 class DaqpSolver(NativeSolver):
@@ -48,7 +49,8 @@ class DaqpSolver(NativeSolver):
             "primal_tol": options.absolute_tolerance, "dual_tol": options.absolute_tolerance
         }
         if options.max_iterations is not None:
-            settings["iter_limit"] = int(options.max_iterations)
+            # Its loop ends before the iteration of that number.
+            settings["iter_limit"] = int(options.max_iterations) + 1
         if options.time_limit is not None:
             settings["time_limit"] = options.time_limit
         handle.settings = handle.settings | settings
@@ -84,6 +86,8 @@ class DaqpSolver(NativeSolver):
             return Answer(None, None, False, False, None, _WORDS.get(flag, str(flag)))
         x, _, flag, info = handle.solve()
         count, words = int(info["iterations"]), _WORDS.get(flag, str(flag))
+        if flag == _AT_CAP:
+            count -= 1  # the one that it did not begin
         if flag != 1:
             return Answer(None, None, False, flag in _STOPPED, count, words)
         bounds = layout.size if layout.boxed else 0

@@ -1,0 +1,169 @@
+"""What is told of a backend, and the solver that comes of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from importlib import metadata
+from importlib.util import find_spec
+
+from .errors import BackendError, QpmheError, tell_unknown_options
+from .options import SolverOptions
+from .solver import Solver
+
+__all__ = ["Backend", "make_solver"]
+
+_NAME = re.compile(r"\w[\w.:+-]*")
+_MATRICES = ("banded", "csc", "dense")
+
+
+@tell_unknown_options
+@dataclass(frozen=True)
+class Backend:
+    """One QP backend and its capabilities.
+
+    Parameters
+    ----------
+    name : str
+        The name that users write: letters, digits, and any of ``_ . : + -``, the first one a
+        letter, a digit or ``_``.
+    factory : callable
+        ``factory(options)`` makes a `Solver`. Called only if the backend is available.
+    method : str
+        The kind of algorithm, in a word or two.
+    module : str or None
+        The module whose presence makes it available; None if nothing more is needed.
+    distribution : str or None
+        What ``pip install`` calls that module.
+    matrices : str
+        The view of the QP that it reads: ``banded``, ``csc`` or ``dense``.
+    inequalities : bool
+        Whether it handles bounds and rows.
+    iteration_cap : bool
+        Whether ``SolverOptions.max_iterations`` is honoured.
+    iterate_at_cap : bool
+        Whether there is an iterate to judge when the cap stops it.
+    warm_start : bool
+        Whether the start given to ``solve`` is used.
+    time_limit : bool
+        Whether ``SolverOptions.time_limit`` is honoured.
+    keeps_duals : bool
+        Whether multipliers of the last solve start the next one, moved by ``Solver.shift``.
+    tells_infeasible : bool
+        Whether its message says "infeasible" where a QP has no feasible point.
+    keeps_workspace : bool
+        Whether the solver is set up once and updated from then on, not anew for each QP.
+
+    Raises
+    ------
+    BackendError
+        If the name cannot be written as above, the factory cannot be called, or anything else
+        is of another kind than told here.
+    """
+
+    name: str
+    factory: Callable[[SolverOptions], Solver]
+    method: str
+    module: str | None = None
+    distribution: str | None = None
+    matrices: str = "dense"
+    inequalities: bool = True
+    iteration_cap: bool = False
+    iterate_at_cap: bool = False
+    warm_start: bool = False
+    time_limit: bool = False
+    keeps_duals: bool = False
+    tells_infeasible: bool = False
+    keeps_workspace: bool = False
+
+    def __post_init__(self) -> None:
+        name: object = self.name
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise BackendError(
+                f"the name of a backend is {name!r}; expected letters, digits and any of "
+                "_ . : + -, such as 'my_solver'."
+            )
+        if not callable(self.factory):
+            raise BackendError(
+                f"the factory of backend {name!r} is {self.factory!r}; expected a callable that "
+                "makes a Solver of SolverOptions: give the class itself, not an instance of it."
+            )
+        if self.matrices not in _MATRICES:
+            raise BackendError(
+                f"matrices of backend {name!r} is {self.matrices!r}; expected one of "
+                f"{', '.join(map(repr, _MATRICES))}: the view of the QP that it reads most."
+            )
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if one.type == "bool" and not isinstance(value, bool):
+                raise BackendError(
+                    f"{one.name} of backend {name!r} is {value!r}; expected True or False."
+                )
+        for what in ("method", "module", "distribution"):
+            value = getattr(self, what)
+            if not (isinstance(value, str) and value) and (what == "method" or value is not None):
+                raise BackendError(
+                    f"{what} of backend {name!r} is {value!r}; expected a text"
+                    + ("." if what == "method" else ", or None if it needs no package.")
+                )
+
+    @property
+    def available(self) -> bool:
+        """Whether its module can be found; nothing is imported to find out."""
+        if self.module is None:
+            return True
+        try:
+            return find_spec(self.module) is not None
+        except (ImportError, ValueError):  # a parent package that is missing or broken
+            return False
+
+    @property
+    def version(self) -> str:
+        """The installed version, or an empty string."""
+        try:
+            return metadata.version(self.distribution) if self.distribution else ""
+        except metadata.PackageNotFoundError:
+            return ""
+
+
+def make_solver(entry: Backend, options: SolverOptions) -> Solver:
+    """Make a solver of an entry, registered or not, whose package is there.
+
+    Parameters
+    ----------
+    entry : Backend
+        Whose factory is called.
+    options : SolverOptions
+        Limits and accuracy.
+
+    Raises
+    ------
+    BackendError
+        If the factory raises, or makes something else than a `Solver`; an error of this project
+        passes as it is.
+    """
+    try:
+        solver: object = entry.factory(options)
+    except QpmheError:
+        raise
+    except (Exception, SystemExit) as error:
+        remedy = (
+            f"reinstall {entry.distribution}, or take another backend"
+            if entry.distribution
+            else "mend the factory: factory(options) is to return a Solver"
+        )
+        raise BackendError(
+            f"backend {entry.name!r} cannot be made: {type(error).__name__}: {error}; {remedy}."
+        ) from error
+    if not isinstance(solver, Solver):
+        raise BackendError(
+            f"the factory of backend {entry.name!r} made {solver!r}; expected an instance of a "
+            "subclass of qpmhe.solvers.Solver."
+        )
+    if not isinstance(getattr(solver, "options", None), SolverOptions):
+        raise BackendError(
+            f"the solver of backend {entry.name!r} has no options; call "
+            "super().__init__(options) in its __init__."
+        )
+    return solver
