@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from rich.console import Console
 
 from ..errors import InvalidInputError, OptionError
-from ..studies.export import export as write_table
+from ..studies.errors import StudyError
 from ..studies.grid import Study
 from ..studies.runner import run
 from ..studies.store import Store
 from ..studies.study_file import WORDS
+from ..studies.table_file import export as write_table
 
 __all__ = ["compare", "export", "study"]
 
@@ -59,7 +64,7 @@ def compare(
     Raises
     ------
     QpmheError
-        If an option does not fit, or the store or cluster cannot be used.
+        If an option does not fit, the store or cluster cannot be used, or all cells failed.
     """
     _run(
         console,
@@ -103,7 +108,7 @@ def study(
     Raises
     ------
     QpmheError
-        If the file does not fit, or the store or cluster cannot be used.
+        If the file does not fit, the store or cluster cannot be used, or all cells failed.
     """
     target = file.with_suffix(".sqlite") if store is None else store
     _run(
@@ -144,14 +149,42 @@ def _run(console: Console, what: Study, store: Path, out: Path, **options: Any) 
         ) from error
     target = Store(store)
     try:
-        run(what, target, progress=console, **options)
-    except KeyboardInterrupt:
+        with _terminated_as_interrupted():
+            run(what, target, progress=console, **options)
+    except (KeyboardInterrupt, SystemExit):
         console.print(f"stopped; what was finished is in {store}: the same command goes on.")
         raise
-    failed = (target.frame()["outcome"] == "failed").sum()
-    if failed:
-        console.print(f"[yellow]{failed} cells failed; their rows tell why.[/]", highlight=False)
+    frame = target.frame()
+    cells = frame[frame["key"].isin({cell.key for cell in what.cells()})]
+    failed = cells[cells["outcome"] == "failed"]
+    if 0 < len(failed) < len(cells):
+        console.print(
+            f"[yellow]{len(failed)} of {len(cells)} cells failed; their rows tell why.[/]",
+            highlight=False,
+        )
     report(console, store, out)
+    if 0 < len(failed) == len(cells):
+        raise StudyError(
+            f"no cell of the study was finished, {len(failed)} failed; the first for this reason: "
+            f"{failed['reason'].iloc[0].rstrip('.')}. When that is put right, give the same "
+            "command with --retry-failed."
+        )
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Within the block SIGTERM ends worker processes and progress bar before this process."""
+    def leave(number: int, _frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    if threading.current_thread() is not threading.main_thread():  # signals are not for it
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _numbers(name: str, text: str) -> list[int | None]:

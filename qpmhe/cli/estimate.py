@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from ..errors import OptionError
 from ..records import Summary, estimate_record
+from ..records.errors import WriteError
 
 __all__ = ["run"]
 
@@ -60,6 +61,9 @@ def run(
     ------
     QpmheError
         If something does not fit, or the record cannot be read on.
+    SystemExit
+        With 1 if whoever read the rows has gone; with 3 if the record was estimated to its end
+        with a model that is wrong, or failed at most of the samples.
     """
     options: dict[str, Any] = {"horizon": horizon, "backend": backend, "engine": engine}
     options = {name: value for name, value in options.items() if value is not None}
@@ -71,16 +75,21 @@ def run(
         )
     if initial_state is not None:
         options["initial_state"] = _vector(initial_state)
-    mixed = out == "-" and sys.stdout.isatty()  # a bar would stand among the rows
+    # A bar would stand among the rows.
+    mixed = out == "-" and sys.stdout is not None and sys.stdout.isatty()
     bar = _Bar(console) if console.is_terminal and not (quiet or mixed) else None
     try:
         summary = estimate_record(
-            model, record, out, progress=None if bar is None else bar.show, **reading, **options
+            model, record, out, progress=None if bar is None else bar.show,
+            tell=None if quiet else lambda text: _warn(console, text), **reading, **options
         )
-    except BrokenPipeError:
-        # Whoever read the rows has had enough. Python would complain once more at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # whoever read the rows has had enough
+        _leave_standard_output()
         raise SystemExit(1) from None
+    except WriteError:
+        if out == "-":
+            _leave_standard_output()
+        raise
     except KeyboardInterrupt:
         if out != "-":
             console.print("stopped; --resume goes on.", highlight=False)
@@ -88,8 +97,24 @@ def run(
     finally:
         if bar is not None:
             bar.close()
+    most_failed = 2 * summary.failed > summary.samples + summary.inserted
+    is_broken = summary.model_is_wrong or most_failed
     if not quiet:
         _tell(console, summary, out)
+    if summary.failure and (is_broken or not quiet):
+        _warn(console, summary.failure)
+    if is_broken:
+        raise SystemExit(3)
+
+
+def _warn(console: Console, text: str) -> None:
+    console.print(f"[bold yellow]warning:[/] {escape(text)}", highlight=False, soft_wrap=True)
+
+
+def _leave_standard_output() -> None:
+    """Write nothing more there; Python would try once more at its end, and complain."""
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _tell(console: Console, summary: Summary, out: str) -> None:

@@ -33,7 +33,9 @@ def estimate(
         typer.Argument(help="Model of the zoo, package.module:function or file.py:function."),
     ],
     record: Annotated[
-        str, typer.Argument(help="CSV or Parquet file with a time column; - is standard input.")
+        str,
+        typer.Argument(help="CSV (also .gz) or Parquet file with a time column; - is standard "
+                       "input."),
     ],
     out: Annotated[
         str, typer.Option(help="What to write: .csv, .parquet, or - for standard output.")
@@ -67,7 +69,7 @@ def estimate(
         bool, typer.Option("--resume", help="Go on with a record that was cut off.")
     ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Start again where one was cut off.")
+        bool, typer.Option("--overwrite", help="Replace what is there already.")
     ] = False,
     checkpoint_every: Annotated[
         int | None, typer.Option(min=1, help="Samples from checkpoint to checkpoint; 100.")
@@ -82,8 +84,9 @@ def estimate(
         bool, typer.Option("--equal-steps", help="Insist on equal steps; rows come at once.")
     ] = False,
     max_gap: Annotated[
-        int, typer.Option(min=0, help="Most samples in a row that may be missing.")
-    ] = 1000,
+        int | None,
+        typer.Option(min=0, help="Most samples in a row that may be missing; 1000."),
+    ] = None,
     skip_repeated: Annotated[
         bool, typer.Option("--skip-repeated", help="Pass over lines whose time was there already.")
     ] = False,
@@ -92,6 +95,10 @@ def estimate(
     ] = None,
     decimal: Annotated[DecimalMark, typer.Option(help="Decimal mark.")] = DecimalMark.AUTO,
     encoding: Annotated[str, typer.Option(help="Of a CSV file.")] = "utf-8",
+    missing: Annotated[
+        list[str] | None,
+        typer.Option(metavar="WORD", help="What stands for a missing value; may be repeated."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Tell nothing but errors.")] = False,
 ) -> None:
     """Estimate the states of a measured record; in a pipe, line by line."""
@@ -102,8 +109,8 @@ def estimate(
         max_solver_iterations=max_solver_iterations, initial_state=initial_state,
         horizon=horizon, backend=backend, engine=engine, quiet=quiet, time=time,
         outputs=outputs, inputs=inputs, separator=separator, decimal=decimal.value,
-        encoding=encoding, dt=dt, time_scale=time_scale, equal_steps=equal_steps,
-        max_gap=max_gap, skip_repeated=skip_repeated, covariances=covariances.value,
-        step_time=step_time, resume=resume, overwrite=overwrite,
+        encoding=encoding, missing=missing or (), dt=dt, time_scale=time_scale,
+        equal_steps=equal_steps, max_gap=max_gap, skip_repeated=skip_repeated,
+        covariances=covariances.value, step_time=step_time, resume=resume, overwrite=overwrite,
         checkpoint_every=checkpoint_every,
     )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Set
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,18 +24,42 @@ __all__ = ["report", "show"]
 
 _MOST_ROWS = 40
 _BEST = "[bold green]{}*[/]"
-# Column of the summary, heading, words, whether less is better (None: neither), and whether it
-# is shown on narrow terminals too.
-_COLUMNS: tuple[tuple[str, str, Callable[[Any], str], bool | None, bool], ...] = (
-    ("rmse", "RMSE", number, True, True),
-    ("rmse_half", "± 95 %", number, None, False),
-    ("rmse_settled", "RMSE\nsettled", number, True, False),
-    ("cost_ratio", "J /\nconv.", number, True, True),
-    ("time_median", "median", seconds, True, True),
-    ("time_p99", "99 %", seconds, True, False),
-    ("late", "late", percent, True, False),
-    ("improved", "impr.", percent, False, True),
-    ("failed_steps", "failed\nsteps", percent, True, False),
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A column of the table: of the summary, heading, words, whether less is better."""
+
+    name: str
+    heading: str
+    words: Callable[[Any], str]
+    less: bool | None = None  # None: neither is better
+
+
+# In the order in which they stand.
+_COLUMNS = (
+    _Column("rmse", "RMSE", number, True),
+    _Column("rmse_half", "± 95 %", number),
+    _Column("rmse_settled", "RMSE\nsettled", number, True),
+    _Column("nees", "NEES", number),
+    _Column("cost_ratio", "J /\nconv.", number, True),
+    _Column("time_median", "median", seconds, True),
+    _Column("time_p95", "95 %", seconds, True),
+    _Column("time_p99", "99 %", seconds, True),
+    _Column("time_max", "max", seconds, True),
+    _Column("late", "late", percent, True),
+    _Column("improved", "impr.", percent, False),
+    _Column("kept", "kept", percent),
+    _Column("fallback", "fall-\nback", percent, True),
+    _Column("failed_steps", "failed\nsteps", percent, True),
+    _Column("cap_hits", "cap\nhits", percent),
+)
+# Those that are always shown: NEES and late are there only where they were asked for.
+_ALWAYS = ("rmse", "time_median", "late", "nees")
+# The others, in the order in which they are given the room that is left.
+_THEN = (
+    "cost_ratio", "improved", "rmse_half", "rmse_settled", "time_p99", "failed_steps", "cap_hits",
+    "fallback", "time_p95", "kept", "time_max",
 )
 
 
@@ -76,6 +101,9 @@ def report(console: Console, store_path: str | Path, out: str | Path) -> Path:
 def show(console: Console, summary: DataFrame, *, every: bool = False) -> None:
     """Print the answers and a table for each model and horizon, the best of a column marked.
 
+    What was asked for (a deadline, covariances) is always shown, further columns as there is
+    room.
+
     Parameters
     ----------
     console : rich.console.Console
@@ -91,19 +119,30 @@ def show(console: Console, summary: DataFrame, *, every: bool = False) -> None:
         console.print(f"[bold]{case.title}[/]", highlight=False)
         for answer in case.answers():
             console.print(f"  [bold]{answer.question}:[/] {answer.text}", highlight=False)
-        table = _table(case, every, wide=True)
-        unlimited = console.options.update_width(10_000)
-        if Measurement.get(console, unlimited, table).maximum > console.width:
-            table = _table(case, every, wide=False)
-        console.print(table)
+        rows = case.summary.assign(
+            rmse_half=(case.summary["rmse_high"] - case.summary["rmse_low"]) / 2
+        )
+        told = {one.name for one in _COLUMNS if rows[one.name].notna().any()}
+        chosen_ones = told & set(_ALWAYS)
+        for name in _THEN:
+            more = chosen_ones | {name}
+            if name in told and _width(console, _table(case, rows, every, more)) <= console.width:
+                chosen_ones = more
+        console.print(_table(case, rows, every, chosen_ones, told - chosen_ones))
 
 
-def _table(case: Case, every: bool, wide: bool) -> Table:
-    rows = case.summary.assign(
-        rmse_half=(case.summary["rmse_high"] - case.summary["rmse_low"]) / 2
-    )
-    columns = [one for one in _COLUMNS if (wide or one[4]) and rows[one[0]].notna().any()]
-    best = {name: _best(rows.loc[case.whole.index], name, less) for name, _, _, less, _ in columns}
+def _width(console: Console, table: Table) -> int:
+    unlimited = console.options.update_width(10_000)
+    return Measurement.get(console, unlimited, table).maximum
+
+
+def _table(
+    case: Case, rows: DataFrame, every: bool, names: Set[str], absent: Set[str] = frozenset()
+) -> Table:
+    columns = [one for one in _COLUMNS if one.name in names]
+    best = {
+        one.name: _best(rows.loc[case.whole.index], one.name, one.less) for one in columns
+    }
     drawn, caption = rows, "*: the best, of equals the fastest. front: Pareto front."
     if not every and len(rows) > _MOST_ROWS:
         drawn = rows.loc[sorted(_selection(case) | {one for one in best.values() if one >= 0})]
@@ -111,20 +150,31 @@ def _table(case: Case, every: bool, wide: bool) -> Table:
             f"{len(drawn)} of {len(rows)} configurations: the Pareto front, the best of each "
             f"column, and of each backend the fastest near its best RMSE. {caption}"
         )
+    if absent:
+        left_out = [
+            ("time " if one.name.startswith("time_") else "")
+            + one.heading.replace("-\n", "").replace("\n", " ")
+            for one in _COLUMNS if one.name in absent
+        ]
+        caption += f" No room here, but in the report: {', '.join(left_out)}."
     table = Table(
         box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), caption=caption, caption_justify="left",
     )
     starts = ["start"] if rows["start"].nunique() > 1 else []
     for head in ["backend", "QPs", "cap", *starts]:
-        table.add_column(head, no_wrap=True, justify="left" if head == "backend" else "right")
-    for _, heading, _, _, _ in columns:
-        table.add_column(heading, no_wrap=True, justify="right")
+        named = head == "backend"  # where all else does not fit, names are broken
+        table.add_column(
+            head, no_wrap=not named, overflow="fold", min_width=8 if named else None,
+            justify="left" if named else "right",
+        )
+    for one in columns:
+        table.add_column(one.heading, no_wrap=True, justify="right")
     table.add_column("failed\nruns", no_wrap=True, justify="right")
     table.add_column("", no_wrap=True)
     for index, row in drawn.sort_values(["time_median", "rmse"]).iterrows():
         cells = [
-            _BEST.format(words(row[name])) if index == best[name] else words(row[name]) + " "
-            for name, _, words, _, _ in columns
+            _BEST.format(one.words(row[one.name])) if index == best[one.name]
+            else one.words(row[one.name]) + " " for one in columns
         ]
         table.add_row(
             str(row["backend"]), qps_words(row["qps"]).replace("converged", "conv."),

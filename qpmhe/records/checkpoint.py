@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import zipfile
@@ -12,14 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InvalidInputError
-from .errors import CheckpointError
+from .errors import CheckpointError, WriteError
 
 __all__ = ["Checkpoint", "load", "save"]
 
 Array = NDArray[Any]
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class Checkpoint:
     offset : int
         Bytes of the results that belong to them.
     time : str
-        Time of the last one.
+        Time of the last one; blank before the first.
     inputs : list of float
         Its inputs.
     usual : float or None
         The usual step.
-    digest : str
-        Of all samples so far.
+    digest, written : str
+        Of all samples so far, and of the results that belong to them.
     finished : bool
         Whether the record had come to its end.
     versions : dict
@@ -60,6 +60,7 @@ class Checkpoint:
     inputs: list[float]
     usual: float | None
     digest: str
+    written: str
     finished: bool
     versions: dict[str, str]
     state: dict[str, Any]
@@ -79,7 +80,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
 
     Raises
     ------
-    InvalidInputError
+    WriteError
         If it cannot be written.
     """
     arrays: dict[str, Array] = {}
@@ -94,7 +95,9 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        raise InvalidInputError(
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise WriteError(
             f"cannot write the checkpoint {path}: {error.strerror or error}."
         ) from error
 
@@ -128,7 +131,7 @@ def load(path: Path) -> Checkpoint | None:
                 )
             content["state"] = _full(content["state"], file)
             return Checkpoint(**content)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (
         OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile

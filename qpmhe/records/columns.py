@@ -16,6 +16,9 @@ _TIMES = ("time", "t", "timestamp", "datetime", "date_time")
 # "Voltage (V)", "Voltage [V]", "Voltage / V"
 _UNIT = re.compile(r"\s*(\([^()]*\)|\[[^\[\]]*\]|/\s*\S+)$")
 
+# So many names are shown, and so much of each.
+_MOST, _LONG = 40, 60
+
 
 @dataclass(frozen=True)
 class Columns:
@@ -71,7 +74,8 @@ class Wanted:
         RecordError
             If a column is not there, or is there twice.
         OptionError
-            If an option names an output or input that the model does not have.
+            If an option names an output or input that the model does not have, or the time
+        would be one, too.
         """
         table = _Header(header, file, line)
         if self.time is not None:
@@ -82,6 +86,11 @@ class Wanted:
         inputs = self._find(table, "inputs", "u", self.inputs, self.input_columns)
         if all(position < 0 for position in outputs):
             raise OptionError("--outputs leaves all outputs out; expected a column for one.")
+        if time in (*outputs, *inputs):
+            raise OptionError(
+                f"column {header[time]!r} is taken for the time, and for an output or input as "
+                "well; give each a column of its own by --time, --outputs and --inputs."
+            )
         return Columns(time, outputs, inputs)
 
     @staticmethod
@@ -143,9 +152,15 @@ class _Header:
         raise self._missing(f"column for {what} (looked for {tried})", remedy)
 
     def _missing(self, what: str, remedy: str) -> RecordError:
-        there = ", ".join(repr(name) for name in self._names)
+        there = ", ".join(repr(_short(name)) for name in self._names[:_MOST])
+        if len(self._names) > _MOST:
+            there += f" and {len(self._names) - _MOST} more"
         return self._fail(f"there is no {what}; the columns are {there}. If it is one of them, "
                           f"{remedy}")
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= _LONG else f"{name[:_LONG]}..."
 
 
 def pairs(option: str, text: str | None, letter: str, names: tuple[str, ...]) -> dict[int, str]:

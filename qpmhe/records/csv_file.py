@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import re
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from typing import BinaryIO
 from ..errors import OptionError
 from .errors import RecordError
 from .numbers import Reader
+from .opening import BROKEN
 
 __all__ = ["CsvFile", "Row"]
 
@@ -19,6 +21,11 @@ _SEPARATORS = {"\t": "tab", ";": "semicolon", "|": "bar", ",": "comma"}
 _NAMES = {name: mark for mark, name in _SEPARATORS.items()} | {"space": " "}
 _TOLD = re.compile(r"\s*sep=(.)\s*", re.IGNORECASE)
 _WIDE = (b"\xff\xfe", b"\xfe\xff")
+# A field in quotation marks may go on over so many lines, and no further: a mark that is never
+# closed must not swallow the record, nor keep a pipe waiting.
+_LINES = 20
+# Above the header there may stand so many lines for it to be found, and named, below.
+_PREAMBLE = 50
 
 
 @dataclass(frozen=True)
@@ -111,10 +118,11 @@ class CsvFile:
                 raise RecordError("it has no header with the columns' names.", name)
             text, _ = line
         self.header_line = self._line
-        if self._separator is None:
-            counts = {mark: len(self._split(text, mark)) for mark in _SEPARATORS}
-            self._separator = next((mark for mark, count in counts.items() if count > 1), ",")
-        self.header = self._split(text, self._separator)
+        if "\r" in text:
+            raise RecordError(
+                "its lines end in CR alone; turn these into LF, as by tr '\\r' '\\n'.", name,
+            )
+        self._separator, self.header = self._told_apart(text)
         if all(_is_number(field) for field in self.header):
             raise RecordError(
                 "it begins with numbers; expected a header with the columns' names above them.",
@@ -129,16 +137,55 @@ class CsvFile:
         return f" Columns are taken to be separated by {word}; --separator says otherwise."
 
     def __iter__(self) -> Iterator[Row]:
+        assert self._separator is not None
         while (line := self._next_line()) is not None:
             text, whole = line
-            assert self._separator is not None
-            fields = self._split(text, self._separator)
+            number = self._line
+            try:
+                fields = self._split(text, self._separator)
+            except RecordError as error:
+                joined = self._joined(text) if _is_open(error) else None
+                if joined is None:
+                    raise
+                text, whole, fields = joined
             if len(fields) != len(self.header):
-                fields = self._fitted(text, fields, whole)
-            yield Row(self._line, fields, whole)
+                fields = self._fitted(text, fields, whole, number)
+            yield Row(number, fields, whole)
 
-    def _next_line(self) -> tuple[str, bool] | None:
-        """The next line that is not blank, and whether it was ended."""
+    def later_headers(self) -> Iterator[tuple[int, list[str]]]:
+        """Fields of the next lines, where the first one turned out not to be the header."""
+        for _ in range(_PREAMBLE):
+            try:
+                line = self._next_line()
+                if line is None:
+                    return
+                fields = self._told_apart(line[0])[1]
+            except RecordError:
+                continue
+            yield self._line, fields
+
+    def _joined(self, text: str) -> tuple[str, bool, list[str]] | None:
+        """A line with the next ones, up to where its quotation marks are closed."""
+        assert self._separator is not None
+        for _ in range(_LINES):
+            line = self._next_line(blank=True)
+            if line is None:
+                return None
+            text = f"{text}\n{line[0]}"
+            with contextlib.suppress(csv.Error):
+                return text, line[1], self._parsed(text, self._separator)
+        return None
+
+    def _told_apart(self, text: str) -> tuple[str, list[str]]:
+        """The separator of a line of names, and these."""
+        for mark in _SEPARATORS if self._separator is None else (self._separator,):
+            names = self._split(text, mark)
+            if len(names) > 1:
+                return mark, names
+        return self._separator or ",", self._split(text, self._separator or ",")
+
+    def _next_line(self, blank: bool = False) -> tuple[str, bool] | None:
+        """The next line (that is not blank, or any), and whether it was ended."""
         while raw := self._read():
             self._line += 1
             self.position += len(raw)
@@ -154,31 +201,35 @@ class CsvFile:
                     "record as UTF-8, or give --encoding (cp1252 is usual in Western Europe).",
                     self._name, self._line,
                 ) from None
-            if text.strip():
+            if blank or text.strip():
                 return text.rstrip("\r\n"), text.endswith(("\n", "\r"))
         return None
 
     def _read(self) -> bytes:
         try:
             return self._stream.readline()
-        except OSError as error:
+        except BROKEN as error:
             raise RecordError(
-                f"cannot be read on ({error.strerror or error}).", self._name, self._line + 1
+                f"cannot be read on ({getattr(error, 'strerror', None) or error}).",
+                self._name, self._line + 1,
             ) from error
 
     def _split(self, text: str, separator: str) -> list[str]:
         if '"' not in text:
             return text.split(separator)
         try:
-            # Line by line: one mark that is never closed must not swallow the record.
-            return next(csv.reader([text], delimiter=separator, strict=True))
+            return self._parsed(text, separator)
         except csv.Error as error:
             raise RecordError(
-                f"its quotation marks do not fit ({error}); close each within its line.",
+                f"its quotation marks do not fit ({error}); close each that is open.",
                 self._name, self._line,
-            ) from None
+            ) from error
 
-    def _fitted(self, text: str, fields: list[str], whole: bool) -> list[str]:
+    @staticmethod
+    def _parsed(text: str, separator: str) -> list[str]:
+        return next(csv.reader([text], delimiter=separator, strict=True))
+
+    def _fitted(self, text: str, fields: list[str], whole: bool, line: int) -> list[str]:
         """The fields of a line that has more or fewer than the header."""
         width, found = len(self.header), len(fields)
         if found > width and not any(field.strip() for field in fields[width:]):
@@ -186,7 +237,7 @@ class CsvFile:
         if not whole and found < width:
             raise RecordError(
                 f"the last line is cut off: it has {found} of {width} fields and no end. "
-                "Complete or delete it.", self._name, self._line,
+                "Complete or delete it.", self._name, line,
             )
         what = f"it has {found} field{'s' if found > 1 else ''}, and the header {width}; "
         assert self._separator is not None
@@ -195,15 +246,22 @@ class CsvFile:
                 usual = _SEPARATORS.get(self._separator, repr(self._separator))
                 raise RecordError(
                     f"{what}this line is separated by {word}, the header by {usual}. Separate "
-                    "all lines alike.", self._name, self._line,
+                    "all lines alike.", self._name, line,
                 )
         remedy = "mend the line."
+        if text.lstrip().startswith(("#", "//", "%")):
+            remedy = "comments are not understood; delete such lines."
         if self._separator == "," and found > width:
             remedy = (
                 "mend the line; numbers with decimal commas need quotation marks or another "
                 "separator."
             )
-        raise RecordError(what + remedy, self._name, self._line)
+        raise RecordError(what + remedy, self._name, line)
+
+
+def _is_open(error: RecordError) -> bool:
+    """Whether a field in quotation marks has not come to its end."""
+    return "unexpected end" in str(error.__cause__)
 
 
 def _is_number(field: str) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ..errors import InvalidInputError, QpmheError
 
-__all__ = ["CheckpointError", "RecordError"]
+__all__ = ["CheckpointError", "RecordError", "WriteError"]
 
 
 class RecordError(InvalidInputError):
@@ -35,3 +35,7 @@ class RecordError(InvalidInputError):
 
 class CheckpointError(QpmheError):
     """A checkpoint that is damaged, or does not belong to what is to go on from it."""
+
+
+class WriteError(InvalidInputError):
+    """Results or a checkpoint that cannot be written; what was written before stays."""

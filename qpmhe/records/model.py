@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
-import traceback
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from ..observers import Observer
 from ..studies.errors import StudyError
 from ..studies.sources import Source, _arguments, _function, find
 from ..system import System
+from .places import place
 
 __all__ = ["RecordModel", "load_model"]
 
@@ -47,6 +49,8 @@ class RecordModel:
         Usual step, if the model tells.
     identity : dict
         What a checkpoint must have been made with.
+    file : Path or None
+        Where the model is written down; None for one of the catalogue.
     """
 
     estimator: MovingHorizonEstimator
@@ -55,6 +59,7 @@ class RecordModel:
     inputs: tuple[str, ...]
     dt: float | None
     identity: dict[str, Any]
+    file: Path | None
 
 
 def load_model(text: str, **options: Any) -> RecordModel:
@@ -77,8 +82,14 @@ def load_model(text: str, **options: Any) -> RecordModel:
         If an option is missing or unknown.
     """
     source = find(text)
+    with _neighbours(source):
+        return _loaded(source, options)
+
+
+def _loaded(source: Source, options: dict[str, Any]) -> RecordModel:
     name = source.name
     parts, given = _parts(source)
+    file = _file(source)
     names = {kind: given.pop(kind, None) for kind in _NAMES}
     dt = given.pop("dt", None)
     for key in given:
@@ -97,7 +108,9 @@ def load_model(text: str, **options: Any) -> RecordModel:
     try:
         estimator = MovingHorizonEstimator(*parts, **chosen)
     except QpmheError as error:
-        raise StudyError(f"model {name!r} makes no estimator: {error}") from error
+        raise StudyError(
+            f"{place(error, file)}model {name!r} makes no estimator: {error}"
+        ) from error
     system = estimator.system
     return RecordModel(
         estimator,
@@ -106,14 +119,44 @@ def load_model(text: str, **options: Any) -> RecordModel:
         _named(name, "inputs", names["inputs"], "u", system.m),
         dt,
         {
-            "model": source.where.rpartition(":")[2] if source.fingerprint else source.where,
+            # A file may be moved; its digest tells it.
+            "model": source.where.rpartition(":")[2] if _is_file(source) else source.where,
             "arguments": source.arguments,
             "file": source.fingerprint,
             "engine at work": estimator.engine,
             "initial_state": estimator.initial_state.tolist(),
             **{key: _plain(value) for key, value in vars(estimator.settings).items()},
         },
+        file,
     )
+
+
+@contextlib.contextmanager
+def _neighbours(source: Source) -> Iterator[None]:
+    """Let a file import those beside it, as it can when Python runs it."""
+    if not _is_file(source):
+        yield
+        return
+    folder = str(Path(source.where.rpartition(":")[0]).parent)
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ValueError):  # the model may have put the path in order
+            sys.path.remove(folder)
+
+
+def _is_file(source: Source) -> bool:
+    return source.where.rpartition(":")[0].endswith(".py")
+
+
+def _file(source: Source) -> Path | None:
+    """Where a model is written down, as far as it is known; None for the catalogue."""
+    module = source.where.rpartition(":")[0]
+    if _is_file(source):
+        return Path(module)
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return Path(file) if file else None
 
 
 def _parts(source: Source) -> tuple[tuple[Any, ...], dict[str, Any]]:
@@ -156,29 +199,20 @@ def _made(source: Source) -> Any:
     except StudyError as error:
         if error.__cause__ is None:
             raise
-        place = _place(error.__cause__, source)
-        raise StudyError(f"{place}{error}") from error.__cause__
+        raise StudyError(
+            f"{place(error.__cause__, _file(source))}{error}"
+        ) from error.__cause__
     except SystemExit as error:
         raise StudyError(
-            f"{_place(error, source)}model {source.name!r} ends the program; put what is not the "
-            "model behind if __name__ == '__main__'."
+            f"{place(error, _file(source))}model {source.name!r} ends the program; put what is not "
+            "the model behind if __name__ == '__main__'."
         ) from error
     except Exception as error:
         kind = "" if isinstance(error, QpmheError) else f"{type(error).__name__}: "
         said = str(error).rstrip(".")
         raise StudyError(
-            f"{_place(error, source)}model {source.name!r} cannot be made: {kind}{said}."
+            f"{place(error, _file(source))}model {source.name!r} cannot be made: {kind}{said}."
         ) from error
-
-
-def _place(error: BaseException, source: Source) -> str:
-    """File and line of the user's own code where an error arose."""
-    if isinstance(error, SyntaxError) and error.filename and error.lineno:
-        return f"{error.filename}, line {error.lineno}: "
-    file = Path(source.where.rpartition(":")[0])
-    frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if source.fingerprint and Path(frame.filename) == file]
-    return f"{own[-1].filename}, line {own[-1].lineno}: " if own else ""
 
 
 def _named(model: str, kind: str, names: Any, letter: str, size: int) -> tuple[str, ...]:

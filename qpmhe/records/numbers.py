@@ -3,29 +3,15 @@
 from __future__ import annotations
 
 import math
-from datetime import datetime
+from collections.abc import Sequence
 
-__all__ = ["MISSING", "Reader", "Time", "spacing"]
+from ..errors import OptionError
+from .times import Time, date, whole_number
+
+__all__ = ["MISSING", "Reader"]
 
 #: Words for a value that is missing, in lower case.
-MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none"})
-
-Time = float | datetime
-
-
-def spacing(before: Time, after: Time) -> float:
-    """Time from one stamp to a later one: a difference, or seconds between two dates.
-
-    Parameters
-    ----------
-    before, after : float or datetime
-        Of one kind.
-    """
-    if isinstance(before, datetime) and isinstance(after, datetime):
-        return (after - before).total_seconds()
-    assert not isinstance(before, datetime)
-    assert not isinstance(after, datetime)
-    return after - before
+MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "null", "none"})
 
 
 class Reader:
@@ -35,10 +21,23 @@ class Reader:
     ----------
     mark : {"auto", ".", ","}
         Decimal mark; ``auto`` is the first one that occurs.
+    missing : sequence of str
+        More words for a value that is missing, or numbers that stand for it.
+
+    Raises
+    ------
+    OptionError
+        If such a word is blank.
     """
 
-    def __init__(self, mark: str = "auto") -> None:
+    def __init__(self, mark: str = "auto", missing: Sequence[str] = ()) -> None:
         self._mark = "" if mark == "auto" else mark
+        own = [str(word).strip().lower() for word in missing]
+        if not all(own):
+            raise OptionError("--missing is blank; expected a word. Blank fields are missing.")
+        self._missing = MISSING | frozenset(own)
+        # -999 is also written -999.0.
+        self._markers = frozenset(value for value in map(_value, own) if value is not None)
 
     def plain(self, field: str) -> str:
         """A field without blanks around it, its decimal mark a point.
@@ -73,8 +72,12 @@ class Reader:
             If it is no number.
         """
         text = field.strip()
-        if text.lower() in MISSING:
+        if text.lower() in self._missing:
             return math.nan
+        value = self._parsed(text)
+        return math.nan if value in self._markers else value
+
+    def _parsed(self, text: str) -> float:
         if "_" in text:  # Python's own way of writing, and nobody else's
             raise ValueError("is not a number")
         text = self.plain(text)
@@ -94,14 +97,24 @@ class Reader:
         text = field.strip()
         if text.lower() in MISSING:
             raise ValueError("is blank; every line needs its time")
+        whole = whole_number(text)
+        if whole is not None:
+            return whole, text
         try:
-            value = self.number(text)
+            value = self._parsed(text)
         except ValueError:
             try:
-                return datetime.fromisoformat(text), text
+                return date(text), text
             except ValueError:
                 pass
             raise
         if not math.isfinite(value):
             raise ValueError("is not finite")
         return value, self.plain(text)
+
+
+def _value(word: str) -> float | None:
+    try:
+        return float(word)
+    except ValueError:
+        return None

@@ -9,6 +9,7 @@ from typing import Any
 from ..studies.errors import need
 from .csv_file import Row
 from .errors import RecordError
+from .parquet_times import is_kept, timestamp_texts
 
 __all__ = ["ParquetFile"]
 
@@ -33,6 +34,8 @@ class ParquetFile:
         They stand in no line.
     position, total : int
         Rows read so far, and in all.
+    types : list of pyarrow.DataType or None
+        Types of the columns, None where results cannot have times of them.
 
     Raises
     ------
@@ -58,6 +61,7 @@ class ParquetFile:
             )
         schema = self._file.schema_arrow
         self.header: list[str] = list(schema.names)
+        self.types: list[Any] = [kind if is_kept(kind) else None for kind in schema.types]
         self.position, self.total = 0, int(self._file.metadata.num_rows)
 
     def __iter__(self) -> Iterator[Row]:
@@ -65,7 +69,7 @@ class ParquetFile:
         while True:
             try:
                 batch = next(batches)
-                columns = [column.to_pylist() for column in batch.columns]
+                columns = [_texts(column) for column in batch.columns]
             except StopIteration:
                 return
             except (*self._broken, ValueError) as error:
@@ -75,17 +79,25 @@ class ParquetFile:
                 ) from error
             for values in zip(*columns, strict=True):
                 self.position += 1
-                yield Row(self.position, [_text(value) for value in values], True)
+                yield Row(self.position, list(values), True)
 
     def close(self) -> None:
         """Let go of the file."""
         self._file.close()
 
 
+def _texts(column: Any) -> list[str]:
+    if hasattr(column.type, "unit") and hasattr(column.type, "tz"):
+        return timestamp_texts(column)
+    return [_text(value) for value in column.to_pylist()]
+
+
 def _text(value: Any) -> str:
     """A value as a CSV file would have it; floats keep all their digits."""
     if value is None:
         return ""
+    if isinstance(value, bool):
+        return str(int(value))
     if hasattr(value, "isoformat"):
         return str(value.isoformat())
     return repr(value) if isinstance(value, float) else str(value)

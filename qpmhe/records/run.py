@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from .._checks import count
-from ..errors import OptionError
-from .checkpoint import Checkpoint, load
+from .checkpoint import Checkpoint
 from .columns import Wanted
 from .errors import CheckpointError
+from .failures import Failures
 from .model import load_model
+from .ownership import insist_on_two_files, may_write
 from .results import Results
 from .samples import Record
 from .session import Session
@@ -37,10 +38,11 @@ def estimate_record(
     separator: str | None = None,
     decimal: str = "auto",
     encoding: str = "utf-8",
+    missing: Sequence[str] = (),
     dt: float | None = None,
     time_scale: float = 1.0,
     equal_steps: bool = False,
-    max_gap: int = 1000,
+    max_gap: int | None = None,
     skip_repeated: bool = False,
     covariances: str = "none",
     step_time: bool = True,
@@ -49,6 +51,7 @@ def estimate_record(
     checkpoint_every: int | None = None,
     checkpoint_seconds: float = 1.0,
     progress: Callable[[int, int | None], None] | None = None,
+    tell: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Summary:
     """Estimate the states of a measured record, and write them down sample by sample.
@@ -64,23 +67,26 @@ def estimate_record(
         Name of the catalogue, ``package.module:function`` or ``path/file.py:function``; see
         `qpmhe.records.model.load_model`.
     record : str or Path
-        CSV or Parquet file with a header; ``-`` is standard input.
+        CSV (or gzip of it) or Parquet file with a header; ``-`` is standard input.
     out : str or Path
-        File in .csv or .parquet; ``-`` is standard output.
+        File in .csv or .parquet, which must not be there yet; ``-`` is standard output.
     time : str, optional
         Column of the time, numbers or ISO dates (which count in seconds).
     outputs, inputs : str, optional
         Columns of y and u, as ``y1=column,y2=column``, or columns in order.
     separator, decimal, encoding : str, optional
         How a CSV file is written, where it cannot be told from the file.
+    missing : sequence of str
+        Words (or numbers) that stand for a missing value, besides the usual ones.
     dt : float, optional
         Usual step of a discrete-time model, in its unit of time.
     time_scale : float
         The record's unit of time in the model's.
     equal_steps : bool
         Insist on equal steps also where the model takes any.
-    max_gap : int
-        Most samples without measurement in a row.
+    max_gap : int, optional
+        Most samples without measurement in a row. If left out, 1000, and a record that
+        consists of gaps of one size is refused: its unit of time is another.
     skip_repeated : bool
         Pass over lines whose time is that of the line before.
     covariances : {"none", "std", "full"}
@@ -90,7 +96,7 @@ def estimate_record(
     resume : bool
         Go on where the checkpoint beside ``out`` stands, if there is one.
     overwrite : bool
-        Start again even if there is a checkpoint of a record that was cut off.
+        Replace what is there, whatever it is.
     checkpoint_every : int, optional
         Samples from checkpoint to checkpoint, 100 if left out. A solver forgets its warm
         start there, so the number belongs to the last bits of the results.
@@ -98,6 +104,8 @@ def estimate_record(
         Least time from one that is written to the disk to the next.
     progress : callable, optional
         Called after each sample with bytes (or rows) read and their total, if it is known.
+    tell : callable, optional
+        Called with a text when the model fails for the first time; the run goes on.
     **options
         Options of `qpmhe.MovingHorizonEstimator` that replace the model's own.
 
@@ -112,20 +120,16 @@ def estimate_record(
         If the record cannot be read or read on; the rows before stay, and can be resumed.
     CheckpointError
         If the checkpoint does not fit.
+    WriteError
+        If results cannot be written, as on a full disk; the rows before stay.
     InvalidInputError
-        If model, options or files do not fit; nothing has been written then.
+        If model, options or files do not fit, or a file is there already; nothing has been
+        written then.
     """
     sink = Sink(out)
-    _insist_on_two_files(record, out, sink)
-    if sink.checkpoint is None and resume:
-        raise OptionError("--resume needs a file: give --out a name in .csv or .parquet.")
-    found = None if sink.checkpoint is None or overwrite else load(sink.checkpoint)
-    if found is not None and not resume and not found.finished:
-        raise CheckpointError(
-            f"{sink.name} holds an estimation that was cut off after {found.samples} samples; go "
-            "on by --resume, or start again by --overwrite."
-        )
-    every = _every(checkpoint_every, found if resume else None)
+    insist_on_two_files(record, sink)
+    found = may_write(sink, resume, overwrite)
+    every = _every(checkpoint_every, found)
     with contextlib.ExitStack() as stack:
         if sink.path is None:
             # A model that prints must not print among the rows.
@@ -139,18 +143,21 @@ def estimate_record(
         wanted = Wanted(made.outputs, made.inputs, time, outputs, inputs)
         source = Record(
             record, wanted, separator=separator, decimal=decimal, encoding=encoding,
+            missing=(missing,) if isinstance(missing, str) else missing,
             skip_repeated=skip_repeated,
         )
         stack.callback(source.close)
         stack.callback(sink.close)
         timing = {
-            "dt": dt, "time_scale": time_scale, "equal_steps": equal_steps, "max_gap": max_gap,
+            "dt": dt, "time_scale": time_scale, "equal_steps": equal_steps,
+            "max_gap": steps.most,
         }
         session = Session(
-            made.estimator, results, steps, source, sink, identity=made.identity | timing,
-            every=every, seconds=checkpoint_seconds,
+            made.estimator, results, steps, source, sink,
+            Failures(made.estimator.system, made.estimator.horizon, made.file),
+            identity=made.identity | timing, every=every, seconds=checkpoint_seconds, tell=tell,
         )
-        return session.run(found if resume else None, progress)
+        return session.run(found, progress)
 
 
 def _every(given: int | None, found: Checkpoint | None) -> int:
@@ -163,10 +170,3 @@ def _every(given: int | None, found: Checkpoint | None) -> int:
             "the option out."
         )
     return found.every
-
-
-def _insist_on_two_files(record: str | Path, out: str | Path, sink: Sink) -> None:
-    if sink.path is None or str(record) == "-":
-        return
-    if Path(record).resolve() in (Path(out).resolve(), sink.path.resolve()):
-        raise OptionError(f"--out would overwrite the record itself, {record}; name another file.")

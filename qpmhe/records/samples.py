@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from .columns import Columns, Wanted
 from .csv_file import CsvFile, Row
 from .errors import RecordError
-from .numbers import Reader, Time
+from .numbers import Reader
+from .opening import open_file, open_standard_input
 from .parquet_file import ParquetFile
+from .times import Time, alike
 
 __all__ = ["Record", "Sample"]
 
@@ -30,7 +32,7 @@ class Sample:
     ----------
     line : int
         Its line; 0 if it is not of this record.
-    time : float or datetime
+    time : int, float or Stamp
         Its time.
     text : str
         Its time as results have it.
@@ -59,7 +61,7 @@ class Record:
         The file; ``-`` is standard input, in CSV.
     wanted : Wanted
         The columns to look for.
-    separator, decimal, encoding
+    separator, decimal, encoding, missing
         Of `CsvFile` and `Reader`.
     skip_repeated : bool
         Pass over samples whose time is that of the one before.
@@ -74,6 +76,12 @@ class Record:
         Blank inputs so far that were replaced by the last value.
     repeated : int
         Samples so far that were passed over.
+    blank : int
+        Rows at the end that have nothing in them.
+    cut : int or None
+        The last line, if it has no end.
+    time_type : pyarrow.DataType or None
+        Type of the times in a Parquet file.
 
     Raises
     ------
@@ -91,14 +99,16 @@ class Record:
         separator: str | None = None,
         decimal: str = "auto",
         encoding: str = "utf-8",
+        missing: Sequence[str] = (),
         skip_repeated: bool = False,
     ) -> None:
         self.is_stream = str(path) == "-"
         self.name = "standard input" if self.is_stream else str(path)
         self.total: int | None = None
-        self.held = self.repeated = 0
+        self.held = self.repeated = self.blank = 0
+        self.cut: int | None = None
         self._skip_repeated = skip_repeated
-        self._reader = Reader(decimal)
+        self._reader = Reader(decimal, missing)
         self._closing = contextlib.ExitStack()
         try:
             self._table = self._open(Path(path), separator, encoding)
@@ -109,29 +119,44 @@ class Record:
 
     def _open(self, path: Path, separator: str | None, encoding: str) -> CsvFile | ParquetFile:
         if self.is_stream:
-            return CsvFile(sys.stdin.buffer, self.name, separator, encoding)
-        try:
-            stream = self._closing.enter_context(path.open("rb"))
-            self.total = path.stat().st_size
-        except OSError as error:
-            raise RecordError(f"cannot be read ({error.strerror or error}).", self.name) from error
-        if path.suffix.lower() in (".parquet", ".pq"):
+            opened = open_standard_input(self.name)
+            return CsvFile(opened.stream, self.name, separator, encoding)
+        opened = open_file(path, self.name)
+        self._closing.callback(opened.close)
+        self.total = opened.total
+        if opened.is_parquet:
             table = ParquetFile(path, self.name)
             self._closing.callback(table.close)
             self.total = table.total
             return table
-        return CsvFile(stream, self.name, separator, encoding)
+        return CsvFile(opened.stream, self.name, separator, encoding)
 
     def _find(self, wanted: Wanted) -> Columns:
         table = self._table
         try:
             return wanted.find(table.header, self.name, table.header_line)
         except RecordError as error:
-            if not table.hint:
+            if isinstance(table, ParquetFile):
                 raise
-            message = str(error) + table.hint
-            error.args = (message,)
+            error.args = (f"{error}{table.hint}{self._above(table, wanted)}",)
             raise
+
+    def _above(self, table: CsvFile, wanted: Wanted) -> str:
+        """What to add where lines stand above the header."""
+        if not self.is_stream:  # a pipe would keep waiting
+            for line, fields in table.later_headers():
+                with contextlib.suppress(RecordError):
+                    wanted.find(fields, self.name, line)
+                    return f" Line {line} looks like the header; delete the lines above it."
+        if table.header[0].lstrip().startswith(("#", "//", "%")):
+            return " Comments and other lines above the header are not understood; delete them."
+        return ""
+
+    @property
+    def time_type(self) -> Any:
+        """Type of the times in a Parquet file."""
+        table = self._table
+        return table.types[self._columns.time] if isinstance(table, ParquetFile) else None
 
     @property
     def position(self) -> int:
@@ -156,6 +181,17 @@ class Record:
         """
         return RecordError(what, self.name, line, column, self._table.unit)
 
+    def place(self, sample: Sample) -> str:
+        """What texts call a sample of this record.
+
+        Parameters
+        ----------
+        sample : Sample
+            The sample.
+        """
+        line = f"{self.name}, {self._table.unit} {sample.line}" if sample.line else self.name
+        return f"{line} (time {sample.text})"
+
     def samples(self, held: Array | None = None) -> Iterator[Sample]:
         """The samples, in the order of their times.
 
@@ -170,7 +206,16 @@ class Record:
             At the first sample that cannot be used.
         """
         before: Sample | None = None
+        blank: Row | None = None
         for row in self._table:
+            if not any(field.strip() for field in row.fields):
+                blank, self.blank = blank or row, self.blank + 1
+                continue
+            if blank is not None:
+                raise self.fail(
+                    "the line is blank, and others are behind it; delete it.", blank.line
+                )
+            self.cut = None if row.whole else row.line
             sample = self._sample(row, before, held)
             if sample is None:
                 self.repeated += 1
@@ -223,15 +268,14 @@ class Record:
     def _insist_on_order(self, row: Row, time: Time, before: Sample) -> None:
         column = self._table.header[self._columns.time]
         unit = self._table.unit
-        try:
-            if time > before.time:  # type: ignore[operator]  # of one kind, or it raises
-                return
-            equal = time == before.time
-        except TypeError:
+        if not alike(time, before.time):
             raise self.fail(
                 f"its time cannot be compared with that of {unit} {before.line}; write all as "
                 "numbers, or all as dates with or all without a zone.", row.line, column,
-            ) from None
+            )
+        if time > before.time:  # type: ignore[operator]
+            return
+        equal = time == before.time
         shown = row.fields[self._columns.time].strip()
         if equal:
             raise self.fail(

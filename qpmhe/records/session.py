@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
-import platform
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import chain
-from time import monotonic
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import __version__
-from ..errors import InvalidInputError
 from ..estimate import Estimate, Status
 from ..estimator import MovingHorizonEstimator
-from .checkpoint import Checkpoint, save
-from .errors import CheckpointError, RecordError
-from .numbers import Reader, spacing
+from .checkpoint import Checkpoint
+from .errors import RecordError, WriteError
+from .failures import Failures
+from .keeper import Keeper, versions
 from .results import Results
+from .resuming import known_sample, remaining
 from .samples import Record, Sample
 from .sink import Sink
-from .steps import Step, Steps
+from .steps import OnlyGapsError, Step, Steps
 from .summary import Summary
+from .times import spacing
 
 __all__ = ["Session"]
 
@@ -39,7 +37,7 @@ class Session:
     ----------
     estimator : MovingHorizonEstimator
         Before its first measurement.
-    results, steps, record, sink
+    results, steps, record, sink, failures
         The parts.
     identity : dict
         What a checkpoint must have been made with.
@@ -47,6 +45,8 @@ class Session:
         Samples from checkpoint to checkpoint.
     seconds : float
         Least time from one that is written to the disk to the next.
+    tell : callable, optional
+        Called with what should be known at once.
     """
 
     def __init__(
@@ -56,22 +56,20 @@ class Session:
         steps: Steps,
         record: Record,
         sink: Sink,
+        failures: Failures,
         *,
         identity: dict[str, Any],
         every: int,
         seconds: float,
+        tell: Callable[[str], None] | None = None,
     ) -> None:
         self._mhe, self._results, self._steps = estimator, results, steps
-        self._record, self._sink = record, sink
-        self._identity, self._every, self._seconds = identity, every, seconds
+        self._record, self._sink, self._failures = record, sink, failures
+        self._keeper = Keeper(sink, identity, every, seconds)
+        self._tell = tell
         self._summary = Summary()
         self._taken = 0  # samples, with those of former runs
         self._inserted = 0  # since the last row
-        self._segment = bytearray()  # of the samples since the last checkpoint
-        self._digest = ""
-        self._newest: Checkpoint | None = None
-        self._written_at = monotonic()
-        self._is_written = True
 
     def run(
         self, found: Checkpoint | None, progress: Callable[[int, int | None], None] | None
@@ -85,41 +83,69 @@ class Session:
         progress : callable or None
             Called after each sample with what was read and its total.
         """
-        record, sink = self._record, self._sink
-        before = None if found is None else self._restore(found)
-        samples = record.samples(before.u if before is not None and record.is_stream else None)
-        if found is not None and before is not None:
-            if record.is_stream:
-                self._digest = found.digest
-                samples = self._behind(samples, before, found)
-            else:
-                self._skip_known(samples, found)
-        if found is None and sink.checkpoint is not None:
-            sink.checkpoint.unlink(missing_ok=True)
-        sink.begin(self._results.header, None if found is None else found.offset)
+        record, sink, keeper = self._record, self._sink, self._keeper
+        before: Sample | None = None
+        if found is None:
+            samples = record.samples()
+            sink.begin(self._results.header, keeper.begin if sink.checkpoint else None)
+        else:
+            before = self._restore(found)
+            samples = remaining(found, before, record, sink, keeper)
+            sink.go_on(self._results.header, found.offset, found.written)
         try:
             self._take_all(samples, before, progress)
-        except RecordError as error:
-            self._keep()
-            if sink.path is not None and self._taken:
-                error.args = (
-                    f"{error} The {self._taken} samples before are in {sink.name}; with the "
-                    "record mended, --resume goes on.",
-                )
+            self._insist_on_samples()
+            keeper.finish()
+        except (RecordError, WriteError) as error:
+            with contextlib.suppress(WriteError):  # the one before is good, too
+                keeper.keep()
+            error.args = (f"{error}{self._how_to_go_on(error)}",)
             raise
         except BaseException:
-            self._keep()
+            with contextlib.suppress(WriteError):
+                keeper.keep()
             raise
+        sink.finish(record.time_type)
+        return self._finished()
+
+    def _how_to_go_on(self, error: RecordError | WriteError) -> str:
+        """What to add to an error that stopped the run."""
+        if self._sink.checkpoint is None or not self._taken:
+            return ""
+        there = f" The {self._taken} samples before are in {self._sink.name}; "
+        if isinstance(error, WriteError):
+            return f"{there}when there is room again, --resume goes on."
+        if isinstance(error.__cause__, OnlyGapsError):
+            return f"{there}start again by --overwrite."
+        return f"{there}with the record mended, --resume goes on."
+
+    def _insist_on_samples(self) -> None:
         if not self._taken:
             raise RecordError(
-                "it has a header and no samples; expected a line for each.", record.name
+                "it has a header and no samples; expected a line for each.", self._record.name
             )
-        if self._newest is not None:
-            self._newest, self._is_written = replace(self._newest, finished=True), False
-            self._keep()
-        sink.finish()
-        self._summary.held, self._summary.repeated = record.held, record.repeated
-        return self._summary
+        try:
+            self._steps.finish()
+        except OnlyGapsError as error:
+            raise self._record.fail(f"{error}.", None) from error
+
+    def _finished(self) -> Summary:
+        record, summary, failures = self._record, self._summary, self._failures
+        summary.held, summary.repeated = record.held, record.repeated
+        summary.failed, summary.stale = failures.failed, failures.stale
+        summary.failure = failures.told(summary.samples + summary.inserted)
+        summary.model_is_wrong = failures.is_mistake
+        if record.cut is not None:
+            summary.notes.append(
+                f"the last line of {record.name}, {record.cut}, has no end of line and may be cut "
+                "off: its numbers were taken as they stand. If more comes, --resume reads it again."
+            )
+        if record.blank:
+            summary.notes.append(
+                f"{record.blank} rows without any value at the end of {record.name} were passed "
+                "over."
+            )
+        return summary
 
     def _take_all(
         self, samples: Iterator[Sample], before: Sample | None,
@@ -153,16 +179,25 @@ class Session:
             self._advance(replace(pending, whole=False), None)
 
     def _step(self, before: Sample, after: Sample) -> Step:
-        magnitude = after.time if isinstance(after.time, float) else 0.0
+        magnitude = abs(after.time) if isinstance(after.time, float) else 0.0
         try:
-            return self._steps.between(spacing(before.time, after.time), abs(magnitude))
+            return self._steps.between(spacing(before.time, after.time), magnitude)
         except ValueError as error:
-            raise self._record.fail(f"{error}.", after.line) from None
+            raise self._record.fail(f"{error}.", after.line) from error
 
     def _update(
         self, y: NDArray[np.float64] | None, sample: Sample, length: float | None
     ) -> Estimate:
-        return self._mhe.update(y, sample.u if sample.u.size else None, dt=length)
+        estimate = self._mhe.update(y, sample.u if sample.u.size else None, dt=length)
+        failures = self._failures
+        if failures.note(estimate, sample.u, length):
+            failures.where = self._record.place(sample)
+            if self._tell is not None:
+                self._tell(
+                    f"the model failed at {failures.reason} The run goes on; the status marks "
+                    "such rows."
+                )
+        return estimate
 
     def _advance(self, sample: Sample, length: float | None) -> None:
         """Take a sample in, and write its row."""
@@ -173,111 +208,28 @@ class Session:
         summary.samples += 1
         summary.improved += estimate.improved
         summary.incomplete += Status.MISSING in estimate.status
-        self._remember(sample)
-        if self._taken % self._every == 0:
+        self._keeper.remember(sample)
+        if self._taken % self._keeper.every == 0:
             self._check(sample)
 
-    def _remember(self, sample: Sample) -> None:
-        self._segment += sample.text.encode() + b"\n" + sample.y.tobytes() + sample.u.tobytes()
-
-    def _close_segment(self) -> None:
-        self._digest = hashlib.sha256(self._digest.encode() + self._segment).hexdigest()
-        self._segment.clear()
-
     def _check(self, sample: Sample) -> None:
-        """Take a checkpoint, and write it if the last one is old enough."""
-        self._close_segment()
+        """Take a checkpoint where what was taken in is sure to be right."""
+        self._keeper.close_segment()
         # Also where nothing is kept: the solver forgets its warm start at the same samples.
         state = self._mhe.state_dict()
-        if self._sink.checkpoint is None or not sample.whole:
-            return
-        self._newest = Checkpoint(
-            self._identity, self._every, self._taken, self._sink.offset, sample.text,
-            sample.u.tolist(), self._steps.usual, self._digest, False, _versions(), state,
-        )
-        self._is_written = False
-        if monotonic() - self._written_at >= self._seconds:
-            self._keep()
+        if self._sink.checkpoint is not None and sample.whole and self._steps.settled:
+            self._keeper.take(sample, self._taken, self._steps.usual, state)
 
-    def _keep(self) -> None:
-        """Write the newest checkpoint, if that is not done."""
-        if self._newest is None or self._is_written:
-            return
-        assert self._sink.checkpoint is not None
-        self._sink.sync()
-        save(self._sink.checkpoint, self._newest)
-        self._is_written, self._written_at = True, monotonic()
-
-    def _restore(self, found: Checkpoint) -> Sample:
+    def _restore(self, found: Checkpoint) -> Sample | None:
         """Take a checkpoint over; the last sample that it knows."""
-        differing = [
-            f"{key} {found.identity.get(key)!r}, now {value!r}"
-            for key, value in self._identity.items()
-            if found.identity.get(key) != value
-        ]
-        if differing:
-            raise CheckpointError(
-                f"the checkpoint {self._sink.checkpoint} was made with {'; '.join(differing)}. Go "
-                "on with the same model and options, or start again by --overwrite."
-            )
-        try:
-            self._mhe.load_state_dict(found.state)
-            time, text = Reader(".").time(found.time)
-            inputs = np.array(found.inputs, np.float64).reshape(self._mhe.system.m)
-        except (InvalidInputError, TypeError, ValueError) as error:
-            raise CheckpointError(
-                f"the checkpoint {self._sink.checkpoint} does not fit: {error}"
-            ) from error
+        before = known_sample(found, self._sink, self._keeper, self._mhe)
+        self._keeper.go_on(found)
         self._taken = self._summary.before = found.samples
-        self._steps.usual, self._newest = found.usual, found
-        if found.versions != _versions():
+        if before is not None:
+            self._steps.restore(found.usual)
+        if found.versions != versions():
             self._summary.notes.append(
-                f"the checkpoint is of {found.versions}, this is {_versions()}: the last bits of "
+                f"the checkpoint is of {found.versions}, this is {versions()}: the last bits of "
                 "the results may differ."
             )
-        return Sample(0, time, text, np.empty(0), inputs)
-
-    def _skip_known(self, samples: Iterator[Sample], found: Checkpoint) -> None:
-        """Read over the samples that the checkpoint knows, and compare them with it."""
-        for number in range(1, found.samples + 1):
-            sample = next(samples, None)
-            if sample is None:
-                raise CheckpointError(
-                    f"{self._record.name} has {number - 1} samples, and the checkpoint was made "
-                    f"after {found.samples}; give the record that it was made of."
-                )
-            self._remember(sample)
-            if number % self._every == 0:
-                self._close_segment()
-        if self._digest != found.digest:
-            raise CheckpointError(
-                f"the first {found.samples} samples of {self._record.name} are not those that the "
-                "checkpoint was made of (or other columns are read); give the same record and "
-                "columns, or start again by --overwrite."
-            )
-        self._record.held = self._record.repeated = 0
-
-    def _behind(
-        self, samples: Iterator[Sample], last: Sample, found: Checkpoint
-    ) -> Iterator[Sample]:
-        """The samples of a stream behind the last one that the checkpoint knows."""
-        new = (
-            sample for sample in samples
-            if type(sample.time) is not type(last.time)
-            or sample.time > last.time  # type: ignore[operator]  # of one kind
-        )
-        first, text = next(new, None), self._sink.time_behind(found.offset)
-        if text is not None:
-            # Its row is about to be cut off: it must come again.
-            due = Reader(".").time(text)[0]
-            if first is None or type(first.time) is not type(due) or first.time > due:  # type: ignore[operator]
-                raise CheckpointError(
-                    f"{self._record.name} does not have the sample of time {text} again; the "
-                    f"checkpoint is of the one before, at {last.text}. Give the record from "
-                    "there, or from its beginning."
-                )
-        return new if first is None else chain((first,), new)
-
-
-def _versions() -> dict[str, str]:
-    return {"qpmhe": __version__, "numpy": np.__version__, "machine": platform.machine()}
+        return before

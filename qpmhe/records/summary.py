@@ -25,6 +25,14 @@ class Summary:
         Blank inputs that were replaced by the last value.
     repeated : int
         Lines that were passed over, since their time stood there already.
+    failed, stale : int
+        Steps at which the model failed (``MODEL_FAILED``), and others whose window still has
+        such a step in it (``FAILED_STAGE``).
+    failure : str
+        Where it failed first, and why; blank if it did not.
+    model_is_wrong : bool
+        Whether it failed by a mistake, such as a value of another shape, rather than at
+        states where it has no value.
     notes : list of str
         What the user should know besides.
     """
@@ -36,4 +44,8 @@ class Summary:
     inserted: int = 0
     held: int = 0
     repeated: int = 0
+    failed: int = 0
+    stale: int = 0
+    failure: str = ""
+    model_is_wrong: bool = False
     notes: list[str] = field(default_factory=list)

@@ -7,6 +7,7 @@ from .report import write_report
 from .runner import run
 from .store import Store
 from .summary import summarise
+from .table_file import export
 
 __all__ = [
     "ExportedSet",
@@ -16,6 +17,7 @@ __all__ = [
     "Store",
     "Study",
     "backend_rows",
+    "export",
     "export_qpbenchmark",
     "ipopt_rows",
     "paper_rows",

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 from uuid import uuid4
 
+from .address import insist_on_scheduler
 from .cell import Task
 from .compute import Result, compute_once, failure
 from .errors import SchedulerError, need
@@ -20,6 +21,7 @@ __all__ = ["ClusterPool"]
 
 # Seconds to reach a scheduler; seconds without any worker before giving up.
 _CONNECT, _PATIENCE = 15.0, 60.0
+_LOGGERS = ("distributed", "tornado")
 
 
 class ClusterPool(Pool):
@@ -37,7 +39,7 @@ class ClusterPool(Pool):
     Raises
     ------
     SchedulerError
-        If there is no scheduler at the address, or it has no workers.
+        If the address is none, no scheduler answers there, or it has no workers.
     InvalidInputError
         If joblib, dask or distributed is not installed.
     """
@@ -46,13 +48,16 @@ class ClusterPool(Pool):
         self._joblib = need("joblib", "a study")
         distributed = need("distributed", "a study on a cluster", "dask")
         self._address, self._notes = address, f"qpmhe-study-{uuid4().hex}"
+        insist_on_scheduler(address, _CONNECT)
+        self._quiet = ExitStack()
+        self._quiet.enter_context(_without_log())
         try:
             self._client = distributed.Client(address, timeout=_CONNECT, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
+            self._quiet.close()
             raise SchedulerError(
-                f"no Dask scheduler answers at {address!r} ({error}); start one with 'dask "
-                "scheduler' and workers with 'dask worker ADDRESS --nthreads 1', and check the "
-                "address."
+                f"the Dask scheduler at {address!r} did not take us ({error}); check that it "
+                "works, and has the same version of distributed."
             ) from error
         try:
             from .dask_backend import DaskBackend
@@ -110,12 +115,27 @@ class ClusterPool(Pool):
         with suppress(Exception):  # a cluster that is gone has nothing to tidy up
             if self._client.status == "running":
                 self._client.run(_tidy, self._notes)
-        logger = logging.getLogger("distributed.client")
-        level = logger.level
-        logger.setLevel(logging.CRITICAL)  # what it was waiting for no longer matters
         with suppress(Exception):
             self._client.close(timeout=5)
-        logger.setLevel(level)
+        self._quiet.close()
+
+
+@contextmanager
+def _without_log() -> Iterator[None]:
+    """Keep Dask's own words back: where a cluster is lost, ours tell it."""
+    for name in _LOGGERS:
+        logging.getLogger(name)
+    levels = {
+        logger: logger.level for name, logger in logging.root.manager.loggerDict.items()
+        if isinstance(logger, logging.Logger) and name.partition(".")[0] in _LOGGERS
+    }
+    try:
+        for logger in levels:
+            logger.setLevel(logging.CRITICAL + 1)
+        yield
+    finally:
+        for logger, level in levels.items():
+            logger.setLevel(level)
 
 
 def _tidy(notes: str) -> None:

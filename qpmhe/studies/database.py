@@ -11,7 +11,7 @@ from urllib.parse import quote
 from .errors import StoreError
 from .rows import COLUMNS
 
-__all__ = ["SCHEMA", "check", "connect", "create", "reading", "told"]
+__all__ = ["SCHEMA", "check", "connect", "create", "insist_on_file", "reading", "told"]
 
 #: Version of the tables.
 SCHEMA = 1
@@ -127,12 +127,31 @@ def reading(path: Path) -> Iterator[sqlite3.Connection]:
     StoreError
         If there is no such file, or it cannot be read.
     """
-    if not path.is_file():
+    if not path.exists():
         raise StoreError(f"there is no store {path}; run a study first, or check the name.")
+    insist_on_file(path)
     with told(path), closing(_reader(path)) as connection:
         connection.execute("BEGIN")
         check(connection, path, empty=False)
         yield connection
+
+
+def insist_on_file(path: Path) -> None:
+    """Insist that a store is a file, or nothing yet.
+
+    Parameters
+    ----------
+    path : Path
+        The store.
+
+    Raises
+    ------
+    StoreError
+        If it is a folder, a device or the like.
+    """
+    if path.exists() and not path.is_file():
+        what = "a folder" if path.is_dir() else "a device or the like"
+        raise StoreError(f"the store {path} is {what}; name a file, such as study.sqlite.")
 
 
 def _reader(path: Path) -> sqlite3.Connection:

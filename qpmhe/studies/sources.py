@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import ast
-import hashlib
-import importlib
-import importlib.util
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,6 +16,7 @@ from ..models import Example, Scenario, catalogue
 from ..observers import Observer
 from ..system import System
 from .errors import StudyError
+from .model_files import fingerprint, imported, module_file
 
 __all__ = ["Source", "find", "load"]
 
@@ -46,7 +43,8 @@ class Source:
     arguments : str
         Keyword arguments of the function, as ``key=value, key=value``.
     fingerprint : str
-        Digest of the file that it comes from; empty for the catalogue and for modules.
+        Digest of the file that it comes from, and of those that this imports from its own
+        folder; empty for the catalogue.
     """
 
     name: str
@@ -88,14 +86,19 @@ def find(text: Any, folder: Path | None = None) -> Source:
     place, _, function = written.rpartition(":")
     if not function.isidentifier() or not place:
         raise StudyError(f"the model is {text!r}; {_EXPECTED}.")
-    if not place.endswith(".py"):
-        return Source(name, f"{place}:{function}", arguments)
-    path = (folder or Path()).joinpath(place).resolve()
+    path: Path | None
+    if place.endswith(".py"):
+        path = (folder or Path()).joinpath(place).resolve()
+        place = str(path)
+    else:
+        path = module_file(place)
     try:
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        digest = "" if path is None else fingerprint(path)
     except OSError as error:
-        raise StudyError(f"model {name!r}: cannot read {path} ({error.strerror}).") from error
-    return Source(name, f"{path}:{function}", arguments, digest)
+        raise StudyError(
+            f"model {name!r}: cannot read {error.filename} ({error.strerror})."
+        ) from error
+    return Source(name, f"{place}:{function}", arguments, digest)
 
 
 def _arguments(text: str, inside: str) -> dict[str, Any]:
@@ -126,10 +129,11 @@ def load(source: Source) -> Example:
     Raises
     ------
     StudyError
-        If there is no such function, it raises, or returns anything but the four parts.
+        If there is no such function, it raises, or returns anything but the four parts; or
+        if its file is not the one that was found.
     """
     name = source.name
-    function = _function(name, source.where)
+    function = _function(name, source.where, source.fingerprint)
     try:
         parts = function(**_arguments(name, source.arguments))
     except QpmheError as error:
@@ -152,49 +156,24 @@ def load(source: Source) -> Example:
     return Example(*parts)
 
 
-def _function(name: str, where: str) -> Callable[..., Any]:
+def _function(name: str, where: str, digest: str = "") -> Callable[..., Any]:
     if ":" not in where:
         return catalogue()[where]
     place, _, attribute = where.rpartition(":")
     try:
-        module = _of_file(Path(place)) if place.endswith(".py") else _of_module(place)
+        module, now = imported(place)
     except Exception as error:
         raise StudyError(
             f"model {name!r}: cannot import {place} ({type(error).__name__}: {error})."
         ) from error
+    if digest and now != digest:
+        raise StudyError(
+            f"model {name!r}: {place}, or a file that it imports, is another here than where the "
+            "study was started, or was changed since; bring the same files to all machines, and "
+            "give the command again."
+        )
     function = getattr(module, attribute, None)
     if not callable(function):
         raise StudyError(f"model {name!r}: {place} has no function {attribute}.")
     found: Callable[..., Any] = function
     return found
-
-
-def _of_module(place: str) -> Any:
-    try:
-        return importlib.import_module(place)
-    except ModuleNotFoundError as error:
-        if error.name != place.partition(".")[0] or "" in sys.path:
-            raise
-    # A console script has its own folder in the path, not the one it is called from.
-    sys.path.insert(0, str(Path.cwd()))
-    try:
-        return importlib.import_module(place)
-    finally:
-        sys.path.remove(str(Path.cwd()))
-
-
-def _of_file(path: Path) -> Any:
-    name = f"qpmhe_study_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
-    if name in sys.modules:
-        return sys.modules[name]
-    specification = importlib.util.spec_from_file_location(name, path)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[name] = module
-    try:
-        specification.loader.exec_module(module)
-    except BaseException:
-        del sys.modules[name]
-        raise
-    return module

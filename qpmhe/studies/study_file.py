@@ -42,8 +42,8 @@ def read(path: Path) -> Study:
     Raises
     ------
     StudyError
-        If it cannot be read, has an unknown key or a value that does not fit; the text
-        begins with the file and the line.
+        If it cannot be read, names nothing, has an unknown key or a value that does not fit;
+        the text has the file and the line.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -64,6 +64,11 @@ def read(path: Path) -> Study:
                 f"{_at(path, lines, key)}: unknown key {key!r}; expected some of "
                 f"{', '.join(CHECKS)}.{f' Did you mean {near[0]}?' if near else ''}"
             )
+    if not found:
+        raise StudyError(
+            f"the study file {path} is empty; name at least one of {', '.join(CHECKS)}; "
+            "what is left out has its default."
+        )
     options = {key: _translated(key, value) for key, value in found.items()}
     for key, value in options.items():
         _check(path, lines, key, value)

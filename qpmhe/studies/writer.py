@@ -67,9 +67,9 @@ class Writer:
             for name, fingerprint in fingerprints.items():
                 if known.get(name, fingerprint) != fingerprint:
                     raise StoreError(
-                        f"the file of model {name!r} has changed since cells of it were put "
-                        f"into {self._path}; name another store for the new model, or change "
-                        "the file back."
+                        f"the file of model {name!r}, or one that it imports, has changed since "
+                        f"cells of it were put into {self._path}; name another store for the new "
+                        "model, or change the file back."
                     )
                 connection.execute(
                     "INSERT OR IGNORE INTO models VALUES (?, ?)", (name, fingerprint)
@@ -174,6 +174,7 @@ def writing(path: Path) -> Iterator[Writer]:
     StoreError
         If it is no store of this version, damaged, read-only, or another study writes to it.
     """
+    database.insist_on_file(path)
     with _alone(path), database.told(path):
         connection = database.connect(path, "rwc")
         try:

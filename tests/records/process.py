@@ -29,3 +29,13 @@ def finish(process, text=""):
     """What it answers: exit code, standard output and standard error."""
     out, error = process.communicate(text.encode(), timeout=60)
     return process.returncode, (out or b"").decode(), error.decode()
+
+
+def shell(line):
+    """Exit code, standard output and standard error of a line with `qpmhe` in it."""
+    call = f'{sys.executable} -c "from qpmhe.cli import main; main()"'
+    done = subprocess.run(
+        ["sh", "-c", line.replace("qpmhe ", f"{call} ", 1)], capture_output=True, text=True,
+        stdin=subprocess.DEVNULL, timeout=120, check=False,
+    )
+    return done.returncode, done.stdout, done.stderr

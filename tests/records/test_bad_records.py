@@ -140,7 +140,7 @@ def test_a_parquet_file_counts_rows(here):
     frame["time"] = [0.0, 0.1, 0.2]
     frame.to_parquet("record.parquet")
     with pytest.raises(RecordError, match="row 3, column 'y': 'x' is not a number"):
-        estimate_record(CONTINUOUS, "record.parquet", "out.csv")
+        estimate_record(CONTINUOUS, "record.parquet", "out.csv", overwrite=True)
 
 
 def test_the_command_ends_with_2_and_a_line(here):

@@ -66,6 +66,23 @@ def test_another_model_is_refused(cut, here):
     assert told.before == 40
 
 
+def test_another_model_of_the_same_module_is_refused(cut, here, monkeypatch):
+    monkeypatch.syspath_prepend(here)
+    source = Path(CONTINUOUS.rpartition(":")[0]).read_text()
+    path = here / "model_of_a_module.py"
+    path.write_text(source)
+    name, options = "model_of_a_module:continuous", {**OPTIONS, "overwrite": True}
+    put("half.csv", cut[:51])
+    estimate_record(name, "half.csv", "out.csv", **options)
+    path.write_text(source.replace("0.5 * x[..., 1]", "0.7 * x[..., 1]"))
+    before = Path("out.csv").read_bytes()
+    with pytest.raises(CheckpointError, match="was made with file"):
+        estimate_record(name, "record.csv", "out.csv", resume=True, **OPTIONS)
+    assert Path("out.csv").read_bytes() == before
+    path.write_text(source)
+    assert estimate_record(name, "record.csv", "out.csv", resume=True, **OPTIONS).before == 40
+
+
 def test_results_that_do_not_belong_to_the_checkpoint(cut):
     whole = Path("out.csv").read_bytes()
     Path("out.csv").write_bytes(whole[:500])

@@ -1,5 +1,6 @@
 """A user's model: what it may give, and what is told where it does not."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import qpmhe
 from qpmhe.errors import InvalidInputError, OptionError
 from qpmhe.records.model import load_model
+from qpmhe.records.places import place
 from qpmhe.studies.errors import StudyError
 
 BEGIN = """
@@ -129,3 +131,55 @@ def test_no_such_function(make):
     assert qpmhe.models.catalogue()  # and a name without a colon is one of these
     with pytest.raises(StudyError, match="battery_cell"):
         load_model("nowhere")
+
+
+def test_a_file_imports_those_beside_it(make, here):
+    folder = here / "sub"
+    folder.mkdir()
+    (folder / "helper_of_sib.py").write_text("HORIZON = 6\n")
+    (folder / "second_helper_of_sib.py").write_text("START = [3.0]\n")
+    name = make(
+        "from second_helper_of_sib import START\n"
+        "    return system, observer, cost, dict(horizon=helper_of_sib.HORIZON, "
+        "initial_state=START)",
+        begin=f"import helper_of_sib\n{BEGIN}",
+    )
+    before = list(sys.path)
+    (folder / "sib.py").write_text(Path(name.partition(":")[0]).read_text())
+    found = load_model("sub/sib.py:make")
+    assert (found.estimator.horizon, found.estimator.initial_state.tolist()) == (6, [3.0])
+    assert sys.path == before
+
+
+@pytest.mark.parametrize(
+    ("f", "h", "line", "words"),
+    [
+        ("x * gain", "x", 10, "f raised NameError: name 'gain' is not defined"),
+        ("0.9 * x", "x.first()", 13, "h raised AttributeError"),
+    ],
+)
+@pytest.mark.parametrize("form", ["{}.py:make", "{}:make"])
+def test_the_line_of_a_mistake_in_the_model(here, monkeypatch, form, f, h, line, words):
+    monkeypatch.syspath_prepend(here)
+    name = f"typo{line}{form[2:3] == '.'}"
+    Path(f"{name}.py").write_text(
+        "import numpy as np\nimport qpmhe\n\n\n"
+        "def make():\n    return system(), qpmhe.Luenberger([0.3]), qpmhe.QuadraticCost(\n"
+        "        prior=1.0, disturbance=10.0, noise=1.0), dict(horizon=3, initial_state=[1.0])\n"
+        f"\ndef f(x):\n    return {f}\n\ndef h(x):\n    return {h}\n\n"
+        "def system():\n    return qpmhe.System(f, h, n=1, p=1)\n"
+    )
+    with pytest.raises(StudyError) as caught:
+        load_model(form.format(name))
+    assert f"{here / name}.py, line {line}: " in str(caught.value)
+    assert words in str(caught.value)
+
+
+def test_places_are_in_the_users_own_files(here):
+    """A model beside the package's own folder must not be told lines of that one."""
+    package = Path(qpmhe.__file__).parent
+    with pytest.raises(InvalidInputError) as caught:
+        qpmhe.Luenberger("what")
+    for file in (package.parent / "model.py", Path(__file__)):
+        assert place(caught.value, file).startswith(f"{__file__}, line ")
+    assert place(caught.value, None) == ""

@@ -1,4 +1,5 @@
 import re
+import sys
 
 import pytest
 
@@ -113,7 +114,7 @@ def test_what_does_not_fit_is_refused(options, error, words):
 
 
 def test_a_backend_that_is_not_installed_is_refused_by_name(monkeypatch):
-    monkeypatch.setattr("qpmhe_solvers.registry.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "osqp", None)
     with pytest.raises(BackendError, match="'osqp' is not installed; pip install osqp"):
         Study(backends=["osqp"])
 

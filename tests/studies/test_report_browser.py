@@ -123,6 +123,30 @@ def test_search_and_numeric_order(opened):
     assert max(shown) > 10 > 1.5 > min(shown)
 
 
+def test_what_decides_is_in_sight_and_the_rest_is_pointed_at(opened):
+    page = opened.page
+    section, more = page.locator("#table"), page.locator("#further")
+    body = "document.querySelector('#table .dt-scroll-body')"
+    right = f"{body}.getBoundingClientRect().right"
+    for heading in ("RMSE", "J / converged", "failed runs", "failed steps (%)", "fallback (%)"):
+        head = section.locator("thead th", has=page.get_by_text(heading, exact=True)).first
+        box = head.bounding_box()
+        assert box["x"] + box["width"] <= page.evaluate(right), heading
+    assert page.evaluate(f"{body}.scrollWidth") < 2 * page.evaluate(f"{body}.clientWidth")
+    assert more.is_visible()
+    first = section.locator("tbody tr").first.locator("td").first
+    place = first.bounding_box()["x"]
+    for _ in range(10):
+        if more.is_visible():
+            more.click()
+            page.wait_for_function("document.getElementById('table').matches('.scrolled')")
+    page.wait_for_function("!document.getElementById('table').matches('.more')")
+    assert not more.is_visible()
+    assert first.bounding_box()["x"] == place
+    page.evaluate(f"{body}.scrollLeft = 0")
+    page.wait_for_function("document.getElementById('table').matches('.more:not(.scrolled)')")
+
+
 def test_each_figure_is_drawn_and_its_menus_work(opened):
     page = opened.page
     for name in ("accuracy", "anytime", "times", "profile", "trajectories"):

@@ -22,12 +22,36 @@ def shown(summary: pd.DataFrame, width: int, **options: bool) -> str:
     return console.export_text()
 
 
-@pytest.mark.parametrize("width", [80, 120])
-def test_nothing_is_cut(width):
+def headings(text: str) -> set[str]:
+    """Of the first table, those of one line, and the last words of the others."""
+    (line, *_) = (line for line in text.splitlines() if line.strip().startswith("backend"))
+    return set(re.split(r"\s{2,}", line.strip()))
+
+
+@pytest.mark.parametrize("width", [80, 120, 200])
+def test_nothing_is_cut_and_the_room_is_used(width):
     text = shown(summarise(frame()), width)
     assert "…" not in text
     assert "observer" in text
-    assert ("99 %" in text) == (width == 120)
+    told = headings(text)
+    assert {"RMSE", "conv.", "median", "impr."} <= told
+    assert ("99 %" in told) == (width >= 120)
+    assert ({"95 %", "kept", "back", "hits", "max"} <= told) == (width == 200)
+    assert ("No room here, but in the report" in " ".join(text.split())) == (width < 200)
+    assert not {"late", "NEES"} & told
+
+
+@pytest.mark.parametrize("width", [80, 120, 200])
+def test_what_was_asked_for_is_shown_at_any_width(width):
+    rows = frame().query("horizon == 10")
+    # As wide as they get: generic backends, two starts, failed runs.
+    rows = rows.assign(late=0.9995, nees=1230.0, backend="qpsolvers:" + rows.backend)
+    rows = pd.concat([rows, rows.assign(start="best")])
+    text = shown(summarise(rows), width)
+    assert {"late", "NEES", "RMSE", "median"} <= headings(text)
+    assert "> 99.9 %" in text
+    assert "1,230" in text
+    assert "…" not in text
 
 
 def test_best_of_a_column_is_marked_once():

@@ -1,4 +1,5 @@
 import json
+import os
 import sqlite3
 from contextlib import closing, suppress
 
@@ -7,11 +8,10 @@ import pandas as pd
 import pytest
 
 from qpmhe.errors import InvalidInputError, OptionError
-from qpmhe.studies import database, rows
+from qpmhe.studies import database, export, rows
 from qpmhe.studies.cell import Cell, Task
 from qpmhe.studies.compute import compute, failure
 from qpmhe.studies.errors import StoreError
-from qpmhe.studies.export import export
 from qpmhe.studies.grid import Study
 from qpmhe.studies.sources import find
 from qpmhe.studies.store import Store
@@ -165,6 +165,16 @@ def test_a_file_that_is_not_there_is_told_to_readers(path):
         with pytest.raises(StoreError, match="there is no store"):
             read()
     assert not path.exists()
+
+
+def test_what_is_no_file_is_told_with_the_remedy(path):
+    os.mkfifo(path)
+    before = sorted(path.parent.iterdir())
+    for store, what in ((path, "a device or the like"), (path.parent, "a folder")):
+        for use in (Store(store).frame, lambda at=store: Store(at).writing().__enter__()):
+            with pytest.raises(StoreError, match=f"is {what}; name a file"):
+                use()
+    assert sorted(path.parent.iterdir()) == before
 
 
 def test_a_file_that_is_no_store_is_refused(path):

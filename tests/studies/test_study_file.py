@@ -40,8 +40,16 @@ def test_a_file_is_the_same_study_as_in_python(tmp_path):
     )
 
 
-def test_an_empty_file_is_the_study_of_defaults(tmp_path):
-    assert Study.from_toml(written(tmp_path, "")) == Study()
+@pytest.mark.parametrize("text", ["", "# seeds = 3\n"])
+def test_an_empty_file_is_refused(tmp_path, text):
+    path = written(tmp_path, text)
+    with pytest.raises(StudyError, match="is empty; name at least one of models, backends") as told:
+        Study.from_toml(path)
+    assert str(path) in str(told.value)
+
+
+def test_what_is_left_out_has_its_default(tmp_path):
+    assert Study.from_toml(written(tmp_path, "seeds = 20\n")) == Study()
 
 
 def test_single_words_stand_for_lists(tmp_path):

@@ -78,6 +78,23 @@
       .draw();
   }
 
+  // What is left and right of the table's visible part shows by shadows, and by the button.
+  function watchSides() {
+    const section = document.getElementById("table");
+    const body = section.querySelector(".dt-scroll-body");
+    if (!body) { return; }
+    const look = () => {
+      section.classList.toggle("scrolled", body.scrollLeft > 1);
+      section.classList.toggle("more", body.scrollLeft + body.clientWidth < body.scrollWidth - 1);
+    };
+    body.addEventListener("scroll", look);
+    new ResizeObserver(look).observe(body);
+    window.configurationTable.on("draw", look);
+    document.getElementById("further").addEventListener("click",
+      () => body.scrollBy({ left: 0.7 * body.clientWidth }));
+    look();
+  }
+
   function refresh() {
     for (const button of document.querySelectorAll("button.backend")) {
       button.setAttribute("aria-pressed", String(!hidden.has(button.dataset.backend)));
@@ -113,6 +130,8 @@
     refresh();
   });
   window.addEventListener("configurationTable", filterTable);
+  window.addEventListener("configurationTable", watchSides);
+  if (window.configurationTable) { watchSides(); }
   fill();
   refresh();
 })();

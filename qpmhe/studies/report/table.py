@@ -31,26 +31,31 @@ _TELL = """function () {
   window.configurationTable = this.api();
   window.dispatchEvent(new Event('configurationTable'));
 }"""
-# Column of the summary, heading, and the factor to what is shown.
-_NUMBERS: tuple[tuple[str, str, float], ...] = (
+# Shown while there are columns out of sight; the page's script gives it its work.
+_FURTHER = '<button id="further" type="button">more columns →</button>'
+# Column of the summary, heading, and the factor to what is shown (None: a count); what decides
+# comes first.
+_NUMBERS: tuple[tuple[str, str, float | None], ...] = (
     ("rmse", "RMSE", 1.0),
-    ("rmse_half", "± 95 %", 1.0),
-    ("rmse_settled", "RMSE settled", 1.0),
+    ("rmse_half", "±\u00a095\u00a0%", 1.0),
     ("cost_ratio", "J / converged", 1.0),
     ("time_median", "time median (µs)", 1e6),
-    ("time_half", "± 95 % (µs)", 1e6),
-    ("time_p95", "time 95 % (µs)", 1e6),
-    ("time_p99", "time 99 % (µs)", 1e6),
-    ("time_max", "time max (µs)", 1e6),
+    ("time_p99", "time 99\u00a0% (µs)", 1e6),
     ("late", "late (%)", 100.0),
-    ("improved", "improved (%)", 100.0),
-    ("kept", "kept (%)", 100.0),
-    ("fallback", "fallback (%)", 100.0),
+    ("nees", "NEES", 1.0),
+    ("failures", "failed runs", None),
     ("failed_steps", "failed steps (%)", 100.0),
+    ("fallback", "fallback (%)", 100.0),
+    ("improved", "improved (%)", 100.0),
     ("cap_hits", "cap hits (%)", 100.0),
+    ("rmse_settled", "RMSE settled", 1.0),
+    ("time_half", "time ±\u00a095\u00a0% (µs)", 1e6),
+    ("time_p95", "time 95\u00a0% (µs)", 1e6),
+    ("time_max", "time max (µs)", 1e6),
+    ("kept", "kept (%)", 100.0),
     ("qps_mean", "QPs used", 1.0),
     ("solver_iterations_mean", "solver iterations", 1.0),
-    ("nees", "NEES", 1.0),
+    ("seeds", "seeds", None),
 )
 _WHY = {
     "CONVERGED": "converged", "NO_DECREASE": "no decrease", "SOLVER_STOPPED": "solver stopped",
@@ -94,12 +99,15 @@ def table(cases: list[Case]) -> str:
     ]
     for _, name, scale in _NUMBERS:
         if name in places:
-            definitions.append({
+            definition: dict[str, Any] = {
                 "targets": [places[name]],
                 "className": "dt-right",
-                "render": JavascriptFunction(_SIGNIFICANT.replace("SCALE", repr(scale))),
                 "columnControl": ["order", ["searchNumber"]],
-            })
+            }
+            if scale is not None:
+                words = _SIGNIFICANT.replace("SCALE", repr(scale))
+                definition["render"] = JavascriptFunction(words)
+            definitions.append(definition)
     definitions += [
         {"targets": [places[name]], "columnControl": ["order", ["searchList"]],
          "className": "dt-right" if name in ("N", "QPs", "cap") else "dt-left"}
@@ -121,7 +129,7 @@ def table(cases: list[Case]) -> str:
                   "infoFiltered": "(of _MAX_)", "infoEmpty": "no configuration",
                   "zeroRecords": "no configuration passes the filters"},
         text_in_header_can_be_selected=False,
-        layout={"topStart": {"pageLength": {}}, "topEnd": {"search": {}},
+        layout={"topStart": {"pageLength": {}}, "topEnd": {"div": {"html": _FURTHER}, "search": {}},
                 "bottomStart": {"info": {}}, "bottomEnd": {"paging": {}}},
         style="width:100%", drawCallback=JavascriptFunction(_TELL),
     )
@@ -145,9 +153,8 @@ def _columns(case: Case) -> DataFrame:
         "cap": _ranked([cap_words(one) for one in rows["solver_iterations"]]),
         "front": ["front" if one else "" for one in rows["pareto"]],
     })
-    for name, heading, _ in _NUMBERS:
-        frame[heading] = rows[name].astype(float).to_numpy()
-    frame["seeds"], frame["failures"] = rows["seeds"].to_numpy(), rows["failures"].to_numpy()
+    for name, heading, scale in _NUMBERS:
+        frame[heading] = rows[name].astype(int if scale is None else float).to_numpy()
     frame["RMSE by state"] = [_numbers(one) for one in rows["rmse_states"]]
     frame["why a sequence ended"] = [_why(one) for one in rows["reasons"]]
     return frame

@@ -1,0 +1,150 @@
+"""Times keep their type and all their digits."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qpmhe.records import RecordError, estimate_record
+from qpmhe.records.parquet_times import common_type
+from qpmhe.records.times import date, spacing
+
+from .conftest import CONTINUOUS, DISCRETE
+from .test_resume import put
+
+pa = pytest.importorskip("pyarrow")
+pq = pytest.importorskip("pyarrow.parquet")
+
+OPTIONS = {"step_time": False}
+START = 1_780_000_000 * 10**9  # in May 2026, in nanoseconds; no float has its last digits
+
+
+def table(time):
+    size = len(time)
+    return pa.table({
+        "time": time, "y1": pa.array(np.arange(size) % 7.0), "y2": pa.array(np.arange(size) % 3.0),
+    })
+
+
+def nanoseconds(step, size=12, first=START + 100):
+    return [first + k * step for k in range(size)]
+
+
+def stamps(kind, step):
+    per = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}[kind.unit]
+    whole = [value // per for value in nanoseconds(step)]
+    return pa.array(whole, pa.int64()).cast(kind)
+
+
+@pytest.mark.parametrize(
+    ("time", "dt", "scale"),
+    [
+        (pa.array(nanoseconds(100)), 1e-7, 1e-9),
+        (pa.array(list(range(12)), pa.int32()), 1.0, 1.0),
+        (pa.array(list(range(12)), pa.uint8()), 1.0, 1.0),
+        (pa.array([0.1 * k for k in range(12)], pa.float64()), 0.1, 1.0),
+        (pa.array([0.5 * k for k in range(12)], pa.float32()), 0.5, 1.0),
+        (stamps(pa.timestamp("ns"), 100), 1e-7, 1.0),
+        (stamps(pa.timestamp("ns", "UTC"), 100), 1e-7, 1.0),
+        (stamps(pa.timestamp("ns", "Europe/Berlin"), 100), 1e-7, 1.0),
+        (stamps(pa.timestamp("us", "America/New_York"), 3600 * 10**9), 3600.0, 1.0),
+        (stamps(pa.timestamp("us", "+05:30"), 10**6), 1e-3, 1.0),
+        (stamps(pa.timestamp("ms"), 10**6), 1e-3, 1.0),
+        (pa.array(np.arange(20_000, 20_012), pa.int32()).cast(pa.date32()), 86_400.0, 1.0),
+        (pa.array([f"2026-05-04T12:00:{k:02d}+02:00" for k in range(12)]), 1.0, 1.0),
+    ],
+    ids=lambda value: str(getattr(value, "type", "")) or None,
+)
+def test_parquet_to_parquet(here, time, dt, scale):
+    pq.write_table(table(time), "record.parquet")
+    told = estimate_record(
+        DISCRETE, "record.parquet", "out.parquet", dt=dt, time_scale=scale, **OPTIONS
+    )
+    assert (told.samples, told.inserted) == (12, 0)
+    found = pq.read_table("out.parquet").column("time").combine_chunks()
+    assert found.type == time.type
+    assert found.equals(time)
+    # And by way of CSV, where there are no types.
+    estimate_record(DISCRETE, "record.parquet", "out.csv", dt=dt, time_scale=scale, **OPTIONS)
+    for name in ("out.csv", "again.csv"):
+        rows = Path(name).read_text().splitlines()[1:]
+        put("text.csv", ["time,y1,y2", *(f"{row.split(',')[0]},1,2" for row in rows)])
+        estimate_record(
+            DISCRETE, "text.csv", "again.csv", dt=dt, time_scale=scale, overwrite=True, **OPTIONS
+        )
+        assert [row.split(",")[0] for row in Path("again.csv").read_text().splitlines()[1:]] == [
+            row.split(",")[0] for row in rows
+        ]
+
+
+def test_the_hour_that_comes_twice(here):
+    first = int(datetime(2026, 10, 24, 23, 30, tzinfo=UTC).timestamp())
+    kind = pa.timestamp("ms", "Europe/Berlin")
+    time = pa.array([1000 * (first + 1800 * k) for k in range(6)], pa.int64()).cast(kind)
+    pq.write_table(table(time), "record.parquet")
+    told = estimate_record(DISCRETE, "record.parquet", "out.parquet", dt=1800.0, **OPTIONS)
+    assert told.inserted == 0
+    assert pq.read_table("out.parquet").column("time").combine_chunks().equals(time)
+
+
+@pytest.mark.parametrize(
+    ("times", "kind"),
+    [
+        (["0", "1", "2"], pa.int64()),
+        ([str(one) for one in nanoseconds(10**9, 3)], pa.int64()),
+        (["0", "1.0", "2"], pa.float64()),
+        (["2026-05-04 12:00:00", "2026-05-04 12:00:01"], pa.timestamp("us")),
+        (["2026-05-04T12:00:00Z", "2026-05-04T12:00:01Z"], pa.timestamp("us", "UTC")),
+        (["2026-05-04T12:00:00-03:30", "2026-05-04T12:00:01-03:30"],
+         pa.timestamp("us", "-03:30")),
+        (["2026-05-04T12:00:00+02:00", "2026-05-04T11:00:01+01:00"], pa.timestamp("us", "UTC")),
+        (["2026-05-04T12:00:00.000000001", "2026-05-04T12:00:01"], pa.timestamp("ns")),
+    ],
+)
+def test_csv_to_parquet(here, times, kind):
+    put("record.csv", ["time,y1,y2", *(f"{time},1,2" for time in times)])
+    estimate_record(DISCRETE, "record.csv", "out.parquet", **OPTIONS)
+    found = pq.read_table("out.parquet").column("time")
+    assert found.type == kind
+    if pa.types.is_int64(kind):
+        assert [str(one) for one in found.to_pylist()] == times
+
+
+def test_whole_numbers_that_are_too_large(here):
+    assert common_type(["0", str(2**63 - 1)]) == pa.int64()
+    assert common_type(["0", str(2**63)]) == pa.float64()
+    assert common_type([]) == pa.int64()
+
+
+def test_dates_a_nanosecond_apart():
+    one, other = date("2026-05-04T12:00:00.123456789"), date("2026-05-04T12:00:00.12345679+00:00")
+    assert (one.rest, other.rest) == (789, 790)
+    later = date("2026-05-04T12:00:01.123456790")
+    assert later > one
+    assert spacing(one, later) == pytest.approx(1 + 1e-9, abs=1e-15)
+    assert date("2026-05-04T12:00:00,5").rest == date("2026-05-04").rest == 0
+
+
+def test_whole_numbers_are_exact():
+    assert spacing(START, START + 1) == 1.0
+    assert spacing(1, 2.5) == 1.5
+
+
+def test_inputs_that_are_true_or_false(here):
+    times = [0.1 * k for k in range(20)]
+    on = [k % 5 > 2 for k in range(20)]
+    frame = {"time": pa.array(times), "y": pa.array(np.sin(times)), "u": pa.array(on)}
+    pq.write_table(pa.table(frame), "record.parquet")
+    frame["u"] = pa.array([float(one) for one in on])
+    pq.write_table(pa.table(frame), "plain.parquet")
+    for name in ("record", "plain"):
+        estimate_record(CONTINUOUS, f"{name}.parquet", f"{name}.csv", **OPTIONS)
+    assert Path("record.csv").read_bytes() == Path("plain.csv").read_bytes()
+
+
+def test_dates_that_no_calendar_has(here):
+    time = pa.array([2**62, 2**62 + 1], pa.int64()).cast(pa.timestamp("us"))
+    pq.write_table(table(time), "record.parquet")
+    with pytest.raises(RecordError, match=r"row 1: it cannot be read on.*years 1 to 9999"):
+        estimate_record(DISCRETE, "record.parquet", "out.csv", **OPTIONS)
