@@ -7,7 +7,13 @@ from .choices import Sizes, tighten
 from .closed_runs import attack_estimator
 from .decay import DecayingSums
 from .detectability import certify_detectability
-from .errors import CertificateError, NotCertifiedError, OutOfTimeError
+from .errors import (
+    CertificateError,
+    JumpError,
+    MismatchError,
+    NotCertifiedError,
+    OutOfTimeError,
+)
 from .evidence import Evidence
 from .falsification import attack_detectability, attack_observer
 from .figures import error_and_bounds
@@ -27,6 +33,8 @@ __all__ = [
     "Detectability",
     "Evidence",
     "Hypotheses",
+    "JumpError",
+    "MismatchError",
     "Monitor",
     "MonitorSummary",
     "NotCertifiedError",

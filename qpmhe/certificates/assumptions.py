@@ -14,6 +14,7 @@ from ..observers import Observer, Sample
 from ..system import System
 from .deadline import PART_SECONDS, Deadline
 from .errors import CertificateError
+from .evaluation import evaluated
 from .evidence import Evidence
 from .lipschitz import output_lipschitz
 from .observer import constant_gain
@@ -35,6 +36,7 @@ Array = NDArray[np.float64]
 
 _SAMPLES = 2000
 _SEED = 20210829
+_SETS = ("states stay in X", "candidate in the sets")
 _SCALES = (1e-3, 1e-1, 1.0, 10.0)  # of fitting errors that are tried, in sizes of the output
 
 
@@ -69,10 +71,19 @@ class Finding:
     value: float | None = None
     counterexample: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def needed(self) -> bool:
+        """Whether the bounds rest on it.
+
+        They rest on no set: what is certified holds for any w and v, so that the theorem is
+        applied with the whole space in place of W and V, and the region in place of X.
+        """
+        return self.name not in _SETS
+
     def to_dict(self) -> dict[str, Any]:
         """The finding in types that JSON knows; numbers that are not finite as text."""
         return {
-            "name": self.name, "label": self.label, "holds": self.holds,
+            "name": self.name, "label": self.label, "holds": self.holds, "needed": self.needed,
             "evidence": None if self.evidence is None else self.evidence.value,
             "text": self.text, "value": _plain(self.value),
             "counterexample": {
@@ -208,8 +219,7 @@ def _steepest(
     generator = np.random.default_rng(_SEED)
     points = region.sample(_SAMPLES, generator)
     states, u = points[:, : system.n], points[:, system.n :]
-    with np.errstate(all="ignore"):
-        size = np.ptp(system.h.batch(states, u), axis=0)
+    size = np.ptp(evaluated("h", system.h, states, u), axis=0)
     size = np.where(size > 0.0, size, 1.0)
     worst = 0.0, states[0], size
     for z in states:
@@ -273,17 +283,31 @@ def invariance_finding(system: System, region: Region) -> Finding:
         The system.
     region : Region
         Where states are tried.
+
+    Raises
+    ------
+    ModelError
+        If f raises there.
     """
     name, label = "states stay in X", "eq:system"
-    if system.states is None:
-        return Finding(name, label, True, Evidence.PROVED, "X is the whole space")
     points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
-    points = points[[system.states.violation(x) == 0.0 for x in points[:, : system.n]]]
+    if system.states is not None:
+        points = points[[system.states.violation(x) == 0.0 for x in points[:, : system.n]]]
     x, u = points[:, : system.n], points[:, system.n :]
     if not x.shape[0]:
         return Finding(name, label, None, None, "the region and X have no sample in common")
-    with np.errstate(all="ignore"):
-        following = np.asarray(system.f.batch(x, u), np.float64)
+    following = evaluated("f", system.f, x, u)
+    lost = ~np.isfinite(following).all(axis=1)
+    if lost.any():
+        k = int(np.argmax(lost))
+        return Finding(
+            name, label, False, Evidence.PROVED,
+            f"f is not finite: {following[k].tolist()} at x = {x[k].tolist()}"
+            + (f", u = {u[k].tolist()}" if system.m else ""),
+            None, {"x": x[k], "f(x)": following[k]} | ({"u": u[k]} if system.m else {}),
+        )
+    if system.states is None:
+        return Finding(name, label, True, Evidence.PROVED, "X is the whole space")
     missed = np.array([system.states.violation(one) for one in following])
     worst = int(missed.argmax())
     if missed[worst] == 0.0:
@@ -327,6 +351,8 @@ def candidate_finding(system: System, region: Region, run: ObserverRun | None) -
         )
     if run is None:
         return Finding(name, label, None, None, "pass a run, to check the candidate along it")
+    told: list[str] = []
+    counterexample: dict[str, Any] = {}
     for letter, symbol, one in sets:
         if one is None:
             continue
@@ -334,12 +360,17 @@ def candidate_finding(system: System, region: Region, run: ObserverRun | None) -
         missed = np.array([one.violation(value) for value in values])
         if missed.max() > 0.0:
             t = int(np.argmax(missed > 0.0))
-            return Finding(
-                name, label, False, Evidence.PROVED,
+            told.append(
                 f"{symbol}({t}) = {values[t].tolist()} is not in {letter}, by {missed[t]:.6g}; it "
-                f"is outside {int((missed > 0.0).sum())} times of {missed.size}",
-                None, {"t": t, symbol: values[t], "missed by": float(missed[t])},
+                f"is outside {int((missed > 0.0).sum())} times of {missed.size}"
             )
+            counterexample = counterexample or {
+                "t": t, symbol: values[t], "missed by": float(missed[t])
+            }
+    if told:
+        return Finding(
+            name, label, False, Evidence.PROVED, ". ".join(told), None, counterexample
+        )
     return Finding(
         name, label, True, Evidence.SAMPLED,
         f"z, L and v_z are in X, W and V on a run of {run.noises.shape[0]} samples; "

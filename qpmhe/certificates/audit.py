@@ -15,6 +15,7 @@ from ..models.scenario import Record
 from ..observers import Observer
 from ..sets import Box, ConvexSet
 from ..system import System
+from .arguments import checked_ingredients
 from .assumptions import (
     Finding,
     candidate_finding,
@@ -109,8 +110,10 @@ def audit(
     Raises
     ------
     SetError, ShapeError, InvalidInputError, ModelError
-        If an argument does not fit. An assumption that does not hold raises nothing.
+        If an argument does not fit, or f or h raises in the region, or h is not finite. An
+        assumption that does not hold raises nothing.
     """
+    checked_ingredients(system, observer, cost)
     deadline = Deadline.of(seconds)
     place = bounded_region(system, region, inputs)
     observed = _observed(system, observer, run, initial_state)

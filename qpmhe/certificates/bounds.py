@@ -5,28 +5,33 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import product
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost, CostConstants, QuadraticCost
+from ..errors import OptionError
 from .choices import Sizes, level, tighten
 from .decay import DecayingSums
+from .pairs import Pairs
 from .results import Detectability, ObserverStability
 from .sharper import WindowBound
 from .summed import SummedBound
 from .theorem import TERMS, TheoremConstants, theorem
+from .verification import Matrices
 from .weighted import WeightedBound, fit_weight, largest
 
-__all__ = ["HorizonBounds", "bounds_for"]
+__all__ = ["HorizonBounds", "Kind", "bounds_for", "window_bound", "window_level"]
 
 Array = NDArray[np.float64]
+Kind = Literal["paper", "summed", "weighted", "measured"]
 
 # Steps after which what is left of the initial error no longer matters for a comparison.
 _MOST_STEPS = 400
-# Derivatives by differences are that far off at most.
-_JACOBIAN_ERROR = 1e-6
+# Covers the rounding of a few products and roots.
+_OUTWARD = 1.0 + 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +107,8 @@ def bounds_for(
     *,
     lipschitz: float,
     sizes: Sizes,
-    output: Array | None = None,
+    output: Matrices | None = None,
+    pairs: Pairs | None = None,
 ) -> HorizonBounds:
     """The best bounds of each kind that follow from what was certified.
 
@@ -120,52 +126,61 @@ def bounds_for(
         L_h.
     sizes : Sizes
         For which errors the bounds are to be tight.
-    output : (p, n) array, optional
-        The Jacobian of h, if it is constant.
+    output : Matrices, optional
+        An enclosure of the Jacobian of h, (1, p, n), if it is constant.
+    pairs : Pairs, optional
+        To which pairs of detectability and observer the choice is confined; all, if left
+        out. What is found is noted in it.
     """
     kappa = max(each.kappa for each in observers)
     plain = [DecayingSums(d.eta, d.c_p, d.c_w, d.c_v) for d in detectabilities]
     observing = [DecayingSums(o.rho, o.C_p, o.C_w, o.C_v) for o in observers]
+    tried = Pairs() if pairs is None else pairs
+    every = list(product(range(len(plain)), range(len(observing))))
     paper = tighten(
         plain, observing, constants, kappa=kappa, lipschitz=lipschitz, horizon=horizon,
-        sizes=sizes,
+        sizes=sizes, searched=tried.searched,
     )
-    summed: list[SummedBound] = []
+    summed: list[tuple[float, SummedBound]] = []
     if constants.exponent >= 1.0:
-        summed = [
-            SummedBound(theorem(
-                one, other, constants, kappa=kappa, lipschitz=lipschitz, horizon=horizon
+        for i, j in tried.of("summed", every):
+            bound = SummedBound(theorem(
+                plain[i], observing[j], constants, kappa=kappa, lipschitz=lipschitz,
+                horizon=horizon,
             ))
-            for one in plain for other in observing
-        ]
-    weighted: list[WeightedBound] = []
+            summed.append((window_level(bound, sizes), bound))
+            tried.note("summed", (i, j), summed[-1][0])
+    weighted: list[tuple[float, WeightedBound]] = []
     if isinstance(cost, QuadraticCost) and cost.discount == 1.0:
-        weighted = [
-            bound
-            for one in detectabilities for other in observers
-            if (bound := _weighted(cost, one, other, lipschitz, horizon, output)) is not None
-        ]
+        for i, j in tried.of("weighted", every):
+            sharper = _weighted(
+                cost, detectabilities[i], observers[j], lipschitz, horizon, output
+            )
+            if sharper is not None:
+                weighted.append((window_level(sharper, sizes), sharper))
+                tried.note("weighted", (i, j), weighted[-1][0])
     return HorizonBounds(
         paper,
-        min(summed, key=lambda bound: window_level(bound, sizes), default=None),
-        min(weighted, key=lambda bound: window_level(bound, sizes), default=None),
+        min(summed, key=lambda pair: pair[0], default=(0.0, None))[1],
+        min(weighted, key=lambda pair: pair[0], default=(0.0, None))[1],
     )
 
 
 def _weighted(
     cost: QuadraticCost, detectability: Detectability, observer: ObserverStability,
-    lipschitz: float, horizon: int, output: Array | None,
+    lipschitz: float, horizon: int, output: Matrices | None,
 ) -> WeightedBound | None:
     P, V, O, gain = detectability.P, detectability.V, observer.P, observer.gain  # noqa: E741
     if P is None or V is None or O is None or gain is None:
         return None
     fit = fit_weight(cost, gain)
-    if output is None:
-        # |h(x) - h(z)|_M <= sqrt(max eig M) L_h |x - z|, and |x - z| in the norm O.
-        top = float(np.linalg.eigvalsh(fit)[-1])
-        slope = math.sqrt(top * largest(np.eye(cost.n), O)) * lipschitz
-    else:
-        slope = math.sqrt(largest(output.T @ fit @ output, O)) * (1.0 + _JACOBIAN_ERROR)
+    # |h(x) - h(z)|_M <= sqrt(max eig M) L_h |x - z|, and |x - z| in the norm O.
+    plain = math.sqrt(float(np.linalg.eigvalsh(fit)[-1]) * largest(np.eye(cost.n), O))
+    slope = plain * lipschitz * _OUTWARD
+    if output is not None:
+        C, radius = output.middle[0], float(np.linalg.norm(output.radius[0]))
+        own = math.sqrt(largest(C.T @ fit @ C, O)) + plain * radius
+        slope = min(slope, own * _OUTWARD)
     return WeightedBound(
         cost, horizon=horizon, P=P, eta=detectability.eta, noise_weight=V, observer_norm=O,
         rho=observer.rho, gain=gain, slope=slope,
@@ -186,3 +201,34 @@ def window_level(bound: WindowBound, sizes: Sizes) -> float:
     steps = bound.horizon + min(_MOST_STEPS, settled)
     funnel = bound.funnel(sizes.initial, sizes.disturbance, sizes.noise, steps)
     return max(float(funnel.max()), bound.limit(sizes.disturbance, sizes.noise))
+
+
+def window_bound(chosen: HorizonBounds, kind: Kind, kinds: Sequence[Kind]) -> WindowBound:
+    """The bound beyond the paper that a kind asks for.
+
+    Parameters
+    ----------
+    chosen : HorizonBounds
+        Those for the horizon.
+    kind : str
+        Which.
+    kinds : sequence of str
+        Those that there are, for the error text.
+
+    Raises
+    ------
+    OptionError
+        If there is none.
+    """
+    if kind not in get_args(Kind):
+        raise OptionError(f"kind is {kind!r}; expected one of {list(get_args(Kind))}.")
+    bound: WindowBound | None = chosen.sharpest() if kind == "measured" else (
+        chosen.weighted if kind == "weighted" else chosen.summed
+    )
+    if bound is None:
+        raise OptionError(
+            f"kind is {kind!r}, for which there is no bound here; expected one of "
+            f"{list(kinds)}. The weighted one needs a quadratic cost and constants "
+            "that were certified, not assumed."
+        )
+    return bound

@@ -3,32 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import numbers, vector
+from .._checks import count, numbers, vector
 from ..costs import Cost
-from ..errors import InvalidInputError, OptionError, ShapeError
+from ..errors import InvalidInputError, OptionError
 from ..observers import Observer
 from ..run import Run
 from ..system import System
+from .arguments import checked_length
 from .audit import Audit
-from .bounds import HorizonBounds
+from .bounds import HorizonBounds, Kind, window_bound
 from .choices import Sizes
+from .errors import CertificateError
 from .evidence import Evidence, weakest
+from .observer import constant_gain
+from .provenance import fitting
 from .regions import Region
 from .results import Detectability, ObserverStability
-from .sharper import WindowBound
+from .signals import signals
+from .sources import checked_costs
 from .telling import certificate_dict, certificate_text
+
+if TYPE_CHECKING:
+    from ..estimator import MovingHorizonEstimator
+    from .monitor import Monitor
 
 __all__ = ["Certificate", "Kind"]
 
 Array = NDArray[np.float64]
-Kind = Literal["paper", "summed", "weighted", "measured"]
 
 # The constants are upper bounds, what is computed from them is not: this covers its rounding.
 _OUTWARD = 1.0 + 1e-9
@@ -53,6 +61,14 @@ class Certificate:
         For each horizon.
     sizes : Sizes
         For which errors the bounds are tight.
+    origin : tuple
+        What `certify` made it of. A certificate whose parts are others, or that was made by
+        hand, is assumed.
+
+    Raises
+    ------
+    MismatchError
+        If a part is of another system or gain, or does not hold on the whole region.
     """
 
     system: System
@@ -63,6 +79,29 @@ class Certificate:
     stabilities: tuple[ObserverStability, ...]
     bounds: Mapping[int, HorizonBounds]
     sizes: Sizes
+    origin: tuple[Any, ...] = field(default=(), repr=False)
+
+    def __post_init__(self) -> None:
+        for detected in self.detectabilities:
+            fitting(detected, self.system, self.region, self.gain, thorough=False)
+        for observed in self.stabilities:
+            fitting(observed, self.system, self.region, self.gain, thorough=False)
+
+    @cached_property
+    def gain(self) -> Array | None:
+        """The observer's constant gain, if it has one."""
+        try:
+            return constant_gain(self.observer, self.system)
+        except CertificateError:
+            return None
+
+    @property
+    def ingredients(self) -> tuple[Any, ...]:
+        """All that a certificate is made of, to be compared with its origin."""
+        return (
+            self.system, self.observer, self.cost, self.audit, self.bounds, self.sizes,
+            *self.detectabilities, *self.stabilities,
+        )
 
     @property
     def region(self) -> Region:
@@ -72,6 +111,11 @@ class Certificate:
     @cached_property
     def evidence(self) -> Evidence:
         """What the bounds rest on: the weakest evidence among their ingredients'."""
+        mine = self.ingredients
+        if len(mine) != len(self.origin) or any(
+            one is not other for one, other in zip(mine, self.origin, strict=True)
+        ):
+            return Evidence.ASSUMED
         used = [self.audit[name].evidence for name in (
             "output Lipschitz", "no correction without error", "correction bound", "cost bounds"
         )]
@@ -89,7 +133,7 @@ class Certificate:
     @cached_property
     def diameter(self) -> float:
         """The largest distance of two states of the region, or a little more."""
-        return float(np.linalg.norm((self.region.upper - self.region.lower)[: self.region.n]))
+        return self.region.diameter
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
@@ -113,6 +157,7 @@ class Certificate:
         initial_error: ArrayLike,
         horizon: int | None = None,
         kind: Kind = "paper",
+        source: MovingHorizonEstimator | Monitor | None = None,
     ) -> Array:
         """The bound of the error |x(t) - x_hat(t)| along a run.
 
@@ -127,11 +172,16 @@ class Certificate:
         initial_error : (n,) array_like or float
             x_0 - z_0, or a bound on its length.
         horizon : int, optional
-            N; the only one, if left out.
+            N; that of the source, or the only one, if left out.
         kind : {"paper", "summed", "weighted", "measured"}
             The right-hand side of (eq:RGES_result) with the paper's constants, or beyond the
             paper: with the proof's sums kept, with its norms kept as well, or with the
             estimates' own costs in place of their bound.
+        source : MovingHorizonEstimator or Monitor, optional
+            The estimator that made the run, as the run left it, or the monitor that checked
+            all its estimates: a run does not tell of which horizon and cost it is. Checked
+            where given, and needed for ``kind="measured"``; without one, the bound is that
+            of an estimator with this certificate's cost and this horizon, whatever the run.
 
         Returns
         -------
@@ -142,23 +192,36 @@ class Certificate:
         ------
         ShapeError, OptionError, InvalidInputError
             If an argument does not fit, or there is no such bound.
+        MismatchError
+            If the source is of another system, observer, cost or horizon, or did not make
+            the run.
         """
-        w, v = self._along(run, disturbances, noises)
+        w, v = signals(self.system, run, disturbances, noises)
         start = numbers("initial_error", initial_error)
         if start.ndim:
             start = vector("initial_error", start, self.system.n)
+        else:
+            checked_length("initial_error", start)
+        if source is not None and horizon is None:
+            horizon = getattr(source, "horizon", None)
         chosen = self.of(horizon)
+        costs = None
+        if source is not None:
+            costs = checked_costs(self, source, run, chosen.paper.horizon)
+        elif kind == "measured":
+            raise InvalidInputError(
+                "the measured bound has no source, and a run does not tell of which horizon and "
+                "cost it is; pass the estimator that made it (source=estimator), or the monitor "
+                "that checked it (source=monitor)."
+            )
         if kind == "paper":
             lengths = [x if x.ndim == 1 else np.linalg.norm(x, axis=1) for x in (w, v)]
             return _OUTWARD * chosen.paper.result.bound(
                 float(np.linalg.norm(np.atleast_1d(start))), *lengths
             )
-        costs = None
-        if kind == "measured":
-            if run is None:
-                raise InvalidInputError("the measured bound needs a run, for its costs.")
-            costs = run.costs
-        return _OUTWARD * self._window_bound(chosen, kind).bound(start, w, v, costs=costs)
+        if kind != "measured":
+            costs = None
+        return _OUTWARD * window_bound(chosen, kind, self.kinds).bound(start, w, v, costs=costs)
 
     def funnel(
         self,
@@ -186,10 +249,24 @@ class Certificate:
         Returns
         -------
         (T + 1,) array
+
+        Raises
+        ------
+        OptionError
+            If a length is negative or not finite, the steps are no integer, or there is no
+            such bound.
         """
+        w, v = checked_length("w_max", w_max), checked_length("v_max", v_max)
+        start = checked_length("initial_error", initial_error)
+        if kind == "measured":
+            raise OptionError(
+                "kind is 'measured', but nothing is measured yet; expected one of "
+                f"{[each for each in self.kinds if each != 'measured']}."
+            )
+        length = count("steps", steps, 1)
         return self.bound(
-            None, np.full(steps, float(w_max)), np.full(steps, float(v_max)),
-            initial_error=initial_error, horizon=horizon, kind=kind,
+            None, np.full(length, w), np.full(length, v), initial_error=start, horizon=horizon,
+            kind=kind,
         )
 
     def limit(
@@ -201,11 +278,17 @@ class Certificate:
         ----------
         w_max, v_max, horizon, kind
             As of `funnel`.
+
+        Raises
+        ------
+        OptionError
+            As of `funnel`.
         """
+        w, v = checked_length("w_max", w_max), checked_length("v_max", v_max)
         chosen = self.of(horizon)
         if kind == "paper":
-            return _OUTWARD * chosen.paper.result.limit(w_max, v_max)
-        return _OUTWARD * self._window_bound(chosen, kind).limit(w_max, v_max)
+            return _OUTWARD * chosen.paper.result.limit(w, v)
+        return _OUTWARD * window_bound(chosen, kind, self.kinds).limit(w, v)
 
     def vacuous(
         self,
@@ -224,6 +307,11 @@ class Certificate:
         w_max, v_max : float, optional
             As of `funnel`; left out, the certificate's `sizes`.
         horizon, kind
+            As of `funnel`.
+
+        Raises
+        ------
+        OptionError
             As of `funnel`.
         """
         w = self.sizes.disturbance if w_max is None else w_max
@@ -259,41 +347,3 @@ class Certificate:
     def summary(self) -> str:
         """The certificate in some lines of text."""
         return certificate_text(self)
-
-    def _along(
-        self, run: Run | None, disturbances: ArrayLike, noises: ArrayLike
-    ) -> tuple[Array, Array]:
-        w, v = numbers("disturbances", disturbances), numbers("noises", noises)
-        steps = len(run) if run is not None else next(
-            (len(x) for x in (w, v) if x.ndim), None
-        )
-        if steps is None:
-            raise ShapeError(
-                "disturbances and noises are numbers and there is no run; expected a sequence "
-                "for one of them, to tell how many steps there are."
-            )
-        for name, x, width in (
-            ("disturbances", w, self.system.n), ("noises", v, self.system.p)
-        ):
-            if x.ndim and x.shape not in ((steps,), (steps, width)):
-                raise ShapeError(
-                    f"{name} has shape {x.shape}; expected ({steps}, {width}), their lengths "
-                    f"({steps},), or a number."
-                )
-        return (
-            w if w.ndim else np.full(steps, float(w)), v if v.ndim else np.full(steps, float(v))
-        )
-
-    def _window_bound(self, chosen: HorizonBounds, kind: Kind) -> WindowBound:
-        if kind not in get_args(Kind):
-            raise OptionError(f"kind is {kind!r}; expected one of {list(get_args(Kind))}.")
-        bound: WindowBound | None = chosen.sharpest() if kind == "measured" else (
-            chosen.weighted if kind == "weighted" else chosen.summed
-        )
-        if bound is None:
-            raise OptionError(
-                f"kind is {kind!r}, for which there is no bound here; expected one of "
-                f"{list(self.kinds)}. The weighted one needs a quadratic cost and constants "
-                "that were certified, not assumed."
-            )
-        return bound

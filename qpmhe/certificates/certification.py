@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import count
 from ..costs import Cost, CostConstants
-from ..errors import OptionError
 from ..models.scenario import Record
 from ..observers import Observer
 from ..sets import Box, ConvexSet
 from ..system import System
+from .arguments import checked_horizons, checked_ingredients
 from .audit import audit
-from .bounds import bounds_for
+from .bounds import HorizonBounds, bounds_for
 from .certificate import Certificate
 from .choices import Sizes, level, tighten
 from .deadline import DEFAULT_SECONDS, Deadline
@@ -25,7 +25,11 @@ from .decay import DecayingSums
 from .detectability import certify_detectability
 from .errors import CertificateError, NotCertifiedError
 from .evidence import Evidence
+from .lipschitz import constant_output
 from .observer import certify_observer, constant_gain
+from .pairs import Pairs
+from .programs import started
+from .provenance import fitting
 from .regions import Region, bounded_region
 from .results import Detectability, ObserverStability
 
@@ -38,6 +42,8 @@ Result = TypeVar("Result", Detectability, ObserverStability)
 # the search for the best one may ask for.
 _SHARES = (0.8, 0.55, 0.35)
 _EVALUATIONS = 4
+# So many horizons get all pairs of detectability and observer tried.
+_FULL = 6
 # How much of the time left the audit, the first search of each kind, and every later one take.
 _AUDIT, _FIRST, _LATER = 0.25, 0.4, 0.25
 
@@ -73,12 +79,17 @@ def certify(
         For which initial errors, disturbances and noises the bounds are to be tight; left
         out, those of which each alone costs 1 in its cheapest direction.
     detectability, stability : optional
-        Constants to take instead of looking for them, such as assumed ones.
+        Constants to take instead of looking for them, such as assumed ones, or those that
+        were certified of this system and gain on a set that contains the region.
     run, initial_state : optional
         A record along which the candidate is checked against the sets; see `audit`.
     seconds : float or Deadline
-        How long all of it may take, about. What is not proved when its share is over rests on
-        samples, and says so; better rates are sought in what is left.
+        How long the audit and the search for constants may take, about, from when the solvers
+        are loaded. What is not proved when its share is over rests on samples, and says so;
+        better rates are sought in what is left. The bounds are computed from the constants
+        after that, which takes a fraction of a second for each horizon (longer for N in the
+        hundreds): all pairs of rates are tried for up to six horizons, of more only those
+        that were best at the smallest, the middle and the largest one.
 
     Returns
     -------
@@ -88,6 +99,9 @@ def certify(
     ------
     SetError, ShapeError, OptionError, InvalidInputError, ModelError
         If an argument does not fit.
+    MismatchError
+        If constants that are passed are of another system or gain, or of a set that does not
+        contain the region and the inputs.
     CertificateError
         If the cost has no constants, h no Lipschitz constant, or the observer no constant
         gain and no assumed constants.
@@ -95,11 +109,20 @@ def certify(
         If detectability or the observer's stability cannot be shown; the text tells what
         may help.
     """
-    deadline = Deadline.of(seconds)
-    horizons = _horizons(horizon)
+    checked_ingredients(system, observer, cost)
+    horizons = checked_horizons(horizon)
     place = bounded_region(system, region, inputs)
-    if stability is None:
-        constant_gain(observer, system)  # without one, all else would be in vain
+    gain = None
+    try:
+        gain = constant_gain(observer, system)
+    except CertificateError:
+        if stability is None:  # without one, all else would be in vain
+            raise
+    if detectability is not None:
+        detectability = fitting(detectability, system, place, gain)
+    if stability is not None:
+        stability = fitting(stability, system, place, gain)
+    deadline = started(seconds)
     findings = audit(
         system, observer, cost, place, run, initial_state=initial_state,
         seconds=deadline.part(_AUDIT),
@@ -147,16 +170,31 @@ def certify(
         observing = _refined(
             _family(observing[0], observed_at), observed_at, lambda one: reached(first, one)
         )
-    bounds = {
-        N: bounds_for(
+    output = constant_output(system, place)
+
+    def bounded(N: int, pairs: Pairs) -> HorizonBounds:
+        return bounds_for(
             N, detected, observing, cost, constants, lipschitz=lipschitz, sizes=wanted,
-            output=_constant_output(system, place, detected),
+            output=output, pairs=pairs,
         )
-        for N in horizons
-    }
-    return Certificate(
-        system, observer, cost, findings, tuple(detected), tuple(observing), bounds, wanted
+
+    made = Certificate(
+        system, observer, cost, findings, tuple(detected), tuple(observing),
+        _at_each(horizons, bounded), wanted,
     )
+    return replace(made, origin=made.ingredients)
+
+
+def _at_each(
+    horizons: list[int], bounded: Callable[[int, Pairs], HorizonBounds]
+) -> dict[int, HorizonBounds]:
+    """The bounds at each horizon: where they are many, most try what was best at three."""
+    if len(horizons) <= _FULL:
+        return {N: bounded(N, Pairs()) for N in horizons}
+    seen = {N: Pairs() for N in (horizons[0], horizons[len(horizons) // 2], horizons[-1])}
+    found = {N: bounded(N, pairs) for N, pairs in seen.items()}
+    best = Pairs().best(*seen.values())
+    return {N: found[N] if N in found else bounded(N, best) for N in horizons}
 
 
 def cost_sizes(constants: CostConstants) -> Sizes:
@@ -171,13 +209,6 @@ def cost_sizes(constants: CostConstants) -> Sizes:
     return Sizes(*(
         each[0] ** root for each in (constants.prior, constants.disturbance, constants.noise)
     ))
-
-
-def _horizons(horizon: int | Sequence[int]) -> list[int]:
-    given = [horizon] if isinstance(horizon, (int, np.integer)) else list(horizon)
-    if not given:
-        raise OptionError("horizon is empty; expected at least one integer >= 1.")
-    return sorted({count("horizon", each, 1) for each in given})
 
 
 def _rate(result: Detectability | ObserverStability) -> float:
@@ -230,17 +261,3 @@ def _best_founded(found: list[Result]) -> list[Result]:
     """Those that are proved, if any is."""
     proved = [each for each in found if each.evidence is Evidence.PROVED]
     return proved or found
-
-
-def _constant_output(
-    system: System, region: Region, detected: list[Detectability]
-) -> Array | None:
-    """The Jacobian of h if it was found to be constant."""
-    if not any(each.form == "output weight" for each in detected):
-        return None
-    point = region.sample(1, np.random.default_rng(0))[:1]
-    jacobian: Array = np.asarray(
-        system.h_jacobian.batch(point[:, : system.n], point[:, system.n :]), np.float64
-    )
-    first: Array = jacobian.reshape(-1, system.p, system.n)[0]
-    return first

@@ -71,6 +71,7 @@ def tighten(
     lipschitz: float,
     horizon: int,
     sizes: Sizes | None = None,
+    searched: int = _SEARCHED,
 ) -> TheoremConstants:
     r"""The theorem's constants for the best of what it leaves free.
 
@@ -91,6 +92,8 @@ def tighten(
         As of `theorem`.
     sizes : Sizes, optional
         For which errors and noises the result is to be tight; all 1 if left out.
+    searched : int
+        In how many pairs of the two to search, the most promising ones first.
 
     Returns
     -------
@@ -123,7 +126,7 @@ def tighten(
         return tried(detectability, replace(slower, noise=noise))
 
     pairs = sorted(product(list(detectabilities), list(observers)), key=guessed)
-    for detectability, observer in pairs[:_SEARCHED]:
+    for detectability, observer in pairs[:searched]:
         _search(tried, detectability, observer, lipschitz)
     if best is None:
         raise OptionError("there is no detectability or no observer bound to choose from.")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from qpmhe_solvers import available
 
 from .._checks import count
+from ..errors import InvalidInputError
 from ..estimator import MovingHorizonEstimator
 from ..run import Run
 from .certificate import Certificate, Kind
@@ -126,7 +127,20 @@ def attack_estimator(
     Returns
     -------
     ClosedRuns
+
+    Raises
+    ------
+    InvalidInputError, OptionError
+        If an argument does not fit.
     """
+    if not isinstance(certificate, Certificate):
+        raise InvalidInputError(
+            f"certificate is {certificate!r}; expected a Certificate, as certify returns it."
+        )
+    for name, value, least in (
+        ("trials", trials, 1), ("steps", steps, 1), ("polished", polished, 0), ("rounds", rounds, 0)
+    ):
+        count(name, value, least)
     rng = np.random.default_rng(count("seed", seed, 0))
     N = certificate.of(horizon).paper.horizon
     names = list(available()) if backends is None else list(backends)
@@ -201,7 +215,8 @@ def _played(certificate: Certificate, trial: _Trial, N: int) -> _Played:
     error[applied + 1 :] = 0.0
     bounds = {
         kind: certificate.bound(
-            run, w, trial.v, initial_error=x[0] - trial.estimate, horizon=N, kind=kind
+            run, w, trial.v, initial_error=x[0] - trial.estimate, horizon=N, kind=kind,
+            source=watch,
         )
         for kind in certificate.kinds
     }

@@ -43,7 +43,7 @@ def euclidean_constants(P: Array, V: Array, rate: float) -> tuple[float, float, 
         Upper bounds: eigenvalues are bounded by verified numbers.
     """
     low, high = eigenvalue_bounds(P)
-    size = float(np.trace(V))
+    size = 2.0 * float(np.linalg.norm(V))
     # Of V, the upper bound alone is needed; shifted, it has the lower one that is verified.
     output = eigenvalue_bounds(V + size * np.eye(V.shape[0]))[1] - size if size > 0.0 else 0.0
     output = max(output, 0.0) + 1e-15 * size

@@ -136,7 +136,9 @@ def _broken(form: Form, jacobians: Array) -> NDArray[np.bool_]:
     broken = np.zeros(jacobians.shape[0], dtype=np.bool_)
     if known.any():
         single = form.matrices(Matrices.exact(jacobians[known])).middle
-        broken[known] = np.linalg.eigvalsh(0.5 * (single + np.swapaxes(single, 1, 2)))[:, 0] <= 0.0
+        broken[known] = np.linalg.eigvalsh(
+            0.5 * single + 0.5 * np.swapaxes(single, 1, 2)
+        )[:, 0] <= 0.0
     return broken
 
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import numbers
 from ..errors import OptionError, ShapeError
+from .arguments import checked_length
 
 __all__ = ["DecayingSums"]
 
@@ -102,7 +103,20 @@ class DecayingSums:
         return self.initial * start * decay + self.rate * sums
 
     def limit(self, disturbance: float, noise: float) -> float:
-        """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows."""
+        """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows.
+
+        Parameters
+        ----------
+        disturbance, noise : float
+            Bounds on the lengths.
+
+        Raises
+        ------
+        OptionError
+            If one is negative or not finite.
+        """
+        checked_length("disturbance", disturbance)
+        checked_length("noise", noise)
         if not all(math.isfinite(each) for each in self.constants):
             return math.inf
         gain = self.rate / (1.0 - self.rate)
@@ -134,6 +148,11 @@ class DecayingSums:
 
 def decaying_sums(rate: float, entering: Array) -> Array:
     """s(t) = sum of rate^(tau - 1) entering(t - tau) over tau = 1, ..., t; at t = 0, ..., T."""
+    if entering.ndim > 1:
+        several = np.zeros((*entering.shape[:-1], entering.shape[-1] + 1))
+        for t in range(entering.shape[-1]):
+            several[..., t + 1] = rate * several[..., t] + entering[..., t]
+        return several
     sums = np.zeros(entering.size + 1)
     for t, value in enumerate(entering.tolist()):
         sums[t + 1] = rate * sums[t] + value

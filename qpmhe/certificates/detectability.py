@@ -9,8 +9,11 @@ from ..sets import Box, ConvexSet
 from ..system import System
 from .constants import euclidean_constants
 from .deadline import PART_SECONDS, Deadline
-from .errors import NotCertifiedError, OutOfTimeError
+from .errors import JumpError, NotCertifiedError, OutOfTimeError
 from .forms import OutputInjection, OutputWeight
+from .jumps import jumping
+from .programs import started
+from .provenance import sealed
 from .regions import Region, bounded_region
 from .results import Detectability
 from .search import Search, checked_rate, checked_weights
@@ -79,7 +82,7 @@ def certify_detectability(
         rate and what is not detected. An `OutOfTimeError` says that it is not known which.
     """
     checked_rate("eta", eta)
-    deadline = Deadline.of(seconds)
+    deadline = started(seconds)
     search = Search(
         system, bounded_region(system, region, inputs), None, checked_weights(weights),
         seconds=deadline,
@@ -98,22 +101,28 @@ def certify_detectability(
             "h is not affine on the region, where the inequality with an output weight does not "
             "carry over from states to averages of Jacobians; that with output injection does",
         )
-    return Detectability(
-        form.rate, c_p, c_w, c_v, found.evidence, search.region, notes, form.P, form.P, form.R,
-        search.kind, found.margin, found.cells,
+    return sealed(
+        Detectability(
+            form.rate, c_p, c_w, c_v, found.evidence, search.region, notes, form.P, form.P,
+            form.R, search.kind, found.margin, found.cells,
+        ),
+        system, found.evidence,
     )
 
 
 def _explained(
     search: Search, error: NotCertifiedError, eta: float | None
 ) -> NotCertifiedError:
-    if isinstance(error, OutOfTimeError):
+    if isinstance(error, (OutOfTimeError, JumpError)):
         return error
     try:
         smallest = search.smallest_rate()
     except OutOfTimeError:
         return error
     if not np.isfinite(smallest):
+        jump = jumping(search)
+        if jump is not None:
+            return jump
         mode = _undetected(search)
         if mode is not None:
             return NotCertifiedError(

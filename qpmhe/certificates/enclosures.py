@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system import System
+from .evaluation import insist_on_values
 from .intervals import Interval, OutsideDomainError
 from .jets import Jet, variables
 from .regions import Region
@@ -105,7 +107,7 @@ class SmoothModel:
     """
 
     def __init__(self, system: System, region: Region) -> None:
-        self._system = system
+        self._system, self._region = system, region
         self._graph, self._output_graph = self._find_graphs(system)
         self.n, self.p = system.n, system.p
         self.affine_output = False
@@ -116,7 +118,7 @@ class SmoothModel:
             return
         try:
             outputs = self._jets(region.lower[None], region.upper[None], output_only=True)
-        except OutsideDomainError:
+        except Exception:  # whatever a user's function makes of unusual numbers
             return
         self.affine_output = all(
             isinstance(jet, float) or not (jet.hessian.low.any() or jet.hessian.high.any())
@@ -156,7 +158,10 @@ class SmoothModel:
                     for function, size in functions[output_only:]
                     for entry in np.asarray(function(x, u), dtype=object).reshape(size)
                 ]
-        return [value if isinstance(value, Jet) else float(value) for value in values]
+        entries = [value if isinstance(value, Jet) else float(value) for value in values]
+        if any(isinstance(value, float) and not math.isfinite(value) for value in entries):
+            raise OutsideDomainError("a value that is not finite on the set")
+        return entries
 
     def enclose(
         self, lower: Array, upper: Array, *, output_only: bool = False
@@ -169,9 +174,21 @@ class SmoothModel:
             Corners of the cells.
         output_only : bool
             Whether to enclose the Jacobian of h alone; f is then not looked at.
+
+        Raises
+        ------
+        ModelError
+            If a function raises or is not finite in the middle of a cell that cannot be
+            enclosed.
         """
         with np.errstate(all="ignore"):
-            return self._enclosed(lower, upper, output_only)
+            found = self._enclosed(lower, upper, output_only)
+        unknown = np.isnan(found.error).any(axis=(1, 2))
+        if unknown.any():
+            middles = 0.5 * lower[unknown] + 0.5 * upper[unknown]
+            middles = middles[self._region.contains(middles[:, : self.n])]
+            insist_on_values(self._system, middles, output_only=output_only)
+        return found
 
     def _enclosed(self, lower: Array, upper: Array, output_only: bool) -> Enclosure:
         cells, N = lower.shape
@@ -209,7 +226,7 @@ class SmoothModel:
         q, n = self.p if output_only else self.n + self.p, self.n
         try:
             jets = self._jets(lower, upper, output_only=output_only)
-        except OutsideDomainError:
+        except Exception:  # outside the domain, or whatever a user's function makes of it
             if cells == 1:
                 first, second = np.full((q, n, 1), np.nan), np.full((q, n, N, 1), np.nan)
                 return Interval(first, first), Interval(second, second)
@@ -231,4 +248,7 @@ class SmoothModel:
             if isinstance(jet, Jet):
                 gradient[0, row], gradient[1, row] = jet.gradient.low[:n], jet.gradient.high[:n]
                 hessian[0, row], hessian[1, row] = jet.hessian.low[:n], jet.hessian.high[:n]
+                # What is not finite has no derivative, whatever its parts had.
+                lost = ~(np.isfinite(jet.value.low) & np.isfinite(jet.value.high))
+                gradient[:, row, :, lost] = hessian[:, row, :, :, lost] = np.nan
         return Interval(*gradient), Interval(*hessian)

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from ..errors import InvalidInputError, QpmheError
 
-__all__ = ["CertificateError", "NotCertifiedError", "OutOfTimeError"]
+__all__ = ["CertificateError", "JumpError", "MismatchError", "NotCertifiedError", "OutOfTimeError"]
 
 
 class CertificateError(InvalidInputError):
     """A question that no certificate can answer, such as one about an unbounded set."""
+
+
+class MismatchError(CertificateError):
+    """Something certified for one system, gain, region or estimator, and used for another."""
 
 
 class NotCertifiedError(QpmheError):
@@ -45,3 +49,7 @@ class NotCertifiedError(QpmheError):
 
 class OutOfTimeError(NotCertifiedError):
     """A search that was stopped before it found anything: nothing is known of the property."""
+
+
+class JumpError(NotCertifiedError):
+    """A function that seems to jump, of which no property with derivatives can be shown."""

@@ -6,12 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .._checks import count
+from .._checks import count, numbers
+from ..errors import InvalidInputError, ShapeError
+from ..sets import Box, ConvexSet
 from ..system import System
 from .decay import DecayingSums
-from .regions import Region
+from .regions import Region, bounded_region
 
 __all__ = ["Attack", "attack_detectability", "attack_observer", "inside"]
 
@@ -56,13 +58,14 @@ class Attack:
 
 def attack_detectability(
     system: System,
-    region: Region,
+    region: ConvexSet | Region | None,
     claim: DecayingSums,
     *,
     trials: int,
     steps: int = 20,
     polish: int = 40,
     seed: int = 0,
+    inputs: Box | None = None,
 ) -> Attack:
     """Look for two trajectories in the region that violate (eq:eIOSS).
 
@@ -75,8 +78,8 @@ def attack_detectability(
     ----------
     system : System
         The system.
-    region : Region
-        Where both trajectories stay.
+    region : Box, Polytope, Region or None
+        Where both trajectories stay; None for the system's own states.
     claim : DecayingSums
         eta, c_p, c_w and c_v.
     trials : int
@@ -87,41 +90,49 @@ def attack_detectability(
         Rounds of changes.
     seed : int
         Of the random numbers.
+    inputs : Box, optional
+        Bounds on the inputs, of a system that has any, unless a region tells them.
+
+    Raises
+    ------
+    SetError, ModelError, OptionError, InvalidInputError
+        If an argument does not fit.
     """
-    rng = np.random.default_rng(count("seed", seed, 0))
-    inputs = _inputs(region, trials, steps, rng)
-    states = _pairs(system, region, trials, steps, inputs, rng)
+    place, rng = _begun(system, region, claim, inputs, trials, steps, polish, seed)
+    acting = _inputs(place, trials, steps, rng)
+    states = _pairs(system, place, trials, steps, acting, rng)
 
     def shares(pairs: Array) -> tuple[Array, Array]:
         x1, x2 = pairs[0], pairs[1]
-        f1, f2 = (system.f.batch(x[:, :-1], inputs) for x in (x1, x2))
-        h1, h2 = (system.h.batch(x[:, :-1], inputs) for x in (x1, x2))
+        f1, f2 = (system.f.batch(x[:, :-1], acting) for x in (x1, x2))
+        h1, h2 = (system.h.batch(x[:, :-1], acting) for x in (x1, x2))
         apart = np.linalg.norm(x1 - x2, axis=-1)
         w = np.linalg.norm((x1[:, 1:] - f1) - (x2[:, 1:] - f2), axis=-1)
         bound = _bounds(claim, apart[:, 0], w, np.linalg.norm(h1 - h2, axis=-1))
         return apart, bound
 
     def change(pairs: Array, size: float) -> Array:
-        move = size * (region.upper - region.lower)[: region.n] * rng.standard_normal(pairs.shape)
+        move = size * (place.upper - place.lower)[: place.n] * rng.standard_normal(pairs.shape)
         move *= rng.random((*pairs.shape[:-1], 1)) < 0.3
-        return inside(region, pairs + move)
+        return inside(place, pairs + move)
 
     states, apart, bound = _polished(states, shares, change, polish)
     return _verdict(apart, bound, np.ones_like(apart, np.bool_), {
-        "first": states[0], "second": states[1], "inputs": inputs,
+        "first": states[0], "second": states[1], "inputs": acting,
     })
 
 
 def attack_observer(
     system: System,
-    region: Region,
-    gain: Array,
+    region: ConvexSet | Region | None,
+    gain: ArrayLike,
     claim: DecayingSums,
     *,
     trials: int,
     steps: int = 30,
     polish: int = 40,
     seed: int = 0,
+    inputs: Box | None = None,
 ) -> Attack:
     """Look for a run of an observer with constant gain that violates (eq:RGES).
 
@@ -132,43 +143,51 @@ def attack_observer(
     ----------
     system, region
         As of `attack_detectability`.
-    gain : (n, p) array
+    gain : (n, p) array_like
         The observer's.
     claim : DecayingSums
         rho, C_p, C_w and C_v.
-    trials, steps, polish, seed
+    trials, steps, polish, seed, inputs
         As of `attack_detectability`.
+
+    Raises
+    ------
+    SetError, ModelError, OptionError, InvalidInputError, ShapeError
+        If an argument does not fit.
     """
-    rng = np.random.default_rng(count("seed", seed, 0))
-    inputs = _inputs(region, trials, steps, rng)
-    truth = _pairs(system, region, trials, steps, inputs, rng)[0]
-    scale = np.abs(system.h.batch(truth[:, 0], inputs[:, 0])).max() + 1e-3
+    place, rng = _begun(system, region, claim, inputs, trials, steps, polish, seed)
+    K = numbers("gain", gain)
+    if K.shape != (system.n, system.p):
+        raise ShapeError(f"gain has shape {K.shape}; expected {(system.n, system.p)}.")
+    acting = _inputs(place, trials, steps, rng)
+    truth = _pairs(system, place, trials, steps, acting, rng)[0]
+    scale = np.abs(system.h.batch(truth[:, 0], acting[:, 0])).max() + 1e-3
     noises = _sizes(trials, rng) * scale * rng.standard_normal((trials, steps, system.p))
     noises *= rng.random((trials, steps, 1)) < rng.choice([0.0, 0.1, 1.0], (trials, 1, 1))
-    starts = inside(region, region.sample(trials, rng)[:, : region.n])
+    starts = inside(place, place.sample(trials, rng)[:, : place.n])
     starts = starts[rng.integers(len(starts), size=trials)]
     near = rng.random((trials, 1)) < 0.5
-    starts = np.where(near, inside(region, truth[:, 0] + 0.05 * (starts - truth[:, 0])), starts)
+    starts = np.where(near, inside(place, truth[:, 0] + 0.05 * (starts - truth[:, 0])), starts)
     # One array of all that may be changed: true states, noises, and the observer's start.
     n, p = system.n, system.p
     runs = np.zeros((trials, steps + 1, n + p + n))
     runs[..., :n], runs[:, :-1, n : n + p], runs[:, 0, n + p :] = truth, noises, starts
     widths = np.concatenate((
-        (region.upper - region.lower)[:n], np.full(p, scale), (region.upper - region.lower)[:n]
+        (place.upper - place.lower)[:n], np.full(p, scale), (place.upper - place.lower)[:n]
     ))
 
     def shares(runs: Array) -> tuple[Array, Array]:
         x, v, z = runs[..., :n], runs[:, :-1, n : n + p], runs[:, 0, n + p :]
-        y = system.h.batch(x[:, :-1], inputs) + v
-        w = x[:, 1:] - system.f.batch(x[:, :-1], inputs)
+        y = system.h.batch(x[:, :-1], acting) + v
+        w = x[:, 1:] - system.f.batch(x[:, :-1], acting)
         alive = np.ones((len(runs), steps + 1), np.bool_)
         error = np.empty_like(alive, np.float64)
         error[:, 0] = np.linalg.norm(x[:, 0] - z, axis=-1)
         for t in range(steps):
-            alive[:, t + 1] = alive[:, t] & region.contains(z)
+            alive[:, t + 1] = alive[:, t] & place.contains(z)
             held = np.where(alive[:, t + 1, None], z, x[:, t])
-            misfit = y[:, t] - system.h.batch(held, inputs[:, t])
-            z = system.f.batch(held, inputs[:, t]) + misfit @ gain.T
+            misfit = y[:, t] - system.h.batch(held, acting[:, t])
+            z = system.f.batch(held, acting[:, t]) + misfit @ K.T
             error[:, t + 1] = np.linalg.norm(x[:, t + 1] - z, axis=-1)
         bound = _bounds(
             claim, error[:, 0], np.linalg.norm(w, axis=-1), np.linalg.norm(v, axis=-1)
@@ -180,14 +199,29 @@ def attack_observer(
         move *= rng.random((*runs.shape[:-1], 1)) < 0.3
         moved = runs + move
         for part in (slice(0, n), slice(n + p, None)):
-            moved[..., part] = inside(region, moved[..., part])
+            moved[..., part] = inside(place, moved[..., part])
         return moved
 
     runs, error, bound = _polished(runs[None], lambda r: shares(r[0]), change, polish)
     return _verdict(error, bound, np.isfinite(error), {
         "states": runs[0][..., :n], "noises": runs[0][:, :-1, n : n + p],
-        "start": runs[0][:, 0, n + p :], "inputs": inputs,
+        "start": runs[0][:, 0, n + p :], "inputs": acting,
     })
+
+
+def _begun(
+    system: System, region: ConvexSet | Region | None, claim: DecayingSums, inputs: Box | None,
+    trials: int, steps: int, polish: int, seed: int,
+) -> tuple[Region, Generator]:
+    """Where, and the random numbers, of arguments that fit."""
+    if not isinstance(claim, DecayingSums):
+        raise InvalidInputError(
+            f"claim is {claim!r}; expected DecayingSums(rate, initial, disturbance, noise)."
+        )
+    for name, value, least in (("trials", trials, 1), ("steps", steps, 1), ("polish", polish, 0)):
+        count(name, value, least)
+    place = bounded_region(system, region, inputs)
+    return place, np.random.default_rng(count("seed", seed, 0))
 
 
 def inside(region: Region, points: Array) -> Array:

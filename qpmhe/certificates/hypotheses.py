@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
-__all__ = ["Hypotheses", "MonitorSummary"]
+__all__ = ["NEEDED", "UNNEEDED", "Hypotheses", "MonitorSummary"]
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,8 @@ class Hypotheses:
     complete : bool
         All measurements of the window are there, and the model could be evaluated.
     observer_candidate : bool
-        (eq:warmstart): the candidate is the observer's trajectory, not a projection of it.
+        (eq:warmstart): the candidate is the observer's trajectory, not a projection of it,
+        and corrects by the certificate's gain, where that is constant.
     kappa : bool
         (eq:kappa): |L| <= kappa |v_z| all along the candidate.
     candidate_in_region, estimate_in_region : bool
@@ -54,13 +56,12 @@ class Hypotheses:
     @property
     def failed(self) -> tuple[str, ...]:
         """Names of those that the bound needs and that did not hold."""
-        return tuple(name for name in _NEEDED if not getattr(self, name))
+        return tuple(name for name in NEEDED if not getattr(self, name))
 
 
-_NEEDED = tuple(
-    each.name for each in fields(Hypotheses)
-    if each.name not in ("candidate_in_sets", "feasible")
-)
+#: The hypotheses that are told only, and those that the bound needs.
+UNNEEDED = ("candidate_in_sets", "feasible")
+NEEDED = tuple(each.name for each in fields(Hypotheses) if each.name not in UNNEEDED)
 
 
 @dataclass(frozen=True)
@@ -91,12 +92,48 @@ class MonitorSummary:
     first_failure: int | None
     failed: tuple[str, ...]
 
+    @property
+    def missed(self) -> dict[str, int]:
+        """At how many steps each hypothesis did not hold."""
+        return {name: self.steps - self.counts.get(name, 0) for name in (*NEEDED, *UNNEEDED)}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything in types that JSON knows."""
+        return {
+            "steps": self.steps, "applied": self.applied, "held": self.held,
+            "first_failure": self.first_failure, "failed": list(self.failed),
+            "hypotheses": {
+                name: {"needed": name in NEEDED, "failed": count, "held": self.steps - count}
+                for name, count in self.missed.items()
+            },
+        }
+
     def __str__(self) -> str:
         told = f"The certificate applied at {self.applied} of {self.steps} steps"
         if self.first_failure is None:
-            return told + "."
-        reasons = ", ".join(name.replace("_", " ") for name in self.failed)
-        return (
-            f"{told}: at step {self.first_failure} it was lost ({reasons} did not hold). All "
-            f"hypotheses held at {self.held} steps."
+            told += "."
+        else:
+            reasons = ", ".join(_words(name) for name in self.failed)
+            told += (
+                f": at step {self.first_failure} it was lost ({reasons} did not hold). All "
+                f"hypotheses that the bound needs held at {self.held} steps."
+            )
+            told += _counted("Not held", {name: self.missed[name] for name in NEEDED})
+        return told + _counted(
+            "Not held either, but the bound needs no sets" if self.failed
+            else "Not held, but the bound needs no sets",
+            {name: self.missed[name] for name in UNNEEDED},
         )
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _counted(what: str, missed: dict[str, int]) -> str:
+    """A sentence about the hypotheses that did not hold at all steps; empty without any."""
+    told = ", ".join(
+        f"{_words(name)} at {count} step{'s' if count > 1 else ''}"
+        for name, count in missed.items() if count
+    )
+    return f" {what}: {told}." if told else ""

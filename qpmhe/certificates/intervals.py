@@ -139,6 +139,8 @@ class Interval:
         high = np.maximum(np.maximum(*products[:2]), np.maximum(*products[2:]))
         # Zero times anything is exactly zero: sparse derivatives stay sparse.
         zero = ((self.low == 0.0) & (self.high == 0.0)) | ((other.low == 0.0) & (other.high == 0.0))
+        # But for NaN, which is no number at all.
+        zero &= ~(np.isnan(self.low) | np.isnan(other.low))
         return Interval(np.where(zero, 0.0, _down(low)), np.where(zero, 0.0, _up(high)))
 
     __rmul__ = __mul__

@@ -243,6 +243,9 @@ class Jet:
 
     def _compared(self, other: Any, holds: Callable[[Any, Any], Any]) -> bool:
         bound = other.value if isinstance(other, Jet) else Interval.of(_number(other))
+        ends = self.value.low, self.value.high, bound.low, bound.high
+        if any(np.isnan(end).any() for end in ends):
+            raise OutsideDomainError("a comparison with what is not a number")
         # Both orders of the ends must agree, on all cells, and with room: at equality there
         # may be a kink.
         outcomes = {

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from ..system import System
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import Enclosure, SmoothModel
+from .evaluation import evaluated, insist_on_values
 from .evidence import Evidence
 from .regions import Region
 from .verification import Matrices, norm_bound
 
-__all__ = ["LipschitzConstant", "output_lipschitz"]
+__all__ = ["LipschitzConstant", "constant_output", "output_lipschitz"]
 
 Array = NDArray[np.float64]
 
@@ -70,13 +71,21 @@ def output_lipschitz(
     seconds : float or Deadline
         How long this may take. What is known then is told: a bound that is less tight, or the
         largest norm seen.
+
+    Raises
+    ------
+    ModelError
+        If h raises or is not finite in the region.
     """
     deadline = Deadline.of(seconds)
     model = model or SmoothModel(system, region)
     points = region.sample(_SAMPLES, np.random.default_rng(20210829))
     x, u = points[:, : system.n], points[:, system.n :]
-    with np.errstate(all="ignore"):
-        norms = np.linalg.norm(system.h_jacobian.batch(x, u), 2, axis=(-2, -1))
+    insist_on_values(system, points, output_only=True)
+    gradients = evaluated("the Jacobian of h", system.h_jacobian, x, u)
+    usable = np.isfinite(gradients).all(axis=(-2, -1))
+    norms = np.full(len(x), np.inf)
+    norms[usable] = np.linalg.norm(gradients[usable], 2, axis=(-2, -1))
     worst = int(norms.argmax())
     attained, at = float(norms[worst]), points[worst]
 
@@ -128,6 +137,26 @@ def output_lipschitz(
         inherited = np.append(inherited, np.tile(bounds[open_], 2)[stay])
     how = "h is affine" if model.affine_output else f"bounded on {cells} cells{end}"
     return LipschitzConstant(bound, Evidence.PROVED, attained, at, how)
+
+
+def constant_output(system: System, region: Region) -> Matrices | None:
+    """An enclosure of the Jacobian of h where that is shown to be constant, (1, p, n).
+
+    Parameters
+    ----------
+    system : System
+        The system; its own Jacobian of h is not looked at.
+    region : Region
+        Where.
+    """
+    model = SmoothModel(system, region)
+    if not model.affine_output:
+        return None
+    found = model.enclose(region.lower[None], region.upper[None], output_only=True)
+    corners, error = found.corners()
+    if corners.shape[1] != 1 or not np.isfinite(error).all():
+        return None
+    return Matrices(corners[:, 0], error)
 
 
 def _largest(enclosure: Enclosure, middles: Array, region: Region) -> tuple[float, Array]:

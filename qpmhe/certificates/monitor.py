@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import record
+from .._checks import count, record
 from ..costs import ObserverPrior
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimate import Estimate, Status
@@ -17,7 +17,9 @@ from ..estimator import MovingHorizonEstimator
 from ..run import Run
 from ..system import System
 from .certificate import Certificate
+from .errors import MismatchError
 from .hypotheses import Hypotheses, MonitorSummary
+from .sources import insist_on_same
 
 __all__ = ["Monitor", "monitor", "monitored_run"]
 
@@ -38,6 +40,11 @@ class Monitor:
     horizon : int
         The estimator's.
 
+    Attributes
+    ----------
+    horizon : int
+        As given.
+
     Raises
     ------
     OptionError
@@ -45,8 +52,9 @@ class Monitor:
     """
 
     def __init__(self, certificate: Certificate, horizon: int) -> None:
-        certificate.of(horizon)
+        self.horizon = certificate.of(count("horizon", horizon, 1)).paper.horizon
         self.certificate = certificate
+        self._costs: list[float] = []
         self._inputs: deque[Array] = deque(maxlen=horizon)
         self._checks: list[Hypotheses] = []
 
@@ -63,20 +71,14 @@ class Monitor:
 
         Raises
         ------
+        MismatchError
+            If the certificate is not of its system, observer and cost.
         InvalidInputError
-            If the certificate is not of its system, observer and cost, or the estimator has
-            taken measurements already.
+            If the estimator has taken measurements already.
         OptionError
             If it has no bounds for its horizon, or the estimator takes another candidate.
         """
-        mine = (certificate.system, certificate.observer, certificate.cost)
-        theirs = (estimator.system, estimator.observer, estimator.cost)
-        for name, one, other in zip(("system", "observer", "cost"), mine, theirs, strict=True):
-            if one is not other:
-                raise InvalidInputError(
-                    f"the certificate is of another {name} than the estimator's; certify the "
-                    "very objects that the estimator is made of."
-                )
+        insist_on_same(certificate, estimator)
         if estimator.time:
             raise InvalidInputError(
                 f"the estimator has taken {estimator.time} measurements; reset it first: the "
@@ -98,15 +100,48 @@ class Monitor:
             What `MovingHorizonEstimator.update` returned.
         u : (m,) array_like, optional
             The input of that update.
+
+        Raises
+        ------
+        MismatchError
+            If it is not the next estimate, or its window is not that of the horizon.
+        ShapeError
+            If the input does not fit.
         """
         m = self.certificate.system.m
         given = np.zeros(0) if u is None else np.atleast_1d(np.asarray(u, np.float64))
         if given.shape != (m,):
             raise ShapeError(f"u has shape {given.shape}; expected ({m},).")
+        self._insist_on_next(estimate)
         self._inputs.append(given)
         found = monitor(self.certificate, estimate, np.array(self._inputs))
         self._checks.append(found)
+        self._costs.append(float(estimate.cost))
         return found
+
+    def _insist_on_next(self, estimate: Estimate) -> None:
+        t = len(self._checks)
+        if estimate.time != t:
+            raise MismatchError(
+                f"the estimate is of the time {estimate.time}; expected {t}: a monitor sees all "
+                "estimates of a run, from the first one on."
+            )
+        stages, expected = estimate.trajectory.shape[0] - 1, min(t + 1, self.horizon)
+        if stages != expected:
+            raise MismatchError(
+                f"the estimate's window has {stages} stages at time {t}; expected {expected}, for "
+                f"the horizon {self.horizon}. Make the monitor for the estimator's horizon."
+            )
+
+    @property
+    def costs(self) -> Array:
+        """The costs of the estimates so far, as they tell them, (T,)."""
+        return np.array(self._costs)
+
+    @property
+    def confirmed(self) -> NDArray[np.bool_]:
+        """Which of these costs were found to be those of the trajectories, (T,)."""
+        return np.array([check.cost_decrease and check.complete for check in self._checks], bool)
 
     @property
     def applies(self) -> bool:
@@ -170,6 +205,11 @@ def monitor(
         allowed = kappa * np.linalg.norm(told, axis=1) * (1.0 + _RELATIVE)
         rounding = 1e-12 * (1.0 + float(np.abs(estimate.candidate).max()))
         bounded = bool((np.linalg.norm(corrections, axis=1) <= allowed + rounding).all())
+        gain = certificate.gain
+        observed = gain is None or not complete or bool(
+            (np.abs(corrections - told @ gain.T)
+             <= rounding + _RELATIVE * (np.abs(told) @ np.abs(gain).T)).all()
+        )
         cheaper = estimate.cost <= estimate.candidate_cost and (
             not complete
             or (_costs(certificate, estimate.trajectory, estimate, w, estimate.noises,
@@ -182,7 +222,7 @@ def monitor(
     return Hypotheses(
         cost_decrease=cheaper,
         complete=complete,
-        observer_candidate=Status.PROJECTED not in estimate.status,
+        observer_candidate=observed and Status.PROJECTED not in estimate.status,
         kappa=bounded,
         candidate_in_region=usual and bool(region.contains(estimate.candidate[:-1]).all()),
         estimate_in_region=usual and bool(region.contains(estimate.trajectory[:-1]).all()),

@@ -5,14 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ShapeError
+from ..errors import InvalidInputError, ShapeError
 from ..observers import Luenberger, Observer, OutputInjection, SteadyStateKalman
 from ..sets import Box, ConvexSet
 from ..system import System
+from .arguments import checked_system
 from .constants import euclidean_constants
 from .deadline import PART_SECONDS, Deadline
-from .errors import CertificateError, NotCertifiedError, OutOfTimeError
+from .errors import CertificateError, JumpError, NotCertifiedError, OutOfTimeError
 from .forms import ErrorContraction
+from .jumps import jumping
+from .programs import started
+from .provenance import sealed
 from .regions import Region, bounded_region
 from .results import ObserverStability
 from .search import Found, Search, checked_rate, checked_weights
@@ -39,9 +43,13 @@ def constant_gain(observer: Observer, system: System) -> Array:
     ------
     CertificateError
         If it has none; the text says what can be done instead.
-    ShapeError
-        If it is for a system of other dimensions.
+    ShapeError, InvalidInputError
+        If it is for a system of other dimensions, or no observer.
     """
+    if not isinstance(observer, Observer):
+        raise InvalidInputError(
+            f"observer is {observer!r}; expected an observer, such as qpmhe.Luenberger(gain)."
+        )
     # A class derived from these may correct in another way.
     plain = type(observer).correct in (Luenberger.correct, SteadyStateKalman.correct)
     if plain and isinstance(observer, (Luenberger, SteadyStateKalman)):
@@ -105,9 +113,9 @@ def certify_observer(
         If there are no such constants, or none were found; it tells the smallest feasible
         rate, and what to try. An `OutOfTimeError` says that it is not known which.
     """
-    deadline = Deadline.of(seconds)
     checked_rate("rho", rho)
-    gain = constant_gain(observer, system)
+    gain = constant_gain(observer, checked_system(system))
+    deadline = started(seconds)
     search = Search(
         system, bounded_region(system, region, inputs), "observer", checked_weights(weights), gain,
         deadline,
@@ -134,10 +142,13 @@ def stability(search: Search, found: Found) -> ObserverStability:
     V, allowance = _noise_weight(form.P, form.gain)
     c_p, c_w, c_v = euclidean_constants(form.P, V + allowance * np.eye(V.shape[0]), form.rate)
     kappa = float(norm_bound(Matrices.exact(form.gain[None]))[0])
-    return ObserverStability(
-        form.rate, c_p, c_w, c_v, kappa, found.evidence, search.region,
-        (*found.notes, _STAY), form.P, form.P, V + allowance * np.eye(V.shape[0]), form.gain,
-        found.margin, found.cells,
+    return sealed(
+        ObserverStability(
+            form.rate, c_p, c_w, c_v, kappa, found.evidence, search.region,
+            (*found.notes, _STAY), form.P, form.P, V + allowance * np.eye(V.shape[0]), form.gain,
+            found.margin, found.cells,
+        ),
+        search.system, found.evidence,
     )
 
 
@@ -163,6 +174,9 @@ def _insist_on_stability(search: Search) -> None:
     radii = _radii(search)
     worst = int(radii.argmax())
     if radii[worst] >= 1.0:
+        jump = jumping(search)
+        if jump is not None:
+            raise jump
         raise NotCertifiedError(
             f"the observer's error does not contract: A - L C has the spectral radius "
             f"{radii[worst]:.6g} at {np.round(search.points[worst], 4).tolist()}, in the region",
@@ -171,7 +185,7 @@ def _insist_on_stability(search: Search) -> None:
 
 
 def _explained(search: Search, error: NotCertifiedError) -> NotCertifiedError:
-    if isinstance(error, OutOfTimeError):
+    if isinstance(error, (OutOfTimeError, JumpError)):
         return error
     try:
         smallest = search.smallest_rate()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import math
 import warnings
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from .deadline import Deadline
 
-__all__ = ["Answer", "Kind", "Program", "Scales", "expected_seconds"]
+__all__ = ["Answer", "Kind", "Program", "Scales", "expected_seconds", "started"]
 
 Array = NDArray[np.float64]
 Kind = Literal["output weight", "output injection", "observer", "synthesis"]
@@ -61,6 +62,23 @@ class Answer:
     R: Array | None = None
     M: Array | None = None
     N: Array | None = None
+
+
+def started(seconds: float | Deadline) -> Deadline:
+    """The deadline itself, or one after so many seconds from when the solvers are loaded.
+
+    To import them for the first time takes seconds, which are not the search's.
+
+    Parameters
+    ----------
+    seconds : float or Deadline
+        What to make one of.
+    """
+    Deadline.of(seconds)  # refused before anything is loaded
+    for module in ("cvxpy", "scipy.optimize", *(name.lower() for name in _SOLVERS)):
+        with contextlib.suppress(ImportError):  # told where it is needed
+            importlib.import_module(module)
+    return Deadline.of(seconds)
 
 
 def expected_seconds(n: int, p: int, kind: Kind) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,8 +13,9 @@ from .._checks import numbers
 from ..errors import SetError
 from ..sets import Box, ConvexSet
 from ..system import System
+from .arguments import checked_system
 
-__all__ = ["Region", "bounded_region"]
+__all__ = ["Region", "bounded_region", "dual_bound", "inequalities", "stated_region"]
 
 Array = NDArray[np.float64]
 
@@ -52,6 +54,11 @@ class Region:
     def is_box(self) -> bool:
         """Whether the states form a box, so that its corners are theirs."""
         return not self.states.matrix.size
+
+    @property
+    def diameter(self) -> float:
+        """The largest distance of two of its states, or a little more."""
+        return float(np.linalg.norm((self.upper - self.lower)[: self.n]))
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Which states lie in the region.
@@ -144,12 +151,24 @@ def bounded_region(
     ------
     SetError
         If the set is unbounded, empty, missing, or of the wrong dimension.
+    ModelError
+        If the system is none.
     """
+    checked_system(system)
     if isinstance(region, Region):
         if region.n != system.n or region.lower.size != system.n + system.m:
             raise SetError(
                 f"the region is of {region.n} states and {region.lower.size - region.n} inputs; "
                 f"expected {system.n} and {system.m}."
+            )
+        if inputs is not None and not (
+            isinstance(inputs, Box)
+            and np.array_equal(inputs.lower, region.lower[region.n :])
+            and np.array_equal(inputs.upper, region.upper[region.n :])
+        ):
+            raise SetError(
+                f"inputs is {inputs!r}, but the region that was passed has bounds of its own on "
+                "the inputs; leave inputs out, or pass a qpmhe.Box of states with them."
             )
         return region
     chosen = system.states if region is None else region
@@ -184,23 +203,37 @@ def bounded_region(
     return Region(chosen, inputs, lower, upper)
 
 
+def stated_region(region: Any) -> Region | None:
+    """A set that the user answers for; bounded or not, and for all inputs if not a region.
+
+    Parameters
+    ----------
+    region : Box, Polytope, Region or None
+        The set; None for all states.
+
+    Raises
+    ------
+    SetError
+        If it is something else.
+    """
+    if region is None or isinstance(region, Region):
+        return region
+    if not isinstance(region, ConvexSet):
+        raise SetError(f"region is {region!r}; expected a qpmhe.Box or a qpmhe.Polytope.")
+    return Region(region, None, *_bounds(region))
+
+
 def _bounds(states: ConvexSet) -> tuple[Array, Array]:
     """Outward bounds on the components of a set's members; infinite where there are none."""
     if states.matrix.shape[0] == 0:
         return states.lower, states.upper
     n = states.dimension
-    # All inequalities as G x <= g.
+    G, g = inequalities(states)
     eye = np.eye(n)
-    G = np.vstack((eye, -eye, states.matrix, -states.matrix))
-    g = np.concatenate(
-        (states.upper, -states.lower, states.row_upper, -states.row_lower)
-    )
-    finite = np.isfinite(g)
-    G, g = G[finite], g[finite]
     sides, residuals = np.full((2, n), np.inf), np.zeros((2, n))
     for which, sign in enumerate((-1.0, 1.0)):
         for j in range(n):
-            sides[which, j], residuals[which, j] = _dual_bound(G, g, sign * eye[j])
+            sides[which, j], residuals[which, j] = dual_bound(G, g, sign * eye[j])
     if not np.isfinite(sides).all():
         return -sides[0], sides[1]
     # e^T x <= y^T g + |G^T y - e|_1 |x|_inf for every y >= 0: weak duality, with the
@@ -213,8 +246,31 @@ def _bounds(states: ConvexSet) -> tuple[Array, Array]:
     return np.maximum(-sides[0], states.lower), np.minimum(sides[1], states.upper)
 
 
-def _dual_bound(G: Array, g: Array, e: Array) -> tuple[float, float]:
-    """y^T g and a bound on |G^T y - e|_1 for multipliers of max e^T x over G x <= g."""
+def inequalities(states: ConvexSet) -> tuple[Array, Array]:
+    """All inequalities of a set, as G x <= g.
+
+    Parameters
+    ----------
+    states : ConvexSet
+        The set.
+    """
+    eye = np.eye(states.dimension)
+    G = np.vstack((eye, -eye, states.matrix, -states.matrix))
+    g = np.concatenate((states.upper, -states.lower, states.row_upper, -states.row_lower))
+    finite = np.isfinite(g)
+    return G[finite], g[finite]
+
+
+def dual_bound(G: Array, g: Array, e: Array) -> tuple[float, float]:
+    """y^T g and a bound on |G^T y - e|_1 for multipliers of max e^T x over G x <= g.
+
+    Parameters
+    ----------
+    G, g : (K, n) and (K,) array
+        The inequalities.
+    e : (n,) array
+        The direction.
+    """
     from scipy.optimize import linprog
 
     answer = linprog(g, A_eq=G.T, b_eq=e, bounds=(0.0, None), method="highs")

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .._checks import numbers, positive
 from ..errors import OptionError
+from ..sets import ConvexSet
 from .errors import CertificateError
 from .evidence import Evidence
-from .regions import Region
+from .provenance import Subject, founded
+from .regions import Region, stated_region
 
 __all__ = ["Detectability", "ObserverStability"]
 
@@ -92,6 +94,9 @@ class Detectability:
         rounded: what the solver's tolerance and rounding have left.
     cells : int
         In how many pieces of the region the inequality was verified; 0 if in none.
+    subject : Subject or None
+        What it was certified of; None for constants stated by hand, which are assumed
+        whatever evidence is claimed, as are certified ones that were changed.
     """
 
     eta: float
@@ -107,10 +112,15 @@ class Detectability:
     form: str = "assumed"
     margin: float = math.nan
     cells: int = 0
+    subject: Subject | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "evidence", founded(self))
 
     @classmethod
     def assumed(
-        cls, *, eta: float, c_p: float, c_w: float, c_v: float, region: Region | None = None
+        cls, *, eta: float, c_p: float, c_w: float, c_v: float,
+        region: ConvexSet | Region | None = None,
     ) -> Detectability:
         """Constants that the user answers for.
 
@@ -123,10 +133,12 @@ class Detectability:
         ------
         OptionError
             If a constant is not positive, or eta not below 1.
+        SetError
+            If the region is no set.
         """
         return cls(
             _rate("eta", eta), positive("c_p", c_p), positive("c_w", c_w), positive("c_v", c_v),
-            Evidence.ASSUMED, region,
+            Evidence.ASSUMED, stated_region(region),
         )
 
     def bound(
@@ -227,7 +239,7 @@ class ObserverStability:
         Norms of disturbance and noise: W is P and V is L^T P L.
     gain : (n, p) array or None
         L, the observer's constant gain.
-    margin, cells
+    margin, cells, subject
         As for `Detectability`.
     """
 
@@ -245,6 +257,10 @@ class ObserverStability:
     gain: Array | None = None
     margin: float = math.nan
     cells: int = 0
+    subject: Subject | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "evidence", founded(self))
 
     @classmethod
     def assumed(
@@ -255,7 +271,7 @@ class ObserverStability:
         C_w: float,
         C_v: float,
         kappa: float,
-        region: Region | None = None,
+        region: ConvexSet | Region | None = None,
     ) -> ObserverStability:
         """Constants that the user answers for.
 
@@ -268,10 +284,12 @@ class ObserverStability:
         ------
         OptionError
             If a constant is not positive, or rho not below 1.
+        SetError
+            If the region is no set.
         """
         return cls(
             _rate("rho", rho), positive("C_p", C_p), positive("C_w", C_w), positive("C_v", C_v),
-            positive("kappa", kappa), Evidence.ASSUMED, region,
+            positive("kappa", kappa), Evidence.ASSUMED, stated_region(region),
         )
 
     def bound(self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike) -> Array:

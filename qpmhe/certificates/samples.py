@@ -7,15 +7,26 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError
 from ..system import System
+from .enclosures import SmoothModel
+from .evaluation import evaluated, insist_on_values
 from .forms import Form
 from .programs import Scales
 from .regions import Region
 from .verification import Matrices, definite
 
-__all__ = ["MOST_POINTS", "between_samples", "far_apart", "joint_jacobians", "typical_scales"]
+__all__ = [
+    "MOST_POINTS",
+    "between_samples",
+    "far_apart",
+    "insist_on_derivatives",
+    "joint_jacobians",
+    "typical_scales",
+]
 
 Array = NDArray[np.float64]
 
+_WRONG = 1e-3  # more than a derivative computed in some other way may be off
+_WORK = 5e4  # entries of second derivatives that come with an enclosure of the first
 MOST_POINTS = 24  # Jacobians that a program starts with
 
 
@@ -32,13 +43,17 @@ def joint_jacobians(system: System, points: Array) -> Array:
     Raises
     ------
     ModelError
-        If one is not finite.
+        If one is not finite, or f or h is not, or raises.
     """
+    insist_on_values(system, points)  # a step in the imaginary direction may not see NaN
     x, u = points[:, : system.n], points[:, system.n :]
-    with np.errstate(all="ignore"):
-        joint = np.concatenate(
-            (system.f_jacobian.batch(x, u), system.h_jacobian.batch(x, u)), axis=1
-        )
+    joint = np.concatenate(
+        (
+            evaluated("the Jacobian of f", system.f_jacobian, x, u),
+            evaluated("the Jacobian of h", system.h_jacobian, x, u),
+        ),
+        axis=1,
+    )
     broken = ~np.isfinite(joint).all(axis=(1, 2))
     if broken.any():
         raise ModelError(
@@ -46,6 +61,48 @@ def joint_jacobians(system: System, points: Array) -> Array:
             "region; expected functions with derivatives there. Take a smaller region."
         )
     return np.asarray(joint, np.float64)
+
+
+def insist_on_derivatives(
+    model: SmoothModel, system: System, points: Array, jacobians: Array
+) -> None:
+    """Insist that given Jacobians are the derivatives of f and h, where they lie far apart.
+
+    Parameters
+    ----------
+    model : SmoothModel
+        The functions, enclosed.
+    system : System
+        The system.
+    points, jacobians : (K, n + m) and (K, n + p, n) array
+        Where, and what its Jacobians are there.
+
+    Raises
+    ------
+    ModelError
+        If one is not; it names the state.
+    """
+    n = system.n
+    if "given" not in system.derivatives.values():
+        return
+    few = int(np.clip(_WORK / (jacobians[0].size * points.shape[1]), 1, MOST_POINTS))
+    chosen = far_apart(jacobians, few)
+    points, jacobians = points[chosen], jacobians[chosen]
+    enclosure = model.enclose(points, points)
+    for name, rows in (("f", slice(None, n)), ("h", slice(n, None))):
+        if system.derivatives[name] != "given":
+            continue
+        true, given = enclosure.centre[:, rows], jacobians[:, rows]
+        size = np.abs(true).max(axis=(1, 2)) + np.abs(given).max(axis=(1, 2))
+        apart = np.abs(given - true).max(axis=(1, 2)) - enclosure.error[:, rows].max(axis=(1, 2))
+        wrong = apart > _WRONG * (size + 1.0)
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            raise ModelError(
+                f"{name}_jacobian is {given[k].tolist()} at {points[k].tolist()}, but the "
+                f"derivative of {name} there is {np.round(true[k], 9).tolist()}. Correct it, or "
+                "leave it out."
+            )
 
 
 def far_apart(jacobians: Array, count: int = MOST_POINTS) -> NDArray[np.intp]:

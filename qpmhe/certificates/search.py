@@ -13,12 +13,20 @@ from ..system import System
 from .cover import Cover, cover
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel
-from .errors import NotCertifiedError, OutOfTimeError
+from .errors import JumpError, NotCertifiedError, OutOfTimeError
 from .evidence import Evidence
 from .forms import ErrorContraction, Form, OutputInjection, OutputWeight
+from .jumps import jumping
 from .programs import Answer, Kind, Program, expected_seconds
 from .regions import Region
-from .samples import MOST_POINTS, between_samples, far_apart, joint_jacobians, typical_scales
+from .samples import (
+    MOST_POINTS,
+    between_samples,
+    far_apart,
+    insist_on_derivatives,
+    joint_jacobians,
+    typical_scales,
+)
 from .verification import Matrices, definite
 
 __all__ = ["Found", "Search", "checked_rate", "checked_weights"]
@@ -91,7 +99,8 @@ class Search:
     Raises
     ------
     ModelError
-        If the Jacobians are not finite at the samples.
+        If f, h or a Jacobian raises or is not finite at the samples, or a given Jacobian is
+        not the derivative.
     """
 
     def __init__(
@@ -108,6 +117,8 @@ class Search:
         self.model = SmoothModel(system, region)
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
         self.jacobians = joint_jacobians(system, self.points)
+        if not self.model.reason:
+            insist_on_derivatives(self.model, system, self.points, self.jacobians)
         if kind is None:
             outputs = self.jacobians[:, system.n :]
             same = self.model.affine_output or (
@@ -231,7 +242,7 @@ class Search:
                 rate = max(rate, self.best_rate(smallest))
             try:
                 return self.find(rate)
-            except OutOfTimeError:
+            except (OutOfTimeError, JumpError):
                 raise
             except NotCertifiedError as error:
                 # What failed has left more states in the program, and moves the smallest rate.
@@ -291,6 +302,11 @@ class Search:
     def _form(self, answer: Answer, rate: float) -> Form:
         P, Y, R, M, N = answer.P, answer.Y, answer.R, answer.M, answer.N
         assert P is not None
+        if R is not None:
+            # The solver's tolerance may leave it below zero; a larger R asks for less.
+            values, vectors = np.linalg.eigh(R)
+            R = (vectors * np.maximum(values, 0.0)) @ vectors.T
+            R = 0.5 * (R + R.T)
         if self.gain is not None:
             return ErrorContraction(P, self.gain, rate)
         if R is not None and Y is None:
@@ -327,6 +343,9 @@ class Search:
             return Cover(
                 False, 0, float(least.min()), self.points[broken], self.jacobians[broken]
             )
+        jump = jumping(self, everywhere=True)
+        if jump is not None:
+            raise jump
         note = (
             f"{why}; the inequality holds at {self.points.shape[0]} states of the region, and "
             f"{between_samples(form, self.points, self.jacobians)}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -12,11 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import count, numbers, positive
 from ..errors import OptionError, ShapeError
+from .arguments import checked_length
 from .decay import DecayingSums, decaying_sums
 
 __all__ = ["Parts", "WindowBound"]
 
 Array = NDArray[np.float64]
+
+# About as many numbers of windows are held at once.
+_ENTRIES = 4e6
 
 
 @dataclass(frozen=True)
@@ -27,11 +31,11 @@ class Parts:
     ----------
     observer_start, window_start : float
         The initial error as it enters the observer's bound, and detectability's.
-    entering : (T,) array
+    entering : (..., T) array
         What enters the observer's error at each sample.
-    misfit : (T,) array
+    misfit : (..., T) array
         The noises as they enter the candidate's cost.
-    disturbances, noises : (T,) array
+    disturbances, noises : (..., T) array
         As they enter detectability.
     """
 
@@ -190,37 +194,37 @@ class WindowBound(ABC):
         return self.along(self.parts(start, w, v), costs)
 
     def along(self, parts: Parts, costs: ArrayLike | None = None) -> Array:
-        """The bound in the norm of detectability, at t = 0, ..., T.
+        """The bound in the norm of detectability, at t = 0, ..., T, (..., T + 1).
 
         Parameters
         ----------
         parts : Parts
-            What enters.
+            What enters, in one run or in several.
         costs : (T,) array_like, optional
             As of `bound`.
         """
         N, a = self.horizon, self.exponent
-        steps = parts.disturbances.size
+        several, steps = parts.disturbances.shape[:-1], parts.disturbances.shape[-1]
         lengths = np.minimum(np.arange(steps + 1), N)
         decay: Array = self.rho ** np.arange(steps + 1.0)
         error = parts.observer_start * decay + decaying_sums(self.rho, parts.entering)
-        fit = (self.slope * error[:-1] + parts.misfit) ** a
+        fit = (self.slope * error[..., :-1] + parts.misfit) ** a
         roots: Array = _window_sums(fit, N) ** (1.0 / a)
         if costs is not None:
             known = numbers("costs", costs, finite=False)
             if known.shape != (steps,):
                 raise ShapeError(f"costs have shape {known.shape}; expected ({steps},).")
             # NaN is no cost: fmin leaves the bound in its place.
-            roots[1:] = np.fmin(roots[1:], np.maximum(known, 0.0) ** (1.0 / a))
-        entry = np.full(steps + 1, parts.window_start)
-        entry[N + 1 :] = self.entry * error[1 : max(1, steps + 1 - N)]
-        padded = np.zeros((2, N + steps))
-        padded[:, N:] = parts.disturbances, parts.noises
+            roots[..., 1:] = np.fmin(roots[..., 1:], np.maximum(known, 0.0) ** (1.0 / a))
+        entry = np.full((*several, steps + 1), parts.window_start)
+        entry[..., N + 1 :] = self.entry * error[..., 1 : max(1, steps + 1 - N)]
+        padded = np.zeros((2, *several, N + steps))
+        padded[..., N:] = parts.disturbances, parts.noises
         own = np.where(lengths == 0, entry, 0.0)
         for j in range(N):  # a shorter window begins later
             own = np.where(lengths == N - j, entry, own)
-            own = self._advance(own, *padded[:, j : j + steps + 1])
-        own[0] = parts.window_start
+            own = self._advance(own, *padded[..., j : j + steps + 1])
+        own[..., 0] = parts.window_start
         total: Array = self.alphas[lengths] * roots + own
         return total
 
@@ -245,7 +249,14 @@ class WindowBound(ABC):
         ----------
         disturbance, noise : float
             As above.
+
+        Raises
+        ------
+        OptionError
+            If one is negative or not finite.
         """
+        checked_length("disturbance", disturbance)
+        checked_length("noise", noise)
         parts = self.parts(np.zeros(()), np.array([disturbance]), np.array([noise]))
         error = parts.entering / (1.0 - self.rho)
         fit = self.slope * error + parts.misfit
@@ -279,29 +290,49 @@ class WindowBound(ABC):
         # At N + 1 the observer's bound takes the place of the initial error.
         nothing = np.zeros(N + 1)
         first = _over_powers(self.bound(1.0, nothing, nothing), lam, 0)
-        second, third = 0.0, 0.0
-        for start in range(N + 1):
-            impulse = np.zeros(start + N + 1)
-            nothing = np.zeros_like(impulse)
-            impulse[start] = 1.0
-            of_w = self.bound(0.0, impulse, nothing)[start + 1 :]
-            of_v = self.bound(0.0, nothing, impulse)[start + 1 :]
+        second = third = 0.0
+        rows = max(1, int(_ENTRIES / (N * (2 * N + 1))))
+        for least in range(0, N + 1, rows):
+            starts = np.arange(least, min(least + rows, N + 1))
+            of_w, of_v = self._impulses(starts)
             second = max(second, _over_powers(of_w, lam, 1))
             third = max(third, _over_powers(of_v, lam, 1))
         return DecayingSums(lam, max(1.0, first), second, third)
 
 
+    def _impulses(self, starts: NDArray[np.intp]) -> tuple[Array, Array]:
+        """What unit impulses of w and of v at these times make of the N + 1 times after each."""
+        N = self.horizon
+        shape = len(starts), 2 * N + 1
+        impulses, nothing = np.zeros(shape), np.zeros(shape)
+        impulses[np.arange(len(starts)), starts] = 1.0
+        which = np.arange(len(starts))[:, None], starts[:, None] + np.arange(1, N + 2)
+        of_w, of_v = (
+            self.scales[0] * self.along(self._lengths(w, v))[which]
+            for w, v in ((impulses, nothing), (nothing, impulses))
+        )
+        return of_w, of_v
+
+    def _lengths(self, w: Array, v: Array) -> Parts:
+        """`parts` of several runs without initial error, given the lengths (K, T)."""
+        flat = self.parts(np.zeros(()), w.ravel(), v.ravel())
+        return replace(flat, **{
+            name: getattr(flat, name).reshape(w.shape)
+            for name in ("entering", "misfit", "disturbances", "noises")
+        })
+
+
 def _over_powers(values: Array, rate: float, first: int) -> float:
-    """The largest of values[i] / rate^(first + i); infinite where the power vanishes."""
+    """The largest of values[..., i] / rate^(first + i); infinite where the power vanishes."""
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        shares = values / rate ** np.arange(first, first + float(values.size))
+        shares = values / rate ** np.arange(first, first + float(values.shape[-1]))
     return float(np.where(values > 0.0, shares, 0.0).max())
 
 
 def _window_sums(values: Array, width: int) -> Array:
     """Sums over the last values before t = 0, ..., T."""
-    padded = np.concatenate((np.zeros(width), values))
-    sums: Array = sliding_window_view(padded, width).sum(axis=1)
+    padded = np.concatenate((np.zeros((*values.shape[:-1], width)), values), axis=-1)
+    sums: Array = sliding_window_view(padded, width, axis=-1).sum(axis=-1)
     return sums
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import ModelError
 from ..observers import Observer, Sample
 from ..system import System
 
@@ -45,6 +46,11 @@ def observe(
         z(0).
     y, u : (T, p) and (T, m) array
         Measurements and inputs.
+
+    Raises
+    ------
+    ModelError
+        If the model or the observer raises.
     """
     observer.check(system, initial_state)
     steps = y.shape[0]
@@ -54,11 +60,18 @@ def observe(
     with np.errstate(all="ignore"):
         for t in range(steps):
             z = states[t]
-            noises[t] = y[t] - system.h(z, u[t])
-            sample = Sample(system, u[t], covariance=covariance)
-            if observer.needs_jacobians:
-                sample.f_jacobian = system.f_jacobian(z, u[t])
-                sample.h_jacobian = system.h_jacobian(z, u[t])
-            corrections[t], covariance = observer.correct(z, noises[t], sample)
-            states[t + 1] = system.f(z, u[t]) + corrections[t]
+            try:
+                noises[t] = y[t] - system.h(z, u[t])
+                sample = Sample(system, u[t], covariance=covariance)
+                if observer.needs_jacobians:
+                    sample.f_jacobian = system.f_jacobian(z, u[t])
+                    sample.h_jacobian = system.h_jacobian(z, u[t])
+                corrections[t], covariance = observer.correct(z, noises[t], sample)
+                states[t + 1] = system.f(z, u[t]) + corrections[t]
+            except Exception as error:  # a user's function may raise anything
+                raise ModelError(
+                    f"the model or the observer raises {type(error).__name__} along the run, at "
+                    f"z({t}) = {z.tolist()}: {error}. Leave the run out, or make the model defined "
+                    "there."
+                ) from error
     return ObserverRun(states, corrections, noises)

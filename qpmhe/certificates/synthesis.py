@@ -12,8 +12,9 @@ from ..observers import Luenberger
 from ..sets import Box, ConvexSet
 from ..system import System
 from .deadline import DEFAULT_SECONDS, Deadline
-from .errors import NotCertifiedError, OutOfTimeError
+from .errors import JumpError, NotCertifiedError, OutOfTimeError
 from .observer import certify_observer, stability
+from .programs import started
 from .regions import Region, bounded_region
 from .results import ObserverStability
 from .search import Search, checked_rate, checked_weights
@@ -99,7 +100,7 @@ def synthesise_gain(
         )
     checked_rate("rho", rho)
     first, second = checked_weights(weights)
-    deadline = Deadline.of(seconds)
+    deadline = started(seconds)
     search = Search(
         system, bounded_region(system, region, inputs), "synthesis", (first, second),
         seconds=deadline.part(_SEARCH),
@@ -107,7 +108,7 @@ def synthesise_gain(
     try:
         found = search.find_best(criterion) if rho is None else search.find(rho)
         made = stability(search, found)
-    except OutOfTimeError:
+    except (OutOfTimeError, JumpError):
         raise
     except NotCertifiedError as error:
         try:

@@ -12,8 +12,9 @@ from .results import Detectability, ObserverStability
 
 if TYPE_CHECKING:
     from .certificate import Certificate
+    from .regions import Region
 
-__all__ = ["ASSUMED", "certificate_dict", "certificate_text"]
+__all__ = ["ASSUMED", "certificate_dict", "certificate_text", "region_dict", "result_dict"]
 
 #: What no check can see.
 ASSUMED = (
@@ -30,18 +31,14 @@ def certificate_dict(certificate: Certificate) -> dict[str, Any]:
     certificate : Certificate
         The certificate.
     """
-    region = certificate.region
     told = {
         "system": {"n": certificate.system.n, "p": certificate.system.p, "m": certificate.system.m},
-        "region": {
-            "lower": region.lower.tolist(), "upper": region.upper.tolist(),
-            "box": region.is_box, "diameter": certificate.diameter,
-        },
+        "region": region_dict(certificate.region),
         "evidence": certificate.evidence.value,
         "assumed": list(ASSUMED),
         "assumptions": certificate.audit.to_dict(),
-        "detectability": [_told(each) for each in certificate.detectabilities],
-        "observer": [_told(each) for each in certificate.stabilities],
+        "detectability": [result_dict(each) for each in certificate.detectabilities],
+        "observer": [result_dict(each) for each in certificate.stabilities],
         "sizes": vars(certificate.sizes),
         "horizons": [each.to_dict(certificate.sizes) for each in certificate.bounds.values()],
         "vacuous": {
@@ -51,6 +48,20 @@ def certificate_dict(certificate: Certificate) -> dict[str, Any]:
     }
     cleaned: dict[str, Any] = _finite(told)
     return cleaned
+
+
+def region_dict(region: Region) -> dict[str, Any]:
+    """A region in types that JSON knows.
+
+    Parameters
+    ----------
+    region : Region
+        The region.
+    """
+    return {
+        "lower": region.lower.tolist(), "upper": region.upper.tolist(), "box": region.is_box,
+        "diameter": region.diameter,
+    }
 
 
 def certificate_text(certificate: Certificate) -> str:
@@ -65,7 +76,10 @@ def certificate_text(certificate: Certificate) -> str:
     lines = [
         f"On {certificate.region.states!r}: {certificate.evidence}.",
         *(f"Assumed: {each}." for each in ASSUMED),
-        *(f"Violated: {each.text} ({each.label})." for each in certificate.audit.violated),
+        *(
+            f"Violated{'' if each.needed else ', but the bounds need no sets'}: {each.text} "
+            f"({each.label})." for each in certificate.audit.violated
+        ),
         f"Bounds of the error for |w| <= {sizes.disturbance:.3g} and |v| <= "
         f"{sizes.noise:.3g} for all times:",
     ]
@@ -86,13 +100,21 @@ def certificate_text(certificate: Certificate) -> str:
     return "\n".join(lines)
 
 
-def _told(result: Detectability | ObserverStability) -> dict[str, Any]:
+def result_dict(result: Detectability | ObserverStability) -> dict[str, Any]:
+    """What was certified in types that JSON knows.
+
+    Parameters
+    ----------
+    result : Detectability or ObserverStability
+        The result.
+    """
     told = {
         name: value.tolist() if isinstance(value, np.ndarray) else value
         for name, value in vars(result).items()
-        if name not in ("region", "evidence")
+        if name not in ("region", "evidence", "subject")
     }
-    return told | {"evidence": result.evidence.value}
+    cleaned: dict[str, Any] = _finite(told | {"evidence": result.evidence.value})
+    return cleaned
 
 
 def _finite(value: Any) -> Any:

@@ -5,39 +5,35 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 
-from ..certificates.audit import audit
 from ..certificates.certificate import Certificate
 from ..certificates.certification import certify as make
 from ..certificates.choices import Sizes
-from ..certificates.deadline import Deadline
-from ..certificates.detectability import certify_detectability
 from ..certificates.errors import CertificateError, NotCertifiedError
 from ..certificates.figures import LABELS, error_and_bounds
-from ..certificates.hypotheses import MonitorSummary
+from ..certificates.hypotheses import NEEDED, UNNEEDED, MonitorSummary
 from ..certificates.monitor import monitored_run
-from ..certificates.observer import certify_observer
+from ..certificates.programs import started
 from ..certificates.regions import Region, bounded_region
 from ..certificates.results import Detectability, ObserverStability
-from ..certificates.telling import ASSUMED
-from ..errors import InvalidInputError, OptionError, QpmheError, SetError
+from ..certificates.telling import ASSUMED, region_dict
+from ..errors import InvalidInputError, OptionError, SetError
 from ..estimator import MovingHorizonEstimator
 from ..models import Example
 from ..models.scenario import Record
 from ..plots import save
 from ..sets import Box
 from ..studies.sources import find, load
+from .certify_failure import Remainder
 from .certify_tables import assumptions_table, bounds_table, ingredients_table
 
 __all__ = ["certify"]
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
-Result = TypeVar("Result")
 
 # Without --box: the simulated states, with this share of their extent on each side.
 _ROOM = 0.5
@@ -87,72 +83,59 @@ def certify(
     QpmheError
         If an option, the model or the set does not fit.
     """
-    horizons, deadline = _horizons(horizon), Deadline(seconds)
+    horizons, deadline = _horizons(horizon), started(seconds)
     if report is not None:
-        _make_folder(report.parent)  # before any work
+        _check_report(report)  # before any work
     example = load(find(model))
     record = example.scenario.simulate(seed)
     region = _region(example, record, box, input_box)
     sizes = _sizes(example)
     console.print(f"[bold]{example.scenario.title or model}[/], on {_words(region)}",
                   highlight=False)
-    told: dict[str, Any] = {"model": model, "certified": False}
-    try:
+    told: dict[str, Any] = {"model": model, "certified": False, "region": region_dict(region)}
+
+    def attempt(share: float, **parts: Any) -> Certificate:
         with console.status("looking for matrices, and verifying them"):
-            certificate = make(
+            return make(
                 example.system, example.observer, example.cost,
                 horizon=horizons or [example.scenario.horizon], region=region, sizes=sizes,
                 run=record, initial_state=example.scenario.initial_estimate,
-                seconds=deadline.part(0.5),
+                seconds=deadline.part(share), **parts,
             )
+
+    try:
+        certificate = attempt(0.5)
     except (NotCertifiedError, CertificateError) as error:
-        _not_certified(console, example, region, record, error, told, deadline)
-        _write_json(console, report, told)
-        return False
+        rest = Remainder.of(example, region, record, error, deadline)
+        found = None if rest.failures else _from_parts(attempt, rest)
+        if found is None:
+            rest.show(console)
+            _write_json(console, report, told | rest.to_dict())
+            return False
+        certificate = found
     console.print(assumptions_table(certificate.audit))
     console.print(ingredients_table(*_used(certificate)))
     console.print(bounds_table(certificate))
     summary = _picture(console, example, certificate, record, report)
     console.print(f"Simulated record, seed {seed}: {summary}", highlight=False)
+    console.print(
+        f"The bounds need: {', '.join(NEEDED)}. Told only: {', '.join(UNNEEDED)}.".replace(
+            "_", " "), highlight=False,
+    )
     for text in ASSUMED:
         console.print(f"Assumed: {text}.", highlight=False)
-    told |= {"certified": True, "monitor": str(summary)} | certificate.to_dict()
+    told |= {
+        "certified": True, "monitor": str(summary), "monitored": summary.to_dict(),
+    } | certificate.to_dict()
     _write_json(console, report, told)
     return True
 
 
-def _not_certified(
-    console: Console, example: Example, region: Region, record: Record, error: QpmheError,
-    told: dict[str, Any], deadline: Deadline,
-) -> None:
-    """What can be said all the same: the assumptions, and the part that could be shown."""
-    findings = audit(
-        example.system, example.observer, example.cost, region, record,
-        initial_state=example.scenario.initial_estimate, seconds=deadline.part(0.2),
-    )
-    failures: list[str] = []
-    detected = _attempt(failures, "detectability", lambda: certify_detectability(
-        example.system, region, seconds=deadline.part(0.5)))
-    observed = _attempt(failures, "the observer", lambda: certify_observer(
-        example.system, example.observer, region, seconds=deadline))
-    console.print(assumptions_table(findings))
-    if detected is not None or observed is not None:
-        console.print(ingredients_table(detected, observed))
-    failures = failures or [str(error)]
-    for failure in failures:
-        console.print(f"[bold red]Not certified:[/] {escape(failure)}", highlight=False)
-    console.print(
-        "What holds without any certificate: the estimate costs no more than the observer's "
-        "candidate, at each step and with any solver.", highlight=False,
-    )
-    told |= {"failures": failures, "assumptions": findings.to_dict()}
-
-
-def _attempt(failures: list[str], what: str, question: Callable[[], Result]) -> Result | None:
+def _from_parts(attempt: Callable[..., Certificate], rest: Remainder) -> Certificate | None:
+    """The certificate of parts that were found by themselves, where that is enough."""
     try:
-        return question()
-    except (NotCertifiedError, CertificateError) as error:
-        failures.append(f"{what}: {error}")
+        return attempt(1.0, detectability=rest.detected, stability=rest.observed)
+    except (NotCertifiedError, CertificateError):
         return None
 
 
@@ -261,7 +244,7 @@ def _picture(
         v = record.measurements - system.h.batch(record.states[:-1], u)
         bounds = {
             LABELS[kind]: certificate.bound(
-                run, w, v, initial_error=record.states[0] - run.states[0], horizon=N, kind=kind
+                run, w, v, initial_error=record.states[0] - run.states[0], kind=kind, source=mhe
             )
             for kind in certificate.kinds
         }
@@ -276,7 +259,13 @@ def _picture(
     return summary
 
 
-def _make_folder(folder: Path) -> None:
+def _check_report(report: Path) -> None:
+    if report.suffix != ".json":
+        raise OptionError(
+            f"--report is {str(report)!r}; expected a file name that ends with .json, beside which "
+            "the picture goes as .png and .svg."
+        )
+    folder = report.parent
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -286,7 +275,7 @@ def _make_folder(folder: Path) -> None:
 def _write_json(console: Console, report: Path | None, told: dict[str, Any]) -> None:
     if report is None:
         return
-    path = report.with_suffix(".json")
+    path = report
     try:
         path.write_text(json.dumps(told, indent=1, allow_nan=False), encoding="utf-8")
     except OSError as error:

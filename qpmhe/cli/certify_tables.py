@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from rich import box
 from rich.markup import escape
 from rich.table import Table
 
@@ -21,11 +24,18 @@ def assumptions_table(findings: Audit) -> Table:
     findings : Audit
         What was found.
     """
-    table = Table(title="Assumptions", title_justify="left")
+    table = _table("Assumptions")
     for name in ("assumption", "holds", "evidence", "what was found"):
-        table.add_column(name)
+        table.add_column(name, overflow="fold")
+    if any(each.holds is False and not each.needed for each in findings.findings):
+        table.caption = (
+            "The bounds rest on no set: what is certified holds for any w and v, and the region "
+            "takes the place of X."
+        )
     for finding in findings.findings:
         holds = {True: "yes", False: "[bold red]no[/]", None: "not looked at"}[finding.holds]
+        if finding.holds is False and not finding.needed:
+            holds = "no, but not needed"
         table.add_row(
             f"{finding.name} ({finding.label})", holds, str(finding.evidence or "-"),
             escape(finding.text),
@@ -43,13 +53,10 @@ def ingredients_table(
     detected, observed : Detectability and ObserverStability, or None
         What could be certified.
     """
-    table = Table(
-        title="Detectability and observer", title_justify="left",
-        caption="Rate per step; constants of initial error, disturbance and noise. The bounds "
-        "below for other N may use other rates.", caption_justify="left",
+    table = _table(
+        "Detectability and observer", "Rate per step; constants of initial error, disturbance and "
+        "noise. The bounds below for other N may use other rates.",
     )
-    for name in ("", "rate", "c_p", "c_w", "c_v", "evidence"):
-        table.add_column(name, justify="left" if name in ("", "evidence") else "right")
     rows = []
     if detected is not None:
         rows.append(("e-IOSS (eq:eIOSS)", detected.eta, detected.c_p, detected.c_w, detected.c_v,
@@ -57,8 +64,9 @@ def ingredients_table(
     if observed is not None:
         rows.append(("observer (eq:RGES)", observed.rho, observed.C_p, observed.C_w,
                      observed.C_v, observed.evidence))
-    for name, *numbers, evidence in rows:
-        table.add_row(name, *(f"{number:.4g}" for number in numbers), str(evidence))
+    _fill(table, ("", "rate", "c_p", "c_w", "c_v", "evidence"), [
+        (name, *numbers, str(evidence)) for name, *numbers, evidence in rows
+    ])
     return table
 
 
@@ -71,16 +79,19 @@ def bounds_table(certificate: Certificate) -> Table:
         The certificate.
     """
     sizes = certificate.sizes
-    table = Table(
-        title="Bounds of the error (eq:RGES_result)", title_justify="left",
-        caption=f"Limit: for |w| <= {sizes.disturbance:.3g} and |v| <= {sizes.noise:.3g} at all "
-        f"times. Vacuous: no less than {certificate.diameter:.4g}, the diameter of the set. Only "
-        "the first row of each N is the paper's; evidence of all: "
-        f"{certificate.evidence}.",
-        caption_justify="left",
+    largest = {N: bounds.paper.dominating()[1] for N, bounds in certificate.bounds.items()}
+    terms = "; ".join(
+        f"{term} (N = {', '.join(str(N) for N in largest if largest[N] == term)})"
+        for term in dict.fromkeys(largest.values())
     )
-    for name in ("N", "bound", "C_1", "C_2", "C_3", "lambda", "limit", "largest term", ""):
-        table.add_column(name, justify="left" if name in ("bound", "largest term", "") else "right")
+    table = _table(
+        "Bounds of the error (eq:RGES_result)",
+        f"Limit: for |w| <= {sizes.disturbance:.3g} and |v| <= {sizes.noise:.3g} at all "
+        f"times. Vacuous: no less than {certificate.diameter:.4g}, the diameter of the set. Only "
+        f"the first row of each N is the paper's; its largest term in C_2: {terms}. Evidence of "
+        f"all: {certificate.evidence}.",
+    )
+    rows: list[tuple[Any, ...]] = []
     for N, bounds in certificate.bounds.items():
         for kind in certificate.kinds:
             if kind == "measured":
@@ -88,11 +99,34 @@ def bounds_table(certificate: Certificate) -> Table:
             window = {"summed": bounds.summed, "weighted": bounds.weighted}.get(kind)
             result = bounds.paper.result if window is None else window.result()
             limit = certificate.limit(sizes.disturbance, sizes.noise, horizon=N, kind=kind)
-            table.add_row(
-                str(N) if kind == "paper" else "", LABELS[kind],
-                *(f"{value:.4g}" for value in (*result.constants, result.rate, limit)),
-                bounds.paper.dominating()[1] if kind == "paper" else "",
-                "[yellow]vacuous[/]" if certificate.vacuous(horizon=N, kind=kind) else "",
-            )
-        table.add_section()
+            vacuous = certificate.vacuous(horizon=N, kind=kind)
+            rows.append((
+                str(N) if kind == "paper" else "", LABELS[kind], *result.constants, result.rate,
+                limit, "[yellow]vacuous[/]" if vacuous else "",
+            ))
+    _fill(table, ("N", "bound", "C_1", "C_2", "C_3", "lambda", "limit", ""), rows)
     return table
+
+
+def _table(title: str, caption: str | None = None) -> Table:
+    return Table(
+        title=title, title_justify="left", caption=caption, caption_justify="left",
+        box=box.SIMPLE, padding=(0, 1, 0, 0),
+    )
+
+
+def _fill(table: Table, names: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
+    """Columns and rows; words give way where it is narrow, figures are never cut."""
+    told = [
+        [f"{value:.4g}" if isinstance(value, float) else str(value) for value in row]
+        for row in rows
+    ]
+    for j, name in enumerate(names):
+        figures = name == "N" or any(isinstance(row[j], float) for row in rows)
+        width = max([len(name), *(len(row[j]) for row in told)]) if figures else None
+        table.add_column(
+            name, justify="right" if figures else "left", overflow="fold", no_wrap=False,
+            min_width=width,
+        )
+    for row in told:
+        table.add_row(*row)

@@ -7,16 +7,22 @@ import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.certificates import bounds as bounds_module
+from qpmhe.certificates import certification
+from qpmhe.certificates.audit import audit
 from qpmhe.certificates.bounds import window_level
 from qpmhe.certificates.certification import certify, cost_sizes
 from qpmhe.certificates.choices import level
 from qpmhe.certificates.decay import DecayingSums
+from qpmhe.certificates.detectability import certify_detectability
 from qpmhe.certificates.errors import CertificateError, NotCertifiedError
 from qpmhe.certificates.evidence import Evidence
 from qpmhe.certificates.figures import LABELS, error_and_bounds
+from qpmhe.certificates.observer import certify_observer
 from qpmhe.certificates.results import Detectability, ObserverStability
+from qpmhe.certificates.synthesis import synthesise_gain
 from qpmhe.certificates.theorem import theorem
-from qpmhe.errors import OptionError, SetError, ShapeError
+from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
 
 SLACK = 1 + 1e-9
 KINDS = ("paper", "summed", "weighted", "measured")
@@ -72,9 +78,9 @@ def test_the_paper_bound_is_called_vacuous_and_the_measured_one_is_not(reactor):
     assert not certificate.vacuous(0.0, 0.0, horizon=10)
     assert "vacuous" in certificate.summary()
     states, _ = scenario.simulate(0)
-    run, w, v = played(certificate, scenario, 0, 10)
+    run, w, v, mhe = played(certificate, scenario, 0, 10)
     measured = certificate.bound(
-        run, w, v, initial_error=states[0] - run.states[0], horizon=10, kind="measured"
+        run, w, v, initial_error=states[0] - run.states[0], kind="measured", source=mhe
     )
     assert measured.max() < certificate.diameter
 
@@ -87,7 +93,7 @@ def played(certificate, scenario, seed, horizon, **options):
     )
     run = mhe.run(measurements)
     w = states[1:] - certificate.system.f.batch(states[:-1], np.zeros((len(states) - 1, 0)))
-    return run, w, measurements - states[:-1].sum(axis=1, keepdims=True)
+    return run, w, measurements - states[:-1].sum(axis=1, keepdims=True), mhe
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -96,17 +102,18 @@ def test_no_bound_is_below_the_error(reactor, kind, max_qps):
     certificate, scenario = reactor
     for seed in range(3):
         states, _ = scenario.simulate(seed)
-        run, w, v = played(certificate, scenario, seed, 5, max_qps=max_qps)
+        run, w, v, mhe = played(certificate, scenario, seed, 5, max_qps=max_qps)
         error = np.linalg.norm(states - run.states, axis=1)
         bound = certificate.bound(
-            run, w, v, initial_error=states[0] - run.states[0], horizon=5, kind=kind
+            run, w, v, initial_error=states[0] - run.states[0], horizon=5, kind=kind,
+            source=mhe,
         )
         assert (error <= bound).all()
 
 
 def test_bounded_disturbances_give_the_funnel(reactor):
     certificate, scenario = reactor
-    run, w, v = played(certificate, scenario, 0, 5)
+    run, w, v, _ = played(certificate, scenario, 0, 5)
     w_max, v_max = np.linalg.norm(w, axis=1).max(), np.abs(v).max()
     for kind in KINDS[:3]:
         funnel = certificate.funnel(
@@ -126,7 +133,7 @@ def test_bounded_disturbances_give_the_funnel(reactor):
 
 def test_the_paper_bound_is_the_right_hand_side(reactor):
     certificate, scenario = reactor
-    run, w, v = played(certificate, scenario, 0, 5)
+    run, w, v, _ = played(certificate, scenario, 0, 5)
     C, lam = certificate.of(5).paper.C, certificate.of(5).paper.lam
     found = certificate.bound(run, w, v, initial_error=[2.0, 2.0], horizon=5)
     for t in (0, 3, 60):
@@ -272,8 +279,117 @@ def test_bad_arguments_of_a_bound_are_named(reactor):
         certificate.bound(None, np.zeros(4), 0.1, initial_error=np.zeros(3), horizon=5)
     with pytest.raises(OptionError, match="kind"):
         certificate.bound(None, np.zeros(4), 0.1, initial_error=1.0, horizon=5, kind="best")
-    with pytest.raises(qpmhe.errors.InvalidInputError, match="run"):
+    with pytest.raises(qpmhe.errors.InvalidInputError, match="source"):
         certificate.bound(None, np.zeros(4), 0.1, initial_error=1.0, horizon=5, kind="measured")
+
+
+@pytest.mark.parametrize("value", [-1, -1.0, math.nan, math.inf, "1", True, None, [1.0]])
+def test_lengths_out_of_range_are_named(reactor, value):
+    certificate, _ = reactor
+    for kind in ("paper", "weighted"):
+        with pytest.raises(OptionError, match="w_max is"):
+            certificate.limit(value, 0.1, horizon=5, kind=kind)
+        with pytest.raises(OptionError, match="v_max is"):
+            certificate.funnel(0.1, value, initial_error=1.0, steps=3, horizon=5, kind=kind)
+        with pytest.raises(OptionError, match="initial_error is"):
+            certificate.funnel(0.1, 0.1, initial_error=value, steps=3, horizon=5, kind=kind)
+        if value is not None:
+            with pytest.raises(OptionError, match="w_max is"):
+                certificate.vacuous(value, 0.1, horizon=5, kind=kind)
+    with pytest.raises(OptionError, match="noise is"):
+        certificate.of(5).paper.result.limit(1.0, value)
+    with pytest.raises(OptionError, match="noise is"):
+        certificate.of(5).weighted.limit(1.0, value)
+
+
+def test_a_funnel_needs_steps_and_nothing_measured(reactor):
+    certificate, _ = reactor
+    for steps in (2.5, 0, -1, True, "3"):
+        with pytest.raises(OptionError, match="steps is"):
+            certificate.funnel(0.1, 0.1, initial_error=1.0, steps=steps, horizon=5)
+    with pytest.raises(OptionError, match="nothing is measured yet"):
+        certificate.funnel(0.1, 0.1, initial_error=1.0, steps=3, horizon=5, kind="measured")
+    with pytest.raises(OptionError, match="initial_error is"):
+        certificate.bound(None, np.zeros(4), 0.1, initial_error=-1.0, horizon=5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"horizon": 1.5}, OptionError, "horizon is 1.5"),
+        ({"horizon": "5"}, OptionError, "horizon is '5'"),
+        ({"horizon": None}, OptionError, "horizon is None"),
+        ({"horizon": [1, 2.5]}, OptionError, "horizon is 2.5"),
+        ({"observer": None}, InvalidInputError, "observer is None"),
+        ({"cost": None}, InvalidInputError, "cost is None"),
+        ({"system": None}, ModelError, "system is None"),
+        ({"region": ([-1], [1])}, SetError, "region is"),
+        ({"cost": qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)}, ShapeError,
+         "cost is for 1 states and 1 outputs; expected 2 and 1"),
+    ],
+)
+def test_what_is_no_ingredient_is_named(reactor, arguments, error, words):
+    certificate, _ = reactor
+    given = {
+        "system": certificate.system, "observer": certificate.observer,
+        "cost": certificate.cost, "horizon": 5, "region": certificate.region,
+    } | arguments
+    with pytest.raises(error, match=words):
+        certify(given.pop("system"), given.pop("observer"), given.pop("cost"), **given)
+    if "horizon" not in arguments:
+        given = {
+            "system": certificate.system, "observer": certificate.observer,
+            "cost": certificate.cost, "region": certificate.region,
+        } | arguments
+        with pytest.raises(error, match=words):
+            audit(*given.values())
+
+
+@pytest.mark.parametrize("question", [certify_detectability, synthesise_gain])
+def test_no_system_is_named_by_the_parts_as_well(question):
+    with pytest.raises(ModelError, match="system is None"):
+        question(None, qpmhe.Box([-1.0], [1.0]))
+    with pytest.raises(ModelError, match="system is None"):
+        certify_observer(None, qpmhe.Luenberger([[0.1]]), qpmhe.Box([-1.0], [1.0]))
+
+
+def test_no_observer_is_named_by_its_certification(reactor):
+    certificate, _ = reactor
+    with pytest.raises(InvalidInputError, match="observer is None"):
+        certify_observer(certificate.system, None, certificate.region)
+
+
+def test_many_horizons_try_few_pairs_and_lose_little(linear, monkeypatch):
+    seen = []
+    original = bounds_module.window_level
+
+    def counted(bound, sizes):
+        seen.append(bound.horizon)
+        return original(bound, sizes)
+
+    monkeypatch.setattr(bounds_module, "window_level", counted)
+    horizons = list(range(1, 16))
+    many = certification._at_each(
+        horizons, lambda N, pairs: bounds_module.bounds_for(
+            N, linear.detectabilities, linear.stabilities, linear.cost, linear.audit.constants,
+            lipschitz=linear.audit.lipschitz, sizes=linear.sizes, pairs=pairs,
+        )
+    )
+    assert list(many) == horizons
+    pairs = len(linear.detectabilities) * len(linear.stabilities)
+    assert pairs > 12
+    assert [seen.count(N) for N in (1, 8, 15)] == [2 * pairs] * 3
+    assert all(seen.count(N) <= 18 for N in horizons if N not in (1, 8, 15))
+    for N in (3, 11):
+        full = bounds_module.bounds_for(
+            N, linear.detectabilities, linear.stabilities, linear.cost, linear.audit.constants,
+            lipschitz=linear.audit.lipschitz, sizes=linear.sizes,
+        )
+        for kind in ("summed", "weighted"):
+            reached, best = (original(getattr(one, kind), linear.sizes) for one in (many[N], full))
+            assert best <= SLACK * reached <= 1.1 * best
+        reached, best = (level(one.paper.result, linear.sizes) for one in (many[N], full))
+        assert reached <= 1.2 * best
 
 
 def test_figure_shows_error_and_bounds():

@@ -7,18 +7,27 @@ import re
 import pytest
 from rich.console import Console
 
+from qpmhe.certificates.errors import OutOfTimeError
+from qpmhe.cli import certify as command
 from qpmhe.cli.certify import certify
-from qpmhe.errors import OptionError, QpmheError, SetError
+from qpmhe.errors import ModelError, OptionError, QpmheError, SetError
 
 MODEL = '''
 import numpy as np
 import qpmhe
 
-def model(gain=0.4, growth=0.7, discount=1.0):
+def raising(x):
+    if x[0] > 1.5:
+        raise ValueError("no way")
+    return 0.5 * x
+
+def model(gain=0.4, growth=0.7, discount=1.0, room=None, broken=False):
     A = np.array([0.9, growth])
     B = np.array([[0.9, 0.2], [-0.1, 0.7]])
     system = qpmhe.System(
-        lambda x: x @ B.T if growth < 1 else x * A, lambda x: x[..., :1], n=2, p=1)
+        raising if broken else lambda x: x @ B.T if growth < 1 else x * A,
+        lambda x: x[..., :1], n=2, p=1,
+        disturbances=None if room is None else qpmhe.Box([-room] * 2, [room] * 2))
     scenario = qpmhe.models.Scenario(
         system=system, initial_state=np.array([1.0, 0.5]), initial_estimate=np.zeros(2),
         disturbance_covariance=1e-4 * np.eye(2), noise_covariance=1e-2 * np.eye(1), dt=1.0,
@@ -34,9 +43,9 @@ def shown(tmp_path):
     """Calls the command on the model above, and gives what it returned and printed."""
     (tmp_path / "two.py").write_text(MODEL)
 
-    def call(arguments="", **options):
+    def call(arguments="", width=200, **options):
         text = io.StringIO()
-        console = Console(file=text, width=200, color_system=None)
+        console = Console(file=text, width=width, color_system=None)
         done = certify(console, f"{tmp_path}/two.py:model{arguments}", **options)
         return done, text.getvalue()
 
@@ -128,3 +137,99 @@ def test_a_report_that_cannot_be_written_is_told(shown, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(QpmheError, match="cannot write"):
         shown("(gain=-2.0)", report=tmp_path / "file" / "x.json")
+
+
+def test_figures_are_never_cut_at_80_columns(shown, tmp_path):
+    report = tmp_path / "wide.json"
+    done, text = shown(width=80, horizon="1,10,100", report=report, box="-2:2,-2:2")
+    assert done
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= max(80, 7 + len(str(report)))
+    told = json.loads(report.read_text())
+    for each in told["horizons"]:
+        for kind in ("paper", "summed", "weighted"):
+            for value in (*each[kind]["C"], each[kind]["lambda"]):
+                assert f" {value:.4g} " in text, (each["horizon"], kind, value)
+
+
+def test_parts_that_the_fallback_certifies_are_used(shown, monkeypatch, tmp_path):
+    asked = []
+
+    def late(*arguments, **options):
+        asked.append(options)
+        if len(asked) == 1:
+            raise OutOfTimeError("the time for this search was too short", ("more seconds",))
+        return original(*arguments, **options)
+
+    original = command.make
+    monkeypatch.setattr(command, "make", late)
+    report = tmp_path / "late.json"
+    done, text = shown(box="-2:2,-2:2", report=report)
+    assert done
+    assert "too short" not in text
+    assert json.loads(report.read_text())["evidence"] == "proved"
+    assert asked[1]["detectability"].evidence.value == asked[1]["stability"].evidence.value
+
+
+def test_hypotheses_that_the_bound_does_not_need_are_told_as_such(shown, tmp_path):
+    report = tmp_path / "sets.json"
+    done, text = shown("(room=0.001)", box="-2:2,-2:2", report=report)
+    assert done
+    words = " ".join(text.split())
+    assert "no, but not needed" in words
+    assert "The bounds rest on no set" in words
+    assert "Told only: candidate in sets, feasible." in words
+    told = json.loads(report.read_text())
+    hypotheses = told["monitored"]["hypotheses"]
+    assert told["monitored"]["applied"] == 20
+    assert hypotheses["candidate_in_sets"]["needed"] is False
+    missed = hypotheses["candidate_in_sets"]["failed"]
+    assert missed > 0
+    assert f"the bound needs no sets: candidate in sets at {missed} step" in told["monitor"]
+    assert told["monitor"] in words
+    assert hypotheses["kappa"] == {"needed": True, "failed": 0, "held": 20}
+    needed = {each["name"]: each["needed"] for each in told["assumptions"]}
+    assert [name for name in needed if not needed[name]] == [
+        "states stay in X", "candidate in the sets"
+    ]
+
+
+def test_a_failure_is_told_to_machines_in_full(shown, tmp_path):
+    report = tmp_path / "failed.json"
+    assert not shown("(gain=-2.0)", report=report, box="-2:2,-2:2")[0]
+    told = json.loads(report.read_text())
+    assert told["region"]["lower"] == [-2.0, -2.0]
+    assert told["region"]["diameter"] == pytest.approx(32.0 ** 0.5)
+    assert told["detectability"][0]["evidence"] == "proved"
+    assert 0.0 < told["detectability"][0]["eta"] < 1.0
+    assert told["observer"] == []
+    assert any("another gain" in each for each in told["suggestions"])
+    assert told["smallest_rates"] == {"eta": None, "rho": None}
+
+
+def test_smallest_feasible_rate_is_told_to_machines(shown, monkeypatch, tmp_path):
+    from qpmhe.certificates.errors import NotCertifiedError
+
+    def refused(*_, **__):
+        raise NotCertifiedError("no", ("a larger eta",), 0.73)
+
+    monkeypatch.setattr(command, "make", refused)
+    monkeypatch.setattr("qpmhe.cli.certify_failure.certify_detectability", refused)
+    report = tmp_path / "failed.json"
+    assert not shown(report=report, box="-2:2,-2:2")[0]
+    told = json.loads(report.read_text())
+    assert told["smallest_rates"] == {"eta": 0.73, "rho": None}
+    assert told["suggestions"] == ["a larger eta"]
+    assert told["observer"][0]["rho"] < 1.0
+
+
+def test_a_report_of_another_kind_is_refused(shown, tmp_path):
+    for name in ("x.txt", "x"):
+        with pytest.raises(OptionError, match=r"--report is .*x.*\.json"):
+            shown(report=tmp_path / name)
+    assert list(tmp_path.glob("x*")) == []
+
+
+def test_a_model_that_raises_in_the_box_is_an_error_of_ours(shown):
+    with pytest.raises(ModelError, match=r"no way.*smaller region"):
+        shown("(broken=True)", box="-2:2,-2:2")

@@ -16,6 +16,7 @@ from qpmhe.certificates.falsification import attack_detectability, attack_observ
 from qpmhe.certificates.observer import certify_observer
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.certificates.synthesis import synthesise_gain
+from qpmhe.errors import InvalidInputError, OptionError, SetError, ShapeError
 
 # The numbers of the full campaign, by the environment; small ones otherwise.
 FULL = os.environ.get("QPMHE_FULL_FALSIFICATION", "") == "1"
@@ -53,6 +54,35 @@ def test_a_constant_reduced_by_a_fifth_is_caught(which):
         assert attack.ratio == pytest.approx(1.25, rel=1e-2)
         # The example speaks for itself.
         assert (attack.example["error"] > 1.2 * attack.example["bound"]).any()
+
+
+def test_boxes_serve_as_regions_and_what_does_not_fit_is_named():
+    system, region = scalar()
+    gain = [[0.15]]
+    for ask in (
+        lambda place, **more: attack_detectability(system, place, EXACT, **{"trials": 40} | more),
+        lambda place, **more: attack_observer(system, place, gain, EXACT, **{"trials": 40} | more),
+    ):
+        by_box, by_region = ask(qpmhe.Box([-1.0], [1.0])), ask(region)
+        assert by_box.ratio == by_region.ratio
+        with pytest.raises(SetError, match="region is"):
+            ask(([-1.0], [1.0]))
+        with pytest.raises(SetError, match="no region"):
+            ask(None)
+        for name, value in (("trials", 2.5), ("trials", 0), ("steps", 1.5), ("polish", -1)):
+            with pytest.raises(OptionError, match=f"{name} is"):
+                ask(region, **{name: value})
+    with pytest.raises(ShapeError, match="gain has shape"):
+        attack_observer(system, region, [[0.1, 0.2]], EXACT, trials=4)
+    with pytest.raises(InvalidInputError, match="claim is 3"):
+        attack_detectability(system, region, 3, trials=4)
+    with pytest.raises(InvalidInputError, match="certificate is 3"):
+        attack_estimator(3)
+    driven = qpmhe.System(lambda x, u: 0.8 * x + u, lambda x, u: 2.0 * x, n=1, p=1, m=1)
+    box = qpmhe.Box([-1.0], [1.0])
+    assert not attack_detectability(driven, box, EXACT, trials=20, inputs=box).refuted
+    with pytest.raises(SetError, match="inputs is None"):
+        attack_detectability(driven, box, EXACT, trials=20)
 
 
 def test_a_rate_that_is_too_small_is_caught():

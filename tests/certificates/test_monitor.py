@@ -94,6 +94,16 @@ def test_sets_that_were_dropped_are_told_but_not_needed():
     assert values(check) == {"candidate_in_sets", "feasible"}
     assert check.held
     assert check.failed == ()
+    _, summary = monitored_run(certificate, estimator(certificate), [5.0, 0.0, 0.0, 0.0, 0.0])
+    assert (summary.applied, summary.first_failure) == (5, None)
+    assert summary.missed["candidate_in_sets"] > 0
+    for name in ("candidate_in_sets", "feasible"):
+        count = summary.missed[name]
+        assert f"{name.replace('_', ' ')} at {count} step" in str(summary)
+        assert summary.to_dict()["hypotheses"][name] == {
+            "needed": False, "failed": count, "held": 5 - count,
+        }
+    assert "the bound needs no sets" in str(summary)
 
 
 def test_a_projected_candidate_is_no_observer_trajectory():

@@ -1,0 +1,184 @@
+"""Models that raise, are not finite, jump, or come with wrong derivatives, are named so."""
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.certificates.audit import audit
+from qpmhe.certificates.certification import certify
+from qpmhe.certificates.constants import euclidean_constants
+from qpmhe.certificates.detectability import certify_detectability
+from qpmhe.certificates.enclosures import SmoothModel
+from qpmhe.certificates.errors import JumpError, NotCertifiedError
+from qpmhe.certificates.evidence import Evidence
+from qpmhe.certificates.jumps import jump_between
+from qpmhe.certificates.lipschitz import constant_output, output_lipschitz
+from qpmhe.certificates.observer import certify_observer
+from qpmhe.certificates.regions import bounded_region
+from qpmhe.certificates.synthesis import synthesise_gain
+from qpmhe.errors import ModelError
+
+COST = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
+GAIN = qpmhe.Luenberger([[0.1]])
+
+
+def box(low, high):
+    return qpmhe.Box([low], [high])
+
+
+def scalar(f=lambda x: 0.5 * x, h=lambda x: 1.0 * x, **options):
+    return qpmhe.System(f, h, n=1, p=1, **options)
+
+
+def picky(x):
+    if np.any(np.real(x) > 50.0):
+        raise ValueError("too large")
+    return 0.5 * x
+
+
+def lost(x):
+    return np.where(np.real(x) > 5.0, np.nan, 0.5 * x)
+
+
+QUESTIONS = {
+    "detectability": lambda s, r: certify_detectability(s, r),
+    "observer": lambda s, r: certify_observer(s, GAIN, r),
+    "synthesis": lambda s, r: synthesise_gain(s, r),
+    "certificate": lambda s, r: certify(s, GAIN, COST, horizon=2, region=r),
+}
+
+
+@pytest.mark.parametrize("which", [*QUESTIONS, "audit"])
+@pytest.mark.parametrize("letter", ["f", "h"])
+def test_a_function_that_raises_is_told_with_the_state(which, letter):
+    ask = (QUESTIONS | {"audit": lambda s, r: audit(s, GAIN, COST, r)})[which]
+    with pytest.raises(
+        ModelError, match=rf"{letter} raises ValueError at x = \[100.0\].*too large.*smaller region"
+    ):
+        ask(scalar(**{letter: picky}), box(-100.0, 100.0))
+
+
+def test_a_function_that_raises_between_the_samples_is_told():
+    def sliver(x):
+        if x[0] > 0.1234 and x[0] < 0.1235:
+            raise ValueError("in between")
+        return np.array([0.5 * x[0]])
+
+    region = bounded_region(scalar(sliver), box(0.0, 1.0))
+    points = region.sample(400, np.random.default_rng(20210829))[:, 0]
+    assert not ((points > 0.1233) & (points < 0.1236)).any()
+    with pytest.raises(ModelError, match=r"f raises ValueError at x = \[0.123.*in between"):
+        certify_detectability(scalar(sliver), region)
+
+
+@pytest.mark.parametrize("which", list(QUESTIONS))
+@pytest.mark.parametrize("place", [(6.0, 10.0), (-10.0, 10.0), (-10.0, 5.001)])
+def test_what_is_not_finite_is_refused(which, place):
+    with pytest.raises(ModelError, match=r"f is not finite at x = .*nan.*smaller region"):
+        QUESTIONS[which](scalar(lost), box(*place))
+
+
+def test_the_audit_names_where_f_is_not_finite():
+    found = audit(scalar(lost), GAIN, COST, box(6.0, 10.0))["states stay in X"]
+    assert found.holds is False
+    assert "not finite" in found.text
+    assert np.isnan(found.counterexample["f(x)"]).all()
+
+
+def test_nothing_is_enclosed_where_the_value_is_not_a_number():
+    def nothing(x):
+        return np.where(np.real(x) > 5.0, np.nan, 0.0)
+
+    place = np.array([[6.0]]), np.array([[10.0]])
+    for f in (lost, lambda x: np.maximum(0.5 * x, nothing(x)), lambda x: 0.5 * x + nothing(x)):
+        system = scalar(f)
+        model = SmoothModel(system, bounded_region(system, box(6.0, 10.0)))
+        with pytest.raises(ModelError, match="not finite"):
+            model.enclose(*place)
+
+
+def test_a_value_of_nan_has_no_derivative():
+    # Past the middle, where the functions are tried, a number is added that is none.
+    system = scalar(lambda x: 0.5 * x + (np.inf - np.inf if np.all(x > 3.0) else 0.0))
+    region = bounded_region(system, box(-4.0, 4.0))
+    model = SmoothModel(system, region)
+    assert model.reason == ""
+    with pytest.raises(ModelError, match="not finite"):
+        model.enclose(np.array([[3.5]]), np.array([[4.0]]))
+
+
+@pytest.mark.parametrize(
+    ("f", "h", "words"),
+    [
+        (lambda x: 0.5 * x + 5.0 * np.sign(x), lambda x: 0.0 * x, "f seems to jump, by 5 at"),
+        (lambda x: 0.5 * x + 5.0 * np.floor(x), lambda x: 0.0 * x, "f seems to jump, by 5 at"),
+        (lambda x: 1.1 * x, lambda x: 0.0 * x + np.round(x + 0.5), "h seems to jump, by 1 at"),
+        (lambda x: np.array([0.5 * float(x[0]) + (5.0 if x[0] > 0.3 else 0.0)]),
+         lambda x: 0.0 * x,
+         r"f seems to jump, by 5 at \[0.3\]"),
+    ],
+)
+def test_a_jump_is_called_one(f, h, words):
+    with pytest.raises(JumpError, match=words):
+        certify_detectability(scalar(f, h), box(-1.0, 1.0))
+
+
+def test_a_jump_is_told_of_the_observer_too():
+    with pytest.raises(JumpError, match="f seems to jump"):
+        certify_observer(
+            scalar(lambda x: 0.5 * x + 5.0 * np.sign(x)), qpmhe.Luenberger([[0.1]]), box(-1.0, 1.0)
+        )
+
+
+def test_what_is_steep_or_kinked_is_not_said_to_jump():
+    for f in (lambda x: 1e6 * x, lambda x: np.tanh(1e4 * x), lambda x: 0.5 * np.abs(x)):
+        system = scalar(f, lambda x: 0.0 * x)
+        points = bounded_region(system, box(-1.0, 1.0)).sample(200, np.random.default_rng(0))
+        assert jump_between(system, points) == ""
+    with pytest.raises(NotCertifiedError, match="not in the output"):
+        certify_detectability(scalar(lambda x: 1e6 * x, lambda x: 0.0 * x), box(-1.0, 1.0))
+
+
+def wrong_slope(slope):
+    """h(x) = x, with a derivative that is wrong where the system's own check does not look."""
+    return scalar(h_jacobian=lambda x: np.array([[1.0 if x[0] < 3.0 else slope]]))
+
+
+def test_a_wrong_derivative_is_named_where_intervals_know_better():
+    for slope in (0.01, 0.9):
+        with pytest.raises(ModelError, match=rf"h_jacobian is \[\[{slope}\]\].*\[\[1.0\]\]"):
+            certify(
+                wrong_slope(slope), qpmhe.Luenberger([[0.4]]), COST, horizon=[3],
+                region=box(4.0, 10.0),
+            )
+
+
+def test_the_slope_of_the_output_is_that_of_the_enclosure():
+    system = wrong_slope(0.01)
+    region = bounded_region(system, box(4.0, 10.0))
+    found = constant_output(system, region)
+    assert abs(found.middle[0, 0, 0] - 1.0) <= found.radius[0, 0, 0] <= 1e-12
+    right = scalar()
+    detected = certify_detectability(right, region, eta=0.8)
+    observed = certify_observer(right, qpmhe.Luenberger([[0.4]]), region, rho=0.7)
+    slope = certify(
+        right, qpmhe.Luenberger([[0.4]]), COST, horizon=3, region=region,
+        detectability=detected, stability=observed,
+    ).of().weighted.slope
+    # |dh|_M / |dx|_O with M = 0.4^2 + 1.
+    expected = np.sqrt(1.16 / observed.P[0, 0])
+    assert slope == pytest.approx(expected, rel=1e-7)
+    assert slope >= expected
+
+
+def test_an_output_that_cannot_be_enclosed_has_the_sampled_slope():
+    system = scalar(h=lambda x: np.array([float(x[0])]))
+    region = bounded_region(system, box(-1.0, 1.0))
+    assert constant_output(system, region) is None
+    assert output_lipschitz(system, region).evidence is Evidence.SAMPLED
+
+
+def test_an_output_weight_below_zero_by_rounding_is_no_weight():
+    c_p, c_w, c_v = euclidean_constants(np.eye(1), np.array([[-1e-9]]), 0.5)
+    assert (c_p, c_w) == pytest.approx((1.0, 2.0))
+    assert 0.0 < c_v < 1e-3
