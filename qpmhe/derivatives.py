@@ -81,6 +81,11 @@ class Jacobian:
             return self._given.direct
         return self if self._inputs else partial(self, u=np.zeros(0))
 
+    @property
+    def reads_only(self) -> bool:
+        """Whether it works on arrays that it cannot write to."""
+        return self._given is None or self._given.reads_only
+
     def _complex(self, x: Array, u: Array) -> Array:
         n = x.shape[-1]
         moved = x[..., None, :] + (1j * _COMPLEX_STEP) * np.eye(n)

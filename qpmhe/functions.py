@@ -67,6 +67,8 @@ class BatchedFunction:
             )
         # A scalar at one state is a value of shape (1,): p = 1 is written without brackets.
         self._short = False
+        #: Whether it works on arrays that it cannot write to, as compiled code may not.
+        self.reads_only = True
         self._returns_array = True
         self.mode = "unknown"
         self._detect(probes)
@@ -141,15 +143,12 @@ class BatchedFunction:
         """The checked value at a probe; None where the function cannot be used there."""
         x_given, u_given = x.copy(), u.copy()
         try:
-            with np.errstate(all="ignore"):
-                raw = (
-                    self._function(x_given, u_given)
-                    if self._takes_input
-                    else self._function(x_given)
-                )
-                value = np.array(raw, dtype=np.float64)  # a copy: it may be one buffer
+            raw = self._tried(x_given, u_given)
+            value = np.array(raw, dtype=np.float64)  # a copy: it may be one buffer
         except Exception:  # outside its domain; the estimator checks at the initial state
             return None
+        if isinstance(raw, np.ndarray) and raw.dtype == np.object_:
+            self._function = _with_numbers(self._function)
         if not (np.array_equal(x_given, x) and np.array_equal(u_given, u)):
             raise ModelError(
                 f"{self.name} changes its argument in place; copy x before writing to it."
@@ -163,6 +162,24 @@ class BatchedFunction:
         self._short = value.shape != self.shape
         self._returns_array = self._returns_array and isinstance(raw, np.ndarray)
         return value.reshape(self.shape) if np.isfinite(value).all() else None
+
+    def _tried(self, x: Array, u: Array) -> Any:
+        """The raw value, of arguments that it cannot change if it can do with such."""
+        arguments = (x, u) if self._takes_input else (x,)
+        with np.errstate(all="ignore"):
+            if self.reads_only:
+                for one in arguments:
+                    one.flags.writeable = False
+                try:
+                    return self._function(*arguments)
+                except (ValueError, TypeError):  # what writing, or wanting to, comes to
+                    pass
+                finally:
+                    for one in arguments:
+                        one.flags.writeable = True
+            value = self._function(*arguments)
+            self.reads_only = False
+            return value
 
     def agrees(self, x: Array, u: Array, expected: Array, tolerance: float) -> bool:
         """Whether a batch gives what single states gave; if not, states are looped over.
@@ -225,6 +242,15 @@ class BatchedFunction:
                 f"{self.name} is {value.tolist()} at the initial state {x.tolist()}; "
                 "expected finite numbers. Start elsewhere or bound the states."
             )
+
+
+def _with_numbers(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function whose values are arrays of numbers, of one whose arrays hold objects."""
+
+    def evaluate(*arguments: Array) -> Array:
+        return np.array(np.asarray(function(*arguments)).tolist())
+
+    return evaluate
 
 
 def positional_arguments(name: str, function: Callable[..., Any]) -> int | None:

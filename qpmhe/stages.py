@@ -37,7 +37,7 @@ class Place:
     def __init__(self, stages: Stages, k: int) -> None:
         self.z, self.following = stages._z[k], stages._z[k + 1]
         self.y, self.u = stages._y[k], stages._u[k, :-1]
-        self.arguments = (self.z, self.u) if self.u.size else (self.z,)
+        self.arguments: tuple[Array, ...] = (self.z, self.u) if self.u.size else (self.z,)
         self.weight = stages._weight[k]
         self.terms = Stage(stages.terms, k)
 
@@ -159,6 +159,14 @@ class Stages:
     def length(self) -> int:
         """N_t, the number of stages in the window."""
         return self.end - self.start
+
+    def protect_arguments(self) -> None:
+        """Hand the places' states and inputs to the model so that it cannot change them."""
+        for place in self._places:
+            views = tuple(one.view() for one in place.arguments)
+            for one in views:
+                one.flags.writeable = False
+            place.arguments = views
 
     @property
     def frame(self) -> Frame:

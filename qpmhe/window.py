@@ -66,6 +66,9 @@ class Window(Stages):
         self._sample = Sample(system, np.zeros(m))
         self._read = system.f.direct, system.h.direct
         self._slopes = system.f_jacobian.direct, system.h_jacobian.direct
+        functions = system.f, system.h, system.f_jacobian, system.h_jacobian
+        if all(one.reads_only for one in functions):
+            self.protect_arguments()
         self._linear = True  # whether the stage that enters has Jacobians
         self._no_jacobian = -np.eye(n + p, n)  # what stands in for them, with the minus of `linear`
         #: Whole stages and trajectories by one call each, where the model offers that.
@@ -171,19 +174,23 @@ class Window(Stages):
 
     def _enter(self, k: int, time: int) -> tuple[bool, bool, bool]:
         """Compute stage k from z(k) and its sample; what `push` tells."""
-        if self.fused is not None and not (
+        y = self._places[k].y
+        observed: NDArray[np.bool_] | None = None
+        if not math.isfinite(y.dot(y)):
+            self._observed[k] = observed = np.abs(y) < _LARGEST  # false for NaN, too
+            self._set_weight(k, time)
+        elif self.unusual and not self._observed[k].all():
+            observed = self._observed[k]
+        elif self.fused is not None and not (
             self.unusual and (self._special[k] or self._irregular[k])
         ):
             cost = self.fused.enter(k)
             if math.isfinite(cost):
                 self._stage_cost[k] = cost
                 return False, False, False
-        observed: NDArray[np.bool_] | None = None
-        if self.unusual and not self._observed[k].all():
-            observed = self._observed[k]
         cost = self._advance(k, time, observed)
         if not math.isfinite(cost) and observed is None:
-            there = np.abs(self._y[k]) < _LARGEST  # false for NaN, too
+            there = np.abs(y) < _LARGEST
             if not there.all():
                 self._observed[k] = observed = there
                 self._set_weight(k, time)
@@ -339,7 +346,9 @@ class Window(Stages):
         costs = frame.costs
         if self._ages is None:
             return float(costs.dot(self._ones[: costs.size]))
-        return float(costs.dot(self.discounts[1:]))
+        cost = float(costs.dot(self.discounts[1:]))
+        # A failed stage whose factor has underflowed makes 0 times infinity of it.
+        return math.inf if math.isnan(cost) else cost
 
     @property
     def discounts(self) -> Array:

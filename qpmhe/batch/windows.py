@@ -251,7 +251,9 @@ class Windows:
         discounts = self.discounts
         if discounts is None:
             return np.asarray(np.add.reduce(costs))
-        return np.asarray(discounts[1:] @ costs)
+        total = np.asarray(discounts[1:] @ costs)
+        # A failed stage whose factor has underflowed makes 0 times infinity of it.
+        return np.where(np.isnan(total), np.inf, total)
 
     @property
     def discounts(self) -> Array | None:

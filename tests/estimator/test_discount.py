@@ -197,3 +197,24 @@ def test_sets_hold_whatever_the_discount():
         near = np.minimum(estimate.trajectory - box.lower, box.upper - estimate.trajectory)
         bound += bool((near < 1e-6).any())
     assert bound > 8
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_a_factor_that_underflows_at_a_failed_stage_leaves_the_cost_infinite(batch):
+    system = qpmhe.System(lambda x: 0.9 * x, np.sqrt, n=1, p=1)
+    parts = (
+        system, qpmhe.Luenberger([0.3]),
+        qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0, discount=0.01),
+    )
+    ys = np.ones((230, 1))
+    ys[5] = -30.0  # the observer's next state is negative, where the root is not defined
+    if batch:
+        made = qpmhe.BatchEstimator(*parts, horizon=200, members=2, initial_states=[1.0])
+        found = [made.update(np.array([y, y])) for y in ys]
+    else:
+        made = qpmhe.MovingHorizonEstimator(*parts, horizon=200, initial_state=[1.0])
+        found = [made.update(y) for y in ys]
+    costs = np.array([one.costs if batch else one.cost for one in found])
+    candidates = np.array([one.candidate_costs if batch else one.candidate_cost for one in found])
+    assert np.isinf(candidates).any()
+    assert np.all(costs <= candidates)  # as no NaN is

@@ -124,3 +124,24 @@ def test_a_missing_component_is_not_judged_against_its_set():
     # The component that is there is judged.
     assert estimate.improved
     assert mhe.update([None, mhe.state[1] + 30.0]).dropped == ("noises",)
+
+
+@pytest.mark.parametrize("y", [np.full(2, np.nan), np.array([np.inf, 0.7])], ids=str)
+def test_the_model_is_called_once_at_the_candidate_all_the_same(y):
+    calls = []
+
+    def counting(x):
+        if x.ndim == 1:
+            calls.append(x.tolist())
+        return swing(x)
+
+    mhe = qpmhe.MovingHorizonEstimator(
+        qpmhe.System(counting, seen, n=2, p=2, f_jacobian=qpmhe.System(swing, seen, n=2, p=2)
+                     .f_jacobian.direct),
+        qpmhe.Luenberger(GAIN), qpmhe.QuadraticCost(prior=P, disturbance=Q, noise=R),
+        horizon=4, initial_state=START,
+    )
+    mhe.update(MEASURED[0])
+    calls.clear()
+    mhe.update(y)
+    assert len(calls) == 1

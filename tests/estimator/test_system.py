@@ -402,3 +402,54 @@ def test_an_estimator_that_crosses_a_branch_is_judged_by_the_true_cost(where):
         assert estimate.cost == pytest.approx(kept.cost(estimate.trajectory), rel=1e-10)
         sides |= set(estimate.trajectory[:, 0] > 50.0)
     assert sides == {True, False}
+
+
+def test_a_model_cannot_change_the_state_that_it_is_given():
+    def clipping(x):
+        if x.ndim == 1 and x[0] > 30.0:  # beyond all probes
+            x[0] = 30.0
+        return 1.0 * x
+
+    mhe = qpmhe.MovingHorizonEstimator(
+        qpmhe.System(clipping, lambda x: x, n=1, p=1), qpmhe.Luenberger([1.0]),
+        qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0), horizon=3,
+        initial_state=[0.0],
+    )
+    mhe.update([50.0])
+    estimate = mhe.update([50.0])
+    assert estimate.candidate[1, 0] == 50.0
+    assert qpmhe.Status.MODEL_FAILED in estimate.status
+
+
+def test_a_model_that_wants_arrays_that_it_could_write_to_has_them():
+    def wanting(x):
+        if not x.flags.writeable:
+            raise ValueError("buffer source array is read-only")
+        return 0.9 * x
+
+    system = qpmhe.System(wanting, lambda x: x, n=1, p=1)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.5]),
+        qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0), horizon=3,
+        initial_state=[0.0],
+    )
+    assert not system.f.reads_only
+    assert [mhe.update([y]).improved for y in (1.0, 2.0, 1.5)] == [True] * 3
+
+
+def test_arrays_of_objects_are_taken_as_numbers():
+    def listed(x):
+        return np.array([0.9 * x[0] + 0.1 * x[1], 0.8 * x[1]], dtype=object)
+
+    def plain(x):
+        return np.array([0.9 * x[0] + 0.1 * x[1], 0.8 * x[1]])
+
+    runs = [
+        qpmhe.MovingHorizonEstimator(
+            qpmhe.System(f, lambda x: x[:1], n=2, p=1), qpmhe.Luenberger([0.3, 0.1]),
+            qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=1.0), horizon=3,
+            initial_state=[0.0, 0.0],
+        ).run([[1.0], [2.0], [1.5], [1.0]])
+        for f in (listed, plain)
+    ]
+    np.testing.assert_allclose(runs[0].states, runs[1].states, rtol=1e-12)
