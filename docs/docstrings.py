@@ -45,9 +45,11 @@ def _correct(owner: griffe.Object) -> None:
 
 def _correct_groups(owner: griffe.Class | griffe.Function, docstring: griffe.Docstring) -> None:
     named = {name for group in _GROUP.findall(docstring.value) for name in group.split(", ")}
-    for section in docstring.parsed if named else ():
+    # Without them in the signature, as of some data classes yet, griffe would warn.
+    known = bool(named) and all(name in owner.parameters for name in named)
+    for section in docstring.parsed if known else ():
         if isinstance(section, griffe.DocstringSectionParameters):
             for one in section.value:
-                if one.name in named and one.name in owner.parameters:
+                if one.name in named:
                     signature = owner.parameters[one.name]
                     one.annotation, one.value = signature.annotation, signature.default
