@@ -17,30 +17,19 @@ def _block(found: re.Match[str]) -> str:
     return f"{found[1]}$$\n{body}\n{found[1]}$$\n\n"
 
 
-class RstMath(griffe.Extension):
-    """Turns ``:math:`` roles and ``.. math::`` directives into what arithmatex reads."""
+class Docstrings(griffe.Extension):
+    """Turns ``:math:`` roles and ``.. math::`` directives into what arithmatex reads.
+
+    Each of several arguments that are named together gets its own type and default.
+    """
 
     def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
-        """Rewrite an object's docstring before it is parsed."""
+        """Rewrite an object's docstring before it is parsed, and correct what is parsed."""
         if obj.docstring:
             text = _DIRECTIVE.sub(_block, obj.docstring.value + "\n")
             obj.docstring.value = _ROLE.sub(r"$\1$", text).rstrip()
-
-
-class Groups(griffe.Extension):
-    """Gives each of several arguments that are named together its own type and default."""
-
-    def on_package(self, *, pkg: griffe.Module, **kwargs: Any) -> None:
-        """Correct what was parsed of all docstrings of a package."""
-        _correct(pkg)
-
-
-def _correct(owner: griffe.Object) -> None:
-    for member in owner.members.values():
-        if isinstance(member, griffe.Object):
-            if isinstance(member, (griffe.Class, griffe.Function)) and member.docstring:
-                _correct_groups(member, member.docstring)
-            _correct(member)
+            if isinstance(obj, (griffe.Class, griffe.Function)):
+                _correct_groups(obj, obj.docstring)
 
 
 def _correct_groups(owner: griffe.Class | griffe.Function, docstring: griffe.Docstring) -> None:
