@@ -14,7 +14,7 @@ from ._checks import positive, positive_definite, record, vector
 from .costs import Cost, ObserverPrior
 from .engine import PythonEngine
 from .engines import engine_for
-from .errors import InvalidInputError, ShapeError
+from .errors import InvalidInputError, OptionError, ShapeError
 from .estimate import Estimate
 from .observers import Observer
 from .run import Run
@@ -150,7 +150,13 @@ class MovingHorizonEstimator:
         self.initial_state: Array = self._checked_start(initial_state)
         self._no_input = np.zeros(system.m)
         self._timed_is_checked = False
-        self._engine = engine_for(system, observer, cost, self.settings, self.initial_state)
+        try:
+            self._engine = engine_for(system, observer, cost, self.settings, self.initial_state)
+        except MemoryError as error:
+            raise OptionError(
+                f"horizon is {self.settings.horizon}: the arrays of so many stages of "
+                f"{system.n} states do not fit into the memory ({error}); take a shorter one."
+            ) from error
 
     def _checked_start(self, initial_state: ArrayLike) -> Array:
         state = vector("initial_state", initial_state, self.system.n)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,10 @@ from .linearization import Span, Stage, StageTerms
 __all__ = ["Frame", "Place", "Stages"]
 
 Array = NDArray[np.float64]
+View = TypeVar("View")
+
+# Views of longer windows are not kept: they would outweigh the arrays, and are little of a step.
+_KEPT = 256
 
 
 class Place:
@@ -23,7 +29,8 @@ class Place:
     z, following : (n,) array
         State of the observer, and the one after it.
     arguments : tuple
-        What the functions of the usual model take: z, and the inputs if there are any.
+        What the functions of the usual model take: z, and the inputs if there are any. They
+        cannot be written to where the model can do with that.
     y, u : array
         The measurement (p,), and the input (m,).
     weight : (n + p, n + p) array
@@ -38,6 +45,10 @@ class Place:
         self.z, self.following = stages._z[k], stages._z[k + 1]
         self.y, self.u = stages._y[k], stages._u[k, :-1]
         self.arguments: tuple[Array, ...] = (self.z, self.u) if self.u.size else (self.z,)
+        if stages._protected:
+            self.arguments = tuple(one.view() for one in self.arguments)
+            for one in self.arguments:
+                one.flags.writeable = False
         self.weight = stages._weight[k]
         self.terms = Stage(stages.terms, k)
 
@@ -69,6 +80,21 @@ class Frame:
         self.span = Span(stages.terms, first, last - first)
 
 
+class _Views(Sequence[View]):
+    """Views that are made at each use."""
+
+    def __init__(self, count: int, make: Callable[[int], View]) -> None:
+        self._count, self._make = count, make
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, k: Any) -> Any:
+        if k >= self._count:
+            raise IndexError(k)
+        return self._make(k)
+
+
 class Stages:
     """Samples and what was computed on them, stage by stage.
 
@@ -89,6 +115,8 @@ class Stages:
         Weight of a usual stage.
     quadratic : bool
         Whether the cost's weights majorise it themselves.
+    protected : bool
+        Whether the model gets states and inputs that it cannot write to.
     """
 
     def __init__(
@@ -101,8 +129,9 @@ class Stages:
         covariance: Array | None,
         stage_weight: Array,
         quadratic: bool,
+        protected: bool,
     ) -> None:
-        self.horizon = horizon
+        self.horizon, self._protected = horizon, protected
         room = horizon + max(horizon // 4, 32)
         self._room = room
         self._z = np.zeros((room + 1, n))
@@ -122,9 +151,13 @@ class Stages:
         self._stage_cost = np.zeros(room)
         self.terms = StageTerms(room, n, p)
         self._covariance = None if covariance is None else np.zeros((room + 1, n, n))
-        self._places = [Place(self, k) for k in range(room)]
-        # Of the full windows, by their first stage.
-        self._frames = [Frame(self, k, k + horizon) for k in range(room + 1 - horizon)]
+        # By stage; and of the full windows, by their first stage.
+        self._places: Sequence[Place] = _Views(room, partial(Place, self))
+        self._frames: Sequence[Frame] = _Views(
+            room + 1 - horizon, lambda k: Frame(self, k, k + horizon)
+        )
+        if horizon <= _KEPT:
+            self._places, self._frames = list(self._places), list(self._frames)
         self.reset(initial_state, covariance)
 
     def reset(self, initial_state: Array, covariance: Array | None) -> None:
@@ -159,14 +192,6 @@ class Stages:
     def length(self) -> int:
         """N_t, the number of stages in the window."""
         return self.end - self.start
-
-    def protect_arguments(self) -> None:
-        """Hand the places' states and inputs to the model so that it cannot change them."""
-        for place in self._places:
-            views = tuple(one.view() for one in place.arguments)
-            for one in views:
-                one.flags.writeable = False
-            place.arguments = views
 
     @property
     def frame(self) -> Frame:

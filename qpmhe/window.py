@@ -59,16 +59,14 @@ class Window(Stages):
         self._n, self._m, self._linearized = n, m, linearized
         self._quadratic = cost.quadratic
         self._jacobians = linearized or observer.needs_jacobians
+        functions = system.f, system.h, system.f_jacobian, system.h_jacobian
         super().__init__(
             n, p, m, horizon, initial_state, observer.initial_covariance(), cost.stage_weight,
-            cost.quadratic,
+            cost.quadratic, all(one.reads_only for one in functions),
         )
         self._sample = Sample(system, np.zeros(m))
         self._read = system.f.direct, system.h.direct
         self._slopes = system.f_jacobian.direct, system.h_jacobian.direct
-        functions = system.f, system.h, system.f_jacobian, system.h_jacobian
-        if all(one.reads_only for one in functions):
-            self.protect_arguments()
         self._linear = True  # whether the stage that enters has Jacobians
         self._no_jacobian = -np.eye(n + p, n)  # what stands in for them, with the minus of `linear`
         #: Whole stages and trajectories by one call each, where the model offers that.

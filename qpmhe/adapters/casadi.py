@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codegen.compiler import compiled_library, find_compiler
+from ..codegen.evaluation import fixed_call, may_fail, separate_calls
 from ..codegen.expressions import CasadiModel, casadi_model, import_casadi
 from ..codegen.source import model_files
 from ..errors import CompilationError, OptionError
@@ -263,23 +264,26 @@ def _interpreted(
         "f_jacobian": lambda: ca.densify(ca.jacobian(following, x).T),
         "h_jacobian": lambda: ca.densify(ca.jacobian(output, x).T),
     }
+    functions = {
+        name: ca.Function("model", [x, given], [columns[name]()]) for name in names
+    }
     function = ca.Function("model", [x, given], [columns[name]() for name in names])
+    fallible = may_fail(function)
     if count > 1:
         function = function.map(count)
     states, inputs = np.zeros((count, model.n)), np.zeros((count, model.m + timed))
     results = _results(model, count, names)
     all_inputs = inputs if timed else np.full((count, model.m + 1), model.dt or 0.0)
-    buffer, run = function.buffer()
-    buffer.set_arg(0, states.data)
-    buffer.set_arg(1, all_inputs.data)
-    for i, name in enumerate(names):
-        buffer.set_res(i, results[name].data)
-    kept = buffer, function  # `run` refers to them
+    run = fixed_call(function, (states, all_inputs), [results[name] for name in names], fallible)
+    again: list[Callable[[], None]] = []
 
     def evaluate() -> None:
-        if not timed and kept:
+        if not timed:
             all_inputs[:, : model.m] = inputs
-        run()
+        if not run():
+            if not again:
+                again.append(separate_calls(functions, states, all_inputs, results))
+            again[0]()
 
     return states, inputs, results, evaluate
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,24 @@ class CompiledBatchEngine:
         """See `qpmhe.batch.engines.BatchEngine.reset`."""
         self._memory = self._library.estimators(states)
         self.time = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that was learnt from measurements so far."""
+        memory = self._memory.view(np.uint8).copy()  # as bytes: padding is copied, too
+        memory.view(self._memory.dtype)["settings"] = 0  # an address means nothing elsewhere
+        return {"time": self.time, "memory": memory}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where an engine of the same arguments stopped.
+
+        Parameters
+        ----------
+        state : dict
+            What `state_dict` gave.
+        """
+        self._memory = state["memory"].copy().view(self._memory.dtype)
+        self._memory["settings"] = self._library.settings.ctypes.data
+        self.time = state["time"]
 
     @property
     def states(self) -> Array:

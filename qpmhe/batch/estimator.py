@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,10 +14,11 @@ from qpmhe_solvers.errors import tell_unknown_options
 
 from .._checks import count
 from ..costs import Cost, QuadraticCost
-from ..errors import InvalidInputError
+from ..errors import InvalidInputError, OptionError
 from ..estimator import MovingHorizonEstimator
 from ..observers import Luenberger, Observer
 from ..system import System
+from .calls import Calls
 from .engines import BatchEngine
 from .looped import LoopedEngine
 from .results import BatchEstimate, BatchRun
@@ -128,31 +131,40 @@ class BatchEstimator:
         states = starts_of(initial_states, self.members, system.n)
         if isinstance(observer, Observer):
             check_starts(system, observer, states)
-        # The checks of all that members have in common are those of a single estimator.
-        one = MovingHorizonEstimator(
-            system, observer, cost, horizon=horizon, initial_state=states[0], backend=backend,
-            max_qps=max_qps, max_solver_iterations=max_solver_iterations,
-            solver_tolerance=solver_tolerance, tolerance=tolerance, engine=engine,
-            outside=outside, start=start, candidate=candidate, subproblem=subproblem,
-            time_budget=time_budget, delay=delay,
-        )
         self.system, self.observer, self.cost = system, observer, cost
-        # Where it could not be compiled, that was told once.
-        self.settings = replace(one.settings, engine=one.engine)
         self.initial_states = states
-        if threads is not None:
-            count("threads", threads, 1)
+        self._threads = None if threads is None else count("threads", threads, 1)
+        try:
+            # The checks of all that members have in common are those of a single estimator.
+            one = MovingHorizonEstimator(
+                system, observer, cost, horizon=horizon, initial_state=states[0],
+                backend=backend, max_qps=max_qps, max_solver_iterations=max_solver_iterations,
+                solver_tolerance=solver_tolerance, tolerance=tolerance, engine=engine,
+                outside=outside, start=start, candidate=candidate, subproblem=subproblem,
+                time_budget=time_budget, delay=delay,
+            )
+            # Where it could not be compiled, that was told once.
+            self.settings = replace(one.settings, engine=one.engine)
+            self._make_engine(one.engine)
+        except MemoryError as error:
+            raise OptionError(
+                f"{self.members} members with a horizon of {horizon} need more memory than there "
+                f"is ({error}); take a shorter horizon, or fewer members at once."
+            ) from error
+
+    def _make_engine(self, engine: str) -> None:
+        system, observer, cost, states = self.system, self.observer, self.cost, self.initial_states
         found = obstacles(system, observer, cost, self.settings)
         self.mode = "looped" if found else "vectorised"
         self.mode_reason = "; ".join(found)
         self._engine: BatchEngine
         self._compiled: CompiledBatchEngine | None = None
-        if one.engine == "compiled":
+        if engine == "compiled":
             from .compiled import CompiledBatchEngine  # late: most programs do without it
 
             self.mode, self.mode_reason = "compiled", ""
             self._engine = self._compiled = CompiledBatchEngine(
-                system, observer, cost, self.settings, states, threads
+                system, observer, cost, self.settings, states, self._threads
             )
         elif isinstance(observer, Luenberger) and isinstance(cost, QuadraticCost) and not found:
             self._engine = VectorisedEngine(
@@ -248,8 +260,52 @@ class BatchEstimator:
         estimates = (self._engine.step(ys[:, t], us[:, t]) for t in range(steps))
         return BatchRun.of(self.states, estimates, steps)
 
+    def __getstate__(self) -> dict[str, Any]:
+        saved, engine = self.__dict__.copy(), self._engine
+        del saved["_engine"], saved["_compiled"]
+        if self._compiled is not None:
+            saved["state"] = self._compiled.state_dict()
+        elif isinstance(engine, LoopedEngine):
+            saved["state"] = [one.state_dict() for one in engine._engines]
+        else:
+            memory = BytesIO()
+            _Pickler(memory).dump(engine)
+            saved["state"] = memory.getvalue()
+        return saved
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        self.__dict__.update(saved)
+        state = self.__dict__.pop("state")
+        if isinstance(state, bytes):
+            self._engine, self._compiled = _Unpickler(BytesIO(state), self.system).load(), None
+            return
+        self._make_engine(self.settings.engine)
+        if self._compiled is not None:
+            self._compiled.load_state_dict(state)
+        elif isinstance(self._engine, LoopedEngine):
+            for one, own in zip(self._engine._engines, state, strict=True):
+                one.load_state_dict(own)
+
     def __repr__(self) -> str:
         return (
             f"BatchEstimator(members={self.members}, horizon={self.horizon}, "
             f"mode={self.mode!r}, time={self.time})"
         )
+
+
+class _Pickler(pickle.Pickler):
+    """Leaves the calls of the system out, which is pickled by itself."""
+
+    def persistent_id(self, one: Any) -> str | None:
+        return "calls" if isinstance(one, Calls) else None
+
+
+class _Unpickler(pickle.Unpickler):
+    """Puts the calls of a system in."""
+
+    def __init__(self, file: BytesIO, system: System) -> None:
+        super().__init__(file)
+        self._system = system
+
+    def persistent_load(self, _: Any) -> Calls:
+        return Calls(self._system)

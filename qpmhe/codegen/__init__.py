@@ -14,6 +14,20 @@ if TYPE_CHECKING:
 
 __all__ = ["write"]
 
+# Headers that a compiler, or its own headers, would find in the place of a system's.
+_SYSTEM_HEADERS = frozenset((
+    "aio", "alloca", "assert", "complex", "ctype", "dirent", "dlfcn", "endian", "errno",
+    "error", "fcntl", "features", "fenv", "float", "ftw", "getopt", "glob", "grp", "iconv",
+    "ieee754", "inttypes", "iso646", "libgen", "libintl", "limits", "link", "locale", "malloc",
+    "math", "memory", "monetary", "netdb", "new", "omp", "paths", "poll", "pthread", "pwd",
+    "regex", "resource", "sched", "search", "semaphore", "setjmp", "signal", "spawn", "stab",
+    "stdalign", "stdarg", "stdatomic", "stdbool", "stdbit", "stdckdint", "stddef", "stdint",
+    "stdio", "stdlib", "stdnoreturn", "string", "strings", "syscall", "sysexits", "syslog",
+    "termios", "tgmath", "threads", "time", "types", "uchar", "ucontext", "unistd", "utime",
+    "values", "varargs", "version", "wait", "wchar", "wctype",
+))
+_LONGEST_NAME = 60
+
 
 def write(
     estimator: MovingHorizonEstimator,
@@ -38,7 +52,8 @@ def write(
     directory : str or path
         Where; made if need be.
     name : str
-        Name of the files and prefix of all public names.
+        Name of the files and prefix of all public names: a C identifier of at most 60
+        letters, and not the name of a system's header, such as ``math``.
     real : {"double", "float"}
         Precision. In single precision sets are kept to 1e-5 and the tolerances are widened
         to what can be told apart.
@@ -67,6 +82,16 @@ def write(
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise OptionError(
             f"name is {name!r}; expected a C identifier: letters, digits and underscores."
+        )
+    if len(name) > _LONGEST_NAME:
+        raise OptionError(
+            f"name has {len(name)} letters; expected at most {_LONGEST_NAME}, as compilers tell "
+            "no more apart."
+        )
+    if name.lower() in _SYSTEM_HEADERS:
+        raise OptionError(
+            f"name is {name!r}, but <{name.lower()}.h> is a header of the system, which "
+            f"{name}.h would hide; take another, such as 'mhe_{name}'."
         )
     if real not in ("double", "float"):
         raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")

@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+import time
 from functools import lru_cache
 from pathlib import Path
 
@@ -23,6 +24,9 @@ __all__ = ["cache_directory", "compiled_library", "find_compiler"]
 _FLAGS = ("-std=c99", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno",
           "-fno-trapping-math")
 _FAST = ("-O3", "-march=native")
+# Folders of compilations in progress, in the cache; and the seconds after which none is.
+_SCRATCH = "qpmhe-making-"
+_STALE = 86400.0
 
 
 def find_compiler() -> list[str] | None:
@@ -103,7 +107,8 @@ def compiled_library(files: dict[str, str], main: str, key: str | None = None) -
 def _make(
     compiler: list[str], files: dict[str, str], main: str, path: Path, seal: Path
 ) -> None:
-    with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+    _remove_stale(path.parent)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=_SCRATCH) as scratch:
         for name, text in files.items():
             Path(scratch, name).write_text(text, encoding="ascii")
         made, sealed = Path(scratch, "library.so"), Path(scratch, "seal")
@@ -112,6 +117,16 @@ def _make(
         # Each in one motion; a process that sees the one without the other compiles, too.
         os.replace(made, path)
         os.replace(sealed, seal)
+
+
+def _remove_stale(folder: Path) -> None:
+    """Remove what compilations that were killed have left."""
+    for scratch in folder.glob(f"{_SCRATCH}*"):
+        try:
+            if time.time() - scratch.stat().st_mtime > _STALE:
+                shutil.rmtree(scratch)
+        except OSError:  # another process was quicker, or it is not ours
+            continue
 
 
 def _intact(library: Path, seal: Path) -> bool:

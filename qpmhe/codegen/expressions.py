@@ -182,7 +182,9 @@ def _canonical(ca: Any, name: str, given: Any, n: int, m: int) -> Any:
     else:
         raise ModelError(f"{name} is {given!r}; expected a casadi.Function or a callable.")
     error: Exception | None = None
-    for kind in (ca.SX, ca.MX):
+    # Scalar operations are quicker, but cannot break off.
+    asserting = _asserts(ca, call, n, m)
+    for kind in (ca.MX,) if asserting else (ca.SX, ca.MX):
         x, u = kind.sym("x", n), kind.sym("u", m)
         try:
             value = call(x, u)
@@ -192,6 +194,8 @@ def _canonical(ca: Any, name: str, given: Any, n: int, m: int) -> Any:
         except Exception as caught:  # whatever the user's function makes of symbols
             error = caught
             continue
+        if asserting:
+            return function
         try:
             return function.expand()
         except Exception:  # operations that have no scalar form
@@ -200,6 +204,32 @@ def _canonical(ca: Any, name: str, given: Any, n: int, m: int) -> Any:
         f"{name} cannot be evaluated on CasADi symbols ({type(error).__name__}: {error}); write "
         "it with CasADi's functions (casadi.sin, casadi.vertcat), or use qpmhe.System."
     )
+
+
+def _asserts(ca: Any, call: Callable[[Any, Any], Any], n: int, m: int) -> bool:
+    """Whether there is an assertion (attachAssert) in a function, or in one that it calls."""
+    x, u = ca.MX.sym("x", n), ca.MX.sym("u", m)
+    try:
+        value = call(x, u)
+        if isinstance(value, (list, tuple)):
+            value = ca.vertcat(*value)
+        function = ca.Function("tried", [x, u], [ca.MX(value)])
+    except Exception:  # of scalar operations alone, then; or what is told when it is used
+        return False
+    found, waiting = set(), [function]
+    while waiting:
+        one = waiting.pop()
+        if hash(one) in found:
+            continue
+        found.add(hash(one))
+        if one.is_a("MXFunction") and any(
+            one.instruction_id(k) == ca.OP_ASSERTION for k in range(one.n_instructions())
+        ):
+            return True
+        # Those of a graph, and those of a map or switch.
+        waiting += one.find_functions()
+        waiting += [one.get_function(name) for name in one.get_function()]
+    return False
 
 
 def _with_inputs(name: str, function: Callable[..., Any], m: int) -> Callable[[Any, Any], Any]:

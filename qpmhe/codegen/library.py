@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linprog
 
 from ..costs import Cost, ObserverPrior, QuadraticCost
 from ..errors import CompilationError, OptionError
 from ..observers import HighGain, Luenberger, Observer, SteadyStateKalman
+from ..sets import ConvexSet
 from ..settings import Settings
 from ..system import System
 from .compiler import compiled_library
@@ -19,8 +21,10 @@ from .source import CONTINUOUS, estimator_files
 
 __all__ = ["EstimatorLibrary", "generated", "uncovered"]
 
-# Indices in C are of type int.
-_MOST_ENTRIES = 2**31 - 1
+# What NumPy allows a structure; entries of its arrays can be counted by an int then.
+_MOST_BYTES = 2**31 - 1
+# Of a polytope: sets are kept to so much (FEASIBLE in window.c).
+_LEAST_WIDTH = 5e-9
 _CONSTANT_GAIN = (Luenberger, HighGain, SteadyStateKalman)
 
 
@@ -45,18 +49,17 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         return "a prior weight from the observer has no C form; take a constant one."
     for name in SET_NAMES:
         one = getattr(system, name)
-        if one is not None and (
-            one.fixed_components.size or (one.row_lower == one.row_upper).any()
-        ):
+        if one is not None and _is_flat(one):
             return (
-                f"the set of {name} has a direction of zero width, which the interior-point "
-                "method in C cannot take; widen it."
+                f"the set of {name} has a direction of zero width (equal bounds, or a polytope "
+                f"less than {_LEAST_WIDTH:g} wide), which the interior-point method in C cannot "
+                "take; widen it."
             )
-    entries = (settings.horizon + 1) * system.n * (2 * system.n + 32)
-    if entries > _MOST_ENTRIES:
+    size = _window_size(system, settings.horizon)
+    if size > _MOST_BYTES:
         return (
-            f"a horizon of {settings.horizon} with {system.n} states needs {entries:.3g} entries "
-            f"in one array, more than the {_MOST_ENTRIES:.3g} that C counts; take a shorter one."
+            f"a horizon of {settings.horizon} with {system.n} states needs {size:.3g} bytes for "
+            f"its window, more than the {_MOST_BYTES:.3g} of one structure; take a shorter one."
         )
     if settings.backend not in ("auto", "banded"):
         return (
@@ -71,6 +74,42 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             "in place of time_budget."
         )
     return ""
+
+
+def _window_size(system: System, horizon: int) -> int:
+    """Bytes of an estimator's memory, in double precision."""
+    one, two = (Layout.of(system, count, 0).estimator_type().itemsize for count in (1, 2))
+    return one + (horizon - 1) * (two - one)
+
+
+def _is_flat(one: ConvexSet) -> bool:
+    """Whether a set has no interior: no ball within it is wider than what counts as none."""
+    if one.fixed_components.size or (one.row_lower == one.row_upper).any():
+        return True
+    if not one.matrix.size:
+        return False
+    matrix = np.vstack((np.eye(one.dimension), one.matrix))
+    low, high = np.append(one.lower, one.row_lower), np.append(one.upper, one.row_upper)
+    norms = np.linalg.norm(matrix, axis=1)
+    matrix, low, high = matrix / norms[:, None], low / norms, high / norms
+    above, below = np.isfinite(high), np.isfinite(low)
+    rows, limits = np.vstack((matrix[above], -matrix[below])), np.append(high[above], -low[below])
+    found = linprog(
+        np.append(np.zeros(one.dimension), -1.0), np.column_stack((rows, np.ones(limits.size))),
+        limits, bounds=[(None, None)] * one.dimension + [(0.0, 1.0)],
+    )
+    return found.x is not None and bool(2.0 * found.x[-1] <= _LEAST_WIDTH)
+
+
+def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:
+    """Zeros, or an error that tells how many bytes there are not."""
+    try:
+        return np.zeros(count, kind)
+    except (MemoryError, ValueError) as error:  # the latter of more than can be addressed
+        raise OptionError(
+            f"{what} needs {count * kind.itemsize:.3g} bytes, which this machine does not have; "
+            "take a shorter horizon, or fewer members at once."
+        ) from error
 
 
 def generated(
@@ -179,7 +218,7 @@ class EstimatorLibrary:
 
     def workspace(self) -> NDArray[np.uint8]:
         """Scratch for the estimators of one thread."""
-        return np.zeros(self.workspace_size, np.uint8)
+        return _memory(self.workspace_size, np.dtype(np.uint8), "the compiled step's scratch")
 
     def estimators(self, states: NDArray[np.float64]) -> NDArray[Any]:
         """Memory of one estimator for each row of initial states, reset.
@@ -189,7 +228,9 @@ class EstimatorLibrary:
         states : (K, n) array
             Where they start.
         """
-        memory = np.zeros(len(states), self.estimator_type)
+        memory = _memory(
+            len(states), self.estimator_type, f"the memory of {len(states)} estimators"
+        )
         base, size = memory.ctypes.data, self.estimator_type.itemsize
         for i, state in enumerate(np.ascontiguousarray(states)):
             self.reset(base + i * size, self.settings.ctypes.data, state.ctypes.data)

@@ -62,7 +62,8 @@ def model_source(model: CasadiModel) -> str:
     Raises
     ------
     CompilationError
-        If CasADi has no C code for a part of the model, or it has too many states.
+        If CasADi has no C code for a part of the model that tells where it fails, or the
+        model has too many states.
     """
     if model.n > _MOST_STATES:
         raise CompilationError(
@@ -77,12 +78,12 @@ def model_source(model: CasadiModel) -> str:
         name = f"mhe_casadi_{which}"
         named = _named(ca, function, name, model)
         generator.add(named)
-        calls.append(_call(f"mhe_call_{which}", name, named, 1))
+        calls.append(_call(f"mhe_call_{which}", name, named))
         slopes, places = model.with_jacobian(which)
         name = f"mhe_casadi_{which}_jacobian"
         named = _named(ca, slopes, name, model)
         generator.add(named)
-        calls.append(_call(f"mhe_call_{which}_jacobian", name, named, 2))
+        calls.append(_call(f"mhe_call_{which}_jacobian", name, named))
         listed = ", ".join(str(place) for place in places) or "0"
         calls.append(
             f"#define MHE_{which.upper()}_NONZEROS {len(places)}\n"
@@ -95,10 +96,17 @@ def model_source(model: CasadiModel) -> str:
             f"CasADi writes no C code for a part of the model ({line.strip()}); state it by "
             "functions that it can, or use engine='python'."
         )
+    if re.search(r"\bcasadi_newton\(", code):
+        raise CompilationError(
+            "CasADi's code for a rootfinder 'fast_newton' takes an iterate that has not "
+            "converged for a root, without a word; use engine='python', which takes it for a "
+            "failure."
+        )
     return "\n".join((
-        # CasADi writes out some functions that are not called.
+        # CasADi writes out some functions that are not called, and arguments without use.
         "#if defined(__GNUC__)\n#pragma GCC diagnostic push\n"
-        '#pragma GCC diagnostic ignored "-Wunused-function"\n#endif',
+        '#pragma GCC diagnostic ignored "-Wunused-function"\n'
+        '#pragma GCC diagnostic ignored "-Wunused-parameter"\n#endif',
         "#define casadi_real mhe_real", code,
         "#if defined(__GNUC__)\n#pragma GCC diagnostic pop\n#endif",
         *calls, template("model.c"),
@@ -138,9 +146,13 @@ def _named(ca: Any, function: Any, name: str, model: CasadiModel) -> Any:
     return ca.Function(name, [x, u], function.call([x, u]))
 
 
-def _call(name: str, inner: str, function: Any, outputs: int) -> str:
-    """A C function of plain arrays around one with CasADi's calling convention."""
-    results = ", ".join(f"real *out{i}" for i in range(outputs))
+def _call(name: str, inner: str, function: Any) -> str:
+    """A C function of plain arrays around one with CasADi's calling convention.
+
+    Its results are NaN where CasADi's function tells that it failed.
+    """
+    sizes = [function.nnz_out(i) for i in range(function.n_out())]
+    results = ", ".join(f"real *out{i}" for i in range(len(sizes)))
     return (
         f"static void {name}(const real *x, const real *u, {results})\n{{\n"
         f"    const real *arg[{max(function.sz_arg(), 2) + 2}];\n"
@@ -148,8 +160,14 @@ def _call(name: str, inner: str, function: Any, outputs: int) -> str:
         f"    int iw[{function.sz_iw() + 1}];\n"
         f"    real w[{function.sz_w() + 1}];\n"
         "    arg[0] = x;\n    arg[1] = u;\n"
-        + "".join(f"    res[{i}] = out{i};\n" for i in range(outputs))
-        + f"    {inner}(arg, res, iw, w, 0);\n}}\n"
+        + "".join(f"    res[{i}] = out{i};\n" for i in range(len(sizes)))
+        + f"    if ({inner}(arg, res, iw, w, 0)) {{\n"
+        + "".join(
+            f"        for (int i = 0; i < {size}; i++) out{i}[i] = NAN;\n" if size
+            else f"        (void)out{i};\n"
+            for i, size in enumerate(sizes)
+        )
+        + "    }\n}\n"
     )
 
 

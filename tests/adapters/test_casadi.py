@@ -585,3 +585,122 @@ def test_an_input_of_the_output_alone():
     )
     assert system.m == 1
     assert system.h(np.array([2.0, 1.0]), np.array([3.0])) == [6.0]
+
+
+def falling(case):
+    """Models of two states whose evaluation breaks off for x0 beyond 1: f, h, and h's values."""
+    x, z, q = ca.MX.sym("x", 2), ca.SX.sym("z"), ca.SX.sym("q")
+    if case == "linear solver":
+        matrix = ca.densify(ca.diag(ca.vertcat(ca.fmax(1 - x[0], 0), 1)))
+        h, value = ca.solve(matrix, ca.vertcat(1, x[1]))[0], lambda x: 1 / (1 - x[0])
+    elif case == "QP":  # x0 <= r <= 1, near x1
+        quiet = {"print_iter": False, "print_header": False, "print_info": False}
+        dense = {"h": ca.Sparsity.dense(1, 1), "a": ca.Sparsity.dense(2, 1)}
+        qp = ca.conic("qp", "qrqp", dense, quiet)
+        h = qp(h=1, a=ca.DM([1, 1]), g=-x[1], lba=ca.vertcat(x[0], -ca.inf),
+               uba=ca.vertcat(ca.inf, 1))["x"]
+        try:
+            ca.jacobian(h, x)
+        except RuntimeError:
+            pytest.skip("this CasADi has no derivatives of QPs")
+        value = lambda x: min(max(x[0], x[1]), 1)  # noqa: E731
+    else:  # raises
+        root = ca.rootfinder(
+            "root", "fast_newton", ca.Function("g", [z, q], [z**2 - 1 + q]), {"max_iter": 50}
+        )
+        h, value = root(1.0, x[0]), lambda x: math.sqrt(1 - x[0])
+    f = ca.Function("f", [x], [0.9 * x])
+    return f, ca.Function("h", [x], [h + 0 * x[1]]), value
+
+
+FALLING = ["linear solver", "QP", "root"]
+
+
+@pytest.mark.parametrize("case", FALLING)
+def test_an_evaluation_that_breaks_off_is_no_number(case):
+    f, h, value = falling(case)
+    system = qpmhe.System.from_casadi(f, h, compiled=False)
+    xs = np.array([[0.5, 0.2], [3.0, 0.1], [0.25, 0.3], [2.0, 0.4], [-0.2, 0.5]])
+    us, bad = np.zeros((5, 0)), np.array([False, True, False, True, False])
+    expected = np.array([[np.nan if k else value(x)] for x, k in zip(xs, bad, strict=True)])
+    for _ in range(2):
+        for x, y in zip(xs, expected, strict=True):
+            np.testing.assert_allclose(system.h(x, NONE), y, rtol=1e-9)
+            assert np.isnan(system.h_jacobian(x, NONE)).any() == np.isnan(y)
+            # What can be evaluated is, whatever is asked for beside it.
+            ahead, output, slope = system.joint.stage(x, NONE)
+            np.testing.assert_allclose(ahead, 0.9 * x)
+            np.testing.assert_allclose(output, y, rtol=1e-9)
+            np.testing.assert_allclose(slope[:2], 0.9 * np.eye(2))
+        np.testing.assert_allclose(system.h.batch(xs, us), expected, rtol=1e-9)
+        np.testing.assert_allclose(system.f.batch(xs, us), 0.9 * xs)
+        slopes = system.h_jacobian.batch(xs, us)
+        np.testing.assert_array_equal(np.isnan(slopes).any(axis=(1, 2)), bad)
+        residuals = system.joint.residuals(np.vstack((xs, xs[:1])), np.zeros((5, 1)), us)
+        np.testing.assert_allclose(residuals[:, 2:], -expected, rtol=1e-9)
+        np.testing.assert_allclose(residuals[:, :2], np.roll(xs, -1, axis=0) - 0.9 * xs)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no compiler")
+def test_an_evaluation_that_breaks_off_in_compiled_code():
+    f, h, value = falling("QP")
+    system = qpmhe.System.from_casadi(f, h, compiled=True)
+    xs, us = np.array([[0.5, 0.2], [3.0, 0.1], [-0.2, 0.5]]), np.zeros((3, 0))
+    expected = np.array([[value(xs[0])], [np.nan], [value(xs[2])]])
+    np.testing.assert_allclose(system.h.batch(xs, us), expected)
+    np.testing.assert_array_equal(np.isnan(system.h_jacobian.batch(xs, us)), [
+        [[False] * 2], [[True] * 2], [[False] * 2]])
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no compiler")
+def test_rootfinders_that_do_not_tell_are_not_compiled():
+    f, h, value = falling("root")
+    with pytest.raises(CompilationError, match="fast_newton"):
+        qpmhe.System.from_casadi(f, h, compiled=True)
+    system = qpmhe.System.from_casadi(f, h)  # evaluated by CasADi
+    assert system.h(np.array([0.5, 0.0]), NONE)[0] == pytest.approx(value([0.5, 0.0]))
+    assert np.isnan(system.h(np.array([3.0, 0.0]), NONE)[0])
+
+
+@pytest.mark.parametrize("case", FALLING)
+def test_a_step_in_which_the_evaluation_breaks_off(case):
+    f, h, _ = falling(case)
+    system = qpmhe.System.from_casadi(f, h, compiled=False)
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[5.0]])
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.5, 0.1]), cost, horizon=3, initial_state=[0.4, 0.0],
+        max_qps=2,
+    )
+    start = mhe.update([0.5])
+    assert qpmhe.Status.IMPROVED in start.status
+    mhe.update([60.0])  # throws the observer to where h cannot be evaluated
+    failed = mhe.update([0.5])
+    assert failed.candidate[-2, 0] > 1
+    assert qpmhe.Status.MODEL_FAILED in failed.status
+    assert failed.candidate_cost == np.inf
+    assert np.isfinite(failed.state).all()
+    later = [mhe.update([0.5]) for _ in range(6)]
+    assert qpmhe.Status.IMPROVED in later[-1].status
+    assert np.isfinite(later[-1].cost)
+
+
+@pytest.mark.parametrize("compiled", BOTH)
+@pytest.mark.parametrize("way", ["function", "inner", "callable", "mapped"])
+def test_assertions_hold(way, compiled):
+    """A state at which one fails has no value, however the model is evaluated."""
+    x = ca.MX.sym("x", 2)
+    checked = x.attachAssert(x[0] > -1, "below the sensor")
+    inner = ca.Function("inner", [x], [checked[0] + 0.1 * checked[1] ** 2])
+    h = {
+        "function": inner,
+        "inner": ca.Function("h", [x], [ca.if_else(x[1] > 9, 0, inner(x), True)]),
+        "callable": lambda x: inner(x),
+        "mapped": ca.Function("h", [x], [ca.sum2(inner.map(2)(ca.horzcat(x, x))) / 2]),
+    }[way]
+    system = qpmhe.System.from_casadi(ca.Function("f", [x], [0.9 * x]), h, compiled=compiled)
+    xs, us = np.array([[0.5, 1.0], [-2.0, 1.0], [2.0, 0.0]]), np.zeros((3, 0))
+    expected = np.array([[0.6], [np.nan], [2.0]])
+    for x, y in zip(xs, expected, strict=True):
+        np.testing.assert_allclose(system.h(x, NONE), y)
+    np.testing.assert_allclose(system.h.batch(xs, us), expected)
+    np.testing.assert_allclose(system.f.batch(xs, us), 0.9 * xs)

@@ -227,6 +227,20 @@ def test_damaged_libraries_are_made_anew(damage, wrapped, tmp_path):
     assert len(calls()) == 2
 
 
+def test_remains_of_killed_compilations_are_removed(wrapped, tmp_path):
+    wrapped()
+    cache = tmp_path / "cache"
+    names = ["qpmhe-making-old", "qpmhe-making-new", "tmpold"]  # the last may be anyone's
+    for name in names:
+        (cache / name).mkdir(parents=True)
+        (cache / name / "library.so").write_text("half")
+    for name in ("qpmhe-making-old", "tmpold"):
+        os.utime(cache / name, 2 * (os.stat(cache).st_mtime - 2 * 86400,))
+    assert answer() == 42
+    left = sorted(path.name for path in cache.iterdir() if path.is_dir())
+    assert left == ["qpmhe-making-new", "tmpold"]
+
+
 def test_two_processes_at_once(wrapped, tmp_path):
     calls = wrapped(f'sleep 0.3\nexec "{CC}" "$@"')
     program = (

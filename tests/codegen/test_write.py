@@ -18,7 +18,7 @@ from qpmhe.errors import InvalidInputError, OptionError, QpmheError
 ca = pytest.importorskip("casadi")
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 
-STRICT = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-Wno-unused-parameter", "-Werror"]
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror"]
 WATCHED = ["-std=c99", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover"]
 PUBLIC = ["amend", "default_settings", "reset", "run", "sizes", "update", "update_members",
           "update_special"]
@@ -543,7 +543,7 @@ def test_two_in_one_program_and_from_cpp(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["mhe_tank", "MHE_tank", "MHE", "casadi", "real", "size"]
+    "name", ["mhe_tank", "MHE_tank", "MHE", "casadi", "real", "size", 60 * "a"]
 )
 def test_names(name, tmp_path):
     mhe = estimator(model(n=1, p=1, states=box(1, 5.0)), horizon=2)
@@ -568,6 +568,11 @@ BAD = {
     "path": ({"name": "../a"}, OptionError, "name is"),
     "real": ({"real": "half"}, OptionError, "real is 'half'.*'double' or 'float'"),
     "list": ({"real": ["float"]}, OptionError, "real is"),
+    "math.h": ({"name": "math"}, OptionError, "<math.h> is a header of the system.*'mhe_math'"),
+    "string.h": ({"name": "string"}, OptionError, "<string.h> is a header"),
+    "Stdint.h": ({"name": "Stdint"}, OptionError, "<stdint.h> is a header"),
+    "features.h": ({"name": "features"}, OptionError, "<features.h> is a header"),
+    "long": ({"name": 300 * "a"}, OptionError, "name has 300 letters; expected at most 60"),
 }
 
 
@@ -679,6 +684,7 @@ def test_matrix_expressions(case, tmp_path):
         ca.Function("h", [x], [x[0] + 0.1 * x[1] ** 2]), compiled=False,
     )
     mhe = estimator(system, max_qps=2)
+    compiled(mhe, tmp_path, [*STRICT, "-O2"])
     program = compiled(mhe, tmp_path, [*WATCHED, *STRICT])
     commands, expected = record(mhe, 6)
     check(play(program, mhe, commands), expected, 1e-9)
@@ -705,3 +711,30 @@ def test_what_does_not_fit_into_c_is_refused(tmp_path):
             dataclasses.replace(settings, horizon=50000),
         )
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("discount", "real"), [(0.5, "float"), (0.01, "double")])
+def test_failed_stages_whose_discount_underflows(discount, real, tmp_path):
+    """Zero times infinity: the cost of such a window is infinite, not NaN."""
+    x = ca.SX.sym("x", 1)
+    system = qpmhe.System.from_casadi(
+        ca.Function("f", [x], [0.9 * x]), ca.Function("h", [x], [ca.sqrt(x)]), compiled=False
+    )
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.5]),
+        qpmhe.QuadraticCost(prior=1.0, disturbance=5.0, noise=5.0, discount=discount),
+        horizon=190, initial_state=[0.5],
+    )
+    program = compiled(mhe, tmp_path, [*WATCHED, *STRICT], real=real)
+    ys = 0.3 + 0.01 * np.sin(np.arange(220.0))
+    ys[5] = -40.0
+    estimates = play(program, mhe, [(0, [y]) for y in ys], mhe.settings)
+    smallest = np.float32 if real == "float" else np.float64
+    assert smallest(discount) ** 185 == 0
+    failed = [Status.FAILED_STAGE in e.status for e in estimates]
+    assert sum(failed) == 189
+    for estimate, has_failed in zip(estimates, failed, strict=True):
+        assert estimate.cost <= estimate.candidate_cost
+        assert np.isinf(estimate.candidate_cost) == has_failed or (
+            Status.MODEL_FAILED in estimate.status
+        )

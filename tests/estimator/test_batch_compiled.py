@@ -1,5 +1,8 @@
 """Batches in compiled code against single estimators."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 
@@ -147,4 +150,52 @@ def test_bad_input():
     with pytest.raises(qpmhe.errors.OptionError, match="from_casadi"):
         qpmhe.BatchEstimator(
             *plain[:3], members=3, horizon=4, initial_states=[3.0, 0.1], engine="compiled"
+        )
+
+
+@pytest.mark.parametrize("copied", [lambda one: pickle.loads(pickle.dumps(one)), copy.deepcopy],
+                         ids=["pickle", "deepcopy"])
+@pytest.mark.parametrize(
+    ("mode", "engine", "sets", "compiled"),
+    [("compiled", "compiled", {"disturbances": BOX}, None), ("vectorised", "python", {}, None),
+     ("vectorised", "python", {}, False), ("looped", "python", {"disturbances": BOX}, None)],
+)
+def test_copies_go_on_where_they_were_made(mode, engine, sets, compiled, copied):
+    model = qpmhe.models.batch_reactor()
+    system = qpmhe.System.from_casadi(
+        casadi_rate, casadi_output, dt=0.1, method="euler", n=2, compiled=compiled, **sets
+    )
+    members, cut = 20, 14
+    batch = qpmhe.BatchEstimator(
+        system, model.observer, model.cost, members=members, horizon=8, engine=engine,
+        initial_states=starts()[:members], max_qps=2, start="best",
+    )
+    y = records()[:members]
+    batch.run(y[:, :cut])
+    other = copied(batch)
+    assert (other.mode, other.time, other.members) == (mode, cut, members)
+    np.testing.assert_array_equal(other.states, batch.states)
+    one, two = batch.run(y[:, cut:]), other.run(y[:, cut:])
+    np.testing.assert_allclose(two.states, one.states, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(two.costs, one.costs, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(two.statuses, one.statuses)
+    other.reset()
+    again = qpmhe.BatchEstimator(
+        system, model.observer, model.cost, members=members, horizon=8, engine=engine,
+        initial_states=starts()[:members], max_qps=2, start="best",
+    )
+    np.testing.assert_array_equal(other.update(y[:, 0]).states, again.update(y[:, 0]).states)
+
+
+def test_more_memory_than_there_is(monkeypatch):
+    def refuse(*_):
+        raise MemoryError("Unable to allocate 1.49 TiB")
+
+    system, observer, cost = reactor()
+    monkeypatch.setattr("qpmhe.batch.estimator.VectorisedEngine", refuse)
+    with pytest.raises(
+        qpmhe.errors.OptionError, match=r"1000 members with a horizon of 9 .*1.49 TiB.*fewer"
+    ):
+        qpmhe.BatchEstimator(
+            system, observer, cost, members=1000, horizon=9, initial_states=[3.0, 0.1]
         )

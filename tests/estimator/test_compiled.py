@@ -219,6 +219,25 @@ def test_discounts(name, discount):
         follow(model, both(model, cost=cost, **options))
 
 
+def test_a_discount_that_underflows_within_the_window():
+    """The oldest stages then weigh nothing: no reason for the factorisation to fail."""
+    system = system_of(lambda x: 0.9 * x, lambda x: x + 0.1 * x**3, n=1)
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=5.0, noise=5.0, discount=0.01)
+    estimates = {}
+    ys = 0.3 + 0.1 * np.sin(np.arange(200.0))
+    for horizon in (20, 190):
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([0.3]), cost, horizon=horizon, initial_state=[0.5],
+            max_qps=3, engine="compiled",
+        )
+        estimates[horizon] = [mhe.update(y) for y in ys]
+    assert 0.01**190 == 0
+    for short, long in zip(*estimates.values(), strict=True):
+        assert qpmhe.Status.SOLVER_FAILED not in long.status
+        # What is 20 samples old weighs 1e-40.
+        np.testing.assert_allclose(long.state, short.state, rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("name", "horizon"),
     [("reactor rk4", 1), ("reactor rk4", 2), ("inputs", 1), ("inputs", 2), ("inputs", 12)],

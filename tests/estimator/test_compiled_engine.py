@@ -12,6 +12,7 @@ import pytest
 
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
+from qpmhe.codegen.library import EstimatorLibrary
 from qpmhe.errors import EngineWarning, OptionError, QpmheError
 
 from .test_compiled import estimator, made, system_of
@@ -201,6 +202,10 @@ def equality():
             disturbances=qpmhe.Box(0.1, 0.1))}),
         ("noises has a direction of zero width", {"system": lambda: symbolic(
             noises=equality())}),
+        ("disturbances has a direction of zero width", {"system": lambda: symbolic(
+            disturbances=qpmhe.Polytope([[1.0], [-2.0]], [0.3, -0.6]))}),
+        ("noises has a direction of zero width.*less than 5e-09", {"system": lambda: symbolic(
+            noises=qpmhe.Polytope([[1.0], [-1.0]], [1e-9, 1e-9]))}),
         ("not by 'osqp'; take backend='auto'", {"backend": "osqp"}),
         ("take 'qp'", {"subproblem": "exact"}),
         ("max_qps and max_solver_iterations", {"time_budget": 1.0}),
@@ -218,3 +223,32 @@ def test_caps_beyond_all_bounds(option):
     except QpmheError:
         return
     assert mhe.update([1.0]).improved
+
+
+@pytest.mark.parametrize("case", ["opposite rows", "three rows", "rows and a box"])
+def test_equalities_made_of_inequalities(case):
+    flat = {
+        "opposite rows": qpmhe.Polytope([[1, -1], [-3, 3]], [0.1, -0.3]),
+        "three rows": qpmhe.Polytope([[1, 0], [0, 1], [-1, -1]], [0.0, 0.0, 0.0]),
+        "rows and a box": qpmhe.Box([0, 0], [1, 1]) & qpmhe.Polytope([[1, 2]], [0.0]),
+    }[case]
+    with pytest.raises(OptionError, match=r"disturbances has a direction of zero width.*widen"):
+        uncovered(
+            system=lambda: system_of(
+                lambda x: 0.9 * x, lambda x: x[:1], n=2, disturbances=flat),
+            observer=lambda: qpmhe.Luenberger([0.1, 0.1]), initial_state=[0.0, 0.0],
+            cost=lambda: qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=1.0),
+        )
+
+
+@pytest.mark.parametrize("horizon", [5 * 10**7, 10**12])
+def test_horizons_beyond_a_structure(horizon):
+    with pytest.raises(OptionError, match=rf"a horizon of {horizon} .* bytes .* shorter one"):
+        uncovered(horizon=horizon)
+
+
+def test_more_memory_than_there_is():
+    mhe = uncovered()
+    library = EstimatorLibrary(mhe.system, mhe.observer, mhe.cost, mhe.settings)
+    with pytest.raises(OptionError, match=r"memory of 1000000000000 estimators needs .* bytes"):
+        library.estimators(np.broadcast_to(np.zeros(1), (10**12, 1)))

@@ -143,3 +143,14 @@ def test_settings_are_kept_and_frozen():
 def test_an_unknown_option_is_a_type_error():
     with pytest.raises(TypeError, match="max_qp"):
         estimator(max_qp=3)
+
+
+def test_a_horizon_beyond_the_memory(monkeypatch):
+    def exhausted(*_):
+        raise MemoryError("Unable to allocate 745. GiB")
+
+    monkeypatch.setattr("qpmhe.estimator.engine_for", exhausted)
+    check(
+        OptionError, ["horizon is 10000000", "745. GiB", "take a shorter one"],
+        lambda: estimator(horizon=10_000_000),
+    )

@@ -8,7 +8,7 @@
  *     static mhe_estimator estimator;      all that is remembered
  *     static mhe_workspace workspace;      scratch, may be shared by estimators of one thread
  *     static mhe_estimate estimate;
- *     mhe_reset(&estimator, &mhe_default_settings, x0);
+ *     mhe_reset(&estimator, &mhe_default_settings, x0);      keeps a pointer to the settings
  *     mhe_update(&estimator, &workspace, y, u, &estimate);      once a sample
  *     estimate.trajectory[estimate.length * MHE_NX + j]         state j at t+1
  *
@@ -168,6 +168,8 @@ typedef struct {
     int32_t *status, *qps, *iterations;
 } mhe_log;
 
+/* Forget all samples and start at x0. The settings are not copied: they must stay where they
+ * are as long as the estimator is in use. */
 void mhe_reset(mhe_estimator *estimator, const mhe_settings *settings, const mhe_real *x0);
 
 /* Take y(t) and u(t) in. step: length of this step where it is unusual, else 0;

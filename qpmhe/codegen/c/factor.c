@@ -6,6 +6,12 @@
 
 #define WIDTH MHE_PANEL_WIDTH
 
+/* Discounts below it are taken for it in the Hessian, which is singular without them; the cost
+ * has them as they are, and cannot tell. */
+#define LEAST_FACTOR (sizeof(real) == 8 ? (real)1e-280 : (real)1e-27)
+
+static real mhe_floored(real factor) { return factor < LEAST_FACTOR ? LEAST_FACTOR : factor; }
+
 /* Fill panels and gradient from the terms in workspace->at, around a trajectory that starts
  * at the given offset from the prior. */
 static void mhe_assemble(const mhe_estimator *e, mhe_workspace *k, const real *offset)
@@ -16,7 +22,7 @@ static void mhe_assemble(const mhe_estimator *e, mhe_workspace *k, const real *o
     for (int i = 0; i <= count; i++) {
         real *panel = k->panels + i * NX * WIDTH, *g = k->gradient + i * NX;
         const real *weight = i == 0 ? s->prior_weight : s->disturbance_weight;
-        const real factor = factors[i];
+        const real factor = mhe_floored(factors[i]);
         for (int r = 0; r < NX; r++) {
             real *row = panel + r * WIDTH;
             for (int c = 0; c < NX; c++) row[c] = factor * weight[r * NX + c];
@@ -30,7 +36,7 @@ static void mhe_assemble(const mhe_estimator *e, mhe_workspace *k, const real *o
         }
         if (i == count) break;
         const mhe_terms *t = k->at[i];
-        const real next = factors[i + 1];
+        const real next = mhe_floored(factors[i + 1]);
         for (int r = 0; r < NX; r++) {
             real *row = panel + r * WIDTH;
             for (int c = 0; c < NX; c++) {

@@ -268,6 +268,8 @@ static void mhe_set_candidate(mhe_estimator *e, mhe_workspace *k, mhe_trial *tri
         memcpy(trial->v + i * NY, stage->v, sizeof stage->v);
         trial->cost += k->factors[i + 1] * stage->cost;
     }
+    /* No cost is NaN, but 0 times infinity is where a discount underflows. */
+    if (isnan(trial->cost)) trial->cost = INFINITY;
     memcpy(trial->x + count * NX, e->z_end, sizeof e->z_end);
 }
 
