@@ -44,8 +44,8 @@ so that what tells them apart is time, and how much a cap costs.
 ![Error and cost against the cap]({prefix}-anytime.png)
 
 First-order methods (osqp, scs) need a few iterations before they come near the converged cost, ecos
-about ten before it brings anything of use, and daqp and qpalm nothing at a cap of one. Until then
-the true cost rejects the iterates: the dashed line, the observer, is the worst that can happen.
+about ten before it brings anything of use, and qpalm brings nothing at a cap of one. Until then the
+true cost rejects the iterates: the dashed line, the observer, is the worst that can happen.
 
 ![Time per step]({prefix}-step-times.png)
 
