@@ -81,10 +81,11 @@ class Frame:
 
 
 class _Views(Sequence[View]):
-    """Views that are made at each use."""
+    """Views of which only the last that was made is kept."""
 
     def __init__(self, count: int, make: Callable[[int], View]) -> None:
         self._count, self._make = count, make
+        self._k, self._view = -1, None
 
     def __len__(self) -> int:
         return self._count
@@ -92,7 +93,9 @@ class _Views(Sequence[View]):
     def __getitem__(self, k: Any) -> Any:
         if k >= self._count:
             raise IndexError(k)
-        return self._make(k)
+        if k != self._k:
+            self._k, self._view = k, self._make(k)
+        return self._view
 
 
 class Stages:

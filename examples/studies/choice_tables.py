@@ -336,6 +336,7 @@ def sets(figures: Figures) -> str:
 def backends(page: Path) -> str:
     """Some lines of the table in comparison.md."""
     rows, header, seen = [], [""], set()
+    shown = {"0": ("observer",), "1": ("auto",), "2": ("auto", "piqp", "daqp", "osqp")}
     for line in page.read_text(encoding="utf-8").splitlines():
         words = re.split(r" {2,}", line.replace("*", "").strip())
         if words[0] == "backend":
@@ -343,8 +344,7 @@ def backends(page: Path) -> str:
         cells = dict(zip(header, words, strict=False))
         name, qps = cells.get("backend"), cells.get("QPs")
         # Of each the first line, which is the fastest.
-        wanted = qps == "2" and name in ("auto", "piqp", "daqp", "osqp")
-        if (wanted or (name, qps) in (("observer", "0"), ("auto", "1"))) and (name, qps) not in seen:
+        if name in shown.get(qps or "", ()) and (name, qps) not in seen:
             seen.add((name, qps))
             columns = ("QPs", "cap", "RMSE", "conv.", "median")
             rows.append((f"`{name}`", *(cells[column] for column in columns)))
