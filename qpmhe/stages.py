@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 View = TypeVar("View")
 
 # Views of longer windows are not kept: they would outweigh the arrays, and are little of a step.
-_KEPT = 256
+_KEPT = 1000
 
 
 class Place:
@@ -85,7 +85,8 @@ class _Views(Sequence[View]):
 
     def __init__(self, count: int, make: Callable[[int], View]) -> None:
         self._count, self._make = count, make
-        self._k, self._view = -1, None
+        self._k = -1
+        self._view: View | None = None
 
     def __len__(self) -> int:
         return self._count
