@@ -18,7 +18,7 @@ from .window import Window
 
 if TYPE_CHECKING:
     from .adapters.fused import Fused
-    from .stages import Frame
+    from .views import Frame
 
 __all__ = ["Problem", "Trial"]
 

@@ -3,100 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .linearization import Span, Stage, StageTerms
+from .linearization import StageTerms
+from .views import Frame, Place, Views
 
-__all__ = ["Frame", "Place", "Stages"]
+__all__ = ["Stages"]
 
 Array = NDArray[np.float64]
-View = TypeVar("View")
 
 # Views of longer windows are not kept: they would outweigh the arrays, and are little of a step.
 _KEPT = 1000
-
-
-class Place:
-    """Views of one stage's entries in all arrays: making them takes as long as using them.
-
-    Attributes
-    ----------
-    z, following : (n,) array
-        State of the observer, and the one after it.
-    arguments : tuple
-        What the functions of the usual model take: z, and the inputs if there are any. They
-        cannot be written to where the model can do with that.
-    y, u : array
-        The measurement (p,), and the input (m,).
-    weight : (n + p, n + p) array
-        The stage's.
-    terms : Stage
-        Its linear map and terms.
-    """
-
-    __slots__ = ("arguments", "following", "terms", "u", "weight", "y", "z")
-
-    def __init__(self, stages: Stages, k: int) -> None:
-        self.z, self.following = stages._z[k], stages._z[k + 1]
-        self.y, self.u = stages._y[k], stages._u[k, :-1]
-        self.arguments: tuple[Array, ...] = (self.z, self.u) if self.u.size else (self.z,)
-        if stages._protected:
-            self.arguments = tuple(one.view() for one in self.arguments)
-            for one in self.arguments:
-                one.flags.writeable = False
-        self.weight = stages._weight[k]
-        self.terms = Stage(stages.terms, k)
-
-
-class Frame:
-    """Views of a whole window.
-
-    Attributes
-    ----------
-    candidate : (K + 1, n) array
-        The observer's trajectory.
-    prior : (n,) array
-        Its first state.
-    residuals, measurements, inputs : array
-        (K, n + p), (K, p) and (K, m).
-    costs : (K,) array
-        The stages' costs.
-    span : Span
-        The stages' terms.
-    """
-
-    __slots__ = ("candidate", "costs", "inputs", "measurements", "prior", "residuals", "span")
-
-    def __init__(self, stages: Stages, first: int, last: int) -> None:
-        self.candidate, self.prior = stages._z[first : last + 1], stages._z[first]
-        self.residuals = stages.terms.residuals[first:last]
-        self.measurements, self.inputs = stages._y[first:last], stages._u[first:last, :-1]
-        self.costs = stages._stage_cost[first:last]
-        self.span = Span(stages.terms, first, last - first)
-
-
-class _Views(Sequence[View]):
-    """Views of which only the last that was made is kept."""
-
-    def __init__(self, count: int, make: Callable[[int], View]) -> None:
-        self._count, self._make = count, make
-        self._k = -1
-        self._view: View | None = None
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, k: Any) -> Any:
-        if k >= self._count:
-            raise IndexError(k)
-        if k != self._k:
-            self._k, self._view = k, self._make(k)
-        return self._view
 
 
 class Stages:
@@ -156,8 +78,8 @@ class Stages:
         self.terms = StageTerms(room, n, p)
         self._covariance = None if covariance is None else np.zeros((room + 1, n, n))
         # By stage; and of the full windows, by their first stage.
-        self._places: Sequence[Place] = _Views(room, partial(Place, self))
-        self._frames: Sequence[Frame] = _Views(
+        self._places: Sequence[Place] = Views(room, partial(Place, self))
+        self._frames: Sequence[Frame] = Views(
             room + 1 - horizon, lambda k: Frame(self, k, k + horizon)
         )
         if horizon <= _KEPT:

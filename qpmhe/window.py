@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from .costs import Cost, ObserverPrior
 from .linearization import Stage
 from .observers import HighGain, Luenberger, Observer, Sample
-from .stages import Frame, Stages
+from .stages import Stages
 from .system import Function, System
+from .views import Frame
 
 if TYPE_CHECKING:
     from .adapters.fused import Fused
