@@ -228,7 +228,7 @@ class Window(Stages):
             joint = model.joint if self._jacobians else None
             if joint is None:
                 usual = model is self._system
-                arguments = place.arguments if usual else (z, u)
+                arguments = place.arguments if usual else (place.arguments[0], u)
                 f, h = self._read if usual else (model.f, model.h)
                 # Used up at once: the functions may return one array every time.
                 np.subtract(place.y, h(*arguments), error)

@@ -453,3 +453,20 @@ def test_arrays_of_objects_are_taken_as_numbers():
         for f in (listed, plain)
     ]
     np.testing.assert_allclose(runs[0].states, runs[1].states, rtol=1e-12)
+
+
+def test_a_model_cannot_change_the_state_before_a_step_of_unusual_length():
+    def clipping(x):
+        if x.ndim == 1 and x[0] > 30.0:  # beyond all probes
+            x[0] = 30.0
+        return 0.0 * x
+
+    mhe = qpmhe.MovingHorizonEstimator(
+        qpmhe.System.from_ode(clipping, lambda x: x, dt=0.1, n=1, p=1), qpmhe.Luenberger([1.0]),
+        qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0), horizon=3,
+        initial_state=[0.0],
+    )
+    mhe.update([50.0], dt=0.2)
+    estimate = mhe.update([50.0], dt=0.2)
+    assert estimate.candidate[1, 0] == 50.0
+    assert qpmhe.Status.MODEL_FAILED in estimate.status
