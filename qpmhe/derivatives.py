@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import ModelError
-from .functions import BatchedFunction, Probes
+from .functions import BatchedFunction, Probes, Trusted
 
 __all__ = ["Jacobian"]
 
@@ -50,7 +50,7 @@ class Jacobian:
     def __init__(
         self,
         function: BatchedFunction,
-        given: Callable[..., Any] | None,
+        given: Callable[..., Any] | Trusted | None,
         inputs: int,
         probes: Probes,
     ) -> None:
@@ -80,11 +80,6 @@ class Jacobian:
         if self._given is not None:
             return self._given.direct
         return self if self._inputs else partial(self, u=np.zeros(0))
-
-    @property
-    def reads_only(self) -> bool:
-        """Whether it works on arrays that it cannot write to."""
-        return self._given is None or self._given.reads_only
 
     def _complex(self, x: Array, u: Array) -> Array:
         n = x.shape[-1]

@@ -30,9 +30,6 @@ __all__ = ["PythonEngine"]
 
 Array = NDArray[np.float64]
 
-# Every so many samples it is made sure that f and h may be called on many states at once.
-_CHECK_EVERY = 16
-
 
 class PythonEngine:
     """The loop body: sample in, observer, candidate, QPs, verdict, estimate out.
@@ -151,8 +148,6 @@ class PythonEngine:
     def _estimate(self, missing: bool, held: bool, flat: bool, began: float) -> Estimate:
         """Solve the window's problem as it stands."""
         window, problem, settings = self._window, self._problem, self._settings
-        if window.time <= settings.horizon or window.time % _CHECK_EVERY == 0:
-            window.check_batches()
         problem.bind(window)
         start = self._shifted() if settings.start == "best" else None
         deadline = math.inf if settings.time_budget is None else began + settings.time_budget
@@ -203,11 +198,12 @@ class PythonEngine:
         window, before = self._window, self._trajectory
         if before is None:
             return None
+        shifted = np.empty((before.shape[0] + 1, before.shape[1]))
+        shifted[:-1] = before
         try:
-            ahead = np.asarray(window.model.f(before[-1], window.inputs[-1]))
+            shifted[-1] = window.model.f(before[-1], window.inputs[-1])
         except Exception:  # the model is not defined there: no start, then
             return None
-        shifted = np.vstack((before, ahead))
         return shifted[shifted.shape[0] - 1 - window.length :]
 
     def state_dict(self) -> dict[str, Any]:

@@ -6,33 +6,67 @@ import inspect
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ModelError
-from .tracing import mixes_states
+from .errors import ModelError, QpmheError
+from .tracing import trace
 
-__all__ = ["BatchedFunction", "positional_arguments"]
+__all__ = ["BatchedFunction", "Trusted", "check_inputs", "contained", "takes_input"]
 
 Array = NDArray[Any]
 Probes = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
+class EvaluationError(QpmheError):
+    """A model function ended the program, or returned no value, at some state.
+
+    It never leaves an estimator: the step falls back.
+    """
+
+
+class Trusted(NamedTuple):
+    """A function of this package that takes (..., n) as well as (n,) and writes into nothing."""
+
+    function: Callable[..., Any]
+
+
+def contained(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Foreign code that may raise an Exception or be interrupted, and nothing else.
+
+    Parameters
+    ----------
+    function : callable
+        The function; a SystemExit of its own, say, becomes an `EvaluationError`.
+    """
+
+    def call(*arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except (Exception, KeyboardInterrupt):
+            raise
+        except BaseException as error:
+            raise EvaluationError(f"{type(error).__name__}: {error}") from error
+
+    return call
+
+
 class BatchedFunction:
     """g(x) or g(x, u), evaluated over leading dimensions whatever way it was written.
 
-    Three ways of writing are told apart by trying them on a few points: functions that
-    take (..., n) as NumPy's own do (``batched``); functions of one state that happen to
-    work on columns, as ``np.array([x[1], -x[0]])`` does on an (n, B) array (``columns``);
-    and everything else, which is called state by state (``looped``).
+    A function is called state by state (``looped``), with a copy of each argument, unless a
+    trace proves that it needs neither: called on symbols, it returns without asking for a
+    value, writes into no argument, and computes each state's value from this state alone.
+    Then it is called once for many states, as NumPy's own functions are (``batched``), or
+    with the states as columns (``columns``), which suits ``np.array([x[1], -x[0]])``.
 
     Parameters
     ----------
     name : str
         What error texts call it.
-    function : callable
+    function : callable or Trusted
         The user's function.
     shape : tuple of int
         Shape of its value at one state, such as (n,) or (p, n).
@@ -45,53 +79,75 @@ class BatchedFunction:
     ----------
     mode : str
         ``batched``, ``columns``, ``looped``, or ``unknown`` where no probe could be used.
+    takes_input : bool
+        Whether it is a function of u as well.
+    reads_only : bool
+        Whether it is proved to write into no argument, and to return one kind of value.
     """
 
     def __init__(
         self,
         name: str,
-        function: Callable[..., Any],
+        function: Callable[..., Any] | Trusted,
         shape: tuple[int, ...],
         inputs: int,
         probes: Probes,
     ) -> None:
+        self._trusted = isinstance(function, Trusted)
+        if isinstance(function, Trusted):
+            function = function.function
         if not callable(function):
             raise ModelError(f"{name} is {function!r}; expected a function of the state.")
         self.name, self.shape = name, shape
-        self._function, self._inputs = function, inputs
-        self._takes_input = inputs > 0 and positional_arguments(name, function) != 1
-        if inputs == 0 and _required_arguments(function) > 1:
-            raise ModelError(
-                f"{name} needs more than one argument, but the system has no inputs; "
-                "pass m, the number of inputs, or make it a function of x alone."
-            )
+        self._inputs = inputs
+        self.takes_input = takes_input(name, function, inputs)
+        #: What is called: the user's function, contained.
+        self.function = contained(function)
         # A scalar at one state is a value of shape (1,): p = 1 is written without brackets.
         self._short = False
-        #: Whether it works on arrays that it cannot write to, as compiled code may not.
-        self.reads_only = True
+        self.reads_only = self._trusted
         self._returns_array = True
+        self._holds_objects = False
         self.mode = "unknown"
         self._detect(probes)
 
     def __call__(self, x: Array, u: Array) -> Array:
         """The value at one state x (n,) and input u (m,)."""
-        value = self._function(x, u) if self._takes_input else self._function(x)
-        return np.asarray(value).reshape(self.shape) if self._short else value
+        if self.reads_only:
+            value = self.function(x, u) if self.takes_input else self.function(x)
+            return np.asarray(value).reshape(self.shape) if self._short else value
+        return self._as_value(
+            self.function(x.copy(), u.copy()) if self.takes_input else self.function(x.copy())
+        )
+
+    def _as_value(self, raw: Any) -> Array:
+        """What a function without proof has returned, if it is a value."""
+        value = np.asarray(raw)
+        if value.dtype == np.object_:
+            value = np.array(value.tolist())
+        if value.dtype.kind not in "fciub":
+            raise EvaluationError(f"{self.name} returned {value.dtype}; expected numbers")
+        if value.shape != self.shape:
+            if not (self._short and value.shape == self.shape[1:]):
+                raise EvaluationError(
+                    f"{self.name} returned shape {value.shape}; expected {self.shape}"
+                )
+            value = value.reshape(self.shape)
+        return value
 
     def batch(self, x: Array, u: Array) -> Array:
         """The values at states x (..., n) and inputs u (..., m): shape (..., *shape)."""
-        if x.ndim == 2 and self.mode == "batched" and not self._short:
-            return np.asarray(self._function(x, u) if self._takes_input else self._function(x))
         lead = x.shape[:-1]
         if len(lead) != 1:
             # Functions that pass for batched on (B, n) may still mix axes up beyond.
             count = math.prod(lead)
             x, u = x.reshape(count, x.shape[-1]), u.reshape(count, u.shape[-1])
         if self.mode == "batched":
-            value = self._function(x, u) if self._takes_input else self._function(x)
-            value = np.asarray(value)
+            value = np.asarray(self.function(x, u) if self.takes_input else self.function(x))
+            if len(lead) == 1 and not self._short:
+                return value
         elif self.mode == "columns":
-            value = self._function(x.T, u.T) if self._takes_input else self._function(x.T)
+            value = self.function(x.T, u.T) if self.takes_input else self.function(x.T)
             value = np.moveaxis(np.asarray(value), -1, 0)
         else:
             # Copied row by row: a function may return one and the same array every time.
@@ -110,45 +166,60 @@ class BatchedFunction:
                 values.append(value)
         if not points:
             return
+        states, inputs = points[0][0].size, self._inputs
+        self.reads_only = self._trusted or (
+            not self._holds_objects and self._same_everywhere(states)
+        )
         # All points, and more than any dimension of the value, so that axes cannot be mixed up.
-        size = max(len(points), 3, *(d + 1 for d in (*self.shape, points[0][0].size, self._inputs)))
+        size = max(len(points), 3, *(d + 1 for d in (*self.shape, states, inputs)))
         x = np.array([points[i % len(points)][0] for i in range(size)])
         u = np.array([points[i % len(points)][1] for i in range(size)])
         expected = np.array([values[i % len(points)] for i in range(size)])
-        for mode in ("batched", "columns"):
+        for mode in ("batched", "columns") if self.reads_only else ():
             self.mode = mode
             try:
                 with np.errstate(all="ignore"):
-                    raw = self.batch(x, u)
-                    found = np.asarray(raw, dtype=np.float64)
+                    found = np.asarray(self.batch(x.copy(), u.copy()), dtype=np.float64)
             except Exception:  # a function of one state may do anything on many
                 continue
             same = found.shape == expected.shape and np.allclose(found, expected, rtol=1e-9)
-            if same and not self._mixes(mode, x, u):
+            if same and (self._trusted or self._keeps_apart(mode, states)):
                 return
         self.mode = "looped"
 
-    def _mixes(self, mode: str, x: Array, u: Array) -> bool:
-        """Whether the function, called in this mode, decides for a batch by some of it."""
+    def _labelled(self, *labels: Array) -> list[Array]:
+        return list(labels if self.takes_input else labels[:1])
+
+    def _same_everywhere(self, states: int) -> bool:
+        """Whether it computes the same expression at every state, and writes into no argument."""
+        ones = (np.ones(size, np.uint64) for size in (states, self._inputs))
+        return trace(self.function, self._labelled(*ones)) is not None
+
+    def _keeps_apart(self, mode: str, states: int) -> bool:
+        """Whether, called in this mode, each value comes from its own state alone."""
         # No other dimension must have the batch's length.
-        count = 7 + max(*self.shape, x.shape[1], u.shape[1])
-        x, u = (np.resize(values, (count, values.shape[1])) for values in (x, u))
-        arguments: tuple[Array, ...] = (x, u) if self._takes_input else (x,)
+        count = 7 + max(*self.shape, states, self._inputs)
+        bits = np.left_shift(np.uint64(1), np.arange(count, dtype=np.uint64) % np.uint64(64))
+        arguments = self._labelled(
+            *(np.repeat(bits[:, None], size, axis=1) for size in (states, self._inputs))
+        )
         if mode == "columns":
-            arguments = tuple(values.T for values in arguments)
-        with np.errstate(all="ignore"):
-            return mixes_states(self._function, *arguments, batch=count)
+            arguments = [labels.T for labels in arguments]
+        found = trace(self.function, arguments)
+        if found is None or found.size != count * math.prod(self.shape):
+            return False
+        own = bits if mode == "columns" else bits.reshape(-1, *[1] * (found.ndim - 1))
+        return found.shape[-1 if mode == "columns" else 0] == count and not np.any(found & ~own)
 
     def _probe(self, x: Array, u: Array) -> Array | None:
         """The checked value at a probe; None where the function cannot be used there."""
         x_given, u_given = x.copy(), u.copy()
         try:
-            raw = self._tried(x_given, u_given)
+            with np.errstate(all="ignore"):
+                raw = self.function(*((x_given, u_given) if self.takes_input else (x_given,)))
             value = np.array(raw, dtype=np.float64)  # a copy: it may be one buffer
         except Exception:  # outside its domain; the estimator checks at the initial state
             return None
-        if isinstance(raw, np.ndarray) and raw.dtype == np.object_:
-            self._function = _with_numbers(self._function)
         if not (np.array_equal(x_given, x) and np.array_equal(u_given, u)):
             raise ModelError(
                 f"{self.name} changes its argument in place; copy x before writing to it."
@@ -161,63 +232,20 @@ class BatchedFunction:
             )
         self._short = value.shape != self.shape
         self._returns_array = self._returns_array and isinstance(raw, np.ndarray)
+        self._holds_objects = getattr(raw, "dtype", None) == np.object_
         return value.reshape(self.shape) if np.isfinite(value).all() else None
-
-    def _tried(self, x: Array, u: Array) -> Any:
-        """The raw value, of arguments that it cannot change if it can do with such."""
-        arguments = (x, u) if self._takes_input else (x,)
-        with np.errstate(all="ignore"):
-            if self.reads_only:
-                for one in arguments:
-                    one.flags.writeable = False
-                try:
-                    return self._function(*arguments)
-                except (ValueError, TypeError):  # what writing, or wanting to, comes to
-                    pass
-                finally:
-                    for one in arguments:
-                        one.flags.writeable = True
-            value = self._function(*arguments)
-            self.reads_only = False
-            return value
-
-    def agrees(self, x: Array, u: Array, expected: Array, tolerance: float) -> bool:
-        """Whether a batch gives what single states gave; if not, states are looped over.
-
-        A function with a branch on its state (``if x[0] > 1``) can pass for one of many
-        states until states on both sides of the branch meet in one batch.
-
-        Parameters
-        ----------
-        x, u : (B, n) and (B, m) array
-            States and inputs.
-        expected : (B, ...) array
-            Values at these, computed one by one.
-        tolerance : float
-            How far rounding may lead, absolute.
-        """
-        if self.mode == "looped":
-            return True
-        try:
-            close = np.abs(self.batch(x, u) - expected) <= tolerance
-            if close.all():
-                return True
-        except Exception:  # a function of one state may do anything on many
-            pass
-        self.mode = "looped"
-        return False
 
     @property
     def direct(self) -> Callable[..., Any]:
         """A function of one state, and of the input where there are any: the user's if it may."""
-        if not self._short and self._takes_input == (self._inputs > 0):
-            return self._function
+        if self.reads_only and not self._short and self.takes_input == (self._inputs > 0):
+            return self.function
         return self if self._inputs else partial(self, u=np.zeros(0))
 
     @property
     def plain(self) -> bool:
         """Whether the user's function can be called as it is, on (..., n) and all inputs."""
-        takes_all = self._takes_input or self._inputs == 0
+        takes_all = self.takes_input or self._inputs == 0
         return self.mode == "batched" and takes_all and self._returns_array and not self._short
 
     def check(self, x: Array, u: Array) -> None:
@@ -244,40 +272,103 @@ class BatchedFunction:
             )
 
 
-def _with_numbers(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function whose values are arrays of numbers, of one whose arrays hold objects."""
+def takes_input(name: str, function: Callable[..., Any], inputs: int) -> bool:
+    """Whether a model function is one of x and u, by its parameters.
 
-    def evaluate(*arguments: Array) -> Array:
-        return np.array(np.asarray(function(*arguments)).tolist())
+    The second positional parameter is the input, whatever its name and default are.
 
-    return evaluate
+    Parameters
+    ----------
+    name : str
+        What error texts call it.
+    function : callable
+        The function.
+    inputs : int
+        Length m of u; with 0 it is a function of x alone.
 
-
-def positional_arguments(name: str, function: Callable[..., Any]) -> int | None:
-    """How many positional arguments function can take; None if it cannot be told."""
+    Raises
+    ------
+    ModelError
+        If it cannot be called as name(x) or name(x, u), or if it is not clear which of its
+        parameters is the input.
+    """
+    if isinstance(function, np.ufunc):
+        if function.nin > 1 + (inputs > 0):
+            raise ModelError(f"{name} is {function!r}, a function of {function.nin} arguments; "
+                             f"expected {name}(x) or {name}(x, u).")
+        return function.nin == 2
     try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return None
-    if any(q.kind is q.VAR_POSITIONAL for q in parameters):
-        return None
-    taken = sum(q.kind in (q.POSITIONAL_ONLY, q.POSITIONAL_OR_KEYWORD) for q in parameters)
-    if taken == 0:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):  # of a compiled function: it takes all that there is
+        return inputs > 0
+    positional = [q for q in parameters if q.kind in (q.POSITIONAL_ONLY, q.POSITIONAL_OR_KEYWORD)]
+    rest = any(q.kind is q.VAR_POSITIONAL for q in parameters)
+    if not positional and not rest:
         raise ModelError(f"{name} takes no argument; expected {name}(x) or {name}(x, u).")
-    # f(x, scale=2.0) is a function of x: only a second argument without default is an input.
-    second = [q for q in parameters if q.kind in (q.POSITIONAL_ONLY, q.POSITIONAL_OR_KEYWORD)][1:2]
-    if second and second[0].default is not inspect.Parameter.empty and second[0].name != "u":
-        return 1
-    return taken
+    for q in parameters:
+        if q.kind is q.KEYWORD_ONLY and (q.default is q.empty or (q.name == "u" and inputs > 0)):
+            raise ModelError(
+                f"{name} takes {q.name} by keyword only, but is called as {name}(x) or "
+                f"{name}(x, u); make it the second positional parameter, or bind it with "
+                "functools.partial."
+            )
+    required = sum(q.default is q.empty for q in positional)
+    if required > 1 + (inputs > 0):
+        raise ModelError(
+            f"{name} needs {required} arguments, but the system has "
+            + ("no inputs; pass m, the number of inputs, or make it a function of x alone."
+               if inputs == 0 else f"{inputs} inputs: expected {name}(x, u). Bind the others with "
+               "functools.partial.")
+        )
+    if inputs == 0:
+        return False
+    if len(positional) < 2:
+        return rest
+    second = positional[1]
+    if second.name != "u":
+        if any(q.name == "u" for q in positional[2:]):
+            raise ModelError(
+                f"{name} has a parameter u, but its second one is {second.name}; make u the "
+                "second parameter, or bind the other with functools.partial."
+            )
+        if second.default is not second.empty and not _may_be_input(second.default, inputs):
+            raise ModelError(
+                f"{name} is called as {name}(x, u), but the default of its second parameter, "
+                f"{second.name} = {second.default!r}, is no input of {inputs} numbers. Make u the "
+                f"second parameter, or bind {second.name} with functools.partial."
+            )
+    return True
 
 
-def _required_arguments(function: Callable[..., Any]) -> int:
+def check_inputs(m: int, **takes_input: bool) -> None:
+    """Refuse inputs that no function of the model takes.
+
+    Parameters
+    ----------
+    m : int
+        Number of inputs.
+    **takes_input : bool
+        For each function, by name, whether it takes them.
+
+    Raises
+    ------
+    ModelError
+        If none does, although there are inputs.
+    """
+    if m and not any(takes_input.values()):
+        names = list(takes_input)
+        raise ModelError(
+            f"m is {m}, but neither {names[0]} nor {names[1]} takes an input; write "
+            f"{names[0]}(x, u) or {names[1]}(x, u), or leave m out."
+        )
+
+
+def _may_be_input(default: Any, inputs: int) -> bool:
+    """Whether a default could be an input: None, a number, or m of them."""
+    if default is None:
+        return True
     try:
-        parameters = inspect.signature(function).parameters.values()
+        array = np.asarray(default, dtype=np.float64)
     except (TypeError, ValueError):
-        return 0
-    return sum(
-        q.kind in (q.POSITIONAL_ONLY, q.POSITIONAL_OR_KEYWORD)
-        and q.default is inspect.Parameter.empty
-        for q in parameters
-    )
+        return False
+    return array.ndim == 0 or array.shape == (inputs,)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ._checks import count, positive
 from .derivatives import Jacobian
 from .discretize import discretize
-from .functions import BatchedFunction
+from .functions import BatchedFunction, Trusted, check_inputs
 from .sets import ConvexSet
 from .system import System, checked_set, probe_points
 
@@ -24,16 +24,16 @@ Function = Callable[..., Any]
 
 def ode_system(
     cls: type[System],
-    rate: Function,
-    h: Function,
+    rate: Function | Trusted,
+    h: Function | Trusted,
     *,
     dt: float,
     n: int,
     p: int,
     m: int,
     method: str,
-    rate_jacobian: Function | None,
-    h_jacobian: Function | None,
+    rate_jacobian: Function | Trusted | None,
+    h_jacobian: Function | Trusted | None,
     states: ConvexSet | None,
     disturbances: ConvexSet | None,
     noises: ConvexSet | None,
@@ -55,17 +55,18 @@ def ode_system(
         Jacobian(batched, rate_jacobian, m, probes)  # compared with differences here
         given = BatchedFunction("rate_jacobian", rate_jacobian, (n, n), m, probes)
     step, step_jacobian = discretize(
-        _over_leading(batched, rate), given and _over_leading(given, rate_jacobian), method
+        _over_leading(batched), given and _over_leading(given), method
     )
     length = positive("dt", dt)
     sets: dict[str, Any] = {
         "states": states, "disturbances": disturbances, "noises": noises
     }
     system = cls(
-        partial(step, length), h, n=n, p=p, m=m,
-        f_jacobian=step_jacobian and partial(step_jacobian, length),
+        Trusted(partial(step, length)), h, n=n, p=p, m=m,
+        f_jacobian=step_jacobian and Trusted(partial(step_jacobian, length)),
         h_jacobian=h_jacobian, **sets,
     )
+    check_inputs(m, rate=batched.takes_input, h=system.h.takes_input)
     system.dt = length
     system._recipe = (
         cls.from_ode,
@@ -77,20 +78,20 @@ def ode_system(
 
     def timed() -> System:
         return cls(
-            _timed_by_input(step, m), _without_last(system.h.batch, m), n=n, p=p, m=m + 1,
-            f_jacobian=step_jacobian and _timed_by_input(step_jacobian, m),
-            h_jacobian=_without_last(system.h_jacobian.batch, m), **sets,
+            Trusted(_timed_by_input(step, m)), Trusted(_without_last(system.h.batch, m)),
+            n=n, p=p, m=m + 1,
+            f_jacobian=step_jacobian and Trusted(_timed_by_input(step_jacobian, m)),
+            h_jacobian=Trusted(_without_last(system.h_jacobian.batch, m)), **sets,
         )
 
     system._timed = timed
     return system
 
 
-def _over_leading(function: BatchedFunction, written: Any) -> Function:
+def _over_leading(function: BatchedFunction) -> Function:
     """A function of (..., n), whatever way the user's was written."""
     if function.plain:
-        plain: Function = written
-        return plain
+        return function.function
 
     def evaluate(x: Array, *inputs: Array) -> Any:
         u = inputs[0] if inputs else np.empty((*x.shape[:-1], 0))

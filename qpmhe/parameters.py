@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ._checks import count, numbers
 from .errors import InvalidInputError, ModelError, SetError, ShapeError
-from .functions import BatchedFunction, Probes
+from .functions import BatchedFunction, Probes, Trusted
 from .sets import Box, ConvexSet
 from .system import System, probe_points
 
@@ -138,7 +138,7 @@ class _Joint:
 
     def function(
         self, name: str, written: Function, size: int, probes: Probes, append: bool
-    ) -> Function:
+    ) -> Trusted:
         """The function of z, or of z and u, that takes leading dimensions in any case.
 
         With ``append``, the estimated parameters stand behind its value, unchanged.
@@ -151,17 +151,16 @@ class _Joint:
 
         def evaluate(z: Array, u: Array | None) -> Array:
             x, theta = z[..., :n], self._theta(z)
+            known = theta if u is None else np.concatenate((u, theta), axis=-1)
             if z.ndim == 1:
-                value = np.asarray(written(x, theta) if m == 0 else written(x, u, theta))
-                value = value.reshape(size)
+                value = np.asarray(tried.batched(x, known)).reshape(size)
             else:
-                known = theta if u is None else np.concatenate((u, theta), axis=-1)
                 value = tried.batched.batch(x, known)
             return np.concatenate((value, z[..., n:]), axis=-1) if append else value
 
         if m == 0:
-            return lambda z: evaluate(z, None)
-        return lambda z, u: evaluate(z, u)
+            return Trusted(lambda z: evaluate(z, None))
+        return Trusted(evaluate)
 
     def _theta(self, z: Array) -> Array:
         """All parameters at joint states z (..., n + k_e)."""

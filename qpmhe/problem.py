@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from qpmhe_solvers.qp import band_of
 
 from .costs import Cost, ObserverPrior
+from .functions import contained
 from .sets import ConvexSet
 from .system import System
+from .views import read_only
 from .window import Window
 
 if TYPE_CHECKING:
@@ -77,6 +79,8 @@ class Problem:
     def __init__(self, system: System, cost: Cost) -> None:
         self._system, self._cost, self._quadratic = system, cost, cost.quadratic
         self._n, self._q = system.n, system.n + system.p
+        self._stage_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
+        self._prior_cost = contained(cost.prior_cost)
         self._prior_rule = cost.prior if isinstance(cost.prior, ObserverPrior) else None
         #: Weight of the initial error, before discount and majorisation.
         self.prior_weight: Array = (
@@ -195,16 +199,17 @@ class Problem:
             if self._fused is not None:
                 return self._judged(trajectory, *self._call(self._fused, trajectory))
             residuals = self._residuals(trajectory)
-        except Exception:  # a model function outside its domain: such a trial is worthless
+            weights, cost = self._cost_of(residuals)
+            offset = trajectory[0] - self.prior
+            if self._quadratic:
+                prior_cost = float(offset.dot(self.prior_weight).dot(offset))
+            else:
+                prior_cost = self._prior_cost(offset, self.prior_weight)
+            cost += prior_cost if self.discounts is None else float(self.discounts[0]) * prior_cost
+        # A model function outside its domain, or a loss that fails: such a trial is worthless.
+        except Exception:
             nothing = np.full((trajectory.shape[0] - 1, self._q), np.nan)
             return Trial(trajectory, nothing, self.stage_weights, math.inf, math.inf)
-        weights, cost = self._cost_of(residuals)
-        offset = trajectory[0] - self.prior
-        if self._quadratic:
-            prior_cost = float(offset.dot(self.prior_weight).dot(offset))
-        else:
-            prior_cost = self._cost.prior_cost(offset, self.prior_weight)
-        cost += prior_cost if self.discounts is None else float(self.discounts[0]) * prior_cost
         return self._judged(trajectory, residuals, cost, weights)
 
     def _judged(
@@ -254,8 +259,9 @@ class Problem:
             else:
                 weighted = np.matmul(residuals[:, None, :], weights)[:, 0]
             return weights, float(weighted.ravel().dot(residuals.ravel()))
-        costs = self._cost.stage_costs(residuals, weights)
-        weights = self._cost.majorise(residuals, weights)
+        residuals, weights = read_only(residuals), read_only(weights)
+        costs = self._stage_costs(residuals, weights)
+        weights = self._majorise(residuals, weights)
         if self.discounts is not None:
             weights = weights * self.discounts[1:, None, None]
             costs = costs * self.discounts[1:]

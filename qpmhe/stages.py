@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .linearization import StageTerms
-from .views import Frame, Place, Views
+from .views import Frame, Place, Views, read_only
 
 __all__ = ["Stages"]
 
@@ -41,8 +41,6 @@ class Stages:
         Weight of a usual stage.
     quadratic : bool
         Whether the cost's weights majorise it themselves.
-    protected : bool
-        Whether the model gets states and inputs that it cannot write to.
     """
 
     def __init__(
@@ -55,9 +53,8 @@ class Stages:
         covariance: Array | None,
         stage_weight: Array,
         quadratic: bool,
-        protected: bool,
     ) -> None:
-        self.horizon, self._protected = horizon, protected
+        self.horizon = horizon
         room = horizon + max(horizon // 4, 32)
         self._room = room
         self._z = np.zeros((room + 1, n))
@@ -77,6 +74,11 @@ class Stages:
         self._stage_cost = np.zeros(room)
         self.terms = StageTerms(room, n, p)
         self._covariance = None if covariance is None else np.zeros((room + 1, n, n))
+        # What observers and losses get: foreign code cannot write into the window.
+        self._covariance_seen = None if self._covariance is None else read_only(self._covariance)
+        self._weight_seen, self._residuals_seen = (
+            read_only(array) for array in (self._weight, self.terms.residuals)
+        )
         # By stage; and of the full windows, by their first stage.
         self._places: Sequence[Place] = Views(room, partial(Place, self))
         self._frames: Sequence[Frame] = Views(

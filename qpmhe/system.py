@@ -14,7 +14,7 @@ from qpmhe_solvers.errors import tell_unknown_options
 from ._checks import count
 from .derivatives import Jacobian
 from .errors import InvalidInputError, ModelError, SetError
-from .functions import BatchedFunction, Probes
+from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .sets import ConvexSet
 
 if TYPE_CHECKING:
@@ -54,9 +54,12 @@ class System:
     ----------
     f : callable
         f(x) or f(x, u): x of shape (n,) to (n,). A function that takes (..., n), as NumPy's
-        own functions do, is called once for a whole window; one that does not is looped over.
+        own functions do, is called once for a whole window where a trace on symbols proves
+        that it may; any other is called state by state, with a copy of its arguments. With
+        inputs, the second positional parameter is u, whatever its name and default.
     h : callable
-        h(x) or h(x, u): x of shape (n,) to (p,). A scalar will do where p is 1.
+        h(x) or h(x, u): x of shape (n,) to (p,). A scalar will do where p is 1. With inputs,
+        f or h must take them.
     n, p : int
         Number of states and of outputs, at least 1.
     m : int
@@ -87,14 +90,14 @@ class System:
 
     def __init__(
         self,
-        f: Function,
-        h: Function,
+        f: Function | Trusted,
+        h: Function | Trusted,
         *,
         n: int,
         p: int,
         m: int = 0,
-        f_jacobian: Function | None = None,
-        h_jacobian: Function | None = None,
+        f_jacobian: Function | Trusted | None = None,
+        h_jacobian: Function | Trusted | None = None,
         states: ConvexSet | None = None,
         disturbances: ConvexSet | None = None,
         noises: ConvexSet | None = None,
@@ -106,6 +109,7 @@ class System:
         probes = probe_points(self.states, self.n, self.m)
         self.f = BatchedFunction("f", f, (self.n,), self.m, probes)
         self.h = BatchedFunction("h", h, (self.p,), self.m, probes)
+        check_inputs(self.m, f=self.f.takes_input, h=self.h.takes_input)
         self.f_jacobian = Jacobian(self.f, f_jacobian, self.m, probes)
         self.h_jacobian = Jacobian(self.h, h_jacobian, self.m, probes)
         #: The sampling time of a system made by `from_ode`, None otherwise.
@@ -127,16 +131,16 @@ class System:
     @classmethod
     def from_ode(
         cls,
-        rate: Function,
-        h: Function,
+        rate: Function | Trusted,
+        h: Function | Trusted,
         *,
         dt: float,
         n: int,
         p: int,
         m: int = 0,
         method: str = "rk4",
-        rate_jacobian: Function | None = None,
-        h_jacobian: Function | None = None,
+        rate_jacobian: Function | Trusted | None = None,
+        h_jacobian: Function | Trusted | None = None,
         states: ConvexSet | None = None,
         disturbances: ConvexSet | None = None,
         noises: ConvexSet | None = None,

@@ -13,10 +13,23 @@ from .linearization import Span, Stage
 if TYPE_CHECKING:
     from .stages import Stages
 
-__all__ = ["Frame", "Place", "Views"]
+__all__ = ["Frame", "Place", "Views", "read_only"]
 
 Array = NDArray[np.float64]
 View = TypeVar("View")
+
+
+def read_only(array: Array) -> Array:
+    """A view that cannot be written to.
+
+    Parameters
+    ----------
+    array : array
+        What it shows.
+    """
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 class Place:
@@ -27,8 +40,9 @@ class Place:
     z, following : (n,) array
         State of the observer, and the one after it.
     arguments : tuple
-        What the functions of the usual model take: z, and the inputs if there are any. They
-        cannot be written to where the model can do with that.
+        What the functions of the usual model take, read-only: z, and the inputs if there are any.
+    error : (p,) array
+        The fitting error, read-only.
     y, u : array
         The measurement (p,), and the input (m,).
     weight : (n + p, n + p) array
@@ -37,18 +51,17 @@ class Place:
         Its linear map and terms.
     """
 
-    __slots__ = ("arguments", "following", "terms", "u", "weight", "y", "z")
+    __slots__ = ("arguments", "error", "following", "terms", "u", "weight", "y", "z")
 
     def __init__(self, stages: Stages, k: int) -> None:
         self.z, self.following = stages._z[k], stages._z[k + 1]
         self.y, self.u = stages._y[k], stages._u[k, :-1]
-        self.arguments: tuple[Array, ...] = (self.z, self.u) if self.u.size else (self.z,)
-        if stages._protected:
-            self.arguments = tuple(one.view() for one in self.arguments)
-            for one in self.arguments:
-                one.flags.writeable = False
+        self.arguments: tuple[Array, ...] = tuple(
+            read_only(one) for one in ((self.z, self.u) if self.u.size else (self.z,))
+        )
         self.weight = stages._weight[k]
         self.terms = Stage(stages.terms, k)
+        self.error = read_only(self.terms.noise)
 
 
 class Frame:

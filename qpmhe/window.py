@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .costs import Cost, ObserverPrior
+from .functions import contained
 from .linearization import Stage
 from .observers import HighGain, Luenberger, Observer, Sample
 from .stages import Stages
@@ -60,12 +61,13 @@ class Window(Stages):
         self._n, self._m, self._linearized = n, m, linearized
         self._quadratic = cost.quadratic
         self._jacobians = linearized or observer.needs_jacobians
-        functions = system.f, system.h, system.f_jacobian, system.h_jacobian
         super().__init__(
             n, p, m, horizon, initial_state, observer.initial_covariance(), cost.stage_weight,
-            cost.quadratic, all(one.reads_only for one in functions),
+            cost.quadratic,
         )
         self._sample = Sample(system, np.zeros(m))
+        self._correct = contained(observer.correct)
+        self._stage_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
         self._read = system.f.direct, system.h.direct
         self._slopes = system.f_jacobian.direct, system.h_jacobian.direct
         self._linear = True  # whether the stage that enters has Jacobians
@@ -246,9 +248,9 @@ class Window(Stages):
                 sample.f_jacobian, sample.h_jacobian = -terms.minus_f, -terms.minus_h
             if self._own_noise or sample.noise_weight is not None:
                 sample.noise_weight = self._own_noise.get(time)
-            if self._covariance is not None:
-                sample.covariance = self._covariance[k]
-            correction, posterior = self._observer.correct(z, error, sample)
+            if self._covariance_seen is not None:
+                sample.covariance = self._covariance_seen[k]
+            correction, posterior = self._correct(place.arguments[0], place.error, sample)
             terms.disturbance[...] = correction
             np.add(f(*arguments) if joint is None else ahead, correction, following)
         except Exception:  # a model function outside its domain: bad luck, not bad input
@@ -281,16 +283,18 @@ class Window(Stages):
 
     def _weigh(self, k: int) -> float:
         """The cost of stage k, or infinity, and its Gauss-Newton terms; where they are unusual."""
-        place, weight = self._places[k], self._weight[k]
-        terms, stage = self.terms, place.terms
-        residual = terms.residuals[k]
-        cost = float(self._cost.stage_costs(residual[None], weight)[0])
-        if not math.isfinite(cost):
+        weight, stage = self._weight_seen[k], self._places[k].terms
+        terms, residual = self.terms, self._residuals_seen[k]
+        try:
+            cost = float(self._stage_costs(residual[None], weight)[0])
+            if not math.isfinite(cost):
+                return math.inf
+            if self._linearized and not self._quadratic:
+                self._majorising[k] = self._majorise(residual[None], weight)[0]
+                weight = self._majorising[k]
+        except Exception:  # a loss of the user's own
             return math.inf
         if self._linearized:
-            if not self._quadratic:
-                weight = self._majorising[k]
-                weight[...] = self._cost.majorise(residual[None], self._weight[k])[0]
             slopes = stage.linear[:, 1:].ravel()
             # Terms that overflow otherwise are left to the QP, whose data are then not finite.
             cost_of_terms = terms.set_stage(stage, weight)
@@ -317,23 +321,6 @@ class Window(Stages):
     def restart(self, state: Array) -> None:
         """Go on from another state after a failed stage, whose correction is void anyway."""
         self._z[self.end] = state
-
-    def check_batches(self) -> None:
-        """Insist that f and h give over the whole window what they gave state by state.
-
-        Where they do not, they are looped over from now on; see `BatchedFunction.agrees`.
-        """
-        if not math.isfinite(self.candidate_cost):
-            return
-        n, states, inputs = self._n, self.candidate[:-1], self.inputs
-        following, residuals = self.candidate[1:], self.residuals
-        rounding = 1e-9 * (1.0 + float(np.abs(self.candidate).max()))
-        self.model.f.agrees(states, inputs, following - residuals[:, :n], rounding)
-        fitted = np.where(self.observed, self.measurements - residuals[:, n:], np.nan)
-        rounding = 1e-9 * (1.0 + float(np.abs(self.measurements).max()))
-        there = self.observed.all(axis=1)
-        if there.any():
-            self.model.h.agrees(states[there], inputs[there], fitted[there], rounding)
 
     @property
     def candidate_cost(self) -> float:

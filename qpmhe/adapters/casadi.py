@@ -16,6 +16,7 @@ from ..codegen.evaluation import fixed_call, may_fail, separate_calls
 from ..codegen.expressions import CasadiModel, casadi_model, import_casadi
 from ..codegen.source import model_files
 from ..errors import CompilationError, OptionError
+from ..functions import Trusted
 from ..sets import ConvexSet
 from ..system import System
 from .fused import Fused, fused
@@ -66,7 +67,7 @@ def casadi_system(
         evaluator = _Evaluator(maker)
         if library is not None and not timed:
             evaluator.fused = partial(fused, library, model.dt or 0.0)
-        one = {name: partial(evaluator.one, name) for name in _NAMES}
+        one = {name: Trusted(partial(evaluator.one, name)) for name in _NAMES}
         system = System(
             one["f"], one["h"], n=model.n, p=model.p, m=model.m + timed,
             f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"], **sets,

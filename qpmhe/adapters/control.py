@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .._checks import numbers, positive
 from ..errors import InvalidInputError, ModelError, OptionError
+from ..functions import Trusted
 from ..sets import ConvexSet
 from ..system import System, probe_points
 
@@ -136,7 +137,7 @@ def _remembered(system: System, *arguments: Any) -> System:
     return system
 
 
-def _affine(of_state: Array, of_input: Array, m: int) -> tuple[Function, Function]:
+def _affine(of_state: Array, of_input: Array, m: int) -> tuple[Trusted, Trusted]:
     """Sum of x M^T and u N^T over leading dimensions, and its derivative with respect to x."""
     by_state, by_input = of_state.T.copy(), of_input.T.copy()
     constant = of_state.copy()
@@ -151,8 +152,8 @@ def _affine(of_state: Array, of_input: Array, m: int) -> tuple[Function, Functio
         return np.broadcast_to(constant, (*x.shape[:-1], *constant.shape))
 
     if m == 0:
-        return lambda x: value(x), slope
-    return lambda x, u: value(x, u), lambda x, u: slope(x)  # noqa: ARG005
+        return Trusted(lambda x: value(x)), Trusted(slope)
+    return Trusted(lambda x, u: value(x, u)), Trusted(lambda x, u: slope(x))  # noqa: ARG005
 
 
 def _nonlinear(

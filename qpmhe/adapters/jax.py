@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .._checks import count, positive
 from ..errors import ModelError
+from ..functions import Trusted
 from ..sets import ConvexSet
 from ..system import System
 from .fused import Fused
@@ -133,7 +134,7 @@ def jax_system(
 
 
 def _assembled(model: _Model, m: int, sets: dict[str, Any]) -> System:
-    f, h, f_jacobian, h_jacobian = (partial(model.evaluate, part) for part in range(4))
+    f, h, f_jacobian, h_jacobian = (Trusted(partial(model.evaluate, part)) for part in range(4))
     try:
         system = System(
             f, h, n=model.n, p=model.p, m=m, f_jacobian=f_jacobian, h_jacobian=h_jacobian, **sets

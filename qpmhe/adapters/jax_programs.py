@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..discretize import discretize
 from ..errors import InvalidInputError, ModelError
-from ..functions import BatchedFunction
+from ..functions import check_inputs, takes_input
 
 __all__ = ["Programs"]
 
@@ -51,6 +51,7 @@ class Programs:
         self._jax, self._double, self._device = _imported()
         jax, concatenate = self._jax, self._jax.numpy.concatenate
         rate, output = self._checked("f", f, n), self._checked("h", h, p)
+        check_inputs(m, f=takes_input("f", f, m), h=takes_input("h", h, m))
         step = discretize(rate, None, method)[0]
         if method == "rk4":
             step = partial(_runge_kutta, jax, rate)
@@ -121,10 +122,12 @@ class Programs:
 
     def _checked(self, name: str, function: Function, size: int) -> Function:
         """The user's function as one of (x, u) to (size,), traced once to see that it is."""
-        jax, call = self._jax, BatchedFunction(name, function, (size,), self.m, [])
+        if not callable(function):
+            raise ModelError(f"{name} is {function!r}; expected a function of the state.")
+        jax, with_input = self._jax, takes_input(name, function, self.m)
 
         def evaluate(x: Any, u: Any) -> Any:
-            value = jax.numpy.asarray(call(x, u))
+            value = jax.numpy.asarray(function(x, u) if with_input else function(x))
             if value.shape != (size,) and not (value.shape == () and size == 1):
                 raise ModelError(
                     f"{name} returned shape {value.shape}; expected ({size},). Check n, p, m "

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from .._checks import positive
 from ..errors import InvalidInputError, ModelError
+from ..functions import Trusted
 from ..sets import ConvexSet
 from ..system import System
 
@@ -243,5 +244,5 @@ def _numeric(
 
 def _with_inputs(function: Callable[[Array, Array], Array], inputs: bool) -> Any:
     if inputs:
-        return lambda x, u: function(x, u)
-    return lambda x: function(x, np.empty((*x.shape[:-1], 0)))
+        return Trusted(lambda x, u: function(x, u))
+    return Trusted(lambda x: function(x, np.empty((*x.shape[:-1], 0))))

@@ -94,8 +94,7 @@ class MemberFunction:
     def agrees(self, x: Array, u: Array, values: Array, members: Index) -> bool:
         """Whether values of one call on all are those of these members' own states.
 
-        Where they are not, states are called one by one from now on, as
-        `BatchedFunction.agrees` has it.
+        Where they are not, states are called one by one from now on.
 
         Parameters
         ----------
@@ -117,10 +116,7 @@ class MemberFunction:
             if there != np.isfinite(one).all() or (
                 there and not (np.abs(one - values[k]) <= rounding).all()
             ):
-                if isinstance(self._function, BatchedFunction):
-                    self._function.mode = "looped"
-                else:
-                    self._apart = True
+                self._apart = True
                 return False
         return True
 

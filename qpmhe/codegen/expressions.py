@@ -9,7 +9,7 @@ from typing import Any
 from .._checks import count, positive
 from ..discretize import METHODS
 from ..errors import InvalidInputError, ModelError, OptionError
-from ..functions import positional_arguments
+from ..functions import check_inputs, takes_input
 
 __all__ = ["CasadiModel", "casadi_model", "import_casadi"]
 
@@ -139,6 +139,10 @@ def casadi_model(
     n, m = count("n", n, 1), count("m", 0 if m is None else m, 0)
     made_f = _canonical(ca, "f", f, n, m)
     made_h = _canonical(ca, "h", h, n, m)
+    check_inputs(m, **{
+        name: one.n_in() > 1 if isinstance(one, ca.Function) else takes_input(name, one, m)
+        for name, one in (("f", f), ("h", h))
+    })
     _agreed("the number of values of f", n, made_f.numel_out(0))
     p = _agreed("p", p, made_h.numel_out(0))
     if dt is None:
@@ -233,8 +237,7 @@ def _asserts(ca: Any, call: Callable[[Any, Any], Any], n: int, m: int) -> bool:
 
 
 def _with_inputs(name: str, function: Callable[..., Any], m: int) -> Callable[[Any, Any], Any]:
-    takes_input = m > 0 and positional_arguments(name, function) != 1
-    return function if takes_input else _without_input(function)
+    return function if takes_input(name, function, m) else _without_input(function)
 
 
 def _without_input(function: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:

@@ -75,4 +75,5 @@ class OutputInjection(Observer):
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, None]:
         """L(z, v); see `Observer.correct`."""
-        return np.asarray(self._correction(z, v), dtype=np.float64), None
+        # Copies: a correction may write into what it gets in a branch that no check has seen.
+        return np.asarray(self._correction(z.copy(), v.copy()), dtype=np.float64), None

@@ -595,8 +595,8 @@ def test_an_output_of_the_wrong_shape_is_refused(h, p, shape):
         (lambda x: x + undefined, "JAX cannot trace f: NameError"),  # noqa: F821
         (lambda x: x.astype(jnp.float32), "f returned float32 where x is float64"),
         (lambda x: x + 1j, "f returned complex128"),
-        (lambda x, u: x + u, "f needs more than one argument, but the system has no inputs"),
-        (lambda: 1.0, "JAX cannot trace f: TypeError: .* takes 0 positional"),
+        (lambda x, u: x + u, "f needs 2 arguments, but the system has no inputs"),
+        (lambda: 1.0, "f takes no argument; expected"),
         (3.0, "f is 3.0; expected a function"),
         (
             lambda x: jax.pure_callback(

@@ -491,7 +491,7 @@ def test_functions_that_mix_members_unseen_are_called_one_by_one(part, late):
         starts[1, 0] = 200.0
     # Each has a system of its own: what one notices, the other must notice, too.
     batch, single = parts(**functions), parts(**functions)
-    assert batch[0].f.mode == batch[0].h.mode == "batched"
+    assert getattr(batch[0], part[0]).mode == "looped"
     found = BatchEstimator(*batch, members=3, horizon=5, initial_states=starts).run(Y)
     expected = qpmhe.MovingHorizonEstimator(*single, horizon=5, initial_state=starts[0])
     first = 200 if late else 0  # by when the observer has forgotten what it was told wrongly

@@ -54,11 +54,11 @@ def test_h_of_the_wrong_shape(shape, p):
 
 def test_an_input_that_the_system_does_not_know_of():
     check(
-        ModelError, ["f needs more than one argument", "pass m"],
+        ModelError, ["f needs 2 arguments", "pass m"],
         lambda: system_of(lambda x, u: x),
     )
     check(
-        ModelError, ["h needs more than one argument", "pass m"],
+        ModelError, ["h needs 2 arguments", "pass m"],
         lambda: system_of(h=lambda x, u: x[:1]),
     )
 

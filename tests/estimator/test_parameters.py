@@ -497,6 +497,4 @@ def test_bounds_keep_trials_inside_the_domain_of_the_model():
         narrow, lambda x, theta: x, n=1, p=1, nominal=[10.25],
         parameter_bounds=Box([10.24], [10.26]),
     )
-    # A test of the whole batch makes f a function of one state; points to try there are.
-    assert system.f.mode == "looped"
     assert system.derivatives == {"f": "complex step", "h": "complex step"}

@@ -227,11 +227,14 @@ def test_inputs(f, mode):
             id="math",
         ),
         pytest.param(lambda x: 2.0 * x, lambda x, u: 2.0 * x, id="no u"),
-        pytest.param(lambda x, scale=3.0: scale * x, lambda x, u: 3.0 * x, id="scale=3.0"),
+        pytest.param(
+            lambda x, u, scale=3.0: scale * x + u[0], lambda x, u: 3.0 * x + u[0], id="scale=3.0"
+        ),
+        pytest.param(lambda x, q=0.0: x + q[0], lambda x, u: x + u[0], id="q=0.0"),
     ],
 )
 def test_few_and_many_inputs(f, plain, m):
-    system = qpmhe.System(f, lambda x: x[..., :1], n=2, p=1, m=m)
+    system = qpmhe.System(f, lambda x, u: x[..., :1], n=2, p=1, m=m)
     check_values(system.f, plain, 2, m)
 
 
@@ -309,7 +312,8 @@ def test_functions_are_tried_within_the_state_bounds():
 
     box = qpmhe.Box([-3.0, 5.0, -np.inf], [-2.0, np.inf, -7.0])
     qpmhe.System(f, lambda x: x[..., :1], n=3, p=1, states=box)
-    single = np.array([x for x in seen if x.ndim == 1])
+    # Symbols, which prove what it does with many states, have no values.
+    single = np.array([x for x in seen if x.ndim == 1 and x.dtype != object], dtype=float)
     assert len(single) >= 3
     assert box.violation(single) == 0.0
 
@@ -355,33 +359,6 @@ def test_a_branch_beyond_the_probes_is_no_branch_of_a_batch(far_out):
     np.testing.assert_array_equal(found, [[30.0], [30.0], [35.0]])
 
 
-@pytest.mark.parametrize(
-    "f",
-    [
-        pytest.param(lambda x: slow_far_out(np.asarray(x)), id="hidden"),
-        pytest.param(slow_far_out, id="plain"),
-    ],
-)
-def test_a_branch_is_found_out_by_its_values_at_the_latest(f):
-    system, nothing = qpmhe.System(f, lambda x: x, n=1, p=1), np.zeros((3, 0))
-    expected = np.array([f(x) for x in FAR])
-    system.f.agrees(FAR, nothing, expected, 1e-9)
-    assert system.f.mode == "looped"
-    np.testing.assert_array_equal(system.f.batch(FAR, nothing), expected)
-    assert system.f.agrees(FAR, nothing, expected, 1e-9)
-
-
-def test_a_function_that_raises_on_many_far_states_is_looped_over():
-    def f(x):
-        if x.ndim > 1 and (np.asarray(x) > 50.0).any():
-            raise ValueError("one at a time")
-        return 0.5 * x
-
-    system = qpmhe.System(f, lambda x: x, n=1, p=1)
-    assert not system.f.agrees(FAR, np.zeros((3, 0)), 0.5 * FAR, 1e-9)
-    np.testing.assert_array_equal(system.f.batch(FAR, np.zeros((3, 0))), 0.5 * FAR)
-
-
 @pytest.mark.parametrize("where", ["f", "h"])
 def test_an_estimator_that_crosses_a_branch_is_judged_by_the_true_cost(where):
     def bent(x):
@@ -402,23 +379,6 @@ def test_an_estimator_that_crosses_a_branch_is_judged_by_the_true_cost(where):
         assert estimate.cost == pytest.approx(kept.cost(estimate.trajectory), rel=1e-10)
         sides |= set(estimate.trajectory[:, 0] > 50.0)
     assert sides == {True, False}
-
-
-def test_a_model_cannot_change_the_state_that_it_is_given():
-    def clipping(x):
-        if x.ndim == 1 and x[0] > 30.0:  # beyond all probes
-            x[0] = 30.0
-        return 1.0 * x
-
-    mhe = qpmhe.MovingHorizonEstimator(
-        qpmhe.System(clipping, lambda x: x, n=1, p=1), qpmhe.Luenberger([1.0]),
-        qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0), horizon=3,
-        initial_state=[0.0],
-    )
-    mhe.update([50.0])
-    estimate = mhe.update([50.0])
-    assert estimate.candidate[1, 0] == 50.0
-    assert qpmhe.Status.MODEL_FAILED in estimate.status
 
 
 def test_a_model_that_wants_arrays_that_it_could_write_to_has_them():
@@ -453,20 +413,3 @@ def test_arrays_of_objects_are_taken_as_numbers():
         for f in (listed, plain)
     ]
     np.testing.assert_allclose(runs[0].states, runs[1].states, rtol=1e-12)
-
-
-def test_a_model_cannot_change_the_state_before_a_step_of_unusual_length():
-    def clipping(x):
-        if x.ndim == 1 and x[0] > 30.0:  # beyond all probes
-            x[0] = 30.0
-        return 0.0 * x
-
-    mhe = qpmhe.MovingHorizonEstimator(
-        qpmhe.System.from_ode(clipping, lambda x: x, dt=0.1, n=1, p=1), qpmhe.Luenberger([1.0]),
-        qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0), horizon=3,
-        initial_state=[0.0],
-    )
-    mhe.update([50.0], dt=0.2)
-    estimate = mhe.update([50.0], dt=0.2)
-    assert estimate.candidate[1, 0] == 50.0
-    assert qpmhe.Status.MODEL_FAILED in estimate.status
