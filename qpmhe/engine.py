@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers import SolverOptions, create
+from qpmhe_solvers.contained import ContainedSolver
 
 from ._checks import check_problem
 from .costs import Cost
@@ -53,17 +54,15 @@ class PythonEngine:
     ) -> None:
         self._system, self._observer, self._cost = system, observer, cost
         self._settings = settings
-        self._solver = solver = create(
-            settings.backend,
-            SolverOptions(
-                max_iterations=settings.max_solver_iterations,
-                absolute_tolerance=float(settings.solver_tolerance),
-                time_limit=None if settings.time_budget is None else float(settings.time_budget),
-            ),
+        options = SolverOptions(
+            max_iterations=settings.max_solver_iterations,
+            absolute_tolerance=float(settings.solver_tolerance),
+            time_limit=None if settings.time_budget is None else float(settings.time_budget),
         )
-        self._problem = Problem(system, cost)
-        if self._problem.constrained:
+        self._solver = solver = ContainedSolver(create(settings.backend, options))
+        if settings.qp_limit:
             solver.prepare((settings.horizon + 1) * system.n)
+        self._problem = Problem(system, cost)
         self._subproblem = Subproblem(system, cost, settings.horizon)
         exact = None
         if settings.subproblem == "exact":
@@ -113,10 +112,7 @@ class PythonEngine:
         window = self._window
         with np.errstate(all="ignore"):
             if window.length == self._settings.horizon:
-                try:  # noqa: SIM105 - `suppress` would cost every step more than the call
-                    self._solver.shift()
-                except (Exception, SystemExit):  # what a user's solver keeps is its own affair
-                    pass
+                self._solver.shift()
             missing, held, flat = window.push(y, u, dt, noise_weight)
             if self._settings.candidate == "reinitialized":
                 # The history reaches back to the estimate of the window's first state.

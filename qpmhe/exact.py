@@ -106,7 +106,9 @@ class ExactStep:
         program.problem.get_problem_data(self._cp.CLARABEL, enforce_dpp=True)
         self._programs[count] = program
 
-    def solve(self, problem: Problem, trial: Trial, jacobian: Array) -> ExactSolution:
+    def solve(
+        self, problem: Problem, trial: Trial, jacobian: Array, time_limit: float | None = None
+    ) -> ExactSolution:
         """Solve the subproblem around a trial; never raises an `Exception`.
 
         Parameters
@@ -117,22 +119,26 @@ class ExactStep:
             The trajectory to linearise at.
         jacobian : (K, n + p, n) array
             Jacobians of (f, h) at its first K states.
+        time_limit : float, optional
+            Seconds for Clarabel, > 0.
         """
         try:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                return self._solve(problem, trial, jacobian)
+                return self._solve(problem, trial, jacobian, time_limit)
         except Exception as error:  # the wall: whatever the modelling layer or solver raises
             return _failed(f"{type(error).__name__}: {error}")
 
-    def _solve(self, problem: Problem, trial: Trial, jacobian: Array) -> ExactSolution:
+    def _solve(
+        self, problem: Problem, trial: Trial, jacobian: Array, time_limit: float | None
+    ) -> ExactSolution:
         data = (trial.trajectory, trial.residuals, jacobian, problem.prior, problem.stage_weights)
         if not all(np.isfinite(array).all() for array in data):
             return _failed("the subproblem's data are not finite")
         self.prepare(jacobian.shape[0])
         program = self._programs[jacobian.shape[0]]
         program.set(problem, trial, jacobian)
-        d, status, iterations, message = program.solve()
+        d, status, iterations, message = program.solve(time_limit)
         if d is None:
             return ExactSolution(None, status, iterations=iterations, message=message)
         predicted = self._predicted(problem, trial, jacobian, d)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -85,15 +86,23 @@ class ExactProgram:
             root[n:, n:] = _root_of(weight[n:, n:], loss)
         return roots
 
-    def solve(self) -> tuple[Array | None, SolveStatus, int | None, str]:
+    def solve(
+        self, time_limit: float | None = None
+    ) -> tuple[Array | None, SolveStatus, int | None, str]:
         """The increments, how far to trust them, the solver's count, and its words."""
         cp, problem, message = self._cp, self.problem, ""
         best: tuple[Array, int | None] | None = None
+        began = perf_counter()
+        clock: dict[str, float] = {}
         for tolerance in _TOLERANCES:
+            if time_limit is not None:
+                clock["time_limit"] = time_limit - (perf_counter() - began)
+                if clock["time_limit"] <= 0.0:
+                    break
             try:
                 problem.solve(
                     solver=cp.CLARABEL, enforce_dpp=True, warm_start=False,
-                    tol_gap_abs=tolerance, tol_gap_rel=tolerance, tol_feas=tolerance,
+                    tol_gap_abs=tolerance, tol_gap_rel=tolerance, tol_feas=tolerance, **clock,
                 )
             except cp.SolverError as error:
                 message = f"Clarabel failed: {error}"

@@ -9,7 +9,8 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from qpmhe_solvers import QP, Solution, Solver, SolveStatus
+from qpmhe_solvers import QP, Solution, SolveStatus
+from qpmhe_solvers.contained import ContainedSolver
 
 from .estimate import Status
 from .exact import ExactSolution, ExactStep
@@ -96,6 +97,15 @@ class Outcome:
             self.events |= Status.TIME_UP
         return late
 
+    def remaining(self, now: float) -> float | None:
+        """Seconds left at a reading of the clock, noted if there are none; None for no limit."""
+        if self.deadline == math.inf:
+            return None
+        left = self.deadline - now
+        if left <= 0.0:
+            self.events |= Status.TIME_UP
+        return left
+
     def count(self, iterations: int | None, seconds: float) -> None:
         """Add a solve's iterations and time."""
         self.solve_time += seconds
@@ -116,7 +126,7 @@ class Optimizer:
     ----------
     subproblem : Subproblem
         Where the QPs come from.
-    solver : Solver
+    solver : ContainedSolver
         Where they go.
     settings : Settings
         Cap on the QPs, tolerance, and what to do with a candidate outside of the sets.
@@ -127,7 +137,7 @@ class Optimizer:
     def __init__(
         self,
         subproblem: Subproblem,
-        solver: Solver,
+        solver: ContainedSolver,
         settings: Settings,
         exact: ExactStep | None = None,
     ) -> None:
@@ -208,7 +218,8 @@ class Optimizer:
         for attempt in range(1 + _CORRECTIONS):
             if outcome.late():
                 return replace(candidate, cost=math.inf, violation=math.inf)
-            step = self._solve(qp, outcome).d
+            solution = self._solve(qp, outcome)
+            step = None if solution is None else solution.d
             if step is None:
                 return replace(candidate, cost=math.inf, violation=math.inf)
             trial = self._trial(problem, candidate, step)
@@ -219,32 +230,35 @@ class Optimizer:
                 outcome.corrections += 1
         return trial
 
-    def _solve(self, qp: QP, outcome: Outcome) -> Solution:
+    def _solve(self, qp: QP, outcome: Outcome) -> Solution | None:
+        """What the solver makes of a QP in the time that remains; None if there is none."""
         began = perf_counter()
-        solution: Solution
-        try:
-            solution = self._solver.solve(qp)
-        # A user's solver that overrides the contained `solve`.
-        except (Exception, SystemExit) as error:
-            message = f"{type(error).__name__}: {error}"
-            solution = Solution(None, SolveStatus.FAILED, message=message)
+        left = outcome.remaining(began)
+        if left is not None and left <= 0.0:
+            return None
+        solution = self._solver.solve(qp, None, left)
         outcome.count(solution.iterations, perf_counter() - began)
         return solution
 
-    def _solve_exactly(self, problem: Problem, outcome: Outcome) -> ExactSolution:
+    def _solve_exactly(self, problem: Problem, outcome: Outcome) -> ExactSolution | None:
         began = perf_counter()
+        left = outcome.remaining(began)
+        if left is not None and left <= 0.0:
+            return None
         assert self._exact is not None
-        solution = self._exact.solve(problem, outcome.trial, self._subproblem.jacobian)
+        solution = self._exact.solve(problem, outcome.trial, self._subproblem.jacobian, left)
         outcome.count(solution.iterations, perf_counter() - began)
         return solution
 
     def _step(self, problem: Problem, qp: QP, outcome: Outcome) -> bool:
         """Solve one QP and judge its iterate; whether another QP is worth while."""
-        solution: Solution | ExactSolution
+        solution: Solution | ExactSolution | None
         if self._exact is None:
             solution = self._solve(qp, outcome)
         else:
             solution = self._solve_exactly(problem, outcome)
+        if solution is None:
+            return False
         outcome.qps += 1
         step = solution.d
         if step is None:
@@ -305,11 +319,13 @@ class Optimizer:
             if outcome.late():
                 break
             self._subproblem.corrected(qp, problem, best, trial)
-            step = self._solve(qp, outcome).d
-            outcome.corrections += 1
-            if step is None:
+            solution = self._solve(qp, outcome)
+            if solution is None:
                 break
-            trial = self._trial(problem, best, step)
+            outcome.corrections += 1
+            if solution.d is None:
+                break
+            trial = self._trial(problem, best, solution.d)
             if trial.cost < math.inf or not math.isfinite(trial.violation):
                 break
         return trial

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from time import perf_counter
+
 import numpy as np
 from numpy.typing import NDArray
 
 from .banded import BandedSolver
+from .contained import ContainedSolver
 from .options import SolverOptions
 from .qp import QP
 from .solution import RawSolution, Solution, SolveStatus
@@ -28,7 +31,8 @@ class AutoSolver(Solver):
     ----------
     options : SolverOptions
         Handed to the QP solver. With an iteration cap, solvers that return nothing at the
-        cap are passed over.
+        cap are passed over. With a time limit, solvers with a clock are preferred, and each
+        gets what remains of it.
 
     Notes
     -----
@@ -39,7 +43,7 @@ class AutoSolver(Solver):
     def __init__(self, options: SolverOptions) -> None:
         super().__init__(options)
         self._banded = BandedSolver(options)
-        self._others: dict[bool, list[Solver]] = {}
+        self._others: dict[bool, list[ContainedSolver]] = {}
 
     def __reduce__(self) -> tuple[type[AutoSolver], tuple[SolverOptions]]:
         return type(self), (self.options,)
@@ -63,6 +67,8 @@ class AutoSolver(Solver):
         InvalidInputError
             If ``qp`` is no `QP`.
         """
+        limit = remaining = self.time_limit
+        began = 0.0 if limit is None else perf_counter()
         solution = self._banded.solve(qp, start)
         if solution.status is SolveStatus.SOLVED:
             return solution
@@ -70,7 +76,11 @@ class AutoSolver(Solver):
         if small not in self._others:
             self._others[small] = self._choose(small)
         for other in self._others[small]:
-            answer = other.solve(qp, start)
+            if limit is not None:
+                remaining = limit - (perf_counter() - began)
+                if remaining <= 0.0:
+                    break
+            answer = other.solve(qp, start, remaining)
             if answer.status.usable:
                 return answer
         return solution
@@ -88,7 +98,7 @@ class AutoSolver(Solver):
                 other.shift()
 
     def prepare(self, size: int) -> None:
-        """Make the QP solvers: theirs is a long import.
+        """Make and prepare the QP solvers.
 
         Parameters
         ----------
@@ -96,19 +106,24 @@ class AutoSolver(Solver):
             Unknowns of the largest QP to come.
         """
         for small in {True, size <= _SMALL}:
-            self._others[small] = self._choose(small)
+            self._others[small] = others = self._choose(small)
+            for other in others:
+                other.prepare(size)
 
-    def _choose(self, small: bool) -> list[Solver]:
+    def _choose(self, small: bool) -> list[ContainedSolver]:
         """The two best solvers that can be made: the second where the first brings nothing."""
         from .registry import available, backend, create
 
         capped, chosen = self.options.max_iterations is not None, []
         usable = set(available())
-        for name in _SMALL_ORDER if small else _LARGE_ORDER:
-            if name not in usable or (capped and not backend(name).iterate_at_cap):
+        names = [name for name in (_SMALL_ORDER if small else _LARGE_ORDER) if name in usable]
+        if self.options.time_limit is not None:
+            names.sort(key=lambda name: not backend(name).time_limit)
+        for name in names:
+            if capped and not backend(name).iterate_at_cap:
                 continue
             try:
-                chosen.append(create(name, self.options))
+                chosen.append(ContainedSolver(create(name, self.options)))
             except Exception:  # an installed package that does not work: the next will do
                 continue
             if len(chosen) == 2:

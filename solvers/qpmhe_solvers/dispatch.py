@@ -143,14 +143,28 @@ class DispatchSolver(Solver):
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_forms": {}}  # copies of arrays no longer share their numbers
 
+    def prepare(self, size: int) -> None:
+        """Import what qpsolvers and the solver import at their first solve.
+
+        Parameters
+        ----------
+        size : int
+            Unknowns of the largest QP to come.
+        """
+        self._rehearse()
+        self._forms.clear()
+
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
         form, problem = self._form(qp)
         form.fill(qp)
         initial = None
         if start is not None and self._translation.start:
             initial = np.ravel(start).copy()
+        words = self._keywords
+        if self.time_limit is not None and self._translation.time_limit is not None:
+            words[self._translation.time_limit] = self.time_limit
         answer = self._solve_problem(
-            problem, self.name, initvals=initial, verbose=False, **self._keywords
+            problem, self.name, initvals=initial, verbose=False, **words
         )
         bound_duals, row_duals = form.multipliers(answer)
         iterations, message = _told(answer.extras)
@@ -181,8 +195,6 @@ def _keywords(how: Translation, options: SolverOptions) -> dict[str, Any]:
     cap = how.default_cap if options.max_iterations is None else options.max_iterations
     if cap is not None and how.cap is not None:
         words[how.cap] = int(cap) + how.beyond_cap
-    if options.time_limit is not None and how.time_limit is not None:
-        words[how.time_limit] = options.time_limit
     return words
 
 

@@ -20,7 +20,8 @@ def own_backends() -> Iterator[Backend]:
     """All of them; nothing of any solver is imported."""
     yield Backend(
         "auto", AutoSolver, "banded, then a QP", matrices="banded",
-        iteration_cap=True, iterate_at_cap=True, tells_infeasible=True, keeps_workspace=True,
+        iteration_cap=True, iterate_at_cap=True, time_limit=True, tells_infeasible=True,
+        keeps_workspace=True,
     )
     yield Backend(
         "banded", BandedSolver, "banded Cholesky", matrices="banded", inequalities=False,

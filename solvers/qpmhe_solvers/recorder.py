@@ -237,6 +237,7 @@ class _Recorder(Solver):
     def __init__(self, solver: Solver, options: SolverOptions, recording: Recording) -> None:
         super().__init__(options)
         self._solver, self._recording = solver, recording
+        self._own = solver._own  # as far to be trusted as what it hands on
 
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
         return self._solver._solve(qp, start)
@@ -252,6 +253,7 @@ class _Recorder(Solver):
 
     def solve(self, qp: QP, start: Array | None = None) -> Solution:
         expect_qp(qp)
+        self._solver.time_limit = self.time_limit
         try:
             solution = self._solver.solve(qp, start)
         except Exception as error:  # a user's solver that overrides the contained `solve`

@@ -16,7 +16,7 @@ from .options import SolverOptions
 from .qp import ARRAYS, QP
 from .solution import RawSolution, Residuals, Solution, SolveStatus, residuals
 
-__all__ = ["Solver", "expect_qp"]
+__all__ = ["Solver", "as_count", "as_iterate", "as_multipliers", "expect_qp", "failure"]
 
 Array = NDArray[np.float64]
 
@@ -33,14 +33,22 @@ class Solver(ABC):
     ----------
     options : SolverOptions
         Limits and accuracy of every solve.
+
+    Attributes
+    ----------
+    time_limit : float or None
+        Seconds for the next solve, > 0. It begins as that of the options; a caller with a
+        deadline sets it anew before each solve, to what remains. Backends with a clock read it
+        when they set their clock.
     """
 
+    time_limit: float | None = None
     _flat: FlatQP | None = None  # kept while the sizes of the QPs stay
     # Whether Python code may warn during a solve: to keep that inside takes as long as a small QP.
     _warns: ClassVar[bool] = True
     # Whether it is one of this package's, which are tested to read only: all others are lent a
     # copy, since who scales the caller's QP in place would be judged by what is left of it.
-    _own: ClassVar[bool] = False
+    _own: bool = False
     # What the last solve wrote into of what it was lent.
     _wrote: tuple[str, ...] = ()
 
@@ -50,6 +58,7 @@ class Solver(ABC):
 
     def __init__(self, options: SolverOptions) -> None:
         self.options = options
+        self.time_limit = options.time_limit
 
     @abstractmethod
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
@@ -87,13 +96,21 @@ class Solver(ABC):
         """
 
     def prepare(self, size: int) -> None:  # noqa: B027 - most have nothing to prepare
-        """Do beforehand what the first QPs with inequalities would otherwise wait for.
+        """Do beforehand what the first QPs would otherwise wait for, such as imports.
 
         Parameters
         ----------
         size : int
             Unknowns K n of the largest QP to come.
         """
+
+    def _rehearse(self) -> None:
+        """Solve two small QPs, so that whatever is imported or made at first is there."""
+        from .samples import sample  # late: it is used once
+
+        self.solve(sample(3, 2))
+        self.solve(sample(3, 2, 2, bounds="part", sides="mixed"))
+        self.forget()
 
     def solve(self, qp: QP, start: Array | None = None) -> Solution:
         """Solve a QP; whatever the solver raises ends here, and it is never believed.
@@ -130,8 +147,7 @@ class Solver(ABC):
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # the wall; a panic of compiled code is no Exception
-            message = f"{type(error).__name__}: {error}"
-            return Solution(None, SolveStatus.FAILED, message=message)
+            return failure(error)
 
     def _checked(self, qp: QP, start: Array | None) -> Solution:
         """Look at the data, solve, and judge."""
@@ -173,14 +189,14 @@ class Solver(ABC):
         if not isinstance(raw, RawSolution):
             message = f"the backend returned {type(raw).__name__}, not a RawSolution"
             return Solution(None, SolveStatus.FAILED, message=message)
-        count = _as_count(raw.iterations)
-        d, message = _as_iterate(raw, qp)
+        count = as_count(raw.iterations)
+        d, message = as_iterate(raw.d, raw.message, qp)
         if d is None:
             return Solution(None, SolveStatus.FAILED, count, message=message)
         lower, upper = flat.lower, flat.upper
         if qp.bounded or qp.rows:
-            bound_duals = _as_multipliers(raw.bound_duals, qp.size)
-            row_duals = _as_multipliers(raw.row_duals, qp.stages * qp.rows)
+            bound_duals = as_multipliers(raw.bound_duals, qp.size)
+            row_duals = as_multipliers(raw.row_duals, qp.stages * qp.rows)
             duals = None
             if bound_duals is not None and row_duals is not None:
                 duals = np.concatenate((bound_duals, row_duals)) if qp.rows else bound_duals
@@ -234,15 +250,45 @@ def expect_qp(qp: object) -> None:
         )
 
 
-def _as_iterate(raw: RawSolution, qp: QP) -> tuple[Array | None, str]:
-    told: object = raw.message
+def failure(error: BaseException) -> Solution:
+    """The solution of a solver that raised.
+
+    Parameters
+    ----------
+    error : BaseException
+        What it raised.
+    """
+    try:
+        message = f"{type(error).__name__}: {error}"
+    except Exception:  # its own words raise, too
+        message = type(error).__name__
+    return Solution(None, SolveStatus.FAILED, message=message)
+
+
+def as_iterate(given: object, told: object, qp: QP) -> tuple[Array | None, str]:
+    """An iterate (K, n) as a copy, and the message that goes with it; None if it is none.
+
+    Parameters
+    ----------
+    given : object
+        What the solver brought.
+    told : object
+        The solver's own words.
+    qp : QP
+        What was to be solved.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If ``given`` cannot be read as numbers.
+    """
     message = told if isinstance(told, str) else f"its message is a {type(told).__name__}"
-    if raw.d is None:
+    if given is None:
         return None, message or "the solver returned no iterate"
-    given = np.asarray(raw.d)
-    if given.dtype.kind == "c":
+    array = np.asarray(given)
+    if array.dtype.kind == "c":
         return None, "the solver returned complex numbers"
-    d = np.array(given, dtype=np.float64)  # a copy: solvers reuse their buffers
+    d = np.array(array, dtype=np.float64)  # a copy: solvers reuse their buffers
     if d.size != qp.size:
         return None, f"the solver returned {d.size} numbers for {qp.size} unknowns"
     if not _finite(d):
@@ -250,15 +296,29 @@ def _as_iterate(raw: RawSolution, qp: QP) -> tuple[Array | None, str]:
     return d.reshape(qp.stages, qp.n), message
 
 
-def _as_count(value: object) -> int | None:
-    """A count of iterations; None where it is none."""
+def as_count(value: object) -> int | None:
+    """A count of iterations; None where it is none.
+
+    Parameters
+    ----------
+    value : object
+        What the solver says.
+    """
     if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0:
         return int(value)
     return None
 
 
-def _as_multipliers(values: object, size: int) -> Array | None:
-    """Multipliers that can be used; None stands for all that cannot."""
+def as_multipliers(values: object, size: int) -> Array | None:
+    """Multipliers that can be used; None stands for all that cannot.
+
+    Parameters
+    ----------
+    values : object
+        What the solver brought.
+    size : int
+        How many there should be.
+    """
     if values is None:
         return None
     try:

@@ -259,8 +259,24 @@ def test_the_rest_of_the_contract_reaches_the_solver(tmp_path):
         solver.shift()
     assert made[0].calls == [("prepare", 12), "shift"]
     assert made[0].options is solver.options is options
-    public = {name for name in vars(Solver) if not name.startswith("_")}
+    public = {name for name in vars(Solver) if not name.startswith("_")} - {"time_limit"}
     assert public <= set(vars(type(solver)))  # none that a later contract adds is forgotten
+
+
+def test_what_remains_of_the_time_reaches_the_solver(tmp_path):
+    made = []
+
+    def make_one(options):
+        made.append(Told(options))
+        return made[-1]
+
+    with recorded(tmp_path, Backend("told", make_one, "-")) as recording:
+        solver = create(recording.backend, SolverOptions(time_limit=9.0))
+        assert made[0].time_limit == 9.0
+        solver.time_limit = 2.0
+        with pytest.raises(IndexError):  # it was told of no answer
+            solver.solve(QPS[0])
+    assert made[0].time_limit == 2.0
 
 
 def test_outside_of_the_block_nothing_is_left_of_it(tmp_path):

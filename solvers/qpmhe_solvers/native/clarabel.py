@@ -40,8 +40,6 @@ class ClarabelSolver(NativeSolver):
         settings.tol_gap_rel = options.relative_tolerance
         if options.max_iterations is not None:
             settings.max_iter = int(options.max_iterations)
-        if options.time_limit is not None:
-            settings.time_limit = options.time_limit
         equal = int(layout.structure.equal.sum())
         cones = [
             kind(count)
@@ -59,6 +57,11 @@ class ClarabelSolver(NativeSolver):
         handle.update(
             P=layout.hessian.data, q=layout.gradient, A=layout.matrix.data, b=layout.upper
         )
+
+    def _limit(self, handle: Any, seconds: float) -> None:
+        settings = handle.get_settings()
+        settings.time_limit = seconds
+        handle.update(settings=settings)
 
     def _run(
         self, handle: Any, layout: Layout, start: Array | None, duals: Array | None

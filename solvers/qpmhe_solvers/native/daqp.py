@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -51,8 +52,6 @@ class DaqpSolver(NativeSolver):
         if options.max_iterations is not None:
             # Its loop ends before the iteration of that number.
             settings["iter_limit"] = int(options.max_iterations) + 1
-        if options.time_limit is not None:
-            settings["time_limit"] = options.time_limit
         handle.settings = handle.settings | settings
         flag, _ = handle.setup(
             layout.hessian, layout.gradient, layout.matrix, layout.all_upper, layout.all_lower,
@@ -65,13 +64,22 @@ class DaqpSolver(NativeSolver):
     def _update(self, handle: Any, layout: Layout) -> None:
         """Nothing: what is new is handed over with the active set."""
 
+    def _limit(self, handle: Any, seconds: float) -> None:
+        handle.settings = handle.settings | {"time_limit": seconds}
+
     def _run(
         self, handle: Any, layout: Layout, start: Array | None, duals: Array | None
     ) -> Answer:
+        began, limit = perf_counter(), self.time_limit
         sense = self._sense(layout, start, duals)
         answer = self._from(handle, layout, sense)
         if not answer.sound and (start is not None or duals is not None):
             # A start whose active rows depend on each other: it divides by zero, or gives up.
+            if limit is not None:
+                remaining = limit - (perf_counter() - began)
+                if remaining <= 0.0:
+                    return answer
+                self._limit(handle, remaining)
             answer = self._from(handle, layout, self._sense(layout, None, None))
         return answer
 

@@ -43,8 +43,6 @@ class OsqpSolver(NativeSolver):
             self._settings["max_iter"] = int(cap)
             if cap < _CHECKED:
                 self._settings["check_termination"] = 1
-        if options.time_limit is not None:
-            self._settings["time_limit"] = options.time_limit
 
     def _set_up(self, layout: Layout) -> Any:
         handle = self._package.OSQP()
@@ -61,6 +59,9 @@ class OsqpSolver(NativeSolver):
             q=layout.gradient, l=layout.lower, u=layout.upper,
             Px=layout.hessian.data, Ax=layout.matrix.data,
         )
+
+    def _limit(self, handle: Any, seconds: float) -> None:
+        handle.update_settings(time_limit=seconds)
 
     def _run(
         self, handle: Any, layout: Layout, start: Array | None, duals: Array | None

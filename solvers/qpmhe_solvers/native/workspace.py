@@ -106,6 +106,10 @@ class NativeSolver(Solver):
         """Drop the workspaces; see `Solver.forget`."""
         self._workspaces.clear()
 
+    def prepare(self, size: int) -> None:
+        """Import what the first solve imports; see `Solver.prepare`."""
+        self._rehearse()
+
     @abstractmethod
     def _set_up(self, layout: Layout) -> Any:
         """A solver for the arrays of a layout, which are filled."""
@@ -113,6 +117,9 @@ class NativeSolver(Solver):
     @abstractmethod
     def _update(self, handle: Any, layout: Layout) -> None:
         """Hand the arrays, filled anew, to the solver."""
+
+    def _limit(self, handle: Any, seconds: float) -> None:  # noqa: B027 - most have no clock
+        """Set the time limit of the next solve; nothing for a solver without a clock."""
 
     @abstractmethod
     def _run(
@@ -136,6 +143,8 @@ class NativeSolver(Solver):
                 workspace.handle = self._set_up(layout)
         else:
             self._update(workspace.handle, layout)
+        if self.time_limit is not None:
+            self._limit(workspace.handle, self.time_limit)
         point = None if start is None else np.ravel(start)
         answer = self._run(workspace.handle, layout, point, self._kept_duals(workspace, flat))
         if answer.sound and _finite(answer.x) and _finite(answer.duals):
