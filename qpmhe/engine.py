@@ -62,6 +62,8 @@ class PythonEngine:
         self._solver = solver = ContainedSolver(create(settings.backend, options))
         if settings.qp_limit:
             solver.prepare((settings.horizon + 1) * system.n)
+        if system.joint is not None:
+            system.joint.prepare(settings.horizon)
         self._problem = Problem(system, cost)
         self._subproblem = Subproblem(system, cost, settings.horizon)
         exact = None

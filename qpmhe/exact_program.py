@@ -98,6 +98,7 @@ class ExactProgram:
             if time_limit is not None:
                 clock["time_limit"] = time_limit - (perf_counter() - began)
                 if clock["time_limit"] <= 0.0:
+                    message = message or "no time remained for Clarabel"
                     break
             try:
                 problem.solve(

@@ -39,6 +39,9 @@ class Joint(Protocol):
     def residuals(self, trajectory: Array, y: Array, u: Array) -> Array:
         """Residuals (w, v) along a trajectory (K + 1, n), in a (K, n + p) array of their own."""
 
+    def prepare(self, horizon: int) -> None:
+        """Make what the first updates with a window of this length would otherwise wait for."""
+
 
 @tell_unknown_options
 class System:

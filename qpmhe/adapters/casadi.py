@@ -168,6 +168,20 @@ class _Evaluator:
         value: Array = results["residuals"].copy()
         return value
 
+    def prepare(self, horizon: int) -> None:
+        """Make the buffers of the first window and of a full one, in this thread.
+
+        Parameters
+        ----------
+        horizon : int
+            N.
+        """
+        self._buffers(1, _NAMES)
+        for count in dict.fromkeys((1, horizon)):
+            self._buffers(count, _RESIDUALS)
+            for name in _NAMES:
+                self._buffers(count, (name,))
+
     def _buffers(self, count: int, names: tuple[str, ...]) -> Buffers:
         try:
             found: Buffers = self._local.kept[count, names]

@@ -98,9 +98,8 @@ def jax_system(
     come back as read-only views.
 
     Programs for batches are compiled when a batch of their size first occurs, 16 and its
-    doubles; the last state fills the batch up. That takes some tenths of a second, in the
-    first update with more than 16, 32, ... stages. Where this is too late, call
-    ``system.f.batch`` and ``system.f_jacobian.batch`` with so many states before.
+    doubles; the last state fills the batch up. That takes some tenths of a second each. An
+    estimator compiles those of its windows when it is made.
 
     JAX hands programs of a thousand floating-point operations and more to a thread of its
     own, which can cost more than they do; a loop counts as one turn of it. So the states of
@@ -201,6 +200,15 @@ class _Model:
         np.subtract(trajectory[1:], ahead, out=found[:, : self.n])
         np.subtract(y, outputs, out=found[:, self.n :])
         return found
+
+    def prepare(self, horizon: int) -> None:
+        """Compile the programs for all batches of windows up to this length."""
+        for kind in (0, 1):
+            room = _SMALLEST_BATCH
+            self._programs.of_batch(kind, room)
+            while room < horizon:
+                room *= 2
+                self._programs.of_batch(kind, room)
 
     def _over_batch(self, slopes: int, x: Array, u: Array) -> list[Array]:
         programs, size = self._programs, x.shape[0]

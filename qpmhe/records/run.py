@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from .results import Results
 from .samples import Record
 from .session import Session
 from .sink import Sink
+from .standard_output import standard_output_for_rows
 from .steps import Steps
 from .summary import Summary
 
@@ -132,8 +132,8 @@ def estimate_record(
     every = _every(checkpoint_every, found)
     with contextlib.ExitStack() as stack:
         if sink.path is None:
-            # A model that prints must not print among the rows.
-            stack.enter_context(contextlib.redirect_stdout(sys.stderr))
+            # Neither a model nor a solver may print among the rows.
+            sink.use(stack.enter_context(standard_output_for_rows()))
         made = load_model(model, **options)
         results = Results(made.states, covariances, step_time)
         steps = Steps(

@@ -65,7 +65,6 @@ class Sink:
         if str(out) == "-":
             if sys.stdout is None:
                 raise OptionError("standard output is closed; name a file by --out.")
-            self._stream = sys.stdout.buffer
             return
         path = Path(out)
         if path.suffix not in (".csv", ".parquet"):
@@ -93,6 +92,16 @@ class Sink:
     def digest(self) -> str:
         """Of all bytes so far."""
         return self._hash.hexdigest()
+
+    def use(self, stream: BinaryIO) -> None:
+        """Write to standard output by this stream.
+
+        Parameters
+        ----------
+        stream : binary stream
+            As of `standard_output_for_rows`.
+        """
+        self._stream = stream
 
     def begin(self, header: Sequence[str], first: Callable[[bytes], None] | None = None) -> None:
         """Open anew, and write the header.
