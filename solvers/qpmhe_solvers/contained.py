@@ -103,7 +103,8 @@ def _checked(found: object, qp: QP) -> Solution:
     if not isinstance(found, Solution):
         message = f"the backend's solve returned {type(found).__name__}, not a Solution"
         return Solution(None, SolveStatus.FAILED, message=message)
-    count, status = as_count(found.iterations), found.status
+    count = as_count(found.iterations)
+    status: object = found.status
     if not isinstance(status, SolveStatus):
         message = f"the status of the backend's Solution is {type(status).__name__}"
         return Solution(None, SolveStatus.FAILED, count, message=f"{message}, not a SolveStatus")

@@ -345,6 +345,7 @@ class Clock:
 
     def __init__(self, monkeypatch):
         self.now = 0.0
+        self.limits = []
         for module in ("estimator", "engine", "optimizer"):
             monkeypatch.setattr(f"qpmhe.{module}.perf_counter", lambda: self.now)
 
@@ -353,6 +354,7 @@ class Clock:
 
         class Ticking(Solver):
             def _solve(self, qp, start):
+                clock.limits.append(self.time_limit)
                 clock.now += 1.0
                 found = inner.solve(qp, start)
                 return RawSolution(
@@ -383,8 +385,24 @@ def test_no_qp_is_begun_when_the_time_is_up(clock, budget, sets):
         assert estimate.improved
         assert estimate.step_time == estimate.solve_time == estimate.qps + estimate.corrections
         assert estimate.step_time < budget + 1.0
+        # Corrections included, each QP got what remained.
+        assert clock.limits == [budget - k for k in range(estimate.qps + estimate.corrections)]
+        clock.limits.clear()
         up += Status.TIME_UP in estimate.status
     assert up > STEPS // 2
+
+
+@pytest.mark.parametrize("budget", [1.5, 2.5, 9.5])
+@pytest.mark.parametrize("name", TIGHT)
+def test_a_projection_and_what_follows_share_the_time(clock, name, budget):
+    _, found = tight(name, backend="ticking", time_budget=budget, outside="project", max_qps=3)
+    left = []
+    for estimate, *_ in found:
+        solves = round(estimate.solve_time)
+        left.extend(budget - k for k in range(solves))
+    assert any(Status.PROJECTED in estimate.status for estimate, *_ in found)
+    assert clock.limits == left
+    assert min(left) > 0.0
 
 
 @pytest.mark.parametrize("outside", ["drop", "project", "keep"])

@@ -118,7 +118,7 @@ class NativeSolver(Solver):
     def _update(self, handle: Any, layout: Layout) -> None:
         """Hand the arrays, filled anew, to the solver."""
 
-    def _limit(self, handle: Any, seconds: float) -> None:  # noqa: B027 - most have no clock
+    def _limit(self, handle: Any, seconds: float) -> None:
         """Set the time limit of the next solve; nothing for a solver without a clock."""
 
     @abstractmethod
