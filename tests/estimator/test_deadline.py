@@ -145,6 +145,7 @@ GROWTH = """
 import json, os, sys, traceback
 import numpy as np
 import qpmhe
+from qpmhe_solvers.dispatch import DispatchSolver
 
 A = np.array([[1.0, 0.1], [-0.1, 0.9]])
 SETS = {
@@ -171,10 +172,17 @@ def of_one(backend, sets, subproblem):
         mhe.update([y])
     return sorted(set(sys.modules) - before)
 
-cases = [(name, "qp") for name in qpmhe.solvers.available()]
-cases += [("auto", "exact")] if sys.argv[1] == "exact" else []
+def dispatched(name):
+    return getattr(qpmhe.solvers.backend(name).factory, "func", None) is DispatchSolver
+
+cases = [("auto", "exact")] if sys.argv[1] == "exact" else []
+cases += sorted(
+    ((name, "qp") for name in qpmhe.solvers.available()), key=lambda case: dispatched(case[0])
+)
 found = {}
 for case in cases:
+    if dispatched(case[0]) and "qpsolvers" not in sys.modules:
+        import qpsolvers  # as whoever makes one of these does; once for all children
     reader, writer = os.pipe()
     if os.fork() == 0:
         try:

@@ -29,7 +29,7 @@ class Panic(BaseException):
     """As compiled code raises it."""
 
 
-class Speechless(Exception):
+class SpeechlessError(Exception):
     def __str__(self):
         raise RuntimeError("no words")
 
@@ -72,7 +72,7 @@ def raising(error):
     return behaviour
 
 
-ERRORS = [KeyError("it"), SystemExit(3), GeneratorExit("it"), Panic("it"), Speechless()]
+ERRORS = [KeyError("it"), SystemExit(3), GeneratorExit("it"), Panic("it"), SpeechlessError()]
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
@@ -229,7 +229,9 @@ def test_auto_contains_solvers_that_override_solve(monkeypatch, behaviour):
 
 def test_a_recorded_solver_is_trusted_no_more_than_without_recording(tmp_path):
     entry = Backend("hostile", lambda options: Hostile(lambda qp: "no Solution"), "-")
-    with pytest.warns(RecordingWarning), registered(entry):
-        with Recording(tmp_path, "hostile") as recording:
-            solution = ContainedSolver(create(recording.backend)).solve(problem())
+    with (
+        pytest.warns(RecordingWarning), registered(entry),
+        Recording(tmp_path, "hostile") as recording,
+    ):
+        solution = ContainedSolver(create(recording.backend)).solve(problem())
     assert solution.message == "the backend's solve returned str, not a Solution"
