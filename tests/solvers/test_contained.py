@@ -227,6 +227,34 @@ def test_auto_contains_solvers_that_override_solve(monkeypatch, behaviour):
     solver.forget()
 
 
+def test_auto_passes_on_how_far_the_trajectory_moved(monkeypatch):
+    calls = []
+
+    class Counting(Hostile):
+        def shift(self):
+            calls.append("shift")
+
+        def forget(self):
+            calls.append("forget")
+
+    for name in ("clarabel", "daqp", "osqp", "piqp", "proxqp"):
+        entry = Backend(name, lambda options: Counting(lambda qp: None), "-", iterate_at_cap=True)
+        monkeypatch.setitem(qpmhe_solvers.registry._REGISTRY, name, entry)
+    solver, qp = create("auto"), make(6, 2, bounds="all")[0]
+    solver.solve(qp)
+    for shifts, told in ((0, 0), (2, 2), (0, 0), (100, 6)):
+        for _ in range(shifts):
+            solver.shift()
+        assert calls == []
+        solver.solve(qp)
+        assert calls == ["shift"] * 2 * told  # there are two solvers
+        calls.clear()
+    solver.shift()
+    solver.forget()
+    solver.solve(qp)
+    assert calls == ["forget", "forget"]
+
+
 def test_a_recorded_solver_is_trusted_no_more_than_without_recording(tmp_path):
     entry = Backend("hostile", lambda options: Hostile(lambda qp: "no Solution"), "-")
     with (
