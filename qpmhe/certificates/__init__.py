@@ -16,12 +16,12 @@ from .errors import (
 )
 from .evidence import Evidence
 from .falsification import attack_detectability, attack_observer
-from .figures import error_and_bounds
+from .report import error_and_bounds
 from .hypotheses import Hypotheses, MonitorSummary
 from .monitor import Monitor, monitor, monitored_run
 from .observer import certify_observer
 from .regions import Region
-from .results import Detectability, ObserverStability
+from .properties import Detectability, ObserverStability
 from .synthesis import Synthesis, synthesise_gain
 from .theorem import theorem
 

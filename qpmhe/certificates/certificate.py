@@ -18,14 +18,14 @@ from ..run import Run
 from ..system import System
 from .arguments import checked_length
 from .audit import Audit
-from .bounds import HorizonBounds, Kind, window_bound
+from .horizon_bounds import HorizonBounds, Kind, window_bound
 from .choices import Sizes
 from .errors import CertificateError
 from .evidence import Evidence, weakest
 from .observer import constant_gain
 from .provenance import fitting
 from .regions import Region
-from .results import Detectability, ObserverStability
+from .properties import Detectability, ObserverStability
 from .signals import signals
 from .sources import checked_costs
 from .telling import certificate_dict, certificate_text

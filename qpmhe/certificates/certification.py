@@ -17,7 +17,7 @@ from ..sets import Box, ConvexSet
 from ..system import System
 from .arguments import checked_horizons, checked_ingredients
 from .audit import audit
-from .bounds import HorizonBounds, bounds_for
+from .horizon_bounds import HorizonBounds, bounds_for
 from .certificate import Certificate
 from .choices import Sizes, level, tighten
 from .deadline import DEFAULT_SECONDS, Deadline
@@ -28,10 +28,10 @@ from .evidence import Evidence
 from .lipschitz import constant_output
 from .observer import certify_observer, constant_gain
 from .pairs import Pairs
-from .programs import started
+from .sdp import started
 from .provenance import fitting
 from .regions import Region, bounded_region
-from .results import Detectability, ObserverStability
+from .properties import Detectability, ObserverStability
 
 __all__ = ["certify", "cost_sizes"]
 

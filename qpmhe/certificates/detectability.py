@@ -10,12 +10,12 @@ from ..system import System
 from .constants import euclidean_constants
 from .deadline import PART_SECONDS, Deadline
 from .errors import JumpError, NotCertifiedError, OutOfTimeError
-from .forms import OutputInjection, OutputWeight
+from .inequalities import OutputInjection, OutputWeight
 from .jumps import jumping
-from .programs import started
+from .sdp import started
 from .provenance import sealed
 from .regions import Region, bounded_region
-from .results import Detectability
+from .properties import Detectability
 from .search import Search, checked_rate, checked_weights
 
 __all__ = ["Detectability", "certify_detectability"]
@@ -39,7 +39,7 @@ def certify_detectability(
 ) -> Detectability:
     r"""Find and verify constants of e-IOSS, Definition def:eIOSS.
 
-    A constant P with one of the inequalities of `qpmhe.certificates.forms` is sought by
+    A constant P with one of the inequalities of `qpmhe.certificates.inequalities` is sought by
     semidefinite programs at some states of the region, and then verified on all of it: the
     Jacobians are enclosed cell by cell with outward rounding, and each cell's matrices shown
     positive definite. The constants follow as in `euclidean_constants`. Proved is what f and

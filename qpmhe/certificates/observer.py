@@ -13,12 +13,12 @@ from .arguments import checked_system
 from .constants import euclidean_constants
 from .deadline import PART_SECONDS, Deadline
 from .errors import CertificateError, JumpError, NotCertifiedError, OutOfTimeError
-from .forms import ErrorContraction
+from .inequalities import ErrorContraction
 from .jumps import jumping
-from .programs import started
+from .sdp import started
 from .provenance import sealed
 from .regions import Region, bounded_region
-from .results import ObserverStability
+from .properties import ObserverStability
 from .search import Found, Search, checked_rate, checked_weights
 from .verification import Matrices, norm_bound
 
@@ -83,7 +83,7 @@ def certify_observer(
 ) -> ObserverStability:
     r"""Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
 
-    A constant P with the inequality of `qpmhe.certificates.forms.ErrorContraction` is sought
+    A constant P with the inequality of `qpmhe.certificates.inequalities.ErrorContraction` is sought
     and verified as in `certify_detectability`. It serves linear and nonlinear outputs.
 
     Parameters

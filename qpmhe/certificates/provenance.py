@@ -17,7 +17,7 @@ from .evidence import Evidence, weakest
 from .regions import Region
 
 if TYPE_CHECKING:
-    from .results import Detectability, ObserverStability
+    from .properties import Detectability, ObserverStability
 
 __all__ = ["Fingerprint", "Subject", "fitting", "founded", "sealed"]
 

@@ -9,8 +9,8 @@ from ..errors import ModelError
 from ..system import System
 from .enclosures import SmoothModel
 from .evaluation import evaluated, insist_on_values
-from .forms import Form
-from .programs import Scales
+from .inequalities import Form
+from .sdp import Scales
 from .regions import Region
 from .verification import Matrices, definite
 

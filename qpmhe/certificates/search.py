@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from .._checks import positive
 from ..errors import OptionError
 from ..system import System
-from .cover import Cover, cover
+from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel
 from .errors import JumpError, NotCertifiedError, OutOfTimeError
 from .evidence import Evidence
-from .forms import ErrorContraction, Form, OutputInjection, OutputWeight
+from .inequalities import ErrorContraction, Form, OutputInjection, OutputWeight
 from .jumps import jumping
-from .programs import Answer, Kind, Program, expected_seconds
+from .sdp import Answer, Kind, Program, expected_seconds
 from .regions import Region
 from .samples import (
     MOST_POINTS,

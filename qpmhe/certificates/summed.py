@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .sharper import Parts, WindowBound, holder
+from .window_bounds import Parts, WindowBound, holder
 from .theorem import TheoremConstants
 
 __all__ = ["SummedBound"]

@@ -14,9 +14,9 @@ from ..system import System
 from .deadline import DEFAULT_SECONDS, Deadline
 from .errors import JumpError, NotCertifiedError, OutOfTimeError
 from .observer import certify_observer, stability
-from .programs import started
+from .sdp import started
 from .regions import Region, bounded_region
-from .results import ObserverStability
+from .properties import ObserverStability
 from .search import Search, checked_rate, checked_weights
 
 __all__ = ["Synthesis", "synthesise_gain"]
@@ -54,7 +54,7 @@ def synthesise_gain(
 ) -> Synthesis:
     r"""Find a constant gain L whose observer contracts on a region, and verify it.
 
-    With Y = P L, the inequality of `qpmhe.certificates.forms.ErrorContraction` and the bound
+    With Y = P L, the inequality of `qpmhe.certificates.inequalities.ErrorContraction` and the bound
     :math:`L^\top P L \preceq r I` on the amplification of noise are both linear:
 
     .. math::

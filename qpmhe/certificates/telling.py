@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .results import Detectability, ObserverStability
+from .properties import Detectability, ObserverStability
 
 if TYPE_CHECKING:
     from .certificate import Certificate

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import numbers, positive_definite
 from ..costs import ObserverPrior, QuadraticCost
 from ..errors import OptionError, ShapeError
-from .sharper import Parts, WindowBound
+from .window_bounds import Parts, WindowBound
 
 __all__ = ["WeightedBound", "fit_weight", "largest"]
 

@@ -14,12 +14,12 @@ from ..certificates.certificate import Certificate
 from ..certificates.certification import certify as make
 from ..certificates.choices import Sizes
 from ..certificates.errors import CertificateError, NotCertifiedError
-from ..certificates.figures import LABELS, error_and_bounds
+from ..certificates.report import LABELS, error_and_bounds
 from ..certificates.hypotheses import NEEDED, UNNEEDED, MonitorSummary
 from ..certificates.monitor import monitored_run
-from ..certificates.programs import started
+from ..certificates.sdp import started
 from ..certificates.regions import Region, bounded_region
-from ..certificates.results import Detectability, ObserverStability
+from ..certificates.properties import Detectability, ObserverStability
 from ..certificates.telling import ASSUMED, region_dict
 from ..errors import InvalidInputError, OptionError, SetError
 from ..estimator import MovingHorizonEstimator

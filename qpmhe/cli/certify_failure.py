@@ -15,7 +15,7 @@ from ..certificates.detectability import certify_detectability
 from ..certificates.errors import CertificateError, NotCertifiedError
 from ..certificates.observer import certify_observer
 from ..certificates.regions import Region
-from ..certificates.results import Detectability, ObserverStability
+from ..certificates.properties import Detectability, ObserverStability
 from ..certificates.telling import result_dict
 from ..errors import QpmheError
 from ..models import Example

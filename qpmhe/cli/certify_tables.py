@@ -10,8 +10,8 @@ from rich.table import Table
 
 from ..certificates.audit import Audit
 from ..certificates.certificate import Certificate
-from ..certificates.figures import LABELS
-from ..certificates.results import Detectability, ObserverStability
+from ..certificates.report import LABELS
+from ..certificates.properties import Detectability, ObserverStability
 
 __all__ = ["assumptions_table", "bounds_table", "ingredients_table"]
 

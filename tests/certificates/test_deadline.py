@@ -13,16 +13,16 @@ import qpmhe
 from qpmhe.certificates import deadline as deadline_module
 from qpmhe.certificates.assumptions import Finding
 from qpmhe.certificates.certification import certify
-from qpmhe.certificates.cover import cover
+from qpmhe.certificates.branch_and_bound import cover
 from qpmhe.certificates.deadline import Deadline
 from qpmhe.certificates.detectability import certify_detectability
 from qpmhe.certificates.enclosures import Enclosure, SmoothModel
 from qpmhe.certificates.errors import CertificateError, NotCertifiedError, OutOfTimeError
 from qpmhe.certificates.evidence import Evidence
-from qpmhe.certificates.forms import OutputWeight
+from qpmhe.certificates.inequalities import OutputWeight
 from qpmhe.certificates.lipschitz import output_lipschitz
 from qpmhe.certificates.observer import certify_observer
-from qpmhe.certificates.programs import Program, Scales
+from qpmhe.certificates.sdp import Program, Scales
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.certificates.search import Search
 from qpmhe.certificates.synthesis import synthesise_gain
@@ -284,7 +284,7 @@ def test_findings_with_infinite_numbers_can_be_written():
 
 
 def test_loading_the_solvers_is_not_charged_to_the_search(monkeypatch):
-    from qpmhe.certificates import programs
+    from qpmhe.certificates import sdp as programs
 
     now, loaded = [0.0], []
     clock = SimpleNamespace(monotonic=lambda: now[0])

@@ -12,8 +12,8 @@ from qpmhe.certificates import search as search_module
 from qpmhe.certificates.detectability import Detectability, certify_detectability
 from qpmhe.certificates.errors import CertificateError, NotCertifiedError
 from qpmhe.certificates.evidence import Evidence, weakest
-from qpmhe.certificates.forms import OutputWeight
-from qpmhe.certificates.programs import Answer, Program
+from qpmhe.certificates.inequalities import OutputWeight
+from qpmhe.certificates.sdp import Answer, Program
 from qpmhe.certificates.verification import Matrices, definite
 from qpmhe.errors import OptionError
 

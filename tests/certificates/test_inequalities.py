@@ -9,7 +9,7 @@ import pytest
 
 from qpmhe.certificates.constants import euclidean_constants
 from qpmhe.certificates.errors import CertificateError
-from qpmhe.certificates.forms import ErrorContraction, OutputInjection, OutputWeight
+from qpmhe.certificates.inequalities import ErrorContraction, OutputInjection, OutputWeight
 from qpmhe.certificates.verification import Matrices, definite, eigenvalue_bounds, norm_bound
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel
-from .forms import Form
+from .inequalities import Form
 from .regions import Region
 from .verification import Matrices, definite
 

@@ -15,7 +15,7 @@ from qpmhe.certificates.evidence import Evidence
 from qpmhe.certificates.monitor import monitored_run
 from qpmhe.certificates.observer import certify_observer
 from qpmhe.certificates.regions import bounded_region
-from qpmhe.certificates.results import Detectability, ObserverStability
+from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.errors import SetError
 
 COST = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)

@@ -7,7 +7,7 @@ import qpmhe
 from qpmhe.certificates.certification import certify
 from qpmhe.certificates.errors import MismatchError
 from qpmhe.certificates.monitor import Monitor, monitor
-from qpmhe.certificates.results import Detectability, ObserverStability
+from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.errors import InvalidInputError
 from qpmhe.run import Run
 

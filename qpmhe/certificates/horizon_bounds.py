@@ -16,8 +16,8 @@ from ..errors import OptionError
 from .choices import Sizes, level, tighten
 from .decay import DecayingSums
 from .pairs import Pairs
-from .results import Detectability, ObserverStability
-from .sharper import WindowBound
+from .properties import Detectability, ObserverStability
+from .window_bounds import WindowBound
 from .summed import SummedBound
 from .theorem import TERMS, TheoremConstants, theorem
 from .verification import Matrices
