@@ -7,8 +7,8 @@ import re
 import pytest
 from rich.console import Console
 
-from qpmhe.certificates.errors import OutOfTimeError
-from qpmhe.cli import certify as command
+from qpmhe.certificates import report as report_module
+from qpmhe.certificates.evidence import OutOfTimeError
 from qpmhe.cli.certify import certify
 from qpmhe.errors import ModelError, OptionError, QpmheError, SetError
 
@@ -161,8 +161,8 @@ def test_parts_that_the_fallback_certifies_are_used(shown, monkeypatch, tmp_path
             raise OutOfTimeError("the time for this search was too short", ("more seconds",))
         return original(*arguments, **options)
 
-    original = command.make
-    monkeypatch.setattr(command, "make", late)
+    original = report_module.certify
+    monkeypatch.setattr(report_module, "certify", late)
     report = tmp_path / "late.json"
     done, text = shown(box="-2:2,-2:2", report=report)
     assert done
@@ -178,7 +178,7 @@ def test_hypotheses_that_the_bound_does_not_need_are_told_as_such(shown, tmp_pat
     words = " ".join(text.split())
     assert "no, but not needed" in words
     assert "The bounds rest on no set" in words
-    assert "Told only: candidate in sets, feasible." in words
+    assert "Reported only: candidate in sets, feasible." in words
     told = json.loads(report.read_text())
     hypotheses = told["monitored"]["hypotheses"]
     assert told["monitored"]["applied"] == 20
@@ -208,13 +208,13 @@ def test_a_failure_is_told_to_machines_in_full(shown, tmp_path):
 
 
 def test_smallest_feasible_rate_is_told_to_machines(shown, monkeypatch, tmp_path):
-    from qpmhe.certificates.errors import NotCertifiedError
+    from qpmhe.certificates.evidence import NotCertifiedError
 
     def refused(*_, **__):
         raise NotCertifiedError("no", ("a larger eta",), 0.73)
 
-    monkeypatch.setattr(command, "make", refused)
-    monkeypatch.setattr("qpmhe.cli.certify_failure.certify_detectability", refused)
+    monkeypatch.setattr(report_module, "certify", refused)
+    monkeypatch.setattr(report_module, "certify_detectability", refused)
     report = tmp_path / "failed.json"
     assert not shown(report=report, box="-2:2,-2:2")[0]
     told = json.loads(report.read_text())

@@ -5,8 +5,7 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates.certification import certify
-from qpmhe.certificates.hypotheses import Hypotheses
-from qpmhe.certificates.monitor import Monitor, monitor, monitored_run
+from qpmhe.certificates.monitor import Hypotheses, Monitor, monitor, monitored_run
 from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError
 
