@@ -49,20 +49,7 @@ class AutoSolver(Solver):
         return RawSolution(solution.d, solution.status is SolveStatus.SOLVED)
 
     def solve(self, qp: QP, start: Array | None = None) -> Solution:
-        """Solve the QP with the cheapest exact method; see `Solver.solve`.
-
-        Parameters
-        ----------
-        qp : QP
-            The problem.
-        start : (K, n) array, optional
-            Handed to the QP solver, where one is needed.
-
-        Raises
-        ------
-        InvalidInputError
-            If ``qp`` is no `QP`.
-        """
+        """Solve the QP with the cheapest exact method; see `Solver.solve`."""
         solution = self._banded.solve(qp, start)
         if solution.status is SolveStatus.SOLVED:
             return solution
@@ -88,13 +75,7 @@ class AutoSolver(Solver):
                 other.shift()
 
     def prepare(self, size: int) -> None:
-        """Make the QP solvers: theirs is a long import.
-
-        Parameters
-        ----------
-        size : int
-            Unknowns of the largest QP to come.
-        """
+        """Make the QP solvers: theirs is a long import."""
         for small in {True, size <= _SMALL}:
             self._others[small] = self._choose(small)
 
