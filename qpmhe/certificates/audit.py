@@ -380,7 +380,7 @@ def audit(
     inputs: Box | None = None,
     seconds: float | Deadline = PART_SECONDS,
 ) -> Audit:
-    r"""Look at each assumption of the theorem, and show where it fails.
+    r"""Check each assumption of the theorem, and show where it fails.
 
     Parameters
     ----------
@@ -394,7 +394,7 @@ def audit(
     initial_state : (n,) array_like, optional
         z(0) of that run; needed with it.
     inputs : Box, optional
-        Bounds on the inputs, of a system that has any.
+        Bounds on the inputs, for a system with inputs.
     seconds : float or Deadline
         How long the output's Lipschitz constant may take, about.
 

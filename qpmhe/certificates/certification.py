@@ -73,7 +73,7 @@ def certify(
     region : Box, Polytope or Region, optional
         A bounded set of states; the system's own if left out.
     inputs : Box, optional
-        Bounds on the inputs, of a system that has any.
+        Bounds on the inputs, for a system with inputs.
     sizes : Sizes, optional
         For which initial errors, disturbances and noises the bounds are to be tight; left
         out, those of which each alone costs 1 in its cheapest direction.

@@ -54,7 +54,7 @@ def certify_detectability(
         The rate; left out, one is chosen between the smallest feasible one and 1 for which
         lasting disturbances are bounded best.
     inputs : Box, optional
-        Bounds on the inputs, of a system that has any.
+        Bounds on the inputs, for a system with inputs.
     weights : (float, float)
         How much the constants c_w and c_v matter, such as typical sizes of disturbance and
         noise; the programs minimise the sum of squares of the products.

@@ -108,7 +108,7 @@ def attack_detectability(
     seed : int
         Of the random numbers.
     inputs : Box, optional
-        Bounds on the inputs, of a system that has any, unless a region has them.
+        Bounds on the inputs, for a system with inputs, unless the region has them.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Robust exponential stability of an observer with constant gain on a region."""
+"""Robust exponential stability of observers with constant gain on a region, and such gains."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def constant_gain(observer: Observer, system: System) -> Array:
     )
     raise CertificateError(
         f"{kind} has no constant gain: {reason}. Detectability can be certified nevertheless; "
-        "for the observer, take a Luenberger observer (synthesise_gain finds one), or answer for "
+        "for the observer, take a Luenberger observer (synthesise_gain finds one), or state "
         "its constants yourself: ObserverStability.assumed(rho=..., C_p=..., C_w=..., C_v=..., "
         "kappa=...)."
     )
@@ -82,7 +82,7 @@ def certify_observer(
     rho : float, optional
         The rate; left out, it is chosen as for `certify_detectability`.
     inputs : Box, optional
-        Bounds on the inputs, of a system that has any.
+        Bounds on the inputs, for a system with inputs.
     weights : (float, float)
         How much the constants C_w and C_v matter.
     seconds : float or Deadline
@@ -238,7 +238,7 @@ def synthesise_gain(
     rho : float, optional
         The rate.
     inputs : Box, optional
-        Bounds on the inputs, of a system that has any.
+        Bounds on the inputs, for a system with inputs.
     weights : (float, float)
         d and v, such as typical sizes of disturbance and noise.
     seconds : float or Deadline

@@ -108,7 +108,7 @@ class Detectability:
         cls, *, eta: float, c_p: float, c_w: float, c_v: float,
         region: ConvexSet | Region | None = None,
     ) -> Detectability:
-        """Constants that the user answers for.
+        """Constants that the user states without proof.
 
         Parameters
         ----------
@@ -263,7 +263,7 @@ class ObserverStability:
         kappa: float,
         region: ConvexSet | Region | None = None,
     ) -> ObserverStability:
-        """Constants that the user answers for.
+        """Constants that the user states without proof.
 
         Parameters
         ----------

@@ -217,7 +217,7 @@ def bounded_region(
 
 
 def stated_region(region: Any) -> Region | None:
-    """A set that the user answers for; bounded or not, and for all inputs if not a region."""
+    """A set that the user states; bounded or not, and for all inputs if not a region."""
     if region is None or isinstance(region, Region):
         return region
     if not isinstance(region, ConvexSet):

@@ -221,7 +221,7 @@ class Search:
             f"the semidefinite program for the rate {rate:.6g} is {status}"
             if status == "infeasible"
             else f"no matrix that passes the verification was found for the rate {rate:.6g} "
-            f"(the solver's last word: {status})"
+            f"(solver status: {status})"
         )
 
     def _form(self, answer: Answer, rate: float) -> Form:

@@ -1,4 +1,4 @@
-"""The constants of the theorem and of its lemma (lem:boundedness_of_J), as in the paper."""
+"""The theorem's constants and its lemma's (lem:boundedness_of_J), and its best free choices."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class TheoremConstants:
 
     @cached_property
     def factors(self) -> Triple:
-        r"""What turns the bounds of the estimate's parts into such of its error.
+        r"""Factors from the bounds of the estimate's parts to bounds of its error.
 
         :math:`c_p \underline c_p^{-1/a}` (without :math:`\eta^N`),
         :math:`c_w \bar\eta\, \underline c_w^{-1/a}` and
@@ -304,7 +304,7 @@ def _triple(values: Array | list[float]) -> Triple:
 
 @dataclass(frozen=True)
 class Sizes:
-    """For which errors and noises a bound is to be tight.
+    """Errors and noises for which a bound is made tight.
 
     Parameters
     ----------
@@ -345,7 +345,7 @@ def tighten(
     sizes: Sizes | None = None,
     searched: int = _SEARCHED,
 ) -> TheoremConstants:
-    r"""The theorem's constants for the best of what it leaves free.
+    r"""The theorem's constants for its best free choices.
 
     Free are
 

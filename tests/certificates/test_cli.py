@@ -2,15 +2,19 @@
 
 import io
 import json
+import math
 import re
 
 import pytest
 from rich.console import Console
 
+import qpmhe
+from qpmhe.certificates import certify_model
 from qpmhe.certificates import report as report_module
 from qpmhe.certificates.evidence import OutOfTimeError
 from qpmhe.cli.certify import certify
-from qpmhe.errors import ModelError, OptionError, QpmheError, SetError
+from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError, SetError
+from qpmhe.studies.sources import find, load
 
 MODEL = '''
 import numpy as np
@@ -233,3 +237,28 @@ def test_a_report_of_another_kind_is_refused(shown, tmp_path):
 def test_a_model_that_raises_in_the_box_is_an_error_of_ours(shown):
     with pytest.raises(ModelError, match=r"no way.*smaller region"):
         shown("(broken=True)", box="-2:2,-2:2")
+
+
+def test_one_call_does_what_the_command_does(shown, tmp_path):
+    path = tmp_path / "command.json"
+    done, _ = shown(horizon="2", box="-2:2,-2:2", report=path, seconds=math.inf)
+    model = f"{tmp_path}/two.py:model"
+    region = qpmhe.Box([-2.0, -2.0], [2.0, 2.0])
+    report = certify_model(
+        load(find(model)), horizon=2, region=region, seconds=math.inf, name=model
+    )
+    assert done
+    assert report.failures == []
+    written = report.save(tmp_path / "call.json")
+    assert [each.name for each in written] == ["call.png", "call.svg", "call.json"]
+    assert json.loads(written[-1].read_text()) == json.loads(path.read_text())
+
+
+def test_a_report_without_a_certificate_has_nothing_to_draw(shown, tmp_path):
+    shown("(gain=-2.0)")
+    report = certify_model(load(find(f"{tmp_path}/two.py:model(gain=-2.0)")))
+    assert report.certificate is None
+    assert report.stability is None
+    assert list(report.errors) == ["the observer"]
+    with pytest.raises(InvalidInputError, match="no certificate"):
+        report.draw()
