@@ -116,9 +116,10 @@ class BatchedFunction:
         if self.reads_only:
             value = self.function(x, u) if self.takes_input else self.function(x)
             return np.asarray(value).reshape(self.shape) if self._short else value
-        return self._as_value(
-            self.function(x.copy(), u.copy()) if self.takes_input else self.function(x.copy())
-        )
+        raw = self.function(x.copy(), u.copy()) if self.takes_input else self.function(x.copy())
+        if x.dtype == np.object_:  # intervals, as certificates call it with, come back as such
+            return np.asarray(raw, np.object_).reshape(self.shape)
+        return self._as_value(raw)
 
     def _as_value(self, raw: Any) -> Array:
         """What a function without proof has returned, if it is a value."""

@@ -1,29 +1,25 @@
-"""Certificates: what of the theorem holds for a given system, and with which constants."""
+"""Which parts of the theorem hold for a given system, and with which constants."""
 
 from .audit import Audit, audit
 from .certificate import Certificate
 from .certification import certify
-from .choices import Sizes, tighten
-from .closed_runs import attack_estimator
 from .decay import DecayingSums
 from .detectability import certify_detectability
-from .errors import (
+from .evidence import (
     CertificateError,
+    Evidence,
     JumpError,
     MismatchError,
     NotCertifiedError,
     OutOfTimeError,
 )
-from .evidence import Evidence
-from .falsification import attack_detectability, attack_observer
-from .figures import error_and_bounds
-from .hypotheses import Hypotheses, MonitorSummary
-from .monitor import Monitor, monitor, monitored_run
-from .observer import certify_observer
+from .falsification import attack_detectability, attack_estimator, attack_observer
+from .monitor import Hypotheses, Monitor, MonitorSummary, monitor, monitored_run
+from .observer import Synthesis, certify_observer, synthesise_gain
+from .properties import Detectability, ObserverStability
 from .regions import Region
-from .results import Detectability, ObserverStability
-from .synthesis import Synthesis, synthesise_gain
-from .theorem import theorem
+from .report import Report, certify_model, error_and_bounds
+from .theorem import Sizes, theorem, tighten
 
 __all__ = [
     "Audit",
@@ -41,6 +37,7 @@ __all__ = [
     "ObserverStability",
     "OutOfTimeError",
     "Region",
+    "Report",
     "Sizes",
     "Synthesis",
     "attack_detectability",
@@ -49,6 +46,7 @@ __all__ = [
     "audit",
     "certify",
     "certify_detectability",
+    "certify_model",
     "certify_observer",
     "error_and_bounds",
     "monitor",

@@ -5,41 +5,63 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .._checks import count, numbers, vector
 from ..costs import Cost
-from ..errors import InvalidInputError, OptionError
+from ..errors import InvalidInputError, OptionError, ShapeError
+from ..estimate import Status
+from ..estimator import MovingHorizonEstimator
 from ..observers import Observer
 from ..run import Run
 from ..system import System
-from .arguments import checked_length
 from .audit import Audit
-from .bounds import HorizonBounds, Kind, window_bound
-from .choices import Sizes
-from .errors import CertificateError
-from .evidence import Evidence, weakest
+from .decay import checked_length
+from .evidence import CertificateError, Evidence, MismatchError, weakest
+from .horizon_bounds import HorizonBounds, Kind, window_bound
 from .observer import constant_gain
-from .provenance import fitting
+from .properties import Detectability, ObserverStability, fitting, json_ready
 from .regions import Region
-from .results import Detectability, ObserverStability
-from .signals import signals
-from .sources import checked_costs
-from .telling import certificate_dict, certificate_text
+from .theorem import Sizes
 
-if TYPE_CHECKING:
-    from ..estimator import MovingHorizonEstimator
-    from .monitor import Monitor
-
-__all__ = ["Certificate", "Kind"]
+__all__ = ["ASSUMED", "Certificate", "CheckedRun"]
 
 Array = NDArray[np.float64]
 
 # The constants are upper bounds, what is computed from them is not: this covers its rounding.
 _OUTWARD = 1.0 + 1e-9
+
+#: What no check can see.
+ASSUMED = (
+    "the true state stays in the region, and follows the model",
+    "the bounds on disturbances and noises that are passed are true",
+)
+# A window without all its measurements, or with another candidate, has another cost.
+_BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE | Status.PROJECTED
+
+
+@runtime_checkable
+class CheckedRun(Protocol):
+    """What a `Monitor` knows of the run that it checked."""
+
+    @property
+    def certificate(self) -> Certificate:
+        """The certificate that it was checked against."""
+
+    @property
+    def horizon(self) -> int:
+        """The estimator's horizon."""
+
+    @property
+    def costs(self) -> Array:
+        """The costs that the estimates state, (T,)."""
+
+    @property
+    def confirmed(self) -> NDArray[np.bool_]:
+        """Which of these costs were found to be the true ones, (T,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +179,7 @@ class Certificate:
         initial_error: ArrayLike,
         horizon: int | None = None,
         kind: Kind = "paper",
-        source: MovingHorizonEstimator | Monitor | None = None,
+        source: MovingHorizonEstimator | CheckedRun | None = None,
     ) -> Array:
         """The bound of the error |x(t) - x_hat(t)| along a run.
 
@@ -165,21 +187,21 @@ class Certificate:
         ----------
         run : Run or None
             The run, whose costs ``kind="measured"`` uses. None where there is none; then
-            disturbances or noises tell the length.
+            disturbances or noises give the length.
         disturbances, noises : array_like
             w(t) and v(t) as (T, n) and (T, p), their Euclidean lengths (T,), or a number:
             a bound on the length at all times.
         initial_error : (n,) array_like or float
             x_0 - z_0, or a bound on its length.
         horizon : int, optional
-            N; that of the source, or the only one, if left out.
+            N; the source's, or the only one, if left out.
         kind : {"paper", "summed", "weighted", "measured"}
             The right-hand side of (eq:RGES_result) with the paper's constants, or beyond the
             paper: with the proof's sums kept, with its norms kept as well, or with the
             estimates' own costs in place of their bound.
         source : MovingHorizonEstimator or Monitor, optional
             The estimator that made the run, as the run left it, or the monitor that checked
-            all its estimates: a run does not tell of which horizon and cost it is. Checked
+            all its estimates: a run does not say its horizon and cost. Checked
             where given, and needed for ``kind="measured"``; without one, the bound is that
             of an estimator with this certificate's cost and this horizon, whatever the run.
 
@@ -196,7 +218,7 @@ class Certificate:
             If the source is of another system, observer, cost or horizon, or did not make
             the run.
         """
-        w, v = signals(self.system, run, disturbances, noises)
+        w, v = _signals(self.system, run, disturbances, noises)
         start = numbers("initial_error", initial_error)
         if start.ndim:
             start = vector("initial_error", start, self.system.n)
@@ -207,11 +229,11 @@ class Certificate:
         chosen = self.of(horizon)
         costs = None
         if source is not None:
-            costs = checked_costs(self, source, run, chosen.paper.horizon)
+            costs = _checked_costs(self, source, run, chosen.paper.horizon)
         elif kind == "measured":
             raise InvalidInputError(
-                "the measured bound has no source, and a run does not tell of which horizon and "
-                "cost it is; pass the estimator that made it (source=estimator), or the monitor "
+                "the measured bound has no source, and a run does not say its horizon and "
+                "cost; pass the estimator that made it (source=estimator), or the monitor "
                 "that checked it (source=monitor)."
             )
         if kind == "paper":
@@ -298,7 +320,7 @@ class Certificate:
         horizon: int | None = None,
         kind: Kind = "paper",
     ) -> bool:
-        """Whether the bound tells nothing: its limit is no less than the region's diameter.
+        """Whether the bound says nothing: its limit is no less than the region's diameter.
 
         State and estimate are both in the region, so that their distance is never more.
 
@@ -340,10 +362,135 @@ class Certificate:
             )
         return self.bounds[horizon]
 
+    def check_estimator(self, estimator: MovingHorizonEstimator) -> None:
+        """Require that an estimator has the very system, observer and cost of this certificate.
+
+        Parameters
+        ----------
+        estimator : MovingHorizonEstimator
+            The estimator.
+
+        Raises
+        ------
+        MismatchError
+            If one of the three is another object.
+        """
+        for name in ("system", "observer", "cost"):
+            if getattr(self, name) is not getattr(estimator, name):
+                raise MismatchError(
+                    f"the certificate is of another {name} than the estimator's; certify the "
+                    "very objects that the estimator is made of."
+                )
+
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows; infinite numbers become None."""
-        return certificate_dict(self)
+        system, bounds = self.system, self.bounds
+        content: dict[str, Any] = json_ready({
+            "system": {"n": system.n, "p": system.p, "m": system.m},
+            "region": self.region.to_dict(),
+            "evidence": self.evidence.value,
+            "assumed": list(ASSUMED),
+            "assumptions": self.audit.to_dict(),
+            "detectability": [each.to_dict() for each in self.detectabilities],
+            "observer": [each.to_dict() for each in self.stabilities],
+            "sizes": vars(self.sizes),
+            "horizons": [each.to_dict(self.sizes) for each in bounds.values()],
+            "vacuous": {
+                kind: {N: self.vacuous(horizon=N, kind=kind) for N in bounds}
+                for kind in self.kinds if kind != "measured"
+            },
+        })
+        return content
 
     def summary(self) -> str:
         """The certificate in some lines of text."""
-        return certificate_text(self)
+        sizes = self.sizes
+        lines = [
+            f"On {self.region.states!r}: {self.evidence}.",
+            *(f"Assumed: {each}." for each in ASSUMED),
+            *(
+                f"Violated{'' if each.needed else ', but the bounds need no sets'}: {each.text} "
+                f"({each.label})." for each in self.audit.violated
+            ),
+            f"Bounds of the error for |w| <= {sizes.disturbance:.3g} and |v| <= "
+            f"{sizes.noise:.3g} for all times:",
+        ]
+        for N, bounds in self.bounds.items():
+            C, lam = bounds.paper.C, bounds.paper.lam
+            lines.append(
+                f"N = {N}: C_1 = {C[0]:.4g}, C_2 = {C[1]:.4g}, C_3 = {C[2]:.4g}, "
+                f"lambda = {lam:.4g}"
+            )
+            for kind in self.kinds:
+                if kind == "measured":
+                    continue
+                limit = self.limit(sizes.disturbance, sizes.noise, horizon=N, kind=kind)
+                verdict = ""
+                if self.vacuous(horizon=N, kind=kind):
+                    verdict = f", vacuous: the region's diameter is {self.diameter:.4g}"
+                lines.append(f"  {kind}: {limit:.4g}{verdict}")
+        return "\n".join(lines)
+
+
+def _signals(
+    system: System, run: Run | None, disturbances: ArrayLike, noises: ArrayLike
+) -> tuple[Array, Array]:
+    """Vectors or lengths at each sample."""
+    w, v = numbers("disturbances", disturbances), numbers("noises", noises)
+    steps = len(run) if run is not None else next(
+        (len(x) for x in (w, v) if x.ndim), None
+    )
+    if steps is None:
+        raise ShapeError(
+            "disturbances and noises are numbers and there is no run; expected a sequence "
+            "for one of them, to say how many steps there are."
+        )
+    for name, x, width in (("disturbances", w, system.n), ("noises", v, system.p)):
+        if x.ndim and x.shape not in ((steps,), (steps, width)):
+            raise ShapeError(
+                f"{name} has shape {x.shape}; expected ({steps}, {width}), their lengths "
+                f"({steps},), or a number."
+            )
+    return (
+        w if w.ndim else np.full(steps, float(w)), v if v.ndim else np.full(steps, float(v))
+    )
+
+
+def _checked_costs(
+    certificate: Certificate, source: MovingHorizonEstimator | CheckedRun, run: Run | None,
+    horizon: int,
+) -> Array:
+    """The costs of a run's estimates; NaN where a window is not what the bound is of."""
+    if run is None:
+        raise InvalidInputError("a source is given, but no run; pass the run that it made.")
+    if isinstance(source, CheckedRun):
+        if source.certificate is not certificate:
+            raise MismatchError("the monitor is of another certificate; pass one of this one.")
+        same = np.array_equal(source.costs, run.costs, equal_nan=True)
+    elif isinstance(source, MovingHorizonEstimator):
+        certificate.check_estimator(source)
+        same = source.time == len(run) and np.array_equal(
+            source.state, run.states[-1], equal_nan=True
+        )
+    else:
+        raise InvalidInputError(
+            f"source is {source!r}; expected the estimator that made the run, or the Monitor that "
+            "checked it."
+        )
+    if source.horizon != horizon:
+        raise MismatchError(
+            f"horizon is {horizon}, but the run's estimator has {source.horizon}; take the "
+            "bound for its horizon, and certify again if there is none."
+        )
+    if not same:
+        raise MismatchError(
+            "the source is not at the end of this run: it has seen another one, or more or less "
+            "of it. Pass the estimator right after its run from the start, or a Monitor of it."
+        )
+    costs = np.array(run.costs, np.float64)
+    broken = (run.flags & _BROKEN.value) != 0
+    for t in np.flatnonzero(broken):
+        costs[t : t + horizon] = np.nan
+    if isinstance(source, CheckedRun):
+        costs[~source.confirmed] = np.nan
+    return costs

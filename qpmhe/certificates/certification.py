@@ -3,39 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .._checks import count
 from ..costs import Cost, CostConstants
+from ..errors import OptionError
 from ..models.scenario import Record
 from ..observers import Observer
 from ..sets import Box, ConvexSet
 from ..system import System
-from .arguments import checked_horizons, checked_ingredients
-from .audit import audit
-from .bounds import HorizonBounds, bounds_for
+from .audit import audit, checked_ingredients
+from .branch_and_bound import constant_output
 from .certificate import Certificate
-from .choices import Sizes, level, tighten
 from .deadline import DEFAULT_SECONDS, Deadline
 from .decay import DecayingSums
 from .detectability import certify_detectability
-from .errors import CertificateError, NotCertifiedError
-from .evidence import Evidence
-from .lipschitz import constant_output
+from .evidence import CertificateError, Evidence, NotCertifiedError
+from .horizon_bounds import HorizonBounds, Pairs, bounds_for
 from .observer import certify_observer, constant_gain
-from .pairs import Pairs
-from .programs import started
-from .provenance import fitting
+from .properties import Detectability, ObserverStability, fitting
 from .regions import Region, bounded_region
-from .results import Detectability, ObserverStability
+from .sdp import started
+from .theorem import Sizes, level, tighten
 
 __all__ = ["certify", "cost_sizes"]
 
 Array = NDArray[np.float64]
+
 Result = TypeVar("Result", Detectability, ObserverStability)
 
 # Rates that are tried beside the first one found, by what is left to 1; and how many more
@@ -72,9 +71,9 @@ def certify(
     horizon : int or sequence of int
         N, or several of them.
     region : Box, Polytope or Region, optional
-        A bounded set of states; that of the system if left out.
+        A bounded set of states; the system's own if left out.
     inputs : Box, optional
-        Bounds on the inputs, of a system that has any.
+        Bounds on the inputs, for a system with inputs.
     sizes : Sizes, optional
         For which initial errors, disturbances and noises the bounds are to be tight; left
         out, those of which each alone costs 1 in its cheapest direction.
@@ -106,11 +105,11 @@ def certify(
         If the cost has no constants, h no Lipschitz constant, or the observer no constant
         gain and no assumed constants.
     NotCertifiedError
-        If detectability or the observer's stability cannot be shown; the text tells what
+        If detectability or the observer's stability cannot be shown; the text says what
         may help.
     """
     checked_ingredients(system, observer, cost)
-    horizons = checked_horizons(horizon)
+    horizons = _horizons(horizon)
     place = bounded_region(system, region, inputs)
     gain = None
     try:
@@ -148,7 +147,7 @@ def certify(
             system, observer, place, rho=rate, weights=noisy, seconds=share
         )
 
-    # One of each before the others are sought: what cannot be certified is told soon.
+    # One of each before the others: what cannot be certified fails soon.
     detected = [detected_at(None) if detectability is None else detectability]
     observing = [observed_at(None) if stability is None else stability]
 
@@ -185,6 +184,14 @@ def certify(
     return replace(made, origin=made.ingredients)
 
 
+def _horizons(horizon: Any) -> list[int]:
+    """One horizon or several, checked; sorted, each once."""
+    given = list(horizon) if isinstance(horizon, Iterable) else [horizon]
+    if isinstance(horizon, str) or not given:
+        raise OptionError(f"horizon is {horizon!r}; expected an integer >= 1, or several of them.")
+    return sorted({count("horizon", each, 1) for each in given})
+
+
 def _at_each(
     horizons: list[int], bounded: Callable[[int, Pairs], HorizonBounds]
 ) -> dict[int, HorizonBounds]:
@@ -198,13 +205,7 @@ def _at_each(
 
 
 def cost_sizes(constants: CostConstants) -> Sizes:
-    """The errors of which each alone costs 1, in its cheapest direction.
-
-    Parameters
-    ----------
-    constants : CostConstants
-        The cost's.
-    """
+    """The errors of which each alone costs 1, in its cheapest direction."""
     root = -1.0 / constants.exponent
     return Sizes(*(
         each[0] ** root for each in (constants.prior, constants.disturbance, constants.noise)
@@ -258,6 +259,6 @@ def _refined(
 
 
 def _best_founded(found: list[Result]) -> list[Result]:
-    """Those that are proved, if any is."""
+    """The proved ones, if any is."""
     proved = [each for each in found if each.evidence is Evidence.PROVED]
     return proved or found

@@ -10,6 +10,7 @@ from ..errors import OptionError
 
 __all__ = ["DEFAULT_SECONDS", "PART_SECONDS", "Deadline"]
 
+
 # For a whole certificate, and for one of its ingredients asked for by itself.
 DEFAULT_SECONDS, PART_SECONDS = 60.0, 30.0
 # What a part of a time that is over still has: enough to find out that it is over.
@@ -17,23 +18,7 @@ _LEAST = 1e-9
 
 
 class Deadline:
-    """A moment on the monotonic clock, after which searches stop and tell what they have.
-
-    Parameters
-    ----------
-    seconds : float
-        How long from now; infinity for no end.
-
-    Attributes
-    ----------
-    seconds : float
-        As given.
-
-    Raises
-    ------
-    OptionError
-        If seconds is not a number above zero.
-    """
+    """A moment on the monotonic clock, after which searches stop and return what they have."""
 
     __slots__ = ("_end", "seconds")
 
@@ -51,13 +36,7 @@ class Deadline:
 
     @classmethod
     def of(cls, value: Any) -> Deadline:
-        """The deadline itself, or one after so many seconds from now.
-
-        Parameters
-        ----------
-        value : Deadline or float
-            What to make one of.
-        """
+        """The deadline itself, or one after so many seconds from now."""
         return value if isinstance(value, Deadline) else cls(value)
 
     @property
@@ -71,11 +50,5 @@ class Deadline:
         return self.left == 0.0
 
     def part(self, share: float) -> Deadline:
-        """A deadline that leaves some of the time for what comes after.
-
-        Parameters
-        ----------
-        share : float
-            How much of the time left to take, in (0, 1].
-        """
+        """A deadline that leaves some of the time for what comes after."""
         return Deadline(max(share * self.left, _LEAST))

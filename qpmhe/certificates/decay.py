@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import numbers
+from .._checks import numbers, positive
 from ..errors import OptionError, ShapeError
-from .arguments import checked_length
 
 __all__ = ["DecayingSums"]
 
@@ -25,8 +25,8 @@ class DecayingSums:
         |e(t)| \le c_p |e(0)| r^t + c_w \sum_{\tau=1}^t r^\tau |w(t-\tau)|
         + c_v \sum_{\tau=1}^t r^\tau |v(t-\tau)|
 
-    With e the difference of two trajectories, w that of their disturbances and v that of
-    their outputs, this is detectability (eq:eIOSS); with e an estimator's error, it is
+    With e, w and v the differences of two trajectories, of their disturbances and of their
+    outputs, this is detectability (eq:eIOSS); with e an estimator's error, it is
     robust exponential stability (eq:RGES), and the theorem's result (eq:RGES_result).
 
     Parameters
@@ -162,7 +162,7 @@ def decaying_sums(rate: float, entering: Array) -> Array:
 def lengths(
     initial: float, disturbances: ArrayLike, noises: ArrayLike
 ) -> tuple[float, Array, Array]:
-    """Insist on nonnegative lengths, as many of w as of v."""
+    """Nonnegative lengths, checked; as many of w as of v."""
     start = float(numbers("initial", initial))
     w, v = (
         np.atleast_1d(numbers(name, value))
@@ -176,3 +176,23 @@ def lengths(
     if start < 0.0 or (w < 0.0).any() or (v < 0.0).any():
         raise OptionError("a length is negative; expected Euclidean lengths, all >= 0.")
     return start, w, v
+
+
+def checked_length(name: str, value: Any) -> float:
+    """A finite number >= 0, checked."""
+    kinds = (int, float, np.integer, np.floating)
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
+    if isinstance(value, bool) or not isinstance(value, kinds) or not 0.0 <= value < math.inf:
+        raise OptionError(
+            f"{name} is {value!r}; expected a finite number >= 0, which bounds a Euclidean length."
+        )
+    return float(value)
+
+
+def checked_rate(name: str, value: float) -> float:
+    """A rate in (0, 1), checked."""
+    rate = positive(name, value)
+    if rate >= 1.0:
+        raise OptionError(f"{name} is {value!r}; expected a number in (0, 1).")
+    return rate

@@ -7,18 +7,16 @@ from numpy.typing import NDArray
 
 from ..sets import Box, ConvexSet
 from ..system import System
-from .constants import euclidean_constants
 from .deadline import PART_SECONDS, Deadline
-from .errors import JumpError, NotCertifiedError, OutOfTimeError
-from .forms import OutputInjection, OutputWeight
-from .jumps import jumping
-from .programs import started
-from .provenance import sealed
+from .decay import checked_rate
+from .evidence import JumpError, NotCertifiedError, OutOfTimeError
+from .inequalities import OutputInjection, OutputWeight, euclidean_constants
+from .properties import Detectability, sealed
 from .regions import Region, bounded_region
-from .results import Detectability
-from .search import Search, checked_rate, checked_weights
+from .sdp import started
+from .search import Search, checked_weights
 
-__all__ = ["Detectability", "certify_detectability"]
+__all__ = ["certify_detectability"]
 
 Array = NDArray[np.float64]
 
@@ -39,7 +37,7 @@ def certify_detectability(
 ) -> Detectability:
     r"""Find and verify constants of e-IOSS, Definition def:eIOSS.
 
-    A constant P with one of the inequalities of `qpmhe.certificates.forms` is sought by
+    A constant P with one of the inequalities of `qpmhe.certificates.inequalities` is sought by
     semidefinite programs at some states of the region, and then verified on all of it: the
     Jacobians are enclosed cell by cell with outward rounding, and each cell's matrices shown
     positive definite. The constants follow as in `euclidean_constants`. Proved is what f and
@@ -51,17 +49,17 @@ def certify_detectability(
     system : System
         The system.
     region : Box, Polytope or Region, optional
-        A bounded set of states; that of the system if left out.
+        A bounded set of states; the system's own if left out.
     eta : float, optional
         The rate; left out, one is chosen between the smallest feasible one and 1 for which
         lasting disturbances are bounded best.
     inputs : Box, optional
-        Bounds on the inputs, of a system that has any.
+        Bounds on the inputs, for a system with inputs.
     weights : (float, float)
         How much the constants c_w and c_v matter, such as typical sizes of disturbance and
         noise; the programs minimise the sum of squares of the products.
     seconds : float or Deadline
-        How long this may take, about; what is known then is told, or that nothing is.
+        How long this may take, about; the result is then what was found so far, if anything.
 
     Returns
     -------
@@ -78,10 +76,11 @@ def certify_detectability(
     ModelError
         If the Jacobians are not finite in the region.
     NotCertifiedError
-        If there are no such constants, or none were found; it tells the smallest feasible
+        If there are no such constants, or none were found; the text gives the smallest feasible
         rate and what is not detected. An `OutOfTimeError` says that it is not known which.
     """
-    checked_rate("eta", eta)
+    if eta is not None:
+        checked_rate("eta", eta)
     deadline = started(seconds)
     search = Search(
         system, bounded_region(system, region, inputs), None, checked_weights(weights),
@@ -120,7 +119,7 @@ def _explained(
     except OutOfTimeError:
         return error
     if not np.isfinite(smallest):
-        jump = jumping(search)
+        jump = search.jump()
         if jump is not None:
             return jump
         mode = _undetected(search)

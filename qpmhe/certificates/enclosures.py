@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+import operator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..codegen.expressions import CasadiModel, import_casadi
 from ..system import System
-from .evaluation import insist_on_values
-from .intervals import Interval, OutsideDomainError
-from .jets import Jet, variables
+from .evaluation import check_values
+from .intervals import Interval, Jet, OutsideDomainError, variables
 from .regions import Region
 
 __all__ = ["MOST_ACTIVE", "Enclosure", "SmoothModel"]
@@ -38,34 +40,15 @@ class Enclosure:
     and E covers its radius and all rounding. The affine part has its extremes at corners of
     the cell. E vanishes like the square of the cell's size, and is rounding alone where J is
     affine.
-
-    Parameters
-    ----------
-    centre : (B, q, n) array
-        J(c), with q = n + p, or p; NaN where the functions could not be enclosed.
-    slopes : (B, N, q, n) array
-        H_j times the half-width of the cell.
-    error : (B, q, n) array
-        E, rounded up; NaN where the functions could not be enclosed.
-    excess : (B, N) array
-        How much each coordinate's width contributes to E.
     """
 
-    centre: Array
-    slopes: Array
-    error: Array
-    excess: Array
+    centre: Array  # (B, q, n), q = n + p or p: J(c); NaN where it could not be enclosed
+    slopes: Array  # (B, N, q, n): H_j times the half-width of the cell
+    error: Array  # (B, q, n): E, rounded up; NaN where it could not be enclosed
+    excess: Array  # (B, N): what the width of each coordinate contributes to E
 
     def corners(self) -> tuple[Array, Array]:
-        """Matrices whose convex hull, widened by an error, holds J on each cell.
-
-        Returns
-        -------
-        corners : (B, K, q, n) array
-            The matrices.
-        error : (B, q, n) array
-            The error; NaN on cells of which nothing is known.
-        """
+        """Matrices whose convex hull, widened by an error, holds J on each cell."""
         # Cells of which nothing is known must not hide how the others vary.
         known = np.isfinite(self.error).all(axis=(1, 2))
         weight = np.abs(self.slopes[known]).max(axis=(0, 2, 3), initial=0.0)
@@ -89,26 +72,16 @@ class Enclosure:
 class SmoothModel:
     """f and h of a system, to be enclosed over cells of states and inputs.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    region : Region
-        Where; used to try the functions.
-
-    Attributes
-    ----------
-    reason : str
-        Why f and h cannot be run with intervals; empty if they can.
-    output_reason : str
-        The same for h alone.
-    affine_output : bool
-        Whether h is affine in the state on the region, so that its Jacobian is constant.
+    ``reason`` says why f and h cannot be run with intervals, ``output_reason`` why h alone
+    cannot; empty if they can. ``affine_output``: the Jacobian of h is constant on the region.
     """
 
     def __init__(self, system: System, region: Region) -> None:
         self._system, self._region = system, region
-        self._graph, self._output_graph = self._find_graphs(system)
+        self._graph = self._output_graph = None
+        if system.symbolic is not None:
+            self._graph = _model_graph(system.symbolic)
+            self._output_graph = _model_graph(system.symbolic, output_only=True)
         self.n, self.p = system.n, system.p
         self.affine_output = False
         middle = 0.5 * (region.lower + region.upper)[None]
@@ -124,16 +97,6 @@ class SmoothModel:
             isinstance(jet, float) or not (jet.hessian.low.any() or jet.hessian.high.any())
             for jet in outputs
         )
-
-    @staticmethod
-    def _find_graphs(
-        system: System,
-    ) -> tuple[Callable[[Any], list[Any]] | None, Callable[[Any], list[Any]] | None]:
-        if system.symbolic is None:
-            return None, None
-        from .graphs import model_graph
-
-        return model_graph(system.symbolic), model_graph(system.symbolic, output_only=True)
 
     def _refused(self, point: Array, *, output_only: bool) -> str:
         """Why the functions cannot be run with intervals; empty if they can."""
@@ -166,28 +129,14 @@ class SmoothModel:
     def enclose(
         self, lower: Array, upper: Array, *, output_only: bool = False
     ) -> Enclosure:
-        """The joint Jacobian over cells.
-
-        Parameters
-        ----------
-        lower, upper : (B, n + m) array
-            Corners of the cells.
-        output_only : bool
-            Whether to enclose the Jacobian of h alone; f is then not looked at.
-
-        Raises
-        ------
-        ModelError
-            If a function raises or is not finite in the middle of a cell that cannot be
-            enclosed.
-        """
+        """The joint Jacobian over cells."""
         with np.errstate(all="ignore"):
             found = self._enclosed(lower, upper, output_only)
         unknown = np.isnan(found.error).any(axis=(1, 2))
         if unknown.any():
             middles = 0.5 * lower[unknown] + 0.5 * upper[unknown]
             middles = middles[self._region.contains(middles[:, : self.n])]
-            insist_on_values(self._system, middles, output_only=output_only)
+            check_values(self._system, middles, output_only=output_only)
         return found
 
     def _enclosed(self, lower: Array, upper: Array, output_only: bool) -> Enclosure:
@@ -252,3 +201,71 @@ class SmoothModel:
                 lost = ~(np.isfinite(jet.value.low) & np.isfinite(jet.value.high))
                 gradient[:, row, :, lost] = hessian[:, row, :, :, lost] = np.nan
         return Interval(*gradient), Interval(*hessian)
+
+
+def _model_graph(
+    model: CasadiModel, *, output_only: bool = False
+) -> Callable[[Sequence[Any]], list[Any]]:
+    """A CasADi model's f and h as a function of a list of n + m numbers of any kind."""
+    ca = import_casadi()
+    x, u = ca.SX.sym("x", model.n), ca.SX.sym("u", model.m)
+    column = model.h.expand()(x, u)
+    if not output_only:
+        column = ca.vertcat(model.step().expand()(x, u, model.dt or 0.0), column)
+    column, size = ca.densify(column), column.numel()
+    function = ca.Function("model", [ca.vertcat(x, u)], [column])
+    known = _operations()
+    instructions = [
+        (
+            function.instruction_id(k), list(function.instruction_input(k)),
+            list(function.instruction_output(k)),
+            function.instruction_constant(k)
+            if function.instruction_id(k) == ca.OP_CONST else 0.0,
+        )
+        for k in range(function.n_instructions())
+    ]
+
+    def evaluate(values: Sequence[Any]) -> list[Any]:
+        work: dict[int, Any] = {}
+        results: list[Any] = [0.0] * size
+        for code, arguments, targets, constant in instructions:
+            if code == ca.OP_INPUT:
+                work[targets[0]] = values[arguments[1]]
+            elif code == ca.OP_CONST:
+                work[targets[0]] = float(constant)
+            elif code == ca.OP_OUTPUT:
+                results[targets[1]] = work[arguments[0]]
+            elif code in known:
+                work[targets[0]] = known[code](*(work[i] for i in arguments))
+            else:
+                raise OutsideDomainError(f"operation {code} of CasADi, which is not smooth")
+        return results
+
+    return evaluate
+
+
+def _method(name: str) -> Callable[[Any], Any]:
+    def apply(value: Any) -> Any:
+        return getattr(np, name)(value)
+
+    return apply
+
+
+@lru_cache(maxsize=1)
+def _operations() -> dict[int, Callable[..., Any]]:
+    ca = import_casadi()
+    known: dict[int, Callable[..., Any]] = {
+        ca.OP_ADD: operator.add, ca.OP_SUB: operator.sub, ca.OP_MUL: operator.mul,
+        ca.OP_DIV: operator.truediv, ca.OP_NEG: operator.neg, ca.OP_ASSIGN: operator.pos,
+        ca.OP_POW: operator.pow, ca.OP_CONSTPOW: operator.pow, ca.OP_FABS: operator.abs,
+        ca.OP_SQ: lambda s: s * s, ca.OP_TWICE: lambda s: 2.0 * s, ca.OP_INV: lambda s: 1.0 / s,
+    }
+    named = {
+        "SQRT": "sqrt", "SIN": "sin", "COS": "cos", "TAN": "tan", "EXP": "exp", "LOG": "log",
+        "TANH": "tanh", "ATAN": "arctan", "SINH": "sinh", "COSH": "cosh",
+        "EXPM1": "expm1", "LOG1P": "log1p",
+    }
+    for code, name in named.items():
+        if hasattr(ca, f"OP_{code}"):
+            known[getattr(ca, f"OP_{code}")] = _method(name)
+    return known

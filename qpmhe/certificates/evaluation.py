@@ -1,4 +1,4 @@
-"""A model's functions on many states at once; where they fail is told."""
+"""A model's functions at many states at once: values, Jacobians, failures and jumps."""
 
 from __future__ import annotations
 
@@ -9,13 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ModelError
+from ..functions import BatchedFunction
 from ..system import System
 
-__all__ = ["evaluated", "insist_on_values"]
+__all__ = ["check_values", "evaluated", "joint_jacobians", "jump_about", "jump_between"]
 
 Array = NDArray[np.float64]
 
 _REMEDY = "Take a smaller region, or make the model defined on all of it."
+# Beyond the steps of derivatives by differences.
+_REACH = 1e-4
+_PAIRS, _SEED = 400, 20210829
+# A function with derivatives changes on 2^-40 of an interval by about that share.
+_HALVINGS, _LEFT, _LEAST = 40, 1e-3, 1e-9
 
 
 class _Batched(Protocol):
@@ -24,22 +30,7 @@ class _Batched(Protocol):
 
 
 def evaluated(name: str, function: _Batched, x: Array, u: Array) -> Array:
-    """A function's values; the state is named where it raises.
-
-    Parameters
-    ----------
-    name : str
-        What error texts call it.
-    function : object with a method ``batch``
-        f, h, or a Jacobian of theirs.
-    x, u : (K, n) and (K, m) array
-        States and inputs.
-
-    Raises
-    ------
-    ModelError
-        If the function raises.
-    """
+    """A function's values; the state is named where it raises."""
     with np.errstate(all="ignore"):
         try:
             return np.array(function.batch(x, u), np.float64)
@@ -63,27 +54,11 @@ def _raised(name: str, function: _Batched, x: Array, u: Array, first: Exception)
 
 
 def _place(x: Array, u: Array) -> str:
-    told = f"x = {x.tolist()}"
-    return told + (f", u = {u.tolist()}" if u.size else "")
+    return f"x = {x.tolist()}" + (f", u = {u.tolist()}" if u.size else "")
 
 
-def insist_on_values(system: System, points: Array, *, output_only: bool = False) -> None:
-    """Insist that f and h neither raise nor return what is not finite.
-
-    Parameters
-    ----------
-    system : System
-        The system.
-    points : (K, n + m) array
-        States and inputs.
-    output_only : bool
-        Whether to look at h alone.
-
-    Raises
-    ------
-    ModelError
-        If they do; it names the state.
-    """
+def check_values(system: System, points: Array, *, output_only: bool = False) -> None:
+    """Raise a ModelError where f or h raises or is not finite."""
     x, u = points[:, : system.n], points[:, system.n :]
     for name, function in (("f", system.f), ("h", system.h))[output_only:]:
         values = evaluated(name, function, x, u)
@@ -94,3 +69,80 @@ def insist_on_values(system: System, points: Array, *, output_only: bool = False
                 f"{name} is not finite at {_place(x[k], u[k])}, within the region: it returned "
                 f"{values[k].tolist()}. {_REMEDY}"
             )
+
+
+def jump_about(system: System, point: Array) -> str:
+    """Which of f and h seems to jump next to a state, in words; empty if none does."""
+    n = system.n
+    moves = _REACH * np.maximum(1.0, np.abs(point[:n]))[:, None] * np.eye(n, point.size)
+    return _jump(system, point - moves, point + moves)
+
+
+def jump_between(system: System, points: Array) -> str:
+    """Which of f and h seems to jump between some states, in words; empty if none does."""
+    rng = np.random.default_rng(_SEED)
+    first, second = rng.integers(len(points), size=(2, _PAIRS))
+    ends = points[first].copy(), points[second].copy()
+    ends[1][:, system.n :] = ends[0][:, system.n :]
+    return _jump(system, *ends)
+
+
+def _jump(system: System, low: Array, high: Array) -> str:
+    for name, function in (("f", system.f), ("h", system.h)):
+        try:
+            where, size = _traced(function, low, high, system.n)
+        except Exception:  # a user's function may raise outside of the region
+            continue
+        worst = int(size.argmax())
+        if size[worst] > 0.0:
+            return (
+                f"{name} seems to jump, by {size[worst]:.3g} at "
+                f"{np.round(where[worst], 6).tolist()}"
+            )
+    return ""
+
+
+def _traced(function: BatchedFunction, low: Array, high: Array, n: int) -> tuple[Array, Array]:
+    """Where the largest change on each segment is, and its size if it is a jump, else 0.
+
+    The change is traced to ever smaller parts of the segment: where the function has
+    derivatives it vanishes, at a jump it stays.
+    """
+
+    def at(points: Array) -> Array:
+        return np.array(function.batch(points[:, :n], points[:, n:]), np.float64)
+
+    with np.errstate(all="ignore"):
+        below, above = at(low), at(high)
+        first = np.zeros(len(low))
+        for _ in range(_HALVINGS):
+            middle = 0.5 * low + 0.5 * high
+            between = at(middle)
+            halves = np.abs(between - below).max(axis=1), np.abs(above - between).max(axis=1)
+            first = np.maximum(first, np.maximum(*halves))
+            left = (halves[0] >= halves[1])[:, None]
+            low, high = np.where(left, low, middle), np.where(left, middle, high)
+            below, above = np.where(left, below, between), np.where(left, between, above)
+        size = np.abs(above - below).max(axis=1)
+        least = np.maximum(_LEFT * first, _LEAST * (1.0 + np.abs(below).max(axis=1)))
+    return 0.5 * (low + high), np.where(size > least, size, 0.0)
+
+
+def joint_jacobians(system: System, points: Array) -> Array:
+    """The joint Jacobians at some states."""
+    check_values(system, points)  # a step in the imaginary direction may not see NaN
+    x, u = points[:, : system.n], points[:, system.n :]
+    joint = np.concatenate(
+        (
+            evaluated("the Jacobian of f", system.f_jacobian, x, u),
+            evaluated("the Jacobian of h", system.h_jacobian, x, u),
+        ),
+        axis=1,
+    )
+    broken = ~np.isfinite(joint).all(axis=(1, 2))
+    if broken.any():
+        raise ModelError(
+            f"the Jacobians of f and h are not finite at {points[broken][0].tolist()}, within the "
+            "region; expected functions with derivatives there. Take a smaller region."
+        )
+    return np.asarray(joint, np.float64)

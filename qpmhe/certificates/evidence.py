@@ -1,11 +1,21 @@
-"""How well a number of a certificate is founded."""
+"""What a certified number rests on, and the errors where nothing can be certified."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from enum import Enum
 
-__all__ = ["Evidence", "weakest"]
+from ..errors import InvalidInputError, QpmheError
+
+__all__ = [
+    "CertificateError",
+    "Evidence",
+    "JumpError",
+    "MismatchError",
+    "NotCertifiedError",
+    "OutOfTimeError",
+    "weakest",
+]
 
 
 class Evidence(Enum):
@@ -15,7 +25,7 @@ class Evidence(Enum):
     PROVED = "proved"
     #: Held at every point that was tried; points in between may break it.
     SAMPLED = "sampled"
-    #: Taken from the user, not looked at.
+    #: Taken from the user, not examined.
     ASSUMED = "assumed"
 
     def __str__(self) -> str:
@@ -26,11 +36,53 @@ _ORDER = (Evidence.PROVED, Evidence.SAMPLED, Evidence.ASSUMED)
 
 
 def weakest(evidence: Iterable[Evidence]) -> Evidence:
-    """What a number rests on that is computed from others: the weakest of theirs.
+    """What a number rests on that is computed from others: the weakest of theirs."""
+    return max(evidence, key=_ORDER.index, default=Evidence.PROVED)
+
+
+class CertificateError(InvalidInputError):
+    """A question that no certificate can answer, such as one about an unbounded set."""
+
+
+class MismatchError(CertificateError):
+    """Something certified for one system, gain, region or estimator, and used for another."""
+
+
+class NotCertifiedError(QpmheError):
+    """A property that could not be certified, and perhaps does not hold.
 
     Parameters
     ----------
-    evidence : iterable of Evidence
-        Theirs; nothing at all counts as proved.
+    message : str
+        What was asked, and what was found.
+    suggestions : sequence of str
+        What may help.
+    smallest_rate : float, optional
+        The smallest rate that was found to be feasible, where the one asked for was not.
+
+    Attributes
+    ----------
+    suggestions : tuple of str
+        As given; the text of the error lists them.
+    smallest_rate : float or None
+        As given.
     """
-    return max(evidence, key=_ORDER.index, default=Evidence.PROVED)
+
+    def __init__(
+        self,
+        message: str,
+        suggestions: tuple[str, ...] = (),
+        smallest_rate: float | None = None,
+    ) -> None:
+        self.suggestions = tuple(suggestions)
+        self.smallest_rate = smallest_rate
+        advice = f" What may help: {'; '.join(self.suggestions)}." if self.suggestions else ""
+        super().__init__(message + advice)
+
+
+class OutOfTimeError(NotCertifiedError):
+    """A search that was stopped before it found anything: nothing is known of the property."""
+
+
+class JumpError(NotCertifiedError):
+    """A function that seems to jump, of which no property with derivatives can be shown."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,17 +18,154 @@ from ..estimator import MovingHorizonEstimator
 from ..run import Run
 from ..system import System
 from .certificate import Certificate
-from .errors import MismatchError
-from .hypotheses import Hypotheses, MonitorSummary
-from .sources import insist_on_same
+from .evidence import MismatchError
 
-__all__ = ["Monitor", "monitor", "monitored_run"]
+__all__ = [
+    "NEEDED",
+    "UNNEEDED",
+    "Hypotheses",
+    "Monitor",
+    "MonitorSummary",
+    "monitor",
+    "monitored_run",
+]
 
 Array = NDArray[np.float64]
 
 _RELATIVE = 1e-6
 _FEASIBLE = 1e-8  # what the estimator itself takes for rounding on the sets' boundary
 _BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Which hypotheses held at one step; each is checked anew from the estimate's numbers.
+
+    Parameters
+    ----------
+    cost_decrease : bool
+        (eq:estimator): the estimate costs no more than the candidate, and the stated costs are
+        those of the trajectories (which is checked where the window is complete).
+    complete : bool
+        All measurements of the window are there, and the model could be evaluated.
+    observer_candidate : bool
+        (eq:warmstart): the candidate is the observer's trajectory, not a projection of it,
+        and corrects by the certificate's gain, where that is constant.
+    kappa : bool
+        (eq:kappa): |L| <= kappa |v_z| all along the candidate.
+    candidate_in_region, estimate_in_region : bool
+        All states of the window but the newest lie in the certified set, and so do the
+        inputs. The newest one need not: nothing is concluded from it yet.
+    candidate_in_sets : bool
+        Assumption ass:observer: the candidate's states, corrections and fitting errors are in
+        X, W and V.
+    feasible : bool
+        (eq:constraints): the estimate's states, disturbances and noises are in X, W and V.
+    """
+
+    cost_decrease: bool
+    complete: bool
+    observer_candidate: bool
+    kappa: bool
+    candidate_in_region: bool
+    estimate_in_region: bool
+    candidate_in_sets: bool
+    feasible: bool
+
+    @property
+    def held(self) -> bool:
+        """Whether the certificate's bound follows at this step, if it did at those before.
+
+        The last two are no part of that: what is certified holds for any w and v, so that
+        the theorem may be applied with the whole space in place of W and V, and with the
+        region in place of X, which is the paper's remedy after Assumption ass:observer.
+        """
+        return not self.failed
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """Names of those that the bound needs and that did not hold."""
+        return tuple(name for name in NEEDED if not getattr(self, name))
+
+
+#: The hypotheses that are only reported, and those that the bound needs.
+UNNEEDED = ("candidate_in_sets", "feasible")
+NEEDED = tuple(each.name for each in fields(Hypotheses) if each.name not in UNNEEDED)
+
+
+@dataclass(frozen=True)
+class MonitorSummary:
+    """For how many steps of a run the certificate applied.
+
+    Parameters
+    ----------
+    steps : int
+        Steps of the run.
+    applied : int
+        Steps from the first on, until the first at which a needed hypothesis did not hold:
+        the observer's bound goes back to the start, and is lost with it.
+    held : int
+        Steps at which all needed hypotheses held, whatever had happened before.
+    counts : dict of str to int
+        At how many steps each hypothesis held.
+    first_failure : int or None
+        The first step at which one did not.
+    failed : tuple of str
+        Which ones, then.
+    """
+
+    steps: int
+    applied: int
+    held: int
+    counts: dict[str, int]
+    first_failure: int | None
+    failed: tuple[str, ...]
+
+    @property
+    def missed(self) -> dict[str, int]:
+        """At how many steps each hypothesis did not hold."""
+        return {name: self.steps - self.counts.get(name, 0) for name in (*NEEDED, *UNNEEDED)}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything in types that JSON knows."""
+        return {
+            "steps": self.steps, "applied": self.applied, "held": self.held,
+            "first_failure": self.first_failure, "failed": list(self.failed),
+            "hypotheses": {
+                name: {"needed": name in NEEDED, "failed": count, "held": self.steps - count}
+                for name, count in self.missed.items()
+            },
+        }
+
+    def __str__(self) -> str:
+        text = f"The certificate applied at {self.applied} of {self.steps} steps"
+        if self.first_failure is None:
+            text += "."
+        else:
+            reasons = ", ".join(_words(name) for name in self.failed)
+            text += (
+                f": at step {self.first_failure} it was lost ({reasons} did not hold). All "
+                f"hypotheses that the bound needs held at {self.held} steps."
+            )
+            text += _counted("Not held", {name: self.missed[name] for name in NEEDED})
+        return text + _counted(
+            "Not held either, but the bound needs no sets" if self.failed
+            else "Not held, but the bound needs no sets",
+            {name: self.missed[name] for name in UNNEEDED},
+        )
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _counted(what: str, missed: dict[str, int]) -> str:
+    """A sentence about the hypotheses that did not hold at all steps; empty without any."""
+    text = ", ".join(
+        f"{_words(name)} at {count} step{'s' if count > 1 else ''}"
+        for name, count in missed.items() if count
+    )
+    return f" {what}: {text}." if text else ""
 
 
 class Monitor:
@@ -78,7 +216,7 @@ class Monitor:
         OptionError
             If it has no bounds for its horizon, or the estimator takes another candidate.
         """
-        insist_on_same(certificate, estimator)
+        certificate.check_estimator(estimator)
         if estimator.time:
             raise InvalidInputError(
                 f"the estimator has taken {estimator.time} measurements; reset it first: the "
@@ -86,7 +224,7 @@ class Monitor:
             )
         if estimator.settings.candidate != "observer":
             raise OptionError(
-                "the estimator's candidate is that of a reinitialized observer, which the "
+                "the estimator's candidate comes from a reinitialized observer, which the "
                 "theorem does not cover; make it with candidate='observer'."
             )
         return cls(certificate, estimator.horizon)
@@ -104,7 +242,7 @@ class Monitor:
         Raises
         ------
         MismatchError
-            If it is not the next estimate, or its window is not that of the horizon.
+            If it is not the next estimate, or its window does not fit the horizon.
         ShapeError
             If the input does not fit.
         """
@@ -112,14 +250,14 @@ class Monitor:
         given = np.zeros(0) if u is None else np.atleast_1d(np.asarray(u, np.float64))
         if given.shape != (m,):
             raise ShapeError(f"u has shape {given.shape}; expected ({m},).")
-        self._insist_on_next(estimate)
+        self._check_next(estimate)
         self._inputs.append(given)
         found = monitor(self.certificate, estimate, np.array(self._inputs))
         self._checks.append(found)
         self._costs.append(float(estimate.cost))
         return found
 
-    def _insist_on_next(self, estimate: Estimate) -> None:
+    def _check_next(self, estimate: Estimate) -> None:
         t = len(self._checks)
         if estimate.time != t:
             raise MismatchError(
@@ -135,7 +273,7 @@ class Monitor:
 
     @property
     def costs(self) -> Array:
-        """The costs of the estimates so far, as they tell them, (T,)."""
+        """The costs that the estimates so far state, (T,)."""
         return np.array(self._costs)
 
     @property
@@ -173,7 +311,7 @@ def monitor(
     estimate : Estimate
         What the step returned.
     inputs : (K, m) array_like, optional
-        The inputs of the window's K samples, of a system that has any.
+        The inputs of the window's K samples, for a system with inputs.
 
     Returns
     -------
@@ -201,14 +339,14 @@ def monitor(
         )
         kappa = max(each.kappa for each in certificate.stabilities)
         # What is missing is reported as that alone: the observer takes it for a fit.
-        told = np.nan_to_num(fit, nan=0.0)
-        allowed = kappa * np.linalg.norm(told, axis=1) * (1.0 + _RELATIVE)
+        known = np.nan_to_num(fit, nan=0.0)
+        allowed = kappa * np.linalg.norm(known, axis=1) * (1.0 + _RELATIVE)
         rounding = 1e-12 * (1.0 + float(np.abs(estimate.candidate).max()))
         bounded = bool((np.linalg.norm(corrections, axis=1) <= allowed + rounding).all())
         gain = certificate.gain
         observed = gain is None or not complete or bool(
-            (np.abs(corrections - told @ gain.T)
-             <= rounding + _RELATIVE * (np.abs(told) @ np.abs(gain).T)).all()
+            (np.abs(corrections - known @ gain.T)
+             <= rounding + _RELATIVE * (np.abs(known) @ np.abs(gain).T)).all()
         )
         cheaper = estimate.cost <= estimate.candidate_cost and (
             not complete
@@ -237,7 +375,7 @@ def monitored_run(
     measurements: ArrayLike,
     inputs: ArrayLike | None = None,
 ) -> tuple[Run, MonitorSummary]:
-    """Run an estimator over a record, and tell for how many steps the certificate applied.
+    """Run an estimator over a record, and count for how many steps the certificate applied.
 
     Parameters
     ----------
@@ -248,7 +386,7 @@ def monitored_run(
     measurements : (T, p) array_like
         y(0), ..., y(T-1).
     inputs : (T, m) array_like, optional
-        u(0), ..., u(T-1), of a system that has any.
+        u(0), ..., u(T-1), for a system with inputs.
 
     Returns
     -------
@@ -282,9 +420,9 @@ def _along(system: System, states: Array, u: Array) -> tuple[Array, Array]:
 
 
 def _costs(
-    certificate: Certificate, states: Array, estimate: Estimate, w: Array, v: Array, told: float
+    certificate: Certificate, states: Array, estimate: Estimate, w: Array, v: Array, stated: float
 ) -> bool:
-    """Whether a trajectory's cost is what was told, or no less where the prior's weight varies."""
+    """Whether a trajectory has the stated cost, or no less where the prior's weight varies."""
     cost, offset = certificate.cost, states[0] - estimate.candidate[0]
     varies = isinstance(cost.prior, ObserverPrior)
     weight = (
@@ -293,8 +431,8 @@ def _costs(
     )
     stages = cost.stage_costs(np.hstack((w, v)), cost.stage_weight)
     total = cost.prior_cost(offset, weight) + float(np.sum(stages))
-    missed = total - told if varies else abs(total - told)
-    return bool(missed <= _RELATIVE * (abs(told) + 1e-9))
+    missed = total - stated if varies else abs(total - stated)
+    return bool(missed <= _RELATIVE * (abs(stated) + 1e-9))
 
 
 def _in_sets(system: System, states: Array, w: Array, v: Array) -> bool:

@@ -1,51 +1,36 @@
-"""Robust exponential stability of an observer with constant gain on a region."""
+"""Robust exponential stability of observers with constant gain on a region, and such gains."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InvalidInputError, ShapeError
+from ..errors import InvalidInputError, OptionError, ShapeError
 from ..observers import Luenberger, Observer, OutputInjection, SteadyStateKalman
 from ..sets import Box, ConvexSet
 from ..system import System
-from .arguments import checked_system
-from .constants import euclidean_constants
-from .deadline import PART_SECONDS, Deadline
-from .errors import CertificateError, JumpError, NotCertifiedError, OutOfTimeError
-from .forms import ErrorContraction
-from .jumps import jumping
-from .programs import started
-from .provenance import sealed
-from .regions import Region, bounded_region
-from .results import ObserverStability
-from .search import Found, Search, checked_rate, checked_weights
-from .verification import Matrices, norm_bound
+from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
+from .decay import checked_rate
+from .evidence import CertificateError, JumpError, NotCertifiedError, OutOfTimeError
+from .inequalities import ErrorContraction, Matrices, euclidean_constants, norm_bound
+from .properties import ObserverStability, sealed
+from .regions import Region, bounded_region, checked_system
+from .sdp import started
+from .search import Found, Search, checked_weights
 
-__all__ = ["ObserverStability", "certify_observer", "constant_gain"]
+__all__ = ["Synthesis", "certify_observer", "constant_gain", "synthesise_gain"]
 
 Array = NDArray[np.float64]
 
 _STAY = "it holds while the states of system and observer stay in the region"
+_SEARCH = 0.7  # of the time; the rest is for smaller constants of the gain that was found
 
 
 def constant_gain(observer: Observer, system: System) -> Array:
-    """The gain L of an observer that corrects by L(z, v) = L v.
-
-    Parameters
-    ----------
-    observer : Observer
-        The observer.
-    system : System
-        The system that it is for.
-
-    Raises
-    ------
-    CertificateError
-        If it has none; the text says what can be done instead.
-    ShapeError, InvalidInputError
-        If it is for a system of other dimensions, or no observer.
-    """
+    """The gain L of an observer that corrects by L(z, v) = L v."""
     if not isinstance(observer, Observer):
         raise InvalidInputError(
             f"observer is {observer!r}; expected an observer, such as qpmhe.Luenberger(gain)."
@@ -65,7 +50,7 @@ def constant_gain(observer: Observer, system: System) -> Array:
     )
     raise CertificateError(
         f"{kind} has no constant gain: {reason}. Detectability can be certified nevertheless; "
-        "for the observer, take a Luenberger observer (synthesise_gain finds one), or answer for "
+        "for the observer, take a Luenberger observer (synthesise_gain finds one), or state "
         "its constants yourself: ObserverStability.assumed(rho=..., C_p=..., C_w=..., C_v=..., "
         "kappa=...)."
     )
@@ -83,7 +68,7 @@ def certify_observer(
 ) -> ObserverStability:
     r"""Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
 
-    A constant P with the inequality of `qpmhe.certificates.forms.ErrorContraction` is sought
+    A constant P with the inequality of `qpmhe.certificates.inequalities.ErrorContraction` is sought
     and verified as in `certify_detectability`. It serves linear and nonlinear outputs.
 
     Parameters
@@ -93,15 +78,15 @@ def certify_observer(
     observer : Observer
         A `Luenberger` observer or one of its kind, or a `SteadyStateKalman`.
     region : Box, Polytope or Region, optional
-        A bounded set of states; that of the system if left out.
+        A bounded set of states; the system's own if left out.
     rho : float, optional
         The rate; left out, it is chosen as for `certify_detectability`.
     inputs : Box, optional
-        Bounds on the inputs, of a system that has any.
+        Bounds on the inputs, for a system with inputs.
     weights : (float, float)
         How much the constants C_w and C_v matter.
     seconds : float or Deadline
-        How long this may take, about; what is known then is told, or that nothing is.
+        How long this may take, about; the result is then what was found so far, if anything.
 
     Raises
     ------
@@ -110,17 +95,18 @@ def certify_observer(
     SetError, OptionError, ShapeError, ModelError
         As for `certify_detectability`.
     NotCertifiedError
-        If there are no such constants, or none were found; it tells the smallest feasible
+        If there are no such constants, or none were found; the text gives the smallest feasible
         rate, and what to try. An `OutOfTimeError` says that it is not known which.
     """
-    checked_rate("rho", rho)
+    if rho is not None:
+        checked_rate("rho", rho)
     gain = constant_gain(observer, checked_system(system))
     deadline = started(seconds)
     search = Search(
         system, bounded_region(system, region, inputs), "observer", checked_weights(weights), gain,
         deadline,
     )
-    _insist_on_stability(search)
+    _check_stability(search)
     try:
         return stability(search, search.find_best() if rho is None else search.find(rho))
     except NotCertifiedError as error:
@@ -128,15 +114,7 @@ def certify_observer(
 
 
 def stability(search: Search, found: Found) -> ObserverStability:
-    """The constants that follow from a verified contraction of the error.
-
-    Parameters
-    ----------
-    search : Search
-        The search.
-    found : Found
-        What it found.
-    """
+    """The constants that follow from a verified contraction of the error."""
     form = found.form
     assert isinstance(form, ErrorContraction)
     V, allowance = _noise_weight(form.P, form.gain)
@@ -169,18 +147,18 @@ def _radii(search: Search) -> Array:
     return radii
 
 
-def _insist_on_stability(search: Search) -> None:
+def _check_stability(search: Search) -> None:
     """Spare the search for what cannot be: no P is for an A - L C that is not stable."""
     radii = _radii(search)
     worst = int(radii.argmax())
     if radii[worst] >= 1.0:
-        jump = jumping(search)
+        jump = search.jump()
         if jump is not None:
             raise jump
         raise NotCertifiedError(
             f"the observer's error does not contract: A - L C has the spectral radius "
             f"{radii[worst]:.6g} at {np.round(search.points[worst], 4).tolist()}, in the region",
-            ("another gain, such as that of synthesise_gain", "a smaller region"),
+            ("another gain, such as synthesise_gain finds", "a smaller region"),
         )
 
 
@@ -194,12 +172,132 @@ def _explained(search: Search, error: NotCertifiedError) -> NotCertifiedError:
     if np.isfinite(smallest):
         return NotCertifiedError(
             f"{error.args[0]}. Feasible at the states tried: rho from {smallest:.4g} on",
-            ("a larger rho", "another gain, such as that of synthesise_gain", "a smaller region"),
+            ("a larger rho", "another gain, such as synthesise_gain finds", "a smaller region"),
             smallest,
         )
     radii = _radii(search)
     return NotCertifiedError(
         f"{error.args[0]}: no constant P shows contraction on the whole region, although A - L C "
         f"is stable at each of {radii.size} states (spectral radius up to {radii.max():.6g})",
-        ("another gain, such as that of synthesise_gain", "a smaller region"),
+        ("another gain, such as synthesise_gain finds", "a smaller region"),
     )
+
+
+Criterion = Literal["trade", "rate"]
+
+
+@dataclass(frozen=True, eq=False)
+class Synthesis:
+    """An observer made for a region.
+
+    Parameters
+    ----------
+    observer : Luenberger
+        The observer.
+    stability : ObserverStability
+        Its verified constants.
+    """
+
+    observer: Luenberger
+    stability: ObserverStability
+
+
+def synthesise_gain(
+    system: System,
+    region: ConvexSet | Region | None = None,
+    *,
+    criterion: Criterion = "trade",
+    rho: float | None = None,
+    inputs: Box | None = None,
+    weights: tuple[float, float] = (1.0, 1.0),
+    seconds: float | Deadline = DEFAULT_SECONDS,
+) -> Synthesis:
+    r"""Find a constant gain L whose observer contracts on a region, and verify it.
+
+    With Y = P L, the inequality of `qpmhe.certificates.inequalities.ErrorContraction` and the bound
+    :math:`L^\top P L \preceq r I` on the amplification of noise are both linear:
+
+    .. math::
+        \begin{pmatrix} P & P A - Y C \\ \cdot & \rho^2 P \end{pmatrix} \succ 0, \qquad
+        \begin{pmatrix} P & Y \\ \cdot & r I \end{pmatrix} \succeq 0,
+        \qquad I \preceq P \preceq \kappa I .
+
+    Minimised is :math:`d^2 \kappa + v^2 r`, that is the squares of :math:`\rho\, C_w` and
+    :math:`\rho\, C_v`, weighted. The rounded gain is then verified like any other.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    region : Box, Polytope or Region, optional
+        A bounded set of states; the system's own if left out.
+    criterion : {"trade", "rate"}
+        How to choose rho where it is not given: ``trade`` takes the one for which lasting
+        disturbances and noise are bounded best, :math:`\sqrt{d^2 \kappa + v^2 r} / (1 - \rho)`;
+        ``rate`` the smallest that is feasible, plus a hundredth of its distance from 1.
+    rho : float, optional
+        The rate.
+    inputs : Box, optional
+        Bounds on the inputs, for a system with inputs.
+    weights : (float, float)
+        d and v, such as typical sizes of disturbance and noise.
+    seconds : float or Deadline
+        How long this may take, about; the result is then what was found so far, if anything.
+
+    Raises
+    ------
+    OptionError
+        If the criterion, rho or the weights are not among or within what is allowed.
+    SetError, ModelError
+        As for `qpmhe.certificates.detectability.certify_detectability`.
+    NotCertifiedError
+        If there is no such gain, or none was found.
+    """
+    if criterion not in get_args(Criterion):
+        raise OptionError(
+            f"criterion is {criterion!r}; expected one of "
+            f"{', '.join(map(repr, get_args(Criterion)))}."
+        )
+    if rho is not None:
+        checked_rate("rho", rho)
+    first, second = checked_weights(weights)
+    deadline = started(seconds)
+    search = Search(
+        system, bounded_region(system, region, inputs), "synthesis", (first, second),
+        seconds=deadline.part(_SEARCH),
+    )
+    try:
+        found = search.find_best(criterion) if rho is None else search.find(rho)
+        made = stability(search, found)
+    except (OutOfTimeError, JumpError):
+        raise
+    except NotCertifiedError as error:
+        try:
+            smallest = search.smallest_rate()
+        except OutOfTimeError:
+            raise error from None
+        if np.isfinite(smallest):
+            raise NotCertifiedError(
+                f"{error.args[0]}. Feasible at the states tried: rho from {smallest:.4g} on",
+                ("a larger rho", "a smaller region"), smallest,
+            ) from error
+        raise NotCertifiedError(
+            "no constant gain is shown to contract on the whole region: the semidefinite program "
+            "is infeasible for every rate below 1",
+            ("a smaller region", "an observer with a varying gain", "other coordinates"),
+        ) from error
+    assert made.gain is not None
+    observer = Luenberger(made.gain)
+    try:
+        # For the gain as it is now, another P may give smaller constants.
+        again = certify_observer(
+            system, observer, search.region, rho=made.rho, weights=weights, seconds=deadline
+        )
+    except NotCertifiedError:
+        again = made
+
+    def size(one: ObserverStability) -> float:
+        return float(np.hypot(first * one.C_w, second * one.C_v))
+
+    better = again.evidence is made.evidence and size(again) < size(made)
+    return Synthesis(observer, again if better else made)

@@ -10,16 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .._checks import numbers
-from ..errors import SetError
+from ..errors import ModelError, SetError
 from ..sets import Box, ConvexSet
 from ..system import System
-from .arguments import checked_system
 
-__all__ = ["Region", "bounded_region", "dual_bound", "inequalities", "stated_region"]
+__all__ = ["Region", "beyond", "bounded_region", "checked_system", "stated_region"]
 
 Array = NDArray[np.float64]
 
-# Of a polytope's vertices and corners, as starting points of searches; more tell little new.
+# Of a polytope's vertices and corners, as starting points of searches; more add little.
 _MOST_CORNERS = 256
 
 
@@ -59,6 +58,13 @@ class Region:
     def diameter(self) -> float:
         """The largest distance of two of its states, or a little more."""
         return float(np.linalg.norm((self.upper - self.lower)[: self.n]))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The box around the region and its diameter, in types that JSON knows."""
+        return {
+            "lower": self.lower.tolist(), "upper": self.upper.tolist(), "box": self.is_box,
+            "diameter": self.diameter,
+        }
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Which states lie in the region.
@@ -127,10 +133,17 @@ class Region:
             return np.vstack((middle, corners, inner[:count]))
         centre = np.append(_centre(self.states, self.lower, self.upper), middle[0, self.n :])
         points = np.vstack((middle, corners, inner))
-        # Those outside are drawn towards a point inside until they reach the boundary.
+        # Points outside are drawn towards one inside until they reach the boundary.
         points = centre + _shares(self.states, centre, points) * (points - centre)
         points = points[self.contains(points[:, : self.n])]
         return np.vstack((centre, points[: len(corners) + count]))
+
+
+def checked_system(system: Any) -> System:
+    """The argument, if it is a System."""
+    if not isinstance(system, System):
+        raise ModelError(f"system is {system!r}; expected a qpmhe.System.")
+    return system
 
 
 def bounded_region(
@@ -167,7 +180,7 @@ def bounded_region(
             and np.array_equal(inputs.upper, region.upper[region.n :])
         ):
             raise SetError(
-                f"inputs is {inputs!r}, but the region that was passed has bounds of its own on "
+                f"inputs is {inputs!r}, but the region that was passed already has bounds on "
                 "the inputs; leave inputs out, or pass a qpmhe.Box of states with them."
             )
         return region
@@ -204,18 +217,7 @@ def bounded_region(
 
 
 def stated_region(region: Any) -> Region | None:
-    """A set that the user answers for; bounded or not, and for all inputs if not a region.
-
-    Parameters
-    ----------
-    region : Box, Polytope, Region or None
-        The set; None for all states.
-
-    Raises
-    ------
-    SetError
-        If it is something else.
-    """
+    """A set that the user states; bounded or not, and for all inputs if not a region."""
     if region is None or isinstance(region, Region):
         return region
     if not isinstance(region, ConvexSet):
@@ -228,12 +230,12 @@ def _bounds(states: ConvexSet) -> tuple[Array, Array]:
     if states.matrix.shape[0] == 0:
         return states.lower, states.upper
     n = states.dimension
-    G, g = inequalities(states)
+    G, g = _inequalities(states)
     eye = np.eye(n)
     sides, residuals = np.full((2, n), np.inf), np.zeros((2, n))
     for which, sign in enumerate((-1.0, 1.0)):
         for j in range(n):
-            sides[which, j], residuals[which, j] = dual_bound(G, g, sign * eye[j])
+            sides[which, j], residuals[which, j] = _dual_bound(G, g, sign * eye[j])
     if not np.isfinite(sides).all():
         return -sides[0], sides[1]
     # e^T x <= y^T g + |G^T y - e|_1 |x|_inf for every y >= 0: weak duality, with the
@@ -246,14 +248,8 @@ def _bounds(states: ConvexSet) -> tuple[Array, Array]:
     return np.maximum(-sides[0], states.lower), np.minimum(sides[1], states.upper)
 
 
-def inequalities(states: ConvexSet) -> tuple[Array, Array]:
-    """All inequalities of a set, as G x <= g.
-
-    Parameters
-    ----------
-    states : ConvexSet
-        The set.
-    """
+def _inequalities(states: ConvexSet) -> tuple[Array, Array]:
+    """All inequalities of a set, as G x <= g."""
     eye = np.eye(states.dimension)
     G = np.vstack((eye, -eye, states.matrix, -states.matrix))
     g = np.concatenate((states.upper, -states.lower, states.row_upper, -states.row_lower))
@@ -261,16 +257,8 @@ def inequalities(states: ConvexSet) -> tuple[Array, Array]:
     return G[finite], g[finite]
 
 
-def dual_bound(G: Array, g: Array, e: Array) -> tuple[float, float]:
-    """y^T g and a bound on |G^T y - e|_1 for multipliers of max e^T x over G x <= g.
-
-    Parameters
-    ----------
-    G, g : (K, n) and (K,) array
-        The inequalities.
-    e : (n,) array
-        The direction.
-    """
+def _dual_bound(G: Array, g: Array, e: Array) -> tuple[float, float]:
+    """y^T g and a bound on |G^T y - e|_1 for multipliers of max e^T x over G x <= g."""
     from scipy.optimize import linprog
 
     answer = linprog(g, A_eq=G.T, b_eq=e, bounds=(0.0, None), method="highs")
@@ -319,3 +307,62 @@ def _shares(states: ConvexSet, centre: Array, points: Array) -> Array:
         )
     limited: Array = np.clip(share.min(axis=1, keepdims=True), 0.0, 1.0) * (1.0 - 1e-12)
     return limited
+
+
+def beyond(inner: Region, outer: Region) -> str:
+    """Where a region reaches beyond another, in words; empty if it lies within it.
+
+    Sides are compared as they are, general inequalities by the largest value that their row
+    is shown to take on the inner region: by intervals, or by duality, rounded outward.
+    """
+    n = inner.n
+    if outer.n != n:
+        return f"it has {n} states instead of {outer.n}"
+    words = _sides("x", inner.lower[:n], inner.upper[:n], outer.states.lower, outer.states.upper)
+    if outer.lower.size > n:
+        words = words or _sides("u", inner.lower[n:], inner.upper[n:], outer.lower[n:],
+                              outer.upper[n:])
+    return words or _rows(inner, outer.states)
+
+
+def _sides(letter: str, low: Array, high: Array, outer_low: Array, outer_high: Array) -> str:
+    for j in range(low.size):
+        if low[j] < outer_low[j] or high[j] > outer_high[j]:
+            return (
+                f"{letter}[{j}] in [{low[j]:.6g}, {high[j]:.6g}] is not within "
+                f"[{outer_low[j]:.6g}, {outer_high[j]:.6g}]"
+            )
+    return ""
+
+
+def _rows(inner: Region, outer: ConvexSet) -> str:
+    own, sides = _inequalities(inner.states)
+    rows = np.vstack((outer.matrix, -outer.matrix))
+    limits = np.append(outer.row_upper, -outer.row_lower)
+    for row, limit in zip(rows, limits, strict=True):
+        if not np.isfinite(limit):
+            continue
+        same = (own == row).all(axis=1)
+        if same.any() and sides[same].min() <= limit:
+            continue
+        most = _largest(inner, own, sides, row)
+        if not most <= limit:
+            return (
+                f"the inequality {np.round(row, 6).tolist()} x <= {limit:.6g} is not shown to hold "
+                f"on it: the left-hand side may be {most:.6g}"
+            )
+    return ""
+
+
+def _largest(region: Region, G: Array, g: Array, row: Array) -> float:
+    """An upper bound on row^T x over the region."""
+    n, eps = region.n, float(np.finfo(np.float64).eps)
+    low, high = region.lower[:n], region.upper[:n]
+    size = np.maximum(np.abs(low), np.abs(high))
+    rounding = 4.0 * (n + 2) * eps * float(np.abs(row) @ size)
+    by_box = float(np.maximum(row * low, row * high).sum()) + rounding
+    if region.is_box:
+        return by_box
+    side, residual = _dual_bound(G, g, row)
+    by_duality = side + (residual + 4.0 * eps) * float(size.max())
+    return min(by_box, by_duality) if np.isfinite(by_duality) else by_box

@@ -8,28 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import positive
-from ..errors import OptionError
+from ..errors import ModelError, OptionError
 from ..system import System
-from .cover import Cover, cover
+from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel
-from .errors import JumpError, NotCertifiedError, OutOfTimeError
-from .evidence import Evidence
-from .forms import ErrorContraction, Form, OutputInjection, OutputWeight
-from .jumps import jumping
-from .programs import Answer, Kind, Program, expected_seconds
+from .evaluation import joint_jacobians, jump_about, jump_between
+from .evidence import Evidence, JumpError, NotCertifiedError, OutOfTimeError
+from .inequalities import ErrorContraction, Form, Matrices, OutputInjection, OutputWeight, definite
 from .regions import Region
-from .samples import (
-    MOST_POINTS,
-    between_samples,
-    far_apart,
-    insist_on_derivatives,
-    joint_jacobians,
-    typical_scales,
-)
-from .verification import Matrices, definite
+from .sdp import Answer, Kind, Program, Scales, expected_seconds
 
-__all__ = ["Found", "Search", "checked_rate", "checked_weights"]
+__all__ = ["Found", "Search", "checked_weights"]
 
 Array = NDArray[np.float64]
 
@@ -44,31 +34,23 @@ _ABOVE, _ATTEMPTS = 0.01, 4
 # Between the smallest rate, where constants grow without bound, and 1, where they last.
 _SHARES = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
 _SEED = 20210829
+_STATES = 8  # those with the steepest Jacobians, next to which jumps are looked for
 # How much of the time the choice of a rate may take, and one verification; how many programs
 # the former solves; how far off the time that a program is expected to take may be.
 _CHOICE, _VERIFICATION = 0.5, 0.6
 _PROGRAMS, _MISJUDGED = 20, 4.0
+_WRONG = 1e-3  # more than a derivative computed in some other way may be off
+_WORK = 5e4  # entries of second derivatives that come with an enclosure of the first
+_MOST_POINTS = 24  # Jacobians that a program starts with
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """An inequality and how far it was shown.
+    """An inequality and how far it was shown."""
 
-    Parameters
-    ----------
-    form : Form
-        The inequality, filled in.
-    evidence : Evidence
-        Whether it is proved on the region, or holds at samples.
-    margin, cells
-        As in `Cover`.
-    notes : tuple of str
-        What there is to say.
-    """
-
-    form: Form
+    form: Form  # filled in
     evidence: Evidence
-    margin: float
+    margin: float  # margin and cells are those of `Cover`
     cells: int
     notes: tuple[str, ...]
 
@@ -76,31 +58,8 @@ class Found:
 class Search:
     """Programs at some states, verification at all of them, and more states where it fails.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    region : Region
-        Where.
-    kind : str
-        Which form; None for that of detectability which the output allows.
-    weights : (float, float)
-        How much disturbance and noise matter.
-    gain : (n, p) array, optional
-        That of a given observer.
-    seconds : float or Deadline
-        How long all of it may take.
-
-    Attributes
-    ----------
-    scales : Scales
-        Typical sizes of states and outputs.
-
-    Raises
-    ------
-    ModelError
-        If f, h or a Jacobian raises or is not finite at the samples, or a given Jacobian is
-        not the derivative.
+    ``kind=None`` takes the form of detectability that the output allows; the weights say how
+    much disturbance and noise matter.
     """
 
     def __init__(
@@ -118,7 +77,7 @@ class Search:
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
         self.jacobians = joint_jacobians(system, self.points)
         if not self.model.reason:
-            insist_on_derivatives(self.model, system, self.points, self.jacobians)
+            _check_derivatives(self.model, system, self.points, self.jacobians)
         if kind is None:
             outputs = self.jacobians[:, system.n :]
             same = self.model.affine_output or (
@@ -128,8 +87,8 @@ class Search:
         self.kind: Kind = kind
         each = expected_seconds(system.n, system.p, kind)
         affordable = _CHOICE * self._deadline.left / (_PROGRAMS * each)
-        self._chosen = far_apart(self.jacobians, int(np.clip(affordable, 1, MOST_POINTS)))
-        self.scales = typical_scales(region, self.jacobians, system.n)
+        self._chosen = _far_apart(self.jacobians, int(np.clip(affordable, 1, _MOST_POINTS)))
+        self.scales = _typical_scales(region, self.jacobians, system.n)
         self._program: Program | None = None
 
     @property
@@ -145,11 +104,6 @@ class Search:
         """The smallest feasible rate at the chosen states, infinite if none below 1 is.
 
         Where the time is over before, the smallest one that was tried and is.
-
-        Raises
-        ------
-        OutOfTimeError
-            If there was no time to try a single one.
         """
         return self._smallest_rate(self._deadline.part(_CHOICE))
 
@@ -200,11 +154,6 @@ class Search:
         r"""The rate with the smallest :math:`\sqrt{d^2 \kappa + v^2 r} / (1 - \rho)`.
 
         That is what lasting disturbances and noise of sizes d and v make, up to a factor.
-
-        Parameters
-        ----------
-        smallest : float
-            The smallest feasible rate.
         """
         deadline = self._deadline.part(_CHOICE)
         best = np.inf, smallest
@@ -218,18 +167,7 @@ class Search:
         return best[1]
 
     def find_best(self, criterion: str = "trade") -> Found:
-        """An inequality with a rate of its own choice.
-
-        Parameters
-        ----------
-        criterion : {"trade", "rate"}
-            As for `synthesise_gain`.
-
-        Raises
-        ------
-        NotCertifiedError
-            If there is no rate below 1, or none is verified.
-        """
+        """An inequality with the best rate found."""
         share, refused = _ABOVE, NotCertifiedError("no rate was tried")
         for _ in range(_ATTEMPTS):
             smallest = self.smallest_rate()
@@ -250,20 +188,7 @@ class Search:
         raise refused
 
     def find(self, rate: float) -> Found:
-        """An inequality with this rate, verified as far as can be.
-
-        Parameters
-        ----------
-        rate : float
-            eta or rho.
-
-        Raises
-        ------
-        NotCertifiedError
-            If the program is infeasible or not solved, or what it returns fails.
-        OutOfTimeError
-            If nothing was found before the time was over.
-        """
+        """An inequality with this rate, verified as far as can be."""
         level, size = 0, min(1.0, rate * rate)
         best: Found | None = None
         status = "no round was left"
@@ -296,7 +221,7 @@ class Search:
             f"the semidefinite program for the rate {rate:.6g} is {status}"
             if status == "infeasible"
             else f"no matrix that passes the verification was found for the rate {rate:.6g} "
-            f"(the solver's last word: {status})"
+            f"(solver status: {status})"
         )
 
     def _form(self, answer: Answer, rate: float) -> Form:
@@ -343,20 +268,34 @@ class Search:
             return Cover(
                 False, 0, float(least.min()), self.points[broken], self.jacobians[broken]
             )
-        jump = jumping(self, everywhere=True)
+        jump = self.jump(everywhere=True)
         if jump is not None:
             raise jump
         note = (
             f"{why}; the inequality holds at {self.points.shape[0]} states of the region, and "
-            f"{between_samples(form, self.points, self.jacobians)}"
+            f"{_between_samples(form, self.points, self.jacobians)}"
         )
         return Found(form, Evidence.SAMPLED, float(least.min()), 0, (note,))
+
+    def jump(self, *, everywhere: bool = False) -> JumpError | None:
+        """A jump next to the states with the steepest Jacobians, or between all states."""
+        steepness = np.abs(self.jacobians).max(axis=(1, 2))
+        steepest = self.points[np.argsort(-steepness)[:_STATES]]
+        found = next((words for x in steepest if (words := jump_about(self.system, x))), "")
+        if everywhere:
+            found = found or jump_between(self.system, self.points)
+        if not found:
+            return None
+        return JumpError(
+            f"{found}; certificates need functions with derivatives",
+            ("a model without the jump", "a region without it"),
+        )
 
     def _added(self, outcome: Cover) -> bool:
         """Take states where the inequality fails into the program; False if there are none."""
         if not outcome.violations.shape[0]:
             return False
-        chosen = far_apart(outcome.jacobians, 6)
+        chosen = _far_apart(outcome.jacobians, 6)
         count = self.jacobians.shape[0]
         self.points = np.vstack((self.points, outcome.violations[chosen]))
         self.jacobians = np.concatenate((self.jacobians, outcome.jacobians[chosen]))
@@ -365,20 +304,81 @@ class Search:
         return True
 
 
-def checked_rate(name: str, value: float | None) -> float | None:
-    """Insist on a rate in (0, 1), or none."""
-    if value is None:
-        return None
-    rate = positive(name, value)
-    if rate >= 1.0:
-        raise OptionError(f"{name} is {value!r}; expected a number in (0, 1).")
-    return rate
-
-
 def checked_weights(value: tuple[float, float]) -> tuple[float, float]:
-    """Insist on two positive numbers."""
+    """Two positive numbers, checked."""
     try:
         first, second = value
     except (TypeError, ValueError) as error:
         raise OptionError(f"weights is {value!r}; expected two numbers > 0.") from error
     return positive("weights[0]", first), positive("weights[1]", second)
+
+
+def _check_derivatives(
+    model: SmoothModel, system: System, points: Array, jacobians: Array
+) -> None:
+    """Raise a ModelError where a given Jacobian is not the derivative, at states far apart."""
+    n = system.n
+    if "given" not in system.derivatives.values():
+        return
+    few = int(np.clip(_WORK / (jacobians[0].size * points.shape[1]), 1, _MOST_POINTS))
+    chosen = _far_apart(jacobians, few)
+    points, jacobians = points[chosen], jacobians[chosen]
+    enclosure = model.enclose(points, points)
+    for name, rows in (("f", slice(None, n)), ("h", slice(n, None))):
+        if system.derivatives[name] != "given":
+            continue
+        true, given = enclosure.centre[:, rows], jacobians[:, rows]
+        size = np.abs(true).max(axis=(1, 2)) + np.abs(given).max(axis=(1, 2))
+        apart = np.abs(given - true).max(axis=(1, 2)) - enclosure.error[:, rows].max(axis=(1, 2))
+        wrong = apart > _WRONG * (size + 1.0)
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            raise ModelError(
+                f"{name}_jacobian is {given[k].tolist()} at {points[k].tolist()}, but the "
+                f"derivative of {name} there is {np.round(true[k], 9).tolist()}. Correct it, or "
+                "leave it out."
+            )
+
+
+def _far_apart(jacobians: Array, count: int = _MOST_POINTS) -> NDArray[np.intp]:
+    """Indices of Jacobians that lie far apart from each other."""
+    flat = jacobians.reshape(jacobians.shape[0], -1)
+    size = np.ptp(flat, axis=0)
+    flat = flat[:, size > 0.0] / size[size > 0.0]
+    chosen = [0]
+    if flat.shape[1]:
+        away = np.linalg.norm(flat - flat[0], axis=1)
+        while len(chosen) < count and away.max() > 1e-9:
+            chosen.append(int(away.argmax()))
+            away = np.minimum(away, np.linalg.norm(flat - flat[chosen[-1]], axis=1))
+    return np.array(chosen, dtype=np.intp)
+
+
+def _typical_scales(region: Region, jacobians: Array, n: int) -> Scales:
+    """Sizes of states and outputs on a region."""
+    half = 0.5 * (region.upper - region.lower)[:n]
+    states = np.where(half > 0.0, half, 1.0)
+    states = np.maximum(states / states.max(), 1e-6)
+    outputs = np.abs(jacobians[:, n:] * states).sum(axis=2).max(axis=0)
+    return Scales(states, np.where(outputs > 0.0, outputs, 1.0))
+
+
+def _between_samples(form: Form, points: Array, jacobians: Array) -> str:
+    """Whether the margin covers what the Jacobian is seen to do between the samples."""
+    width = np.ptp(points, axis=0)
+    width = np.where(width > 0.0, width, 1.0)
+    spacing, steepest = 0.0, np.zeros(jacobians.shape[1:])
+    for i in range(points.shape[0]):
+        away = np.linalg.norm((points - points[i]) / width, axis=1)
+        away[i] = np.inf
+        near = int(away.argmin())
+        spacing = max(spacing, float(away[near]))
+        if away[near] > 0.0:
+            steepest = np.maximum(steepest, np.abs(jacobians[near] - jacobians[i]) / away[near])
+    radius = np.broadcast_to(steepest * spacing, jacobians.shape)
+    covered = definite(form.matrices(Matrices(jacobians, radius)))[0].all()
+    verdict = "covers" if covered else "does not cover"
+    return (
+        f"its margin {verdict} what lies between them, if the Jacobian's Lipschitz constant is "
+        f"the largest one seen (entries then differ by up to {radius.max():.3g})"
+    )

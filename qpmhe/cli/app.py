@@ -226,7 +226,7 @@ def certify(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated record.")] = 0,
     seconds: Annotated[
-        float, typer.Option(help="After about this long, what was found is told.")
+        float, typer.Option(help="How long the search may take, about.")
     ] = 60.0,
 ) -> None:
     """What the theorem guarantees for a model: its assumptions checked, its constants computed."""

@@ -2,42 +2,25 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from rich import box as boxes
 from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
-from ..certificates.certificate import Certificate
-from ..certificates.certification import certify as make
-from ..certificates.choices import Sizes
-from ..certificates.errors import CertificateError, NotCertifiedError
-from ..certificates.figures import LABELS, error_and_bounds
-from ..certificates.hypotheses import NEEDED, UNNEEDED, MonitorSummary
-from ..certificates.monitor import monitored_run
-from ..certificates.programs import started
-from ..certificates.regions import Region, bounded_region
-from ..certificates.results import Detectability, ObserverStability
-from ..certificates.telling import ASSUMED, region_dict
-from ..errors import InvalidInputError, OptionError, SetError
-from ..estimator import MovingHorizonEstimator
-from ..models import Example
-from ..models.scenario import Record
-from ..plots import save
+from ..certificates.audit import Audit
+from ..certificates.certificate import ASSUMED, Certificate
+from ..certificates.monitor import NEEDED, UNNEEDED
+from ..certificates.properties import Detectability, ObserverStability
+from ..certificates.regions import Region
+from ..certificates.report import LABELS, Report, certify_model
+from ..errors import InvalidInputError, OptionError
 from ..sets import Box
 from ..studies.sources import find, load
-from .certify_failure import Remainder
-from .certify_tables import assumptions_table, bounds_table, ingredients_table
 
 __all__ = ["certify"]
-
-Array = np.ndarray[Any, np.dtype[np.float64]]
-
-# Without --box: the simulated states, with this share of their extent on each side.
-_ROOM = 0.5
-_SIGMAS = 3.0
 
 
 def certify(
@@ -51,7 +34,7 @@ def certify(
     seed: int = 0,
     seconds: float = 60.0,
 ) -> bool:
-    """Audit a model, certify what can be, and show it.
+    """Certify a model with `qpmhe.certificates.certify_model`, and show the result.
 
     Parameters
     ----------
@@ -61,7 +44,7 @@ def certify(
         Name of the catalogue, ``package.module:function`` or ``file.py:function``.
     box : str, optional
         The set of states: ``low:high`` of each component between commas, such as
-        ``0.1:9,-1:9``; left out, the model's own if bounded, or one about a simulated record.
+        ``0.1:9,-1:9``; left out, the model's own if bounded, or one around a simulated record.
     horizon : str, optional
         N, or several between commas; left out, the model's own.
     report : Path, optional
@@ -71,7 +54,7 @@ def certify(
     seed : int
         Of the simulated record.
     seconds : float
-        After about this long, what was found is told.
+        How long the search may take, about.
 
     Returns
     -------
@@ -83,72 +66,43 @@ def certify(
     QpmheError
         If an option, the model or the set does not fit.
     """
-    horizons, deadline = _horizons(horizon), started(seconds)
+    horizons = _horizons(horizon)
     if report is not None:
         _check_report(report)  # before any work
     example = load(find(model))
-    record = example.scenario.simulate(seed)
-    region = _region(example, record, box, input_box)
-    sizes = _sizes(example)
-    console.print(f"[bold]{example.scenario.title or model}[/], on {_words(region)}",
-                  highlight=False)
-    told: dict[str, Any] = {"model": model, "certified": False, "region": region_dict(region)}
+    system, title = example.system, example.scenario.title or model
+    region = None if box is None else _box("--box", box, system.n, "states")
+    inputs = None if input_box is None else _box("--input-box", input_box, system.m, "inputs")
+    with console.status("looking for matrices, and verifying them"):
+        found = certify_model(
+            example, horizon=horizons or None, region=region, inputs=inputs, seed=seed,
+            seconds=seconds, name=model,
+        )
+    console.print(f"[bold]{title}[/], on {_words(found.region)}", highlight=False)
+    console.print(_assumptions_table(found.audit))
+    if found.detectability is not None or found.stability is not None:
+        console.print(_ingredients_table(found.detectability, found.stability))
+    if found.certificate is None:
+        _show_failures(console, found)
+    else:
+        console.print(_bounds_table(found.certificate))
+        console.print(f"Simulated record, seed {seed}: {found.summary}", highlight=False)
+        names = f"The bounds need: {', '.join(NEEDED)}. Reported only: {', '.join(UNNEEDED)}."
+        console.print(names.replace("_", " "), highlight=False)
+        for text in ASSUMED:
+            console.print(f"Assumed: {text}.", highlight=False)
+    if report is not None:
+        for path in found.save(report):
+            console.print(f"wrote {path}", highlight=False)
+    return found.certificate is not None
 
-    def attempt(share: float, **parts: Any) -> Certificate:
-        with console.status("looking for matrices, and verifying them"):
-            return make(
-                example.system, example.observer, example.cost,
-                horizon=horizons or [example.scenario.horizon], region=region, sizes=sizes,
-                run=record, initial_state=example.scenario.initial_estimate,
-                seconds=deadline.part(share), **parts,
-            )
 
-    try:
-        certificate = attempt(0.5)
-    except (NotCertifiedError, CertificateError) as error:
-        rest = Remainder.of(example, region, record, error, deadline)
-        found = None if rest.failures else _from_parts(attempt, rest)
-        if found is None:
-            rest.show(console)
-            _write_json(console, report, told | rest.to_dict())
-            return False
-        certificate = found
-    console.print(assumptions_table(certificate.audit))
-    console.print(ingredients_table(*_used(certificate)))
-    console.print(bounds_table(certificate))
-    summary = _picture(console, example, certificate, record, report)
-    console.print(f"Simulated record, seed {seed}: {summary}", highlight=False)
+def _show_failures(console: Console, found: Report) -> None:
+    for text in found.failures:
+        console.print(f"[bold red]Not certified:[/] {escape(text)}", highlight=False)
     console.print(
-        f"The bounds need: {', '.join(NEEDED)}. Told only: {', '.join(UNNEEDED)}.".replace(
-            "_", " "), highlight=False,
-    )
-    for text in ASSUMED:
-        console.print(f"Assumed: {text}.", highlight=False)
-    told |= {
-        "certified": True, "monitor": str(summary), "monitored": summary.to_dict(),
-    } | certificate.to_dict()
-    _write_json(console, report, told)
-    return True
-
-
-def _from_parts(attempt: Callable[..., Certificate], rest: Remainder) -> Certificate | None:
-    """The certificate of parts that were found by themselves, where that is enough."""
-    try:
-        return attempt(1.0, detectability=rest.detected, stability=rest.observed)
-    except (NotCertifiedError, CertificateError):
-        return None
-
-
-def _used(certificate: Certificate) -> tuple[Detectability, ObserverStability]:
-    """What the theorem's constants for the first horizon are made of."""
-    paper = certificate.of(certificate.horizons[0]).paper
-    return (
-        min(certificate.detectabilities, key=lambda one: abs(one.eta - paper.detectability.rate)),
-        # Its constants may be those of a slower rate than the proved one.
-        min(
-            certificate.stabilities,
-            key=lambda one: (one.C_p != paper.observer.initial, one.rho > paper.observer.rate),
-        ),
+        "What holds without any certificate: the estimate costs no more than the observer's "
+        "candidate, at each step and with any solver.", highlight=False,
     )
 
 
@@ -178,44 +132,6 @@ def _box(option: str, text: str, width: int, kind: str) -> Box:
     return Box(low, high)
 
 
-def _region(
-    example: Example, record: Record, box: str | None, input_box: str | None
-) -> Region:
-    system = example.system
-    inputs = None
-    if input_box is not None:
-        inputs = _box("--input-box", input_box, system.m, "inputs")
-    elif record.inputs is not None:
-        inputs = Box(record.inputs.min(axis=0), record.inputs.max(axis=0))
-    if box is not None:
-        return bounded_region(system, _box("--box", box, system.n, "states"), inputs)
-    if system.states is not None:
-        try:
-            return bounded_region(system, None, inputs)
-        except SetError:
-            pass  # not bounded: what the record fills is
-    low, high = record.states.min(axis=0), record.states.max(axis=0)
-    start = example.scenario.initial_estimate
-    low, high = np.minimum(low, start), np.maximum(high, start)
-    room = _ROOM * np.maximum(high - low, 1e-6)
-    around = Box(low - room, high + room)
-    return bounded_region(
-        system, around if system.states is None else system.states & around, inputs
-    )
-
-
-def _sizes(example: Example) -> Sizes:
-    """Three standard deviations of the scenario's noises, and its initial error."""
-    scenario = example.scenario
-    w, v = (
-        _SIGMAS * float(np.sqrt(np.linalg.eigvalsh(matrix)[-1]))
-        for matrix in (scenario.disturbance_covariance, scenario.noise_covariance)
-    )
-    return Sizes(
-        float(np.linalg.norm(scenario.initial_state - scenario.initial_estimate)), w, v
-    )
-
-
 def _words(region: Region) -> str:
     parts = [
         f"{'x' if j < region.n else 'u'}{(j if j < region.n else j - region.n) + 1} in "
@@ -223,40 +139,6 @@ def _words(region: Region) -> str:
         for j, (low, high) in enumerate(zip(region.lower, region.upper, strict=True))
     ]
     return ", ".join(parts) + ("" if region.is_box else ", and general inequalities")
-
-
-def _picture(
-    console: Console, example: Example, certificate: Certificate, record: Record,
-    report: Path | None,
-) -> MonitorSummary:
-    """Run the estimator on the record, watch it, and draw error and bounds."""
-    system, scenario = example.system, example.scenario
-    N = certificate.horizons[-1]
-    mhe = MovingHorizonEstimator(
-        system, example.observer, example.cost, horizon=N,
-        initial_state=scenario.initial_estimate, max_qps=2,
-    )
-    run, summary = monitored_run(certificate, mhe, record.measurements, record.inputs)
-    if report is not None:
-        steps = len(record.measurements)
-        u = np.zeros((steps, 0)) if record.inputs is None else record.inputs
-        w = record.states[1:] - system.f.batch(record.states[:-1], u)
-        v = record.measurements - system.h.batch(record.states[:-1], u)
-        bounds = {
-            LABELS[kind]: certificate.bound(
-                run, w, v, initial_error=record.states[0] - run.states[0], kind=kind, source=mhe
-            )
-            for kind in certificate.kinds
-        }
-        axes = error_and_bounds(
-            scenario.dt * np.arange(steps + 1.0),
-            np.linalg.norm(record.states - run.states, axis=1), bounds,
-            diameter=certificate.diameter, time_label=f"time t ({scenario.time_unit})",
-            error_label=f"error, N = {N}, 2 QPs a sample",
-        )
-        for path in save(axes.get_figure(), report.with_suffix("")):
-            console.print(f"wrote {path}", highlight=False)
-    return summary
 
 
 def _check_report(report: Path) -> None:
@@ -272,12 +154,99 @@ def _check_report(report: Path) -> None:
         raise InvalidInputError(f"cannot write into {folder}: {error.strerror}.") from error
 
 
-def _write_json(console: Console, report: Path | None, told: dict[str, Any]) -> None:
-    if report is None:
-        return
-    path = report
-    try:
-        path.write_text(json.dumps(told, indent=1, allow_nan=False), encoding="utf-8")
-    except OSError as error:
-        raise InvalidInputError(f"cannot write {path}: {error.strerror}.") from error
-    console.print(f"wrote {path}", highlight=False)
+def _assumptions_table(findings: Audit) -> Table:
+    """The assumptions, one a row."""
+    table = _table("Assumptions")
+    for name in ("assumption", "holds", "evidence", "what was found"):
+        table.add_column(name, overflow="fold")
+    if any(each.holds is False and not each.needed for each in findings.findings):
+        table.caption = (
+            "The bounds rest on no set: what is certified holds for any w and v, and the region "
+            "takes the place of X."
+        )
+    for finding in findings.findings:
+        holds = {True: "yes", False: "[bold red]no[/]", None: "not examined"}[finding.holds]
+        if finding.holds is False and not finding.needed:
+            holds = "no, but not needed"
+        table.add_row(
+            f"{finding.name} ({finding.label})", holds, str(finding.evidence or "-"),
+            escape(finding.text),
+        )
+    return table
+
+
+def _ingredients_table(
+    detected: Detectability | None, observed: ObserverStability | None
+) -> Table:
+    """The constants of detectability and of the observer."""
+    table = _table(
+        "Detectability and observer", "Rate per step; constants of initial error, disturbance and "
+        "noise. The bounds below for other N may use other rates.",
+    )
+    rows = []
+    if detected is not None:
+        rows.append(("e-IOSS (eq:eIOSS)", detected.eta, detected.c_p, detected.c_w, detected.c_v,
+                     detected.evidence))
+    if observed is not None:
+        rows.append(("observer (eq:RGES)", observed.rho, observed.C_p, observed.C_w,
+                     observed.C_v, observed.evidence))
+    _fill(table, ("", "rate", "c_p", "c_w", "c_v", "evidence"), [
+        (name, *numbers, str(evidence)) for name, *numbers, evidence in rows
+    ])
+    return table
+
+
+def _bounds_table(certificate: Certificate) -> Table:
+    """The constants of the bounds, and what they come to."""
+    sizes = certificate.sizes
+    largest = {N: bounds.paper.dominating()[1] for N, bounds in certificate.bounds.items()}
+    terms = "; ".join(
+        f"{term} (N = {', '.join(str(N) for N in largest if largest[N] == term)})"
+        for term in dict.fromkeys(largest.values())
+    )
+    table = _table(
+        "Bounds of the error (eq:RGES_result)",
+        f"Limit: for |w| <= {sizes.disturbance:.3g} and |v| <= {sizes.noise:.3g} at all "
+        f"times. Vacuous: no less than {certificate.diameter:.4g}, the diameter of the set. Only "
+        f"the first row of each N is the paper's; its largest term in C_2: {terms}. Evidence of "
+        f"all: {certificate.evidence}.",
+    )
+    rows: list[tuple[Any, ...]] = []
+    for N, bounds in certificate.bounds.items():
+        for kind in certificate.kinds:
+            if kind == "measured":
+                continue
+            window = {"summed": bounds.summed, "weighted": bounds.weighted}.get(kind)
+            result = bounds.paper.result if window is None else window.result()
+            limit = certificate.limit(sizes.disturbance, sizes.noise, horizon=N, kind=kind)
+            vacuous = certificate.vacuous(horizon=N, kind=kind)
+            rows.append((
+                str(N) if kind == "paper" else "", LABELS[kind], *result.constants, result.rate,
+                limit, "[yellow]vacuous[/]" if vacuous else "",
+            ))
+    _fill(table, ("N", "bound", "C_1", "C_2", "C_3", "lambda", "limit", ""), rows)
+    return table
+
+
+def _table(title: str, caption: str | None = None) -> Table:
+    return Table(
+        title=title, title_justify="left", caption=caption, caption_justify="left",
+        box=boxes.SIMPLE, padding=(0, 1, 0, 0),
+    )
+
+
+def _fill(table: Table, names: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
+    """Columns and rows; words give way where it is narrow, figures are never cut."""
+    texts = [
+        [f"{value:.4g}" if isinstance(value, float) else str(value) for value in row]
+        for row in rows
+    ]
+    for j, name in enumerate(names):
+        figures = name == "N" or any(isinstance(row[j], float) for row in rows)
+        width = max([len(name), *(len(row[j]) for row in texts)]) if figures else None
+        table.add_column(
+            name, justify="right" if figures else "left", overflow="fold", no_wrap=False,
+            min_width=width,
+        )
+    for row in texts:
+        table.add_row(*row)

@@ -19,18 +19,7 @@ Array = NDArray[np.float64]
 
 
 def check_run(run: Any) -> None:
-    """Insist on a run.
-
-    Parameters
-    ----------
-    run : Run
-        What was given as one.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is none.
-    """
+    """Raise an InvalidInputError for anything but a Run."""
     if not isinstance(run, Run):
         raise InvalidInputError(
             f"run is of type {type(run).__name__}; expected a qpmhe.Run, as "
@@ -40,18 +29,7 @@ def check_run(run: Any) -> None:
 
 
 def check_estimate(estimate: Any) -> None:
-    """Insist on an estimate.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        What was given as one.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is none.
-    """
+    """Raise an InvalidInputError for anything but an Estimate."""
     if not isinstance(estimate, Estimate):
         raise InvalidInputError(
             f"estimate is of type {type(estimate).__name__}; expected a qpmhe.Estimate, as "
@@ -60,22 +38,7 @@ def check_estimate(estimate: Any) -> None:
 
 
 def label_list(labels: Sequence[str], n: int | None = None) -> list[str]:
-    """The labels, one a state.
-
-    Parameters
-    ----------
-    labels : sequence of str
-        What was given.
-    n : int, optional
-        How many are expected; at least one if left out.
-
-    Raises
-    ------
-    InvalidInputError
-        If they are no sequence of strings.
-    ShapeError
-        If they are too few or too many.
-    """
+    """The labels, one for each of the n states, checked."""
     given = list(labels) if np.iterable(labels) and not isinstance(labels, str) else None
     if given is None or not all(isinstance(label, str) for label in given):
         raise InvalidInputError(
@@ -89,18 +52,7 @@ def label_list(labels: Sequence[str], n: int | None = None) -> list[str]:
 
 
 def sample_times(times: ArrayLike) -> NDArray[Any]:
-    """The times of samples, (T + 1,).
-
-    Parameters
-    ----------
-    times : array_like
-        What was given: numbers, or dates.
-
-    Raises
-    ------
-    ShapeError
-        If they are no vector.
-    """
+    """The times of samples, (T + 1,), numbers or dates, checked."""
     given = np.asarray(times)
     if given.ndim != 1:
         raise ShapeError(f"times have shape {given.shape}; expected (T + 1,), one a state.")
@@ -108,24 +60,7 @@ def sample_times(times: ArrayLike) -> NDArray[Any]:
 
 
 def curve(name: str, values: ArrayLike, length: int, n: int) -> Array:
-    """A row of n states at each of the times.
-
-    Parameters
-    ----------
-    name : str
-        What the error's text calls it.
-    values : array_like
-        What was given; (length,) will do where n is 1.
-    length, n : int
-        Numbers of times and of states.
-
-    Raises
-    ------
-    InvalidInputError
-        If these are no real numbers.
-    ShapeError
-        If the shape is another.
-    """
+    """A row of n states at each of the times, (length, n); (length,) will do for n = 1."""
     array = numbers(name, values, finite=False)
     if array.ndim == 1 and n == 1:
         array = array[:, None]
@@ -140,24 +75,7 @@ def curve(name: str, values: ArrayLike, length: int, n: int) -> Array:
 def named_curves(
     estimates: Mapping[str, ArrayLike], length: int, n: int, most: int
 ) -> dict[str, Array]:
-    """Some `curve` of each label.
-
-    Parameters
-    ----------
-    estimates : mapping of label to array_like
-        What was given.
-    length, n : int
-        Numbers of times and of states.
-    most : int
-        How many can be told apart.
-
-    Raises
-    ------
-    InvalidInputError
-        If this is no mapping, or one of too many.
-    ShapeError
-        If a shape is another.
-    """
+    """The `curve` of each label, at most so many."""
     if not isinstance(estimates, Mapping):
         raise InvalidInputError(
             f"estimates are of type {type(estimates).__name__}; expected a mapping of labels to "

@@ -48,24 +48,7 @@ LIGHT: Any = {
 
 
 def panels(count: int, axes: Any, height: float = 2.1) -> list[Any]:
-    """Axes to draw into: those given, or panels one above the other in a figure of their own.
-
-    Parameters
-    ----------
-    count : int
-        How many are needed.
-    axes : matplotlib Axes, sequence of Axes, or None
-        Where to draw; None makes a figure.
-    height : float
-        Inches of a panel of a new figure.
-
-    Raises
-    ------
-    InvalidInputError
-        If something else than axes is given.
-    ShapeError
-        If other than ``count`` axes are given.
-    """
+    """Axes to draw into: those given, or panels one above the other in a new figure."""
     from matplotlib import rc_context
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure

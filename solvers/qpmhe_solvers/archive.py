@@ -20,22 +20,7 @@ __all__ = ["damaged", "foreign", "read", "write"]
 
 
 def write(target: Path, header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write header and arrays beside the target, then rename: it is there whole or not at all.
-
-    Parameters
-    ----------
-    target : Path
-        The file.
-    header : dict
-        What can be written as JSON.
-    arrays : mapping of str to array
-        Arrays of numbers.
-
-    Raises
-    ------
-    InvalidInputError
-        If the file cannot be written.
-    """
+    """Write header and arrays beside the target, then rename: it is there whole or not at all."""
     members = {"header": np.array(json.dumps(header)), **arrays}
     unfinished = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
@@ -55,18 +40,7 @@ def write(target: Path, header: dict[str, Any], arrays: Mapping[str, NDArray[Any
 
 
 def read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Header and arrays of a file; nothing in it is executed.
-
-    Parameters
-    ----------
-    source : Path
-        The file.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is not there, damaged, or of another kind.
-    """
+    """Header and arrays of a file; nothing in it is executed."""
     try:
         with source.open("rb") as file:
             magic = file.read(4)

@@ -54,20 +54,7 @@ class AutoSolver(Solver):
         return RawSolution(solution.d, solution.status is SolveStatus.SOLVED)
 
     def solve(self, qp: QP, start: Array | None = None) -> Solution:
-        """Solve the QP with the cheapest exact method; see `Solver.solve`.
-
-        Parameters
-        ----------
-        qp : QP
-            The problem.
-        start : (K, n) array, optional
-            Handed to the QP solver, where one is needed.
-
-        Raises
-        ------
-        InvalidInputError
-            If ``qp`` is no `QP`.
-        """
+        """Solve the QP with the cheapest exact method; see `Solver.solve`."""
         limit = remaining = self.time_limit
         began = 0.0 if limit is None else perf_counter()
         solution = self._banded.solve(qp, start)
@@ -108,13 +95,7 @@ class AutoSolver(Solver):
         self._shifts = 0
 
     def prepare(self, size: int) -> None:
-        """Make and prepare the QP solvers.
-
-        Parameters
-        ----------
-        size : int
-            Unknowns of the largest QP to come.
-        """
+        """Make the QP solvers: theirs is a long import."""
         for small in {True, size <= _SMALL}:
             self._others[small] = others = self._choose(small)
             for other in others:

@@ -48,26 +48,7 @@ class BandedSolver(Solver):
         return RawSolution(solution.d, solution.status is SolveStatus.SOLVED)
 
     def solve(self, qp: QP, start: Array | None = None) -> Solution:
-        """Solve the QP without its inequalities, then look whether they hold.
-
-        Parameters
-        ----------
-        qp : QP
-            The problem; its band and gradient are copied, not overwritten.
-        start : (K, n) array, optional
-            Not used by a direct solve.
-
-        Returns
-        -------
-        Solution
-            SOLVED, UNCONSTRAINED, or FAILED where H is not positive definite or not finite.
-            The iterate lives in this solver's workspace until its next solve.
-
-        Raises
-        ------
-        InvalidInputError
-            If ``qp`` is no `QP`.
-        """
+        """Solve the QP without its inequalities, then look whether they hold."""
         expect_qp(qp)
         row_duals = _NO_ROWS
         if qp.rows and (qp.row_lower == qp.row_upper).any():

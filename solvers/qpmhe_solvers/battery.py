@@ -25,20 +25,7 @@ _SAME = 1e-4
 
 
 def run_battery(name: str, can: Capabilities) -> Iterator[tuple[str, str]]:
-    """Put a backend through all parts of the battery that it can take.
-
-    Parameters
-    ----------
-    name : str
-        A registered name.
-    can : Capabilities
-        What it was seen to do.
-
-    Yields
-    ------
-    part, detail : str
-        What was looked at, and what was wrong; empty where all was well.
-    """
+    """Put a backend through all parts of the battery that it can take."""
     for part, look in _BATTERY.items():
         if can.inequalities or part in _WITHOUT_INEQUALITIES:
             yield part, "; ".join(look(name, can))

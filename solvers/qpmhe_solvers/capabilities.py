@@ -100,13 +100,7 @@ def measure(name: str) -> Capabilities:
 
 
 def tight(cap: int | None = None) -> SolverOptions:
-    """Options with a tight tolerance.
-
-    Parameters
-    ----------
-    cap : int, optional
-        On the solver's iterations.
-    """
+    """Options with a tight tolerance."""
     return SolverOptions(cap, absolute_tolerance=1e-9)
 
 

@@ -128,21 +128,7 @@ class Backend:
 
 
 def make_solver(entry: Backend, options: SolverOptions) -> Solver:
-    """Make a solver of an entry, registered or not, whose package is there.
-
-    Parameters
-    ----------
-    entry : Backend
-        Whose factory is called.
-    options : SolverOptions
-        Limits and accuracy.
-
-    Raises
-    ------
-    BackendError
-        If the factory raises, or makes something else than a `Solver`; an error of this project
-        passes as it is.
-    """
+    """Make a solver of an entry, registered or not, whose package is there."""
     try:
         solver: object = entry.factory(options)
     except QpmheError:

@@ -46,13 +46,7 @@ class BackendError(InvalidInputError):
 
 
 def tell_unknown_options(cls: type[T]) -> type[T]:
-    """Make a class answer an unknown keyword with the ones that it knows.
-
-    Parameters
-    ----------
-    cls : type
-        The class; its constructor is wrapped, its signature stays.
-    """
+    """Make a class answer an unknown keyword with the ones that it knows."""
     plain = cls.__init__
     known = [name for name in inspect.signature(plain).parameters if name != "self"]
 

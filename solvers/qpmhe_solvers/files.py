@@ -179,18 +179,7 @@ def load(path: str | os.PathLike[str]) -> StoredQP:
 
 
 def qp_files(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
-    """The files that are meant by files and folders.
-
-    Parameters
-    ----------
-    paths : iterable of str or path
-        Files are taken as they are; of a folder, all its ``.npz`` files in order of name.
-
-    Raises
-    ------
-    InvalidInputError
-        If a path does not exist, or a folder has no such file.
-    """
+    """The files that are meant by files and folders."""
     found: list[Path] = []
     for path in map(Path, paths):
         if path.is_dir():

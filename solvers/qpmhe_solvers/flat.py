@@ -64,13 +64,7 @@ class FlatQP:
         return FlatQP, self.sizes  # views of a copied array would be arrays of their own
 
     def gather(self, qp: QP) -> None:
-        """Copy the numbers of a QP.
-
-        Parameters
-        ----------
-        qp : QP
-            Of the sizes of this.
-        """
+        """Copy the numbers of a QP."""
         np.concatenate(
             (
                 qp.band, qp.gradient, qp.row_own, qp.row_next, _ONE,
@@ -80,13 +74,7 @@ class FlatQP:
         )
 
     def fault(self) -> str:
-        """What no solver must be given: NaN hangs some and comes back as success from others.
-
-        Returns
-        -------
-        str
-            What is wrong with the QP; empty if nothing is.
-        """
+        """What no solver must be given: NaN hangs some and comes back as success from others."""
         # Squares may overflow where the numbers do not: then each one is looked at.
         finite = math.isfinite(self._data.dot(self._data)) or np.isfinite(self._data).all()
         ordered = (self.lower <= self.upper).all()

@@ -20,13 +20,7 @@ _ONE = np.ones(1)
 
 
 def pattern_of_limits(qp: QP) -> Hashable:
-    """All that a `Form` depends on: the sizes, and which limits are finite or equal.
-
-    Parameters
-    ----------
-    qp : QP
-        The problem.
-    """
+    """All that a `Form` depends on: the sizes, and which limits are finite or equal."""
     return (
         qp.stages, qp.n, qp.rows,
         np.isfinite(qp.lower).tobytes(), np.isfinite(qp.upper).tobytes(),
@@ -131,13 +125,7 @@ class Form:
         return matrix
 
     def fill(self, qp: QP) -> None:
-        """Write the numbers of a QP into the arguments.
-
-        Parameters
-        ----------
-        qp : QP
-            Of the sizes and the pattern of limits that the form was made for.
-        """
+        """Write the numbers of a QP into the arguments."""
         np.concatenate(
             (
                 qp.band, qp.gradient, qp.lower, qp.row_lower, qp.upper, qp.row_upper,
@@ -152,13 +140,7 @@ class Form:
             target[places] = values
 
     def multipliers(self, answer: Any) -> tuple[Array | None, Array | None]:
-        """Multipliers of the QP's bounds and rows; None twice where some are missing.
-
-        Parameters
-        ----------
-        answer : qpsolvers.Solution
-            What came back.
-        """
+        """Multipliers of the QP's bounds and rows; None twice where some are missing."""
         return self._multipliers.of(answer)
 
 

@@ -33,13 +33,7 @@ class Pattern:
 
 @lru_cache(maxsize=256)
 def hessian_pattern(stages: int, n: int) -> Pattern:
-    """H in full, (K n, K n), from the flat band panels.
-
-    Parameters
-    ----------
-    stages, n : int
-        Sizes of the QP.
-    """
+    """H in full, (K n, K n), from the flat band panels."""
     k, c, b, r = np.ix_(np.arange(stages), np.arange(n), np.arange(-1, 2), np.arange(n))
     row, column = (k + b) * n + r, k * n + c + 0 * (b + r)
     valid = (k + b >= 0) & (k + b < stages) & (c + r >= 0)
@@ -49,13 +43,7 @@ def hessian_pattern(stages: int, n: int) -> Pattern:
 
 @lru_cache(maxsize=256)
 def rows_pattern(stages: int, n: int, m: int) -> Pattern:
-    """The general rows [F, G], (K m, K n), from the flat own rows, followed by the next rows.
-
-    Parameters
-    ----------
-    stages, n, m : int
-        Sizes of the QP; m rows per stage.
-    """
+    """The general rows [F, G], (K m, K n), from the flat own rows, followed by the next rows."""
     k, c, b, r = np.ix_(np.arange(stages), np.arange(n), np.arange(-1, 1), np.arange(m))
     row, column = (k + b) * m + r + 0 * c, k * n + c + 0 * (b + r)
     valid = (k + b >= 0) & (c + r >= 0)
@@ -64,20 +52,7 @@ def rows_pattern(stages: int, n: int, m: int) -> Pattern:
 
 
 def chosen_rows(stages: int, n: int, m: int, rows: NDArray[np.intp]) -> Pattern:
-    """Some rows of all constraints [I; F, G; 0], (K n + K m + 1, K n).
-
-    Parameters
-    ----------
-    stages, n, m : int
-        Sizes of the QP; m rows per stage.
-    rows : array of int
-        Which, in their new order; a row may come twice.
-
-    Returns
-    -------
-    Pattern
-        Its source: the flat own rows, followed by the next rows, followed by a 1.
-    """
+    """Some rows of all constraints [I; F, G; 0], (K n + K m + 1, K n)."""
     source, columns, starts, counts = _constraints(stages, n, m)
     taken = counts[rows]
     first = np.cumsum(taken) - taken

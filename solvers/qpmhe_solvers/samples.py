@@ -26,25 +26,7 @@ def sample(
     around: float = 0.2,
     seed: int = 0,
 ) -> QP:
-    """Make a random QP with a point inside of all its limits.
-
-    Parameters
-    ----------
-    stages, n, rows : int
-        Sizes.
-    bounds : {"none", "all", "part"}
-        Which unknowns are bounded; with "part", about half of the limits are infinite.
-    sides : {"none", "two", "equal", "mixed"}
-        What the general rows are: nothing, two-sided, equalities, or all kinds in turn.
-    decades : float
-        Powers of ten over which the weights spread.
-    push : float
-        Size of the gradient; at the default one, a good part of the limits binds.
-    around : float
-        Spread about zero of the point inside.
-    seed : int
-        Of the random numbers.
-    """
+    """Make a random QP with a point inside of all its limits."""
     rng = np.random.default_rng(seed)
     qp = QP(stages, n, rows)
     for k in range(stages):
@@ -78,13 +60,7 @@ def sample(
 
 
 def contradiction(stages: int = 6, n: int = 2) -> QP:
-    """Make a QP of two rows that want the same sum above 5 and below -5.
-
-    Parameters
-    ----------
-    stages, n : int
-        Sizes.
-    """
+    """Make a QP of two rows that want the same sum above 5 and below -5."""
     qp = sample(stages, n, 2, sides="two")
     middle = stages // 2
     qp.row_own[middle], qp.row_next[middle] = 1.0, 0.0

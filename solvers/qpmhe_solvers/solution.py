@@ -112,19 +112,7 @@ class Residuals:
 
 
 def residuals(qp: QP, d: Array, duals: Array | None, lower: Array, upper: Array) -> Residuals:
-    """Residuals of an iterate, with bounds and rows together in one array each.
-
-    Parameters
-    ----------
-    qp : QP
-        The problem.
-    d : (K, n) array
-        The iterate.
-    duals : (K n + K rows,) array or None
-        Multipliers of bounds, then rows.
-    lower, upper : (K n + K rows,) array
-        Their limits; both empty where there is no constraint at all.
-    """
+    """Residuals of an iterate, with bounds and rows together in one array each."""
     size, primal, point = qp.size, 0.0, d.reshape(-1)
     if lower.size:
         value = np.concatenate((d, qp.rows_times(d)), axis=None) if qp.rows else point

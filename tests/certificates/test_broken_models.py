@@ -5,17 +5,15 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates.audit import audit
+from qpmhe.certificates.branch_and_bound import constant_output, output_lipschitz
 from qpmhe.certificates.certification import certify
-from qpmhe.certificates.constants import euclidean_constants
 from qpmhe.certificates.detectability import certify_detectability
 from qpmhe.certificates.enclosures import SmoothModel
-from qpmhe.certificates.errors import JumpError, NotCertifiedError
-from qpmhe.certificates.evidence import Evidence
-from qpmhe.certificates.jumps import jump_between
-from qpmhe.certificates.lipschitz import constant_output, output_lipschitz
-from qpmhe.certificates.observer import certify_observer
+from qpmhe.certificates.evaluation import jump_between
+from qpmhe.certificates.evidence import Evidence, JumpError, NotCertifiedError
+from qpmhe.certificates.inequalities import euclidean_constants
+from qpmhe.certificates.observer import certify_observer, synthesise_gain
 from qpmhe.certificates.regions import bounded_region
-from qpmhe.certificates.synthesis import synthesise_gain
 from qpmhe.errors import ModelError
 
 COST = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)

@@ -7,21 +7,18 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates import bounds as bounds_module
 from qpmhe.certificates import certification
+from qpmhe.certificates import horizon_bounds as bounds_module
 from qpmhe.certificates.audit import audit
-from qpmhe.certificates.bounds import window_level
 from qpmhe.certificates.certification import certify, cost_sizes
-from qpmhe.certificates.choices import level
 from qpmhe.certificates.decay import DecayingSums
 from qpmhe.certificates.detectability import certify_detectability
-from qpmhe.certificates.errors import CertificateError, NotCertifiedError
-from qpmhe.certificates.evidence import Evidence
-from qpmhe.certificates.figures import LABELS, error_and_bounds
-from qpmhe.certificates.observer import certify_observer
-from qpmhe.certificates.results import Detectability, ObserverStability
-from qpmhe.certificates.synthesis import synthesise_gain
-from qpmhe.certificates.theorem import theorem
+from qpmhe.certificates.evidence import CertificateError, Evidence, NotCertifiedError
+from qpmhe.certificates.horizon_bounds import window_level
+from qpmhe.certificates.observer import certify_observer, synthesise_gain
+from qpmhe.certificates.properties import Detectability, ObserverStability
+from qpmhe.certificates.report import LABELS, error_and_bounds
+from qpmhe.certificates.theorem import level, theorem
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
 
 SLACK = 1 + 1e-9

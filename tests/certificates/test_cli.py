@@ -2,15 +2,19 @@
 
 import io
 import json
+import math
 import re
 
 import pytest
 from rich.console import Console
 
-from qpmhe.certificates.errors import OutOfTimeError
-from qpmhe.cli import certify as command
+import qpmhe
+from qpmhe.certificates import certify_model
+from qpmhe.certificates import report as report_module
+from qpmhe.certificates.evidence import OutOfTimeError
 from qpmhe.cli.certify import certify
-from qpmhe.errors import ModelError, OptionError, QpmheError, SetError
+from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError, SetError
+from qpmhe.studies.sources import find, load
 
 MODEL = '''
 import numpy as np
@@ -161,8 +165,8 @@ def test_parts_that_the_fallback_certifies_are_used(shown, monkeypatch, tmp_path
             raise OutOfTimeError("the time for this search was too short", ("more seconds",))
         return original(*arguments, **options)
 
-    original = command.make
-    monkeypatch.setattr(command, "make", late)
+    original = report_module.certify
+    monkeypatch.setattr(report_module, "certify", late)
     report = tmp_path / "late.json"
     done, text = shown(box="-2:2,-2:2", report=report)
     assert done
@@ -178,7 +182,7 @@ def test_hypotheses_that_the_bound_does_not_need_are_told_as_such(shown, tmp_pat
     words = " ".join(text.split())
     assert "no, but not needed" in words
     assert "The bounds rest on no set" in words
-    assert "Told only: candidate in sets, feasible." in words
+    assert "Reported only: candidate in sets, feasible." in words
     told = json.loads(report.read_text())
     hypotheses = told["monitored"]["hypotheses"]
     assert told["monitored"]["applied"] == 20
@@ -208,13 +212,13 @@ def test_a_failure_is_told_to_machines_in_full(shown, tmp_path):
 
 
 def test_smallest_feasible_rate_is_told_to_machines(shown, monkeypatch, tmp_path):
-    from qpmhe.certificates.errors import NotCertifiedError
+    from qpmhe.certificates.evidence import NotCertifiedError
 
     def refused(*_, **__):
         raise NotCertifiedError("no", ("a larger eta",), 0.73)
 
-    monkeypatch.setattr(command, "make", refused)
-    monkeypatch.setattr("qpmhe.cli.certify_failure.certify_detectability", refused)
+    monkeypatch.setattr(report_module, "certify", refused)
+    monkeypatch.setattr(report_module, "certify_detectability", refused)
     report = tmp_path / "failed.json"
     assert not shown(report=report, box="-2:2,-2:2")[0]
     told = json.loads(report.read_text())
@@ -233,3 +237,28 @@ def test_a_report_of_another_kind_is_refused(shown, tmp_path):
 def test_a_model_that_raises_in_the_box_is_an_error_of_ours(shown):
     with pytest.raises(ModelError, match=r"no way.*smaller region"):
         shown("(broken=True)", box="-2:2,-2:2")
+
+
+def test_one_call_does_what_the_command_does(shown, tmp_path):
+    path = tmp_path / "command.json"
+    done, _ = shown(horizon="2", box="-2:2,-2:2", report=path, seconds=math.inf)
+    model = f"{tmp_path}/two.py:model"
+    region = qpmhe.Box([-2.0, -2.0], [2.0, 2.0])
+    report = certify_model(
+        load(find(model)), horizon=2, region=region, seconds=math.inf, name=model
+    )
+    assert done
+    assert report.failures == []
+    written = report.save(tmp_path / "call.json")
+    assert [each.name for each in written] == ["call.png", "call.svg", "call.json"]
+    assert json.loads(written[-1].read_text()) == json.loads(path.read_text())
+
+
+def test_a_report_without_a_certificate_has_nothing_to_draw(shown, tmp_path):
+    shown("(gain=-2.0)")
+    report = certify_model(load(find(f"{tmp_path}/two.py:model(gain=-2.0)")))
+    assert report.certificate is None
+    assert report.stability is None
+    assert list(report.errors) == ["the observer"]
+    with pytest.raises(InvalidInputError, match="no certificate"):
+        report.draw()

@@ -11,21 +11,24 @@ from rich.console import Console
 
 import qpmhe
 from qpmhe.certificates import deadline as deadline_module
-from qpmhe.certificates.assumptions import Finding
+from qpmhe.certificates import sdp
+from qpmhe.certificates.audit import Finding
+from qpmhe.certificates.branch_and_bound import cover, output_lipschitz
 from qpmhe.certificates.certification import certify
-from qpmhe.certificates.cover import cover
 from qpmhe.certificates.deadline import Deadline
 from qpmhe.certificates.detectability import certify_detectability
 from qpmhe.certificates.enclosures import Enclosure, SmoothModel
-from qpmhe.certificates.errors import CertificateError, NotCertifiedError, OutOfTimeError
-from qpmhe.certificates.evidence import Evidence
-from qpmhe.certificates.forms import OutputWeight
-from qpmhe.certificates.lipschitz import output_lipschitz
-from qpmhe.certificates.observer import certify_observer
-from qpmhe.certificates.programs import Program, Scales
+from qpmhe.certificates.evidence import (
+    CertificateError,
+    Evidence,
+    NotCertifiedError,
+    OutOfTimeError,
+)
+from qpmhe.certificates.inequalities import OutputWeight
+from qpmhe.certificates.observer import certify_observer, synthesise_gain
 from qpmhe.certificates.regions import bounded_region
+from qpmhe.certificates.sdp import Program, Scales
 from qpmhe.certificates.search import Search
-from qpmhe.certificates.synthesis import synthesise_gain
 from qpmhe.cli.certify import certify as certify_command
 from qpmhe.errors import OptionError
 
@@ -284,11 +287,9 @@ def test_findings_with_infinite_numbers_can_be_written():
 
 
 def test_loading_the_solvers_is_not_charged_to_the_search(monkeypatch):
-    from qpmhe.certificates import programs
-
     now, loaded = [0.0], []
     clock = SimpleNamespace(monotonic=lambda: now[0])
-    original = programs.importlib.import_module
+    original = sdp.importlib.import_module
 
     def slow(name):
         if name not in loaded:
@@ -297,7 +298,7 @@ def test_loading_the_solvers_is_not_charged_to_the_search(monkeypatch):
         return original(name)
 
     monkeypatch.setattr(deadline_module, "time", clock)
-    monkeypatch.setattr(programs, "importlib", SimpleNamespace(import_module=slow))
+    monkeypatch.setattr(sdp, "importlib", SimpleNamespace(import_module=slow))
     system, region = linear(0.5, 1.0), qpmhe.Box([-1.0], [1.0])
     observer = qpmhe.Luenberger([[0.1]])
     cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)

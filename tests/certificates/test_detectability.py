@@ -9,12 +9,11 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates import search as search_module
-from qpmhe.certificates.detectability import Detectability, certify_detectability
-from qpmhe.certificates.errors import CertificateError, NotCertifiedError
-from qpmhe.certificates.evidence import Evidence, weakest
-from qpmhe.certificates.forms import OutputWeight
-from qpmhe.certificates.programs import Answer, Program
-from qpmhe.certificates.verification import Matrices, definite
+from qpmhe.certificates.detectability import certify_detectability
+from qpmhe.certificates.evidence import CertificateError, Evidence, NotCertifiedError, weakest
+from qpmhe.certificates.inequalities import Matrices, OutputWeight, definite
+from qpmhe.certificates.properties import Detectability
+from qpmhe.certificates.sdp import Answer, Program
 from qpmhe.errors import OptionError
 
 REACTOR = qpmhe.Box([0.1, 0.0], [9.0, 9.0])

@@ -8,14 +8,18 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates.certification import certify
-from qpmhe.certificates.closed_runs import NOISES, attack_estimator
 from qpmhe.certificates.decay import DecayingSums
 from qpmhe.certificates.detectability import certify_detectability
 from qpmhe.certificates.evidence import Evidence
-from qpmhe.certificates.falsification import attack_detectability, attack_observer, inside
-from qpmhe.certificates.observer import certify_observer
+from qpmhe.certificates.falsification import (
+    NOISES,
+    attack_detectability,
+    attack_estimator,
+    attack_observer,
+    inside,
+)
+from qpmhe.certificates.observer import certify_observer, synthesise_gain
 from qpmhe.certificates.regions import bounded_region
-from qpmhe.certificates.synthesis import synthesise_gain
 from qpmhe.errors import InvalidInputError, OptionError, SetError, ShapeError
 
 # The numbers of the full campaign, by the environment; small ones otherwise.

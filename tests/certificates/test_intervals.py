@@ -10,7 +10,7 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates.enclosures import SmoothModel
-from qpmhe.certificates.errors import CertificateError
+from qpmhe.certificates.evidence import CertificateError
 from qpmhe.certificates.intervals import Interval, OutsideDomainError
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.errors import SetError

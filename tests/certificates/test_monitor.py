@@ -5,9 +5,8 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates.certification import certify
-from qpmhe.certificates.hypotheses import Hypotheses
-from qpmhe.certificates.monitor import Monitor, monitor, monitored_run
-from qpmhe.certificates.results import Detectability, ObserverStability
+from qpmhe.certificates.monitor import Hypotheses, Monitor, monitor, monitored_run
+from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError
 
 ALL = tuple(Hypotheses.__dataclass_fields__)

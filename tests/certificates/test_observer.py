@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates.errors import CertificateError, NotCertifiedError
-from qpmhe.certificates.evidence import Evidence
-from qpmhe.certificates.observer import ObserverStability, certify_observer
-from qpmhe.certificates.synthesis import synthesise_gain
+from qpmhe.certificates.evidence import CertificateError, Evidence, NotCertifiedError
+from qpmhe.certificates.observer import certify_observer, synthesise_gain
+from qpmhe.certificates.properties import ObserverStability
 from qpmhe.errors import OptionError
 
 from .test_detectability import REACTOR, linear, unit_box

@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from qpmhe.certificates.choices import Sizes, level, tighten
 from qpmhe.certificates.decay import DecayingSums
-from qpmhe.certificates.theorem import TERMS, theorem
+from qpmhe.certificates.theorem import TERMS, Sizes, level, theorem, tighten
 from qpmhe.costs import CostConstants
 from qpmhe.errors import OptionError, ShapeError
 

@@ -7,9 +7,8 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates.decay import DecayingSums
-from qpmhe.certificates.summed import SummedBound
 from qpmhe.certificates.theorem import theorem
-from qpmhe.certificates.weighted import WeightedBound, largest
+from qpmhe.certificates.window_bounds import SummedBound, WeightedBound, largest
 from qpmhe.costs import CostConstants
 from qpmhe.errors import OptionError, ShapeError, WeightError
 

@@ -7,10 +7,17 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from qpmhe.certificates.constants import euclidean_constants
-from qpmhe.certificates.errors import CertificateError
-from qpmhe.certificates.forms import ErrorContraction, OutputInjection, OutputWeight
-from qpmhe.certificates.verification import Matrices, definite, eigenvalue_bounds, norm_bound
+from qpmhe.certificates.evidence import CertificateError
+from qpmhe.certificates.inequalities import (
+    ErrorContraction,
+    Matrices,
+    OutputInjection,
+    OutputWeight,
+    definite,
+    eigenvalue_bounds,
+    euclidean_constants,
+    norm_bound,
+)
 
 
 def exactly_definite(matrix, shift=0.0):

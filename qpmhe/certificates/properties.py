@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,47 +14,30 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import numbers, positive
 from ..errors import OptionError
 from ..sets import ConvexSet
-from .errors import CertificateError
-from .evidence import Evidence
-from .provenance import Subject, founded
-from .regions import Region, stated_region
+from ..system import System
+from .decay import checked_rate
+from .evaluation import evaluated
+from .evidence import CertificateError, Evidence, MismatchError, weakest
+from .regions import Region, beyond, stated_region
 
-__all__ = ["Detectability", "ObserverStability"]
+__all__ = ["Detectability", "ObserverStability", "Subject", "fitting", "json_ready", "sealed"]
 
 Array = NDArray[np.float64]
+_POINTS, _SEED = 24, 20210829
+_MOST_CORNERS = 8
+# Another compiler or library may round otherwise; derivatives by differences are worse.
+_VALUES, _SLOPES = 1e-9, 1e-5
 
 
-def discounted(
+def _discounted(
     initial: ArrayLike, first: Array, second: Array, rate: float
 ) -> Array:
-    r"""The bound :math:`a \rho^t + \sum_{\tau=1}^t \rho^\tau (b(t-\tau) + c(t-\tau))`.
-
-    Parameters
-    ----------
-    initial : float or (...) array
-        a.
-    first, second : (T, ...) array
-        b and c.
-    rate : float
-        rho.
-
-    Returns
-    -------
-    (T + 1, ...) array
-        The bound at t = 0, ..., T.
-    """
+    r"""The bound :math:`a \rho^t + \sum_{\tau=1}^t \rho^\tau (b(t-\tau) + c(t-\tau))`."""
     bound = np.empty((first.shape[0] + 1, *first.shape[1:]))
     bound[0] = initial
     for t in range(first.shape[0]):
         bound[t + 1] = rate * (bound[t] + first[t] + second[t])
     return bound
-
-
-def _rate(name: str, value: float) -> float:
-    number = positive(name, value)
-    if number >= 1.0:
-        raise OptionError(f"{name} is {value!r}; expected a number in (0, 1).")
-    return number
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,14 +101,14 @@ class Detectability:
     subject: Subject | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "evidence", founded(self))
+        object.__setattr__(self, "evidence", _founded(self))
 
     @classmethod
     def assumed(
         cls, *, eta: float, c_p: float, c_w: float, c_v: float,
         region: ConvexSet | Region | None = None,
     ) -> Detectability:
-        """Constants that the user answers for.
+        """Constants that the user states without proof.
 
         Parameters
         ----------
@@ -137,9 +123,13 @@ class Detectability:
             If the region is no set.
         """
         return cls(
-            _rate("eta", eta), positive("c_p", c_p), positive("c_w", c_w), positive("c_v", c_v),
-            Evidence.ASSUMED, stated_region(region),
+            checked_rate("eta", eta), positive("c_p", c_p), positive("c_w", c_w),
+            positive("c_v", c_v), Evidence.ASSUMED, stated_region(region),
         )
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but the region, in types that JSON knows; infinite numbers become None."""
+        return _to_dict(self)
 
     def bound(
         self, initial: ArrayLike, disturbances: ArrayLike, outputs: ArrayLike
@@ -166,7 +156,7 @@ class Detectability:
                 ("initial", initial), ("disturbances", disturbances), ("outputs", outputs)
             )
         )
-        return discounted(self.c_p * x, self.c_w * w, self.c_v * h, self.eta)
+        return _discounted(self.c_p * x, self.c_w * w, self.c_v * h, self.eta)
 
     def squared(self, rate: float) -> tuple[float, Array, Array]:
         r"""The dissipation inequality in squares, for a rate above eta.
@@ -260,7 +250,7 @@ class ObserverStability:
     subject: Subject | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "evidence", founded(self))
+        object.__setattr__(self, "evidence", _founded(self))
 
     @classmethod
     def assumed(
@@ -273,7 +263,7 @@ class ObserverStability:
         kappa: float,
         region: ConvexSet | Region | None = None,
     ) -> ObserverStability:
-        """Constants that the user answers for.
+        """Constants that the user states without proof.
 
         Parameters
         ----------
@@ -288,9 +278,13 @@ class ObserverStability:
             If the region is no set.
         """
         return cls(
-            _rate("rho", rho), positive("C_p", C_p), positive("C_w", C_w), positive("C_v", C_v),
-            positive("kappa", kappa), Evidence.ASSUMED, stated_region(region),
+            checked_rate("rho", rho), positive("C_p", C_p), positive("C_w", C_w),
+            positive("C_v", C_v), positive("kappa", kappa), Evidence.ASSUMED, stated_region(region),
         )
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but the region, in types that JSON knows; infinite numbers become None."""
+        return _to_dict(self)
 
     def bound(self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike) -> Array:
         """The right-hand side of (eq:RGES) along a run.
@@ -313,4 +307,165 @@ class ObserverStability:
                 ("initial", initial), ("disturbances", disturbances), ("noises", noises)
             )
         )
-        return discounted(self.C_p * x, self.C_w * w, self.C_v * v, self.rho)
+        return _discounted(self.C_p * x, self.C_w * w, self.C_v * v, self.rho)
+
+
+Result = TypeVar("Result", "Detectability", "ObserverStability")
+
+
+@dataclass(frozen=True, eq=False)
+class Fingerprint:
+    """What a system does at some points of a region."""
+
+    sizes: tuple[int, int, int]  # n, p and m
+    points: Array  # (K, n + m): states and inputs
+    values: Array  # (K, n + p): f and h there
+    jacobians: Array  # (K, n + p, n)
+
+    @classmethod
+    def of(cls, system: System, region: Region) -> Fingerprint:
+        """The fingerprint of a system on a region."""
+        drawn = region.sample(_POINTS, np.random.default_rng(_SEED))
+        points = np.vstack((drawn[: 1 + _MOST_CORNERS], drawn[1 + _MOST_CORNERS :][-_POINTS:]))
+        return cls((system.n, system.p, system.m), points, *_behaviour(system, points))
+
+    def difference(self, system: System) -> str:
+        """What a system does otherwise, in words; empty if nothing."""
+        sizes = system.n, system.p, system.m
+        if sizes != self.sizes:
+            return f"(n, p, m) is {sizes} instead of {self.sizes}"
+        try:
+            values, jacobians = _behaviour(system, self.points)
+        except Exception as error:  # a user's function may raise anything
+            return f"it fails where the other one does not ({type(error).__name__}: {error})"
+        for name, mine, theirs, share in (
+            ("f, h", self.values, values, _VALUES),
+            ("the Jacobian of f, h", self.jacobians, jacobians, _SLOPES),
+        ):
+            rows = mine.reshape(len(mine), -1), theirs.reshape(len(theirs), -1)
+            room = share * (1.0 + np.maximum(np.abs(rows[0]), np.abs(rows[1])))
+            same = (np.abs(rows[0] - rows[1]) <= room) | (np.isnan(rows[0]) & np.isnan(rows[1]))
+            if not same.all():
+                k = int(np.argmin(same.all(axis=1)))
+                return (
+                    f"{name} at {np.round(self.points[k], 6).tolist()} is {theirs[k].tolist()} "
+                    f"instead of {mine[k].tolist()}"
+                )
+        return ""
+
+
+def _behaviour(system: System, points: Array) -> tuple[Array, Array]:
+    x, u = points[:, : system.n], points[:, system.n :]
+    values = [evaluated(name, one, x, u) for name, one in (("f", system.f), ("h", system.h))]
+    slopes = [
+        evaluated(f"the Jacobian of {name}", one, x, u)
+        for name, one in (("f", system.f_jacobian), ("h", system.h_jacobian))
+    ]
+    return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What a result is about."""
+
+    fingerprint: Fingerprint
+    digest: str  # of the numbers that were certified
+    evidence: Evidence  # what they rested on
+    system: System | None  # None once it was copied or pickled
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the system, whose functions often cannot be pickled."""
+        return vars(self) | {"system": None}
+
+
+def sealed(result: Result, system: System, evidence: Evidence) -> Result:
+    """A result with what it is about, and with its evidence."""
+    assert result.region is not None
+    fingerprint = Fingerprint.of(system, result.region)
+    subject = Subject(fingerprint, _digest(result), evidence, system)
+    return replace(result, subject=subject, evidence=evidence)
+
+
+def _founded(result: Detectability | ObserverStability) -> Evidence:
+    """The evidence that a result may claim: numbers stated by hand are assumed."""
+    subject = result.subject
+    if subject is None or subject.digest != _digest(result):
+        return Evidence.ASSUMED
+    return weakest((result.evidence, subject.evidence))
+
+
+def _digest(result: Detectability | ObserverStability) -> str:
+    found = hashlib.sha256()
+    for each in fields(result):
+        if each.name in ("subject", "evidence", "notes"):
+            continue
+        value = getattr(result, each.name)
+        if isinstance(value, Region):
+            states = value.states
+            parts: tuple[Any, ...] = (
+                value.lower, value.upper, states.matrix, states.row_lower, states.row_upper
+            )
+        else:
+            parts = (value,)
+        for part in parts:
+            text = repr(part.tolist()) if isinstance(part, np.ndarray) else repr(part)
+            found.update(f"{each.name}={text};".encode())
+    return found.hexdigest()
+
+
+def fitting(
+    part: Result, system: System, region: Region, gain: Array | None, *, thorough: bool = True
+) -> Result:
+    """A part of a certificate, if it is about this system, region and gain."""
+    what = "detectability" if hasattr(part, "eta") else "stability"
+    if part.region is not None:
+        difference = beyond(region, part.region)
+        if difference:
+            raise MismatchError(
+                f"the {what} that was passed does not hold on the whole region: {difference}. "
+                "Certify it on this region, with these inputs, or pass a region within its own."
+            )
+    own = getattr(part, "gain", None)
+    if own is not None and (gain is None or not np.array_equal(own, gain)):
+        theirs = "not constant" if gain is None else str(gain.tolist())
+        raise MismatchError(
+            f"the {what} that was passed is of the gain {own.tolist()}; the observer's is "
+            f"{theirs}. Certify this observer."
+        )
+    if part.subject is None or (part.subject.system is system and not thorough):
+        return part
+    difference = part.subject.fingerprint.difference(system)
+    if difference:
+        raise MismatchError(
+            f"the {what} that was passed is of another system: {difference}. Certify this system."
+        )
+    if part.subject.system is system:
+        return part
+    note = (
+        "certified of another System object; this one does the same at "
+        f"{len(part.subject.fingerprint.points)} states"
+    )
+    return replace(
+        part, evidence=weakest((part.evidence, Evidence.SAMPLED)), notes=(*part.notes, note)
+    )
+
+
+def _to_dict(result: Detectability | ObserverStability) -> dict[str, Any]:
+    values = vars(result) | {"evidence": result.evidence.value}
+    content: dict[str, Any] = json_ready({
+        name: value for name, value in values.items() if name not in ("region", "subject")
+    })
+    return content
+
+
+def json_ready(value: Any) -> Any:
+    """Lists for arrays and tuples, and None for numbers that are not finite."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): json_ready(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(each) for each in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value

@@ -17,6 +17,7 @@ from .deadline import Deadline
 __all__ = ["Answer", "Kind", "Program", "Scales", "expected_seconds", "started"]
 
 Array = NDArray[np.float64]
+
 Kind = Literal["output weight", "output injection", "observer", "synthesis"]
 
 _SOLVERS = ("CLARABEL", "SCS")
@@ -29,33 +30,17 @@ _LEAST = 1e-3  # seconds for a solver, for which zero may mean no limit
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """Typical sizes of states and outputs, in which the programs are posed.
+    """Typical sizes of states and outputs, in which the programs are posed."""
 
-    Parameters
-    ----------
-    states, outputs : (n,) and (p,) array
-        The sizes; the largest of the states' is 1.
-    """
-
-    states: Array
-    outputs: Array
+    states: Array  # (n,); the largest is 1
+    outputs: Array  # (p,)
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a program returned.
+    """What a program returned, in the units of the system; Y is P K or P L."""
 
-    Parameters
-    ----------
-    status : str
-        ``solved``, ``infeasible``, or what stopped the solver.
-    objective : float
-        The optimal value.
-    P, Y, R, M, N : array or None
-        The unknowns, in the units of the system; Y is P K or P L.
-    """
-
-    status: str
+    status: str  # ``solved``, ``infeasible``, or what stopped the solver
     objective: float = np.inf
     P: Array | None = None
     Y: Array | None = None
@@ -68,29 +53,16 @@ def started(seconds: float | Deadline) -> Deadline:
     """The deadline itself, or one after so many seconds from when the solvers are loaded.
 
     To import them for the first time takes seconds, which are not the search's.
-
-    Parameters
-    ----------
-    seconds : float or Deadline
-        What to make one of.
     """
     Deadline.of(seconds)  # refused before anything is loaded
     for module in ("cvxpy", "scipy.optimize", *(name.lower() for name in _SOLVERS)):
-        with contextlib.suppress(ImportError):  # told where it is needed
+        with contextlib.suppress(ImportError):  # raised where it is needed
             importlib.import_module(module)
     return Deadline.of(seconds)
 
 
 def expected_seconds(n: int, p: int, kind: Kind) -> float:
-    """About how long a program takes for each Jacobian, apart from what all of them take.
-
-    Parameters
-    ----------
-    n, p : int
-        Numbers of states and outputs.
-    kind : str
-        Which form.
-    """
+    """About how long a program takes for each Jacobian, apart from what all of them take."""
     size = 2 * n + (p if kind == "output injection" else 0)
     return _SECONDS * (size * (size + 1) / 2) ** 3
 
@@ -107,24 +79,6 @@ class Program:
     r bounds the weight of the output: :math:`R \preceq r I`, or :math:`L^\top P L \preceq r I`.
     Then :math:`\sqrt\kappa / \eta` and :math:`\sqrt r / \eta` are the constants of disturbance
     and noise; d and v say how much each matters.
-
-    Parameters
-    ----------
-    kind : str
-        Which form.
-    jacobians : (K, n + p, n) array
-        Where it must hold.
-    scales : Scales
-        Sizes.
-    weights : (float, float)
-        d and v.
-    gain : (n, p) array, optional
-        L, of a given observer.
-
-    Attributes
-    ----------
-    expected_seconds : float
-        About how long it takes to solve.
     """
 
     def __init__(
@@ -187,19 +141,7 @@ class Program:
     def solve(
         self, rate: float, margin: float, *, thorough: bool = True, seconds: float = math.inf
     ) -> Answer:
-        """Solve for a rate.
-
-        Parameters
-        ----------
-        rate : float
-            eta or rho.
-        margin : float
-            How much room to leave in the inequality, relative to P.
-        thorough : bool
-            Whether to ask a second solver where the first one stops early.
-        seconds : float
-            How long the solvers may take; they look at the clock between two iterations.
-        """
+        """Solve for a rate."""
         self._rate2.value, self._margin.value = rate * rate, margin
         self._rest.value = max(rate * rate - margin, 0.0)
         status, deadline = "no solver", Deadline(max(seconds, _LEAST))

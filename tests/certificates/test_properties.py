@@ -8,14 +8,12 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates.certification import certify
-from qpmhe.certificates.containment import beyond
 from qpmhe.certificates.detectability import certify_detectability
-from qpmhe.certificates.errors import MismatchError
-from qpmhe.certificates.evidence import Evidence
+from qpmhe.certificates.evidence import Evidence, MismatchError
 from qpmhe.certificates.monitor import monitored_run
 from qpmhe.certificates.observer import certify_observer
-from qpmhe.certificates.regions import bounded_region
-from qpmhe.certificates.results import Detectability, ObserverStability
+from qpmhe.certificates.properties import Detectability, ObserverStability
+from qpmhe.certificates.regions import beyond, bounded_region
 from qpmhe.errors import SetError
 
 COST = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)

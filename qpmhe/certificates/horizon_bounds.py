@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, Literal, get_args
 
@@ -13,25 +13,27 @@ from numpy.typing import NDArray
 
 from ..costs import Cost, CostConstants, QuadraticCost
 from ..errors import OptionError
-from .choices import Sizes, level, tighten
 from .decay import DecayingSums
-from .pairs import Pairs
-from .results import Detectability, ObserverStability
-from .sharper import WindowBound
-from .summed import SummedBound
-from .theorem import TERMS, TheoremConstants, theorem
-from .verification import Matrices
-from .weighted import WeightedBound, fit_weight, largest
+from .inequalities import Matrices
+from .properties import Detectability, ObserverStability
+from .theorem import TERMS, Sizes, TheoremConstants, level, theorem, tighten
+from .window_bounds import SummedBound, WeightedBound, WindowBound, fit_weight, largest
 
-__all__ = ["HorizonBounds", "Kind", "bounds_for", "window_bound", "window_level"]
+__all__ = ["HorizonBounds", "Kind", "Pairs", "bounds_for", "window_bound", "window_level"]
 
 Array = NDArray[np.float64]
+Pair = tuple[int, int]
+
 Kind = Literal["paper", "summed", "weighted", "measured"]
 
 # Steps after which what is left of the initial error no longer matters for a comparison.
 _MOST_STEPS = 400
 # Covers the rounding of a few products and roots.
 _OUTWARD = 1.0 + 1e-9
+# Pairs kept of each kind, from each horizon at which all of them were tried.
+_KEPT = 3
+# Pairs in whose rates and constants `tighten` searches, with and without a choice before.
+_SEARCHED, _SEARCHED_AGAIN = 4, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +65,10 @@ class HorizonBounds:
         Parameters
         ----------
         sizes : Sizes
-            For which the bounds' values are told.
+            Errors and noises for which the bounds are evaluated.
         """
         c = self.paper
-        told: dict[str, Any] = {
+        content: dict[str, Any] = {
             "horizon": c.horizon,
             "paper": {
                 "choices": {
@@ -89,13 +91,13 @@ class HorizonBounds:
         for name, bound in (("summed", self.summed), ("weighted", self.weighted)):
             if bound is not None:
                 result = bound.result()
-                told[name] = {
+                content[name] = {
                     "beyond_the_paper": True, "eta": bound.eta, "rho": bound.rho,
                     "alpha": bound.alphas.tolist(), "C": list(result.constants),
                     "lambda": result.rate, "level": window_level(bound, sizes),
                     "limit": bound.limit(sizes.disturbance, sizes.noise),
                 }
-        return told
+        return content
 
 
 def bounds_for(
@@ -110,28 +112,7 @@ def bounds_for(
     output: Matrices | None = None,
     pairs: Pairs | None = None,
 ) -> HorizonBounds:
-    """The best bounds of each kind that follow from what was certified.
-
-    Parameters
-    ----------
-    horizon : int
-        N.
-    detectabilities, observers : sequence
-        What was certified, such as one result for each of several rates.
-    cost : Cost
-        The estimator's cost.
-    constants : CostConstants
-        Its constants.
-    lipschitz : float
-        L_h.
-    sizes : Sizes
-        For which errors the bounds are to be tight.
-    output : Matrices, optional
-        An enclosure of the Jacobian of h, (1, p, n), if it is constant.
-    pairs : Pairs, optional
-        To which pairs of detectability and observer the choice is confined; all, if left
-        out. What is found is noted in it.
-    """
+    """The best bounds of each kind that follow from what was certified."""
     kappa = max(each.kappa for each in observers)
     plain = [DecayingSums(d.eta, d.c_p, d.c_w, d.c_v) for d in detectabilities]
     observing = [DecayingSums(o.rho, o.C_p, o.C_w, o.C_v) for o in observers]
@@ -188,15 +169,7 @@ def _weighted(
 
 
 def window_level(bound: WindowBound, sizes: Sizes) -> float:
-    """The largest value that the bound takes for errors of these sizes.
-
-    Parameters
-    ----------
-    bound : WindowBound
-        The bound.
-    sizes : Sizes
-        As for `level`.
-    """
+    """The largest value that the bound takes for errors of these sizes."""
     settled = math.ceil(math.log(1e-3) / math.log(bound.rho))
     steps = bound.horizon + min(_MOST_STEPS, settled)
     funnel = bound.funnel(sizes.initial, sizes.disturbance, sizes.noise, steps)
@@ -204,22 +177,7 @@ def window_level(bound: WindowBound, sizes: Sizes) -> float:
 
 
 def window_bound(chosen: HorizonBounds, kind: Kind, kinds: Sequence[Kind]) -> WindowBound:
-    """The bound beyond the paper that a kind asks for.
-
-    Parameters
-    ----------
-    chosen : HorizonBounds
-        Those for the horizon.
-    kind : str
-        Which.
-    kinds : sequence of str
-        Those that there are, for the error text.
-
-    Raises
-    ------
-    OptionError
-        If there is none.
-    """
+    """The bound beyond the paper that a kind asks for."""
     if kind not in get_args(Kind):
         raise OptionError(f"kind is {kind!r}; expected one of {list(get_args(Kind))}.")
     bound: WindowBound | None = chosen.sharpest() if kind == "measured" else (
@@ -232,3 +190,38 @@ def window_bound(chosen: HorizonBounds, kind: Kind, kinds: Sequence[Kind]) -> Wi
             "that were certified, not assumed."
         )
     return bound
+
+
+@dataclass
+class Pairs:
+    """What was best at other horizons.
+
+    Any pair gives a bound that holds; fewer of them make it less tight, hardly so where those
+    that were best at a smaller and at a larger horizon are among them.
+    """
+
+    allowed: dict[str, list[Pair]] = field(default_factory=dict)
+    _levels: dict[str, dict[Pair, float]] = field(default_factory=dict)
+
+    @property
+    def searched(self) -> int:
+        """In how many pairs the theorem's free choices are searched."""
+        return _SEARCHED_AGAIN if self.allowed else _SEARCHED
+
+    def of(self, kind: str, every: Sequence[Pair]) -> Sequence[Pair]:
+        """The pairs to try."""
+        return self.allowed.get(kind, every)
+
+    def note(self, kind: str, pair: Pair, level: float) -> None:
+        """Remember the value that a pair reaches."""
+        self._levels.setdefault(kind, {})[pair] = level
+
+    def best(self, *others: Pairs) -> Pairs:
+        """The best pairs of these, to be tried at other horizons."""
+        allowed: dict[str, list[Pair]] = {}
+        for each in (self, *others):
+            for kind, levels in each._levels.items():
+                for pair in sorted(levels, key=levels.__getitem__)[:_KEPT]:
+                    if pair not in allowed.setdefault(kind, []):
+                        allowed[kind].append(pair)
+        return Pairs(allowed)

@@ -5,9 +5,9 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates.certification import certify
-from qpmhe.certificates.errors import MismatchError
+from qpmhe.certificates.evidence import MismatchError
 from qpmhe.certificates.monitor import Monitor, monitor
-from qpmhe.certificates.results import Detectability, ObserverStability
+from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.errors import InvalidInputError
 from qpmhe.run import Run
 
@@ -49,7 +49,7 @@ def measured(certificate, run, **options):
 
 def test_a_run_alone_does_not_tell(certificate):
     run = estimator(1).run(record()[1])
-    with pytest.raises(InvalidInputError, match="of which horizon and cost"):
+    with pytest.raises(InvalidInputError, match="does not say its horizon and cost"):
         measured(certificate, run, horizon=5)
 
 
@@ -59,7 +59,7 @@ def test_the_sources_horizon_is_taken_and_insisted_on(certificate):
     np.testing.assert_array_equal(
         measured(certificate, run, source=mhe), measured(certificate, run, horizon=1, source=mhe)
     )
-    with pytest.raises(MismatchError, match="horizon is 5, but that of the run's estimator is 1"):
+    with pytest.raises(MismatchError, match="horizon is 5, but the run's estimator has 1"):
         measured(certificate, run, horizon=5, source=mhe)
     x, _, w, v = record()
     with pytest.raises(MismatchError, match="horizon is 5"):  # for the other kinds as well

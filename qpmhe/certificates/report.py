@@ -1,0 +1,426 @@
+"""Everything that can be certified of a model at once: as text, JSON and a figure."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InvalidInputError, QpmheError, SetError, ShapeError
+from ..estimator import MovingHorizonEstimator
+from ..models.example import Example
+from ..models.scenario import Record
+from ..plots.style import LIGHT, STYLES, panels, save
+from ..run import Run
+from ..sets import Box, ConvexSet
+from .audit import Audit, audit
+from .certificate import Certificate
+from .certification import certify
+from .deadline import DEFAULT_SECONDS, Deadline
+from .detectability import certify_detectability
+from .evidence import CertificateError, NotCertifiedError
+from .monitor import MonitorSummary, monitored_run
+from .observer import certify_observer
+from .properties import Detectability, ObserverStability
+from .regions import Region, bounded_region
+from .sdp import started
+from .theorem import Sizes
+
+__all__ = ["LABELS", "Report", "certify_model", "error_and_bounds"]
+
+Array = NDArray[np.float64]
+Result = TypeVar("Result")
+
+#: Names of the kinds of bounds in figures and tables.
+LABELS = {
+    "paper": "theorem, paper's constants",
+    "summed": "beyond: sums kept",
+    "weighted": "beyond: norms kept",
+    "measured": "beyond: measured costs",
+}
+
+# Without a region: the simulated states, with this share of their extent on each side.
+_ROOM = 0.5
+_SIGMAS = 3.0
+_QPS = 2  # a sample, in the run on the simulated record
+
+
+@dataclass(eq=False)
+class Report:
+    """What was certified of a model, what was not, and a monitored run on a simulated record.
+
+    Made by `certify_model`.
+
+    Parameters
+    ----------
+    name : str
+        Name of the model.
+    example : Example
+        The model.
+    record : Record
+        The simulated record.
+    audit : Audit
+        The assumptions, one by one, on the region.
+    certificate : Certificate or None
+        The certificate; None where the error could not be bounded.
+    detectability, stability : Detectability and ObserverStability, or None
+        Constants of the first horizon's bound, or those that could be certified alone.
+    errors : dict of str to QpmheError
+        What could not be certified, and why; empty with a certificate.
+    run, summary : Run and MonitorSummary, or None
+        The estimator on the record, with the largest horizon and two QPs a sample, and what
+        the monitor saw; None without a certificate.
+    estimator : MovingHorizonEstimator or None
+        The estimator after that run.
+    """
+
+    name: str
+    example: Example
+    record: Record
+    audit: Audit
+    certificate: Certificate | None = None
+    detectability: Detectability | None = None
+    stability: ObserverStability | None = None
+    errors: dict[str, QpmheError] = field(default_factory=dict)
+    run: Run | None = None
+    summary: MonitorSummary | None = None
+    estimator: MovingHorizonEstimator | None = None
+
+    @property
+    def region(self) -> Region:
+        """Where all of it holds."""
+        return self.audit.region
+
+    @property
+    def failures(self) -> list[str]:
+        """What could not be certified, in words."""
+        return [f"{what}: {each}" if what else str(each) for what, each in self.errors.items()]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything in types that JSON knows; rates that are not known are None."""
+        content = {
+            "model": self.name, "certified": self.certificate is not None,
+            "region": self.region.to_dict(),
+        }
+        if self.certificate is not None and self.summary is not None:
+            return content | {
+                "monitor": str(self.summary), "monitored": self.summary.to_dict(),
+            } | self.certificate.to_dict()
+        suggestions = [
+            text for each in self.errors.values() for text in getattr(each, "suggestions", ())
+        ]
+        return content | {
+            "failures": self.failures,
+            "suggestions": list(dict.fromkeys(suggestions)),
+            "smallest_rates": {
+                name: getattr(self.errors.get(what), "smallest_rate", None)
+                for name, what in (("eta", "detectability"), ("rho", "the observer"))
+            },
+            "assumptions": self.audit.to_dict(),
+            "detectability": [] if self.detectability is None else [self.detectability.to_dict()],
+            "observer": [] if self.stability is None else [self.stability.to_dict()],
+        }
+
+    def draw(self, axes: Any = None) -> Any:
+        """Draw the error of the run and its bounds; see `error_and_bounds`.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Where to draw; a new figure if left out.
+
+        Returns
+        -------
+        Axes
+
+        Raises
+        ------
+        InvalidInputError
+            If there is no certificate, hence no run.
+        """
+        certificate, run = self.certificate, self.run
+        if certificate is None or run is None:
+            raise InvalidInputError("there is no certificate, hence no bound to draw.")
+        system, scenario, record = self.example.system, self.example.scenario, self.record
+        steps = len(record.measurements)
+        u = np.zeros((steps, 0)) if record.inputs is None else record.inputs
+        w = record.states[1:] - system.f.batch(record.states[:-1], u)
+        v = record.measurements - system.h.batch(record.states[:-1], u)
+        bounds = {
+            LABELS[kind]: certificate.bound(
+                run, w, v, initial_error=record.states[0] - run.states[0], kind=kind,
+                source=self.estimator,
+            )
+            for kind in certificate.kinds
+        }
+        return error_and_bounds(
+            scenario.dt * np.arange(steps + 1.0),
+            np.linalg.norm(record.states - run.states, axis=1), bounds,
+            diameter=certificate.diameter, time_label=f"time t ({scenario.time_unit})",
+            error_label=f"error, N = {certificate.horizons[-1]}, {_QPS} QPs a sample", axes=axes,
+        )
+
+    def save(self, path: str | Path) -> list[Path]:
+        """Write everything as JSON, and beside it the figure, if there is one.
+
+        Parameters
+        ----------
+        path : path
+            The JSON file; the figure goes beside it, as ``.png`` and ``.svg``.
+
+        Returns
+        -------
+        list of Path
+            The files.
+
+        Raises
+        ------
+        InvalidInputError
+            If the file cannot be written.
+        """
+        path = Path(path)
+        written: list[Path] = []
+        if self.certificate is not None:
+            written += save(self.draw().get_figure(), path.with_suffix(""))
+        text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
+        try:
+            path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise InvalidInputError(f"cannot write {path}: {error.strerror}.") from error
+        return [*written, path]
+
+
+def certify_model(
+    example: Example,
+    *,
+    horizon: int | list[int] | None = None,
+    region: ConvexSet | Region | None = None,
+    inputs: Box | None = None,
+    seed: int = 0,
+    seconds: float | Deadline = DEFAULT_SECONDS,
+    name: str = "",
+) -> Report:
+    """Certify a model as far as possible, and monitor its estimator on a simulated record.
+
+    Where there is no certificate, the assumptions, detectability and the observer are each
+    examined alone; if both are certified then, the certificate is made from them.
+
+    Parameters
+    ----------
+    example : Example
+        System, observer, cost and scenario, as `qpmhe.models` returns them. The bounds are
+        tight for three standard deviations of the scenario's noises and its initial error.
+    horizon : int or list of int, optional
+        N, or several of them; the scenario's if left out.
+    region : Box, Polytope or Region, optional
+        A bounded set of states; if left out, the system's own if that is bounded, or one
+        around the simulated record.
+    inputs : Box, optional
+        Bounds on the inputs; those of the record if left out.
+    seed : int
+        Seed of the simulated record.
+    seconds : float or Deadline
+        How long the search may take, about; then the report has what was found so far.
+    name : str
+        Name of the model in the report; the scenario's title if left out.
+
+    Returns
+    -------
+    Report
+
+    Raises
+    ------
+    SetError, ModelError
+        If an argument does not fit, or the model raises in the region.
+    """
+    deadline = started(seconds)
+    system, observer, cost, scenario = example
+    record = scenario.simulate(seed)
+    place = _region(example, record, region, inputs)
+    name = name or scenario.title
+
+    def attempt(share: float, **parts: Any) -> Certificate:
+        return certify(
+            system, observer, cost, horizon=[scenario.horizon] if horizon is None else horizon,
+            region=place, sizes=_sizes(example), run=record,
+            initial_state=scenario.initial_estimate, seconds=deadline.part(share), **parts,
+        )
+
+    try:
+        certificate = attempt(0.5)
+    except (NotCertifiedError, CertificateError) as error:
+        report = _parts(name, example, record, place, error, deadline)
+        if report.detectability is None or report.stability is None:
+            return report
+        try:
+            certificate = attempt(
+                1.0, detectability=report.detectability, stability=report.stability
+            )
+        except (NotCertifiedError, CertificateError):
+            return report
+    estimator = MovingHorizonEstimator(
+        system, observer, cost, horizon=certificate.horizons[-1],
+        initial_state=scenario.initial_estimate, max_qps=_QPS,
+    )
+    run, summary = monitored_run(certificate, estimator, record.measurements, record.inputs)
+    return Report(
+        name, example, record, certificate.audit, certificate, *_used(certificate), {}, run,
+        summary, estimator,
+    )
+
+
+def _parts(
+    name: str, example: Example, record: Record, region: Region, reason: QpmheError,
+    deadline: Deadline,
+) -> Report:
+    """The assumptions, detectability and the observer, each examined alone."""
+    system, observer, cost, scenario = example
+    findings = audit(
+        system, observer, cost, region, record, initial_state=scenario.initial_estimate,
+        seconds=deadline.part(0.2),
+    )
+    errors: dict[str, QpmheError] = {}
+
+    def attempt(what: str, question: Callable[[], Result]) -> Result | None:
+        try:
+            return question()
+        except (NotCertifiedError, CertificateError) as error:
+            errors[what] = error
+            return None
+
+    detected = attempt("detectability", lambda: certify_detectability(
+        system, region, seconds=deadline.part(0.5)))
+    observed = attempt("the observer", lambda: certify_observer(
+        system, observer, region, seconds=deadline.part(0.9)))
+    return Report(
+        name, example, record, findings, None, detected, observed, errors or {"": reason}
+    )
+
+
+def _used(certificate: Certificate) -> tuple[Detectability, ObserverStability]:
+    """The parts that the theorem's constants for the first horizon are made of."""
+    paper = certificate.of(certificate.horizons[0]).paper
+    return (
+        min(certificate.detectabilities, key=lambda one: abs(one.eta - paper.detectability.rate)),
+        # Its constants may be those of a slower rate than the proved one.
+        min(
+            certificate.stabilities,
+            key=lambda one: (one.C_p != paper.observer.initial, one.rho > paper.observer.rate),
+        ),
+    )
+
+
+def _region(
+    example: Example, record: Record, region: ConvexSet | Region | None, inputs: Box | None
+) -> Region:
+    system = example.system
+    if inputs is None and record.inputs is not None and not isinstance(region, Region):
+        inputs = Box(record.inputs.min(axis=0), record.inputs.max(axis=0))
+    if region is not None:
+        return bounded_region(system, region, inputs)
+    if system.states is not None:
+        try:
+            return bounded_region(system, None, inputs)
+        except SetError:
+            pass  # not bounded: a box around the record bounds it
+    low, high = record.states.min(axis=0), record.states.max(axis=0)
+    start = example.scenario.initial_estimate
+    low, high = np.minimum(low, start), np.maximum(high, start)
+    room = _ROOM * np.maximum(high - low, 1e-6)
+    around = Box(low - room, high + room)
+    return bounded_region(
+        system, around if system.states is None else system.states & around, inputs
+    )
+
+
+def _sizes(example: Example) -> Sizes:
+    """Three standard deviations of the scenario's noises, and its initial error."""
+    scenario = example.scenario
+    w, v = (
+        _SIGMAS * float(np.sqrt(np.linalg.eigvalsh(matrix)[-1]))
+        for matrix in (scenario.disturbance_covariance, scenario.noise_covariance)
+    )
+    return Sizes(
+        float(np.linalg.norm(scenario.initial_state - scenario.initial_estimate)), w, v
+    )
+
+
+def error_and_bounds(
+    times: Array,
+    error: Array | None,
+    bounds: Mapping[str, Array],
+    *,
+    diameter: float | None = None,
+    time_label: str = "time t",
+    error_label: str = "error",
+    axes: Any = None,
+) -> Any:
+    """The error's length and its bounds over time, on a logarithmic axis.
+
+    Parameters
+    ----------
+    times : (T + 1,) array
+        Times of the states.
+    error : (T + 1,) array or None
+        Length of the error; None for bounds alone.
+    bounds : mapping of label to (T + 1,) array
+        At most six.
+    diameter : float, optional
+        Diameter of the certified set, above which a bound says nothing.
+    time_label, error_label : str
+        Labels of the time axis, with its unit, and of the error.
+    axes : matplotlib Axes, optional
+        Where to draw; a new figure if left out.
+
+    Returns
+    -------
+    Axes
+        Its figure is not shown yet; see `qpmhe.plots.save`.
+
+    Raises
+    ------
+    ShapeError
+        If lengths differ.
+    """
+    from matplotlib import rc_context
+
+    curves = dict(bounds) if error is None else {error_label: error, **bounds}
+    for label, values in curves.items():
+        if np.shape(values) != np.shape(times):
+            raise ShapeError(
+                f"{label!r} has shape {np.shape(values)}; expected {np.shape(times)}, a value for "
+                "each time."
+            )
+    shown = {label: _shown(values) for label, values in curves.items()}
+    ends = [value for each in shown.values() for value in each[np.isfinite(each)]]
+    with rc_context(LIGHT):
+        (drawn,) = panels(1, axes, 3.4)
+        drawn.set_yscale("log")
+        if diameter is not None:
+            drawn.axhline(diameter, color="0.75", linewidth=0.8)
+            drawn.annotate(
+                "diameter of the certified set: above, a bound says nothing",
+                (times[-1], diameter), xytext=(-3, -3), textcoords="offset points", color="0.45",
+                fontsize=8, ha="right", va="top",
+            )
+        if error is not None:
+            drawn.plot(times, shown[error_label], color="0.35", linewidth=1.1, label=error_label)
+        for style, label in zip(STYLES, bounds, strict=False):
+            drawn.plot(times, shown[label], linewidth=1.4, label=label, **style)
+        if ends:
+            drawn.set_ylim(0.5 * min(ends), 3.0 * max(*ends, diameter or 0.0))
+        drawn.margins(x=0.01)
+        drawn.set_xlabel(time_label)
+        drawn.set_ylabel("length of the error, |x - x̂|")
+        drawn.figure.legend(loc="outside upper center", ncols=2)
+    return drawn
+
+
+def _shown(values: Array) -> Array:
+    """What a logarithmic axis can show."""
+    return np.where(np.isfinite(values) & (values > 0.0), values, np.nan)
