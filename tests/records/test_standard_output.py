@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+import qpmhe
 from qpmhe.records import estimate_record
 
 from . import process
@@ -107,6 +108,7 @@ def test_standard_output_is_given_back(loud):
 
 def test_where_it_is_no_descriptor_it_is_replaced_all_the_same(loud, capsys):
     estimate_record("loud.py:discrete", "record.csv", "-", step_time=False)
+    qpmhe.solvers.unregister("loud")
     assert capsys.readouterr().out == loud
     print("after")
     assert capsys.readouterr().out == "after\n"
