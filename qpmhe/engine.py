@@ -59,7 +59,9 @@ class PythonEngine:
             absolute_tolerance=float(settings.solver_tolerance),
             time_limit=None if settings.time_budget is None else float(settings.time_budget),
         )
-        self._solver = solver = ContainedSolver(create(settings.backend, options))
+        self._solver = solver = ContainedSolver(
+            create(settings.backend, options, isolated=settings.isolated)
+        )
         if settings.qp_limit:
             solver.prepare((settings.horizon + 1) * system.n)
         if system.joint is not None:

@@ -58,7 +58,8 @@ class MovingHorizonEstimator:
     max_solver_iterations : int or None
         Cap on the solver's own iterations in each QP; None leaves the solver's default.
     solver_tolerance : float
-        Absolute tolerance on the QP's residuals.
+        Tolerance on the QP's residuals in scaled numbers, which have no unit; see
+        `qpmhe.solvers.SolverOptions`.
     tolerance : float
         The sequence of QPs has converged when a QP that was solved lowers J by less than
         this share of it.
@@ -89,6 +90,10 @@ class MovingHorizonEstimator:
     delay : int
         ``estimate.delayed`` is the estimate of the state this many steps before
         ``estimate.state``; at most N.
+    isolated : bool
+        Whether the backend solves in a process of its own, so that a crash of compiled code is
+        a failed QP and nothing more, and the time budget stops any backend. It adds some tenths
+        of a millisecond to each QP. Not for ``engine="compiled"``, which needs no backend.
 
     Raises
     ------
@@ -127,10 +132,11 @@ class MovingHorizonEstimator:
         subproblem: str = "qp",
         time_budget: float | None = None,
         delay: int = 0,
+        isolated: bool = False,
     ) -> None:
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
-            engine, outside, start, candidate, subproblem, time_budget, delay,
+            engine, outside, start, candidate, subproblem, time_budget, delay, isolated,
         )
         self.system, self.observer, self.cost = system, observer, cost
         _is(system, System, "system", "qpmhe.System")

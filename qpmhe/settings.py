@@ -27,7 +27,7 @@ class Settings:
     Parameters
     ----------
     horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance, engine,
-    outside, start, candidate, subproblem, time_budget, delay
+    outside, start, candidate, subproblem, time_budget, delay, isolated
         As there.
 
     Raises
@@ -49,6 +49,7 @@ class Settings:
     subproblem: str = "qp"
     time_budget: float | None = None
     delay: int = 0
+    isolated: bool = False
 
     def __post_init__(self) -> None:
         # NumPy's numbers are numbers, and some that are handed on do not take them.
@@ -81,6 +82,14 @@ class Settings:
             if value not in choices:
                 known = ", ".join(repr(choice) for choice in choices)
                 raise OptionError(f"{name} is {value!r}; expected one of {known}.")
+
+        if not isinstance(self.isolated, bool):
+            raise OptionError(f"isolated is {self.isolated!r}; expected True or False.")
+        if self.isolated and self.engine == "compiled":
+            raise OptionError(
+                "isolated is True, but engine='compiled' solves its QPs itself, without a "
+                "backend; take engine='python', or leave isolated out."
+            )
 
     @property
     def qp_limit(self) -> int:

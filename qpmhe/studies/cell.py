@@ -89,6 +89,8 @@ class Task:
         Folder in which the worker notes what it is at.
     parent : int, optional
         Process with which the worker ends.
+    isolated : str
+        Why its backend runs in a process of its own; empty where it does not.
     """
 
     cell: Cell
@@ -100,6 +102,7 @@ class Task:
     entry: Backend | None = None
     notes: str | None = None
     parent: int | None = None
+    isolated: str = ""
 
     @property
     def hard_limit(self) -> float:

@@ -19,7 +19,7 @@ from . import metrics
 from .cell import OBSERVER, Cell, Task
 from .environment import environment
 from .sources import Source, load
-from .watch import deaths, died, watched
+from .watch import deaths, died, second_attempt, watched
 
 __all__ = ["Result", "compute", "compute_once", "failure"]
 
@@ -65,8 +65,9 @@ def compute_once(task: Task) -> Result:
     task : Task
         What to run.
     """
-    reason = died(deaths(task))
-    return compute(task) if reason is None else failure(task, reason)
+    words = deaths(task)
+    reason = died(words)
+    return compute(second_attempt(task, words)) if reason is None else failure(task, reason)
 
 
 def failure(task: Task, reason: str) -> Result:
@@ -94,12 +95,13 @@ def _measured(task: Task, limit: float) -> Result:
     _bring(task)
     record = _record(task.source, cell.seed, cell.steps)
     if "time" in task.parts:
-        _warm(task.source, cell, limit)
-    run = _run(_estimator(example, cell), record, limit, "covariance" in task.parts)
+        _warm(task, limit)
+    run = _run(_estimator(example, task), record, limit, "covariance" in task.parts)
     scenario = example.scenario
     settled = int(np.ceil(scenario.settling_time / scenario.dt - 1e-9))
     row: Result = {
-        **_fields(task), "outcome": "done", "reason": "", "environment": environment(),
+        **_fields(task), "outcome": "done", "environment": environment(),
+        "reason": f"the backend ran in {task.isolated}" if task.isolated else "",
         **metrics.accuracy(run.states, record.states, settled), **metrics.outcomes(run),
     }
     if "time" in task.parts:
@@ -110,7 +112,8 @@ def _measured(task: Task, limit: float) -> Result:
         try:
             reference = _reference(task.source, cell, record, limit)
         except OutOfTimeError as error:
-            row["reason"] = f"no cost ratio: the converged reference ran out of time, {error}"
+            late = f"no cost ratio: the converged reference ran out of time, {error}"
+            row["reason"] = "; ".join(filter(None, (row["reason"], late)))
             reference = None
         row["cost_ratio"] = metrics.cost_ratio(run.costs, reference)
     if task.keep:
@@ -133,13 +136,14 @@ def _bring(task: Task) -> None:
         register(task.entry)
 
 
-def _estimator(example: Example, cell: Cell) -> MovingHorizonEstimator:
-    system, observer, cost, scenario = example
+def _estimator(example: Example, task: Task) -> MovingHorizonEstimator:
+    (system, observer, cost, scenario), cell = example, task.cell
     return MovingHorizonEstimator(
         system, observer, cost,
         horizon=cell.horizon, initial_state=scenario.initial_estimate,
         backend="banded" if cell.backend == OBSERVER else cell.backend,
         max_qps=cell.qps, max_solver_iterations=cell.solver_iterations, start=cell.start,
+        isolated=bool(task.isolated),
     )
 
 
@@ -174,12 +178,13 @@ def _record(source: Source, seed: int, steps: int) -> Record:
 _WARM: set[tuple[object, ...]] = set()
 
 
-def _warm(source: Source, cell: Cell, limit: float) -> None:
+def _warm(task: Task, limit: float) -> None:
     """Imports and first calls, which belong to no step, happen before the first measured run."""
+    cell, source = task.cell, task.source
     key = (source, *cell.configuration)
     if key not in _WARM:
         steps = min(cell.steps, cell.horizon + 2)
-        _run(_estimator(load(source), cell), _record(source, cell.seed, steps), limit)
+        _run(_estimator(load(source), task), _record(source, cell.seed, steps), limit)
         _WARM.add(key)
 
 
@@ -196,5 +201,6 @@ def _reference(source: Source, cell: Cell, record: Record, limit: float) -> Arra
             cell.model, "auto", None, None, cell.horizon, cell.start, cell.seed, cell.steps
         )
         _REFERENCES[key] = None  # where it runs out of time, it does so once
-        _REFERENCES[key] = _run(_estimator(load(source), converged), record, limit).costs
+        task = Task(converged, source, frozenset(), 0.0)
+        _REFERENCES[key] = _run(_estimator(load(source), task), record, limit).costs
     return _REFERENCES[key]

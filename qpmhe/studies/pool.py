@@ -18,7 +18,7 @@ from .compute import Result, compute, failure
 from .environment import environment
 from .errors import need
 from .grid import Study
-from .watch import died, folder_of, noted
+from .watch import died, folder_of, noted, second_attempt
 
 __all__ = ["LocalPool", "Pool", "local", "quiet_leaving"]
 
@@ -52,7 +52,7 @@ class LocalPool(Pool):
     """Worker processes of this machine, each with one thread.
 
     Where a worker dies, those that it may have been at are run again, one at a time in a
-    fresh process; one that dies again failed.
+    fresh process, with the backend in another one if it was a crash; one that dies again failed.
 
     Parameters
     ----------
@@ -126,6 +126,7 @@ class LocalPool(Pool):
         reason = died(words)
         if reason is not None:
             return failure(task, reason)
+        task = second_attempt(task, words)
         self._end_workers()
         try:
             (result,) = self._stream(deque([task]), {}, 1)

@@ -10,14 +10,15 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from time import monotonic, sleep
 from typing import IO
 
-from .cell import Task
+from .cell import OBSERVER, Task
 
-__all__ = ["deaths", "died", "folder_of", "noted", "watched"]
+__all__ = ["deaths", "died", "folder_of", "noted", "second_attempt", "watched"]
 
 _LOCK = threading.Lock()
 _LIMITS: dict[object, tuple[float, IO[str] | None]] = {}
@@ -155,9 +156,34 @@ def died(words: list[str]) -> str | None:
     return None
 
 
+def second_attempt(task: Task, words: list[str]) -> Task:
+    """The cell as it is to be run again after a worker died at it.
+
+    Where a crash of compiled code ended the worker, the backend gets a process of its own: if
+    it is to blame, only its QPs fail. A worker that was killed from outside says nothing, and
+    its cell runs as before.
+
+    Parameters
+    ----------
+    task : Task
+        The cell.
+    words : list of str
+        Last words of the workers that ended within it.
+    """
+    crashes = [fatal for text in words if (fatal := _signal(text))]
+    if not crashes or task.cell.backend == OBSERVER:
+        return task
+    return replace(task, isolated=f"a process of its own, since the first one died ({crashes[0]})")
+
+
+def _signal(words: str) -> str:
+    """What the signal that ended a process was called; empty where there was none."""
+    return words.partition("Fatal Python error: ")[2].partition("\n")[0]
+
+
 def _place(words: str) -> str:
     """Where Python was, and what the signal was called."""
-    fatal = words.partition("Fatal Python error: ")[2].partition("\n")[0]
+    fatal = _signal(words)
     told = f" ({fatal})" if fatal else ""
     for thread in words.split("\n\n"):
         lines = [line.strip() for line in thread.splitlines() if line.startswith("  File ")]

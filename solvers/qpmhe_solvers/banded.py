@@ -8,8 +8,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from .flat import FlatQP
 from .options import SolverOptions
 from .qp import QP
+from .scaling import Scaling
 from .solution import RawSolution, Residuals, Solution, SolveStatus
 from .solver import Solver, expect_qp
 
@@ -18,7 +20,9 @@ __all__ = ["BandedSolver"]
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_NO_ROWS: Array = np.zeros(0)
+# How far equality rows may be missed after a solve, in scaled numbers.
+_ROUNDING = 1e-10
+
 
 class BandedSolver(Solver):
     """Solve ``H d = -g``, exact wherever the result meets every inequality.
@@ -50,27 +54,36 @@ class BandedSolver(Solver):
     def solve(self, qp: QP, start: Array | None = None) -> Solution:
         """Solve the QP without its inequalities, then look whether they hold."""
         expect_qp(qp)
-        row_duals = _NO_ROWS
         if qp.rows and (qp.row_lower == qp.row_upper).any():
-            step, multipliers = self._with_equalities(qp)
-            row_duals = multipliers.ravel()
-        else:
-            step = self._cholesky(qp)
+            return self._solve_scaled(qp)
+        step = self._cholesky(qp)
         if step is None:
             message = "the factorisation failed: H is not positive definite, or not finite"
             return Solution(None, SolveStatus.FAILED, 0, message=message)
         if not qp.bounded and not qp.rows:
             return Solution(step, SolveStatus.SOLVED, 0)
-        if not row_duals.size:
-            row_duals = np.zeros(qp.stages * qp.rows)
-        no_bound = np.zeros(qp.size)
+        return _judged(qp, step, np.zeros(qp.stages * qp.rows), qp.violation(step) <= 0.0)
+
+    def _solve_scaled(self, qp: QP) -> Solution:
+        """Solve with equality rows; pivots, unlike a Cholesky factor, depend on units."""
+        flat = self._flat
+        if flat is None or flat.sizes != (qp.stages, qp.n, qp.rows):
+            flat = self._flat = FlatQP(qp.stages, qp.n, qp.rows)
+        flat.gather(qp)
+        if self._scaling is None:
+            self._scaling = Scaling(held=False)
+        scale = self._scaling.scale(flat, qp)
+        scaled = self._scaling.flat.qp
+        step, multipliers = self._with_equalities(scaled)
+        if step is None:
+            message = "the factorisation failed: H is not positive definite, or not finite"
+            return Solution(None, SolveStatus.FAILED, 0, message=message)
         # Equality rows hold up to the rounding of the solve.
-        rounding = 1e-10 * (1.0 + float(np.abs(step).max())) if row_duals.any() else 0.0
-        violation = qp.violation(step)
-        if violation <= rounding:
-            return Solution(step, SolveStatus.SOLVED, 0, None, no_bound, row_duals)
-        residuals = Residuals.of(qp, step, no_bound, row_duals)
-        return Solution(step, SolveStatus.UNCONSTRAINED, 0, residuals, no_bound, row_duals)
+        rounding = _ROUNDING * (1.0 + float(np.abs(step).max()))
+        feasible = scaled.violation(step) <= rounding
+        return _judged(
+            qp, step * scale.step, multipliers.ravel() * scale.duals[qp.size :], feasible
+        )
 
     def _cholesky(self, qp: QP) -> Array | None:
         work = self._work
@@ -126,6 +139,15 @@ class BandedSolver(Solver):
         solution = solution.reshape(stages, s)
         multipliers[:, slots] = solution[:, n:]
         return np.ascontiguousarray(solution[:, :n]), multipliers
+
+
+def _judged(qp: QP, step: Array, row_duals: Array, feasible: bool) -> Solution:
+    """The solution, if no inequality is missed, or a trial."""
+    no_bound = np.zeros(qp.size)
+    if feasible:
+        return Solution(step, SolveStatus.SOLVED, 0, None, no_bound, row_duals)
+    residuals = Residuals.of(qp, step, no_bound, row_duals)
+    return Solution(step, SolveStatus.UNCONSTRAINED, 0, residuals, no_bound, row_duals)
 
 
 def _unpacked(band: Array) -> tuple[Array, Array]:

@@ -47,6 +47,8 @@ class Translation:
         Whether a QP without any inequality row goes wrong, so that a void row is added.
     tells_infeasible : bool
         Whether its words say so where a QP has no feasible point.
+    others : tuple
+        Keywords with values that suit numbers of order one.
     keep_empty : bool
         Whether to give matrices without rows, which qpsolvers would make at each solve.
     """
@@ -63,12 +65,14 @@ class Translation:
     tells_infeasible: bool = False
     default_cap: int | None = None
     beyond_cap: int = 0
+    others: tuple[tuple[str, float], ...] = ()
 
 
 # Caps, tolerances and traps as measured (qpsolvers 4.13). cvxopt is harmed by its start; the
 # IPMs and quadprog ignore it; clarabel and scs hand a QP without rows to a least-squares
 # routine that calls it unbounded; ecos and cvxopt choke on infinite bounds, and ecos on a
-# relative tolerance of 0. highs without rows claims to be optimal far from the optimum.
+# relative tolerance of 0. highs without rows claims to be optimal far from the optimum, and adds
+# 1e-7 to the Hessian's diagonal, which is much where weights spread over decades.
 TRANSLATIONS: Mapping[str, Translation] = {
     "clarabel": Translation(
         "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"), ("tol_gap_rel",), "time_limit",
@@ -86,7 +90,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
     "highs": Translation(
         "csc", "box", "qp_iteration_limit",
         ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), time_limit="time_limit",
-        needs_row=True,
+        needs_row=True, others=(("qp_regularization_value", 1e-12),),
     ),
     "osqp": Translation(
         "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", start=True,
@@ -128,6 +132,8 @@ class DispatchSolver(Solver):
     pattern of limits and filled in place, so that one instance serves one thread. No solver of
     the table writes into it, or holds on to it after its solve: the tests look.
     """
+
+    _keeps = False
 
     def __init__(self, name: str, options: SolverOptions) -> None:
         import qpsolvers  # late: it imports every solver that is installed
@@ -190,7 +196,8 @@ class DispatchSolver(Solver):
 
 
 def _keywords(how: Translation, options: SolverOptions) -> dict[str, Any]:
-    words: dict[str, Any] = dict.fromkeys(how.absolute, options.absolute_tolerance)
+    words: dict[str, Any] = dict(how.others)
+    words.update(dict.fromkeys(how.absolute, options.absolute_tolerance))
     words.update(dict.fromkeys(how.relative, options.relative_tolerance))
     cap = how.default_cap if options.max_iterations is None else options.max_iterations
     if cap is not None and how.cap is not None:

@@ -14,6 +14,9 @@ __all__ = ["FlatQP"]
 Array = NDArray[np.float64]
 
 _ONE = np.ones(1)
+# Spread of the Hessian's diagonal over the stages at which the least known stage, rather than the
+# best, is what the accuracy is for; and below which share double precision has none.
+_SPREAD, _LEAST = 2.0**10, 2.0**-34
 
 
 class FlatQP:
@@ -39,11 +42,16 @@ class FlatQP:
         Views of the limits of all constraints.
     limits : array
         View of both, one behind the other.
+    qp : QP
+        The numbers as a QP, whose arrays are views of them.
+    key : int
+        Name of the scale that the numbers are in.
     """
 
     __slots__ = (
-        "_data", "gradient_at", "limits", "lower", "lower_at", "numbers", "one_at", "own_at",
-        "sizes", "upper", "upper_at",
+        "_columns", "_data", "_diagonal", "_entries", "_looked_at", "_magnitudes", "_starts",
+        "_steps", "_uppers", "gradient_at", "key", "limits", "lower", "lower_at", "numbers",
+        "one_at", "own_at", "qp", "sizes", "upper", "upper_at",
     )
 
     def __init__(self, stages: int, n: int, rows: int) -> None:
@@ -59,6 +67,31 @@ class FlatQP:
         self.limits = self.numbers[self.lower_at :]
         self.lower = self.numbers[self.lower_at : self.upper_at]
         self.upper = self.numbers[self.upper_at :]
+        self.key = 0
+        self.qp = QP.of_numbers(stages, n, rows, self.numbers)
+        self._prepare_peaks()
+
+    def _prepare_peaks(self) -> None:
+        """Find the entries that `peaks` looks at, in groups."""
+        stages, n, rows = self.sizes
+        diagonal = np.arange(self.gradient_at).reshape(stages, n, 2 * n)[:, :, 0].T
+        own, following = np.arange(self.own_at, self.one_at).reshape(2, stages, rows, n)
+        groups = list(diagonal)
+        groups += [  # the last stage's G is never read
+            np.concatenate((own[:, row], following[:-1, row]), axis=None) for row in range(rows)
+        ]
+        gradient = np.arange(self.gradient_at, self.own_at).reshape(stages, n).T
+        # Gradients, then steps, then violations at zero, which are lower - 0 and 0 - upper.
+        groups += [gradient.ravel(), gradient.ravel(), np.arange(self.lower_at, self.numbers.size)]
+        self._entries = np.concatenate(groups, axis=None)
+        seen = self._looked_at = np.empty(self._entries.size)
+        limits = self.limits.size
+        self._magnitudes = seen[: seen.size - limits]
+        self._diagonal = seen[: stages * n]
+        self._steps = self._magnitudes[self._magnitudes.size - stages * n :]
+        self._uppers = seen[seen.size - self.upper.size :]
+        self._starts = np.cumsum([0] + [group.size for group in groups[:-1]])
+        self._columns = self._starts[:n]
 
     def __reduce__(self) -> tuple[type[FlatQP], tuple[int, int, int]]:
         return FlatQP, self.sizes  # views of a copied array would be arrays of their own
@@ -72,6 +105,30 @@ class FlatQP:
             ),
             axis=None, out=self.numbers,
         )
+
+    def peaks(self) -> list[float]:
+        """What says how well the numbers are scaled, the signs left out.
+
+        Returns
+        -------
+        list of float
+            For each component of the state the largest entry of the Hessian's diagonal, or a
+            certain multiple of the smallest if that is less: the accuracy is to do for the
+            stage that is known least. The largest entry of each row of [F, G] over all stages.
+            The smaller of the largest entry of the gradient and the largest step ``g / H`` of
+            an entry of the diagonal, or the violation at zero if that is larger.
+        """
+        self.numbers.take(self._entries, out=self._looked_at, mode="clip")
+        np.abs(self._magnitudes, out=self._magnitudes)
+        np.divide(self._steps, self._diagonal, out=self._steps, where=self._diagonal > 0.0)
+        np.negative(self._uppers, out=self._uppers)
+        found: list[float] = np.maximum.reduceat(self._looked_at, self._starts).tolist()
+        least = np.minimum.reduceat(self._diagonal, self._columns).tolist()
+        missed, step, slope = found.pop(), found.pop(), found.pop()
+        found.append(max(min(slope, step), missed))
+        for at, low in enumerate(least):
+            found[at] = min(found[at], _SPREAD * max(low, _LEAST * found[at]))
+        return found
 
     def fault(self) -> str:
         """What no solver must be given: NaN hangs some and comes back as success from others."""

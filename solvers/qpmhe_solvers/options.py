@@ -22,7 +22,9 @@ class SolverOptions:
         Cap on the solver's own iterations, at least 1. None leaves the solver's default.
         A backend without a cap (see its capabilities) solves fully.
     absolute_tolerance : float
-        Absolute tolerance on the primal and dual residuals (units of the QP's data), > 0.
+        Tolerance on the primal and dual residuals, > 0. It has no unit: every QP is scaled
+        before a solver sees it, by powers of two, so that the Hessian's diagonal, the rows and
+        the step are of order one (see Notes).
     relative_tolerance : float
         Tolerance relative to the size of the residuals' terms, >= 0. Backends that know
         only one tolerance use the absolute one.
@@ -35,6 +37,14 @@ class SolverOptions:
     ------
     OptionError
         If a value is outside its range.
+
+    Notes
+    -----
+    A claim of success is judged in the scaled numbers as well, so that the verdict (SOLVED or
+    INACCURATE) does not depend on the units of states, rows and cost. Iterate, multipliers and
+    residuals of a `Solution` are in the caller's units. There is one factor for each component
+    of the state, at all stages; one for each row, at all stages; and one for the cost. `banded`
+    solves QPs without equality rows as they are, since a Cholesky factor depends on no unit.
     """
 
     max_iterations: int | None = None

@@ -5,13 +5,17 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .qp import QP
 
-__all__ = ["RawSolution", "Residuals", "Solution", "SolveStatus", "residuals"]
+if TYPE_CHECKING:
+    from .scaling import Scale
+
+__all__ = ["Errors", "RawSolution", "Residuals", "Solution", "SolveStatus", "residuals"]
 
 Array = NDArray[np.float64]
 
@@ -113,28 +117,74 @@ class Residuals:
 
 def residuals(qp: QP, d: Array, duals: Array | None, lower: Array, upper: Array) -> Residuals:
     """Residuals of an iterate, with bounds and rows together in one array each."""
-    size, primal, point = qp.size, 0.0, d.reshape(-1)
-    if lower.size:
-        value = np.concatenate((d, qp.rows_times(d)), axis=None) if qp.rows else point
-        primal = float(_largest(np.maximum(lower - value, value - upper)))
-        # Comparisons with NaN are false: a NaN among the numbers must not pass as feasible.
-        primal = math.inf if math.isnan(primal) else max(primal, 0.0)
-    if duals is None:
-        return Residuals(primal, math.nan, math.nan)
-    force = qp.hessian_times(d).reshape(-1)
-    force += qp.gradient.reshape(-1)
-    gap = float(point.dot(force))
-    if lower.size:
-        side = np.where(duals > 0.0, upper, lower)
-        # Multipliers of absent limits are dropped, and then show as a dual residual.
-        there = np.isfinite(side)
-        duals = duals * there
-        gap += float(duals.dot(np.where(there, side, 0.0)))
-        force += duals[:size]
-        if qp.rows:
-            rows = duals[size:].reshape(qp.stages, qp.rows)
-            force += qp.rows_transposed_times(rows).reshape(-1)
-    return Residuals(primal, float(_largest(np.abs(force))), abs(gap))
+    return Residuals(*Errors(qp, d, duals, lower, upper).largest())
+
+
+class Errors:
+    """What an iterate misses optimality by, entry by entry, as in `residuals`.
+
+    Attributes
+    ----------
+    missed : (K n + K rows,) array
+        Amount by which each constraint is missed, negative where it is met; empty where there
+        is no constraint at all.
+    force : (K n,) array or None
+        Gradient of the Lagrangian; None without multipliers.
+    gap : float
+        Distance between primal and dual objective; NaN without multipliers.
+    """
+
+    __slots__ = ("force", "gap", "missed")
+
+    def __init__(
+        self, qp: QP, d: Array, duals: Array | None, lower: Array, upper: Array
+    ) -> None:
+        size, point = qp.size, d.reshape(-1)
+        self.missed, self.force, self.gap = _NOTHING, None, math.nan
+        if lower.size:
+            value = np.concatenate((d, qp.rows_times(d)), axis=None) if qp.rows else point
+            self.missed = np.maximum(lower - value, value - upper)
+        if duals is None:
+            return
+        force = qp.hessian_times(d).reshape(-1)
+        force += qp.gradient.reshape(-1)
+        gap = float(point.dot(force))
+        if lower.size:
+            side = np.where(duals > 0.0, upper, lower)
+            # Multipliers of absent limits are dropped, and then show as a dual residual.
+            there = np.isfinite(side)
+            duals = duals * there
+            gap += float(duals.dot(np.where(there, side, 0.0)))
+            force += duals[:size]
+            if qp.rows:
+                rows = duals[size:].reshape(qp.stages, qp.rows)
+                force += qp.rows_transposed_times(rows).reshape(-1)
+        self.force, self.gap = np.abs(force, out=force), abs(gap)
+
+    def largest(self) -> tuple[float, float, float]:
+        """The residuals, primal, dual and gap."""
+        return _worst(self.missed), _peak(self.force), self.gap
+
+    def unscaled(self, scale: Scale) -> Residuals:
+        """The residuals in the user's units, of an iterate of a scaled QP."""
+        missed, force = self.missed, self.force
+        if missed.size:
+            missed = missed * scale.units
+        if force is not None:
+            force = force * scale.duals[: force.size]
+        return Residuals(_worst(missed), _peak(force), self.gap * scale.cost)
+
+
+def _worst(missed: Array) -> float:
+    if not missed.size:
+        return 0.0
+    worst = float(_largest(missed))
+    # Comparisons with NaN are false: a NaN among the numbers must not pass as feasible.
+    return math.inf if math.isnan(worst) else max(worst, 0.0)
+
+
+def _peak(force: Array | None) -> float:
+    return math.nan if force is None else float(_largest(force))
 
 
 class Solution:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import wraps
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,7 +16,8 @@ from .errors import InvalidInputError
 from .flat import FlatQP
 from .options import SolverOptions
 from .qp import ARRAYS, QP
-from .solution import RawSolution, Residuals, Solution, SolveStatus, residuals
+from .scaling import Scale, Scaling
+from .solution import Errors, RawSolution, Solution, SolveStatus
 
 __all__ = ["Solver", "as_count", "as_iterate", "as_multipliers", "expect_qp", "failure"]
 
@@ -44,17 +47,22 @@ class Solver(ABC):
 
     time_limit: float | None = None
     _flat: FlatQP | None = None  # kept while the sizes of the QPs stay
+    _scaling: Scaling | None = None
     # Whether Python code may warn during a solve: to keep that inside takes as long as a small QP.
     _warns: ClassVar[bool] = True
     # Whether it is one of this package's, which are tested to read only: all others are lent a
     # copy, since who scales the caller's QP in place would be judged by what is left of it.
     _own: bool = False
+    # Whether it may keep anything of a QP beyond its solve.
+    _keeps: ClassVar[bool] = True
     # What the last solve wrote into of what it was lent.
     _wrote: tuple[str, ...] = ()
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         cls._own = cls.__module__.startswith(f"{__package__}.")
+        if "forget" in cls.__dict__:  # which need not call this class's
+            cls.forget = _forgetting(cls.forget)  # type: ignore[assignment,method-assign]
 
     def __init__(self, options: SolverOptions) -> None:
         self.options = options
@@ -67,14 +75,16 @@ class Solver(ABC):
         Parameters
         ----------
         qp : QP
-            The problem, with arrays of its own for this solve. It is to be read: what is written
-            into it is lost, and `check` objects.
+            The problem, scaled by powers of two so that its numbers are of order one, with
+            arrays of its own for this solve. It is to be read: what is written into it is
+            lost, and `check` objects.
         start : (K, n) array or None
-            As given to `solve`, if it is finite and of the right shape.
+            As given to `solve`, scaled likewise, if it is finite and of the right shape.
 
         Returns
         -------
         RawSolution
+            In the scaled numbers; `solve` takes iterate and multipliers back.
         """
 
     def _solve_flat(self, qp: QP, flat: FlatQP, start: Array | None) -> RawSolution:
@@ -88,12 +98,14 @@ class Solver(ABC):
         that keeps nothing from solve to solve has nothing to do.
         """
 
-    def forget(self) -> None:  # noqa: B027 - most keep nothing
+    def forget(self) -> None:
         """Drop what is kept from solve to solve: the next one is as the first.
 
         What a solver keeps may change the last digits of what it finds. So whoever wants the
         same numbers twice asks for this in between.
         """
+        if self._scaling is not None:
+            self._scaling.forget()
 
     def prepare(self, size: int) -> None:  # noqa: B027 - most have nothing to prepare
         """Do beforehand what the first QPs would otherwise wait for, such as imports.
@@ -158,10 +170,15 @@ class Solver(ABC):
         fault = flat.fault()
         if fault:
             return Solution(None, SolveStatus.FAILED, message=fault)
-        usable = self._usable(start, qp)
+        scaling = self._scaling
+        if scaling is None:
+            scaling = self._scaling = Scaling(self._keeps)
+        scale = scaling.scale(flat, qp)
+        scaled, flat = scaling.flat.qp, scaling.flat
+        usable = self._usable(start, qp, scale)
         if self._own:
-            return self._judged(qp, flat, self._solve_flat(qp, flat, usable))
-        solution = self._judged(qp, flat, self._solve_lent(qp, usable))
+            return self._judged(scaled, flat, scale, self._solve_flat(scaled, flat, usable))
+        solution = self._judged(scaled, flat, scale, self._solve_lent(scaled, usable))
         if self._wrote and solution.status is not SolveStatus.SOLVED:
             told = f"it wrote into {', '.join(self._wrote)} of the QP, which is to be read only"
             solution.message = f"{solution.message}; {told}" if solution.message else told
@@ -179,13 +196,14 @@ class Solver(ABC):
                 if not np.array_equal(getattr(lent, name), getattr(qp, name))
             )
 
-    def _usable(self, start: Array | None, qp: QP) -> Array | None:
-        if start is None or not self.options.warm_start:
+    def _usable(self, start: Array | None, qp: QP, scale: Scale) -> Array | None:
+        if start is None or not self.options.warm_start or np.shape(start) != (qp.stages, qp.n):
             return None
-        fits = np.shape(start) == (qp.stages, qp.n) and bool(np.isfinite(start).all())
-        return start if fits else None
+        scaled: Array = start / scale.step
+        return scaled if np.isfinite(scaled).all() else None
 
-    def _judged(self, qp: QP, flat: FlatQP, raw: object) -> Solution:
+    def _judged(self, qp: QP, flat: FlatQP, scale: Scale, raw: object) -> Solution:
+        """Judge the answer to a scaled QP, and give it in the user's units."""
         if not isinstance(raw, RawSolution):
             message = f"the backend returned {type(raw).__name__}, not a RawSolution"
             return Solution(None, SolveStatus.FAILED, message=message)
@@ -193,41 +211,59 @@ class Solver(ABC):
         d, message = as_iterate(raw.d, raw.message, qp)
         if d is None:
             return Solution(None, SolveStatus.FAILED, count, message=message)
-        lower, upper = flat.lower, flat.upper
+        lower, upper, duals = flat.lower, flat.upper, None
         if qp.bounded or qp.rows:
             bound_duals = as_multipliers(raw.bound_duals, qp.size)
             row_duals = as_multipliers(raw.row_duals, qp.stages * qp.rows)
-            duals = None
             if bound_duals is not None and row_duals is not None:
                 duals = np.concatenate((bound_duals, row_duals)) if qp.rows else bound_duals
+            if bound_duals is not None:
+                bound_duals = bound_duals * scale.duals[: qp.size]
+            if row_duals is not None and qp.rows:
+                row_duals *= scale.duals[qp.size :]
         else:  # there is nothing to weigh
             bound_duals, row_duals = np.zeros(qp.size), np.zeros(0)
             duals = lower = upper = row_duals
-        found = residuals(qp, d, duals, lower, upper)
+        errors = Errors(qp, d, duals, lower, upper)
         if not (isinstance(raw.claimed, (bool, np.bool_)) and raw.claimed):
             status = SolveStatus.STOPPED
-        elif self._confirmed(qp, d, found):
+        elif self._confirmed(qp, d, errors.largest()):
             status = SolveStatus.SOLVED
         else:
             status = SolveStatus.INACCURATE
-        return Solution(d, status, count, found, bound_duals, row_duals, message)
+        d *= scale.step
+        if not _finite(d):
+            message = "the solver returned an iterate that is not finite in the user's units"
+            return Solution(None, SolveStatus.FAILED, count, message=message)
+        return Solution(
+            d, status, count, errors.unscaled(scale), bound_duals, row_duals, message
+        )
 
-    def _confirmed(self, qp: QP, d: Array, found: Residuals) -> bool:
-        """Whether the residuals bear a claim out; a claim without multipliers cannot be checked."""
+    def _confirmed(self, qp: QP, d: Array, found: tuple[float, float, float]) -> bool:
+        """Whether the residuals bear a claim out; a claim without multipliers cannot be checked.
+
+        All numbers are scaled ones, which have no unit.
+        """
+        primal, dual, gap = found
         tolerance = self.options.absolute_tolerance + self.options.relative_tolerance
         limit = max(tolerance, min(_SLACK * tolerance, _LOOSEST))
-        # Mostly the residuals are below the limit as it is, without any scale.
+        # Mostly the residuals are below the limit as it is, whatever the size of the QP's terms.
         return (
-            (found.primal <= limit or found.primal <= limit * (1.0 + float(np.abs(d).max())))
-            and (
-                found.dual <= limit
-                or found.dual <= limit * (1.0 + float(np.abs(qp.gradient).max()))
-            )
-            and (
-                found.gap <= limit
-                or found.gap <= limit * (1.0 + abs(float(np.vdot(d, qp.gradient))))
-            )
+            (primal <= limit or primal <= limit * (1.0 + float(np.abs(d).max())))
+            and (dual <= limit or dual <= limit * (1.0 + float(np.abs(qp.gradient).max())))
+            and (gap <= limit or gap <= limit * (1.0 + abs(float(np.vdot(d, qp.gradient)))))
         )
+
+
+def _forgetting(forget: Callable[[Any], None]) -> Callable[[Any], None]:
+    """A subclass's `Solver.forget` that drops the scales, too."""
+
+    @wraps(forget)
+    def both(self: Solver) -> None:
+        Solver.forget(self)
+        forget(self)
+
+    return both
 
 
 def expect_qp(qp: object) -> None:

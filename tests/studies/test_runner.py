@@ -5,6 +5,8 @@ import io
 import numpy as np
 import pytest
 from rich.console import Console
+from solvers.hostile_backend import CrashingOnce, entry
+from solvers.problems import registered
 
 import qpmhe
 import qpmhe_solvers
@@ -153,6 +155,22 @@ def test_a_backend_that_was_registered_here_runs_there(path):
     assert set(frame["outcome"]) == {"done"}
     rmse = frame.pivot_table(index="seed", columns="backend", values="rmse")
     assert list(rmse["mine"]) == list(rmse["banded"])
+
+
+def test_a_cell_whose_backend_crashes_is_run_again_with_the_backend_apart(path):
+    with registered(entry(CrashingOnce)):
+        study = Study(**{**SMALL, "backends": ["crashingonce", "banded"], "qps": [1], "seeds": 2})
+        frame = run(study, path, progress=False).frame()
+    assert set(frame["outcome"]) == {"done"}
+    for row in frame.itertuples():
+        if row.backend == "banded":
+            assert row.reason == ""
+            continue
+        assert row.reason == (
+            "the backend ran in a process of its own, since the first one died "
+            "(Segmentation fault)"
+        )
+        assert sum(n for flags, n in row.reasons.items() if "SOLVER_FAILED" in flags) == 1
 
 
 def test_a_full_disk_in_the_middle_is_told_and_the_same_call_goes_on(path, monkeypatch):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from abc import abstractmethod
 from collections.abc import Hashable
@@ -166,7 +165,10 @@ class NativeSolver(Solver):
         )
         known = self._known.get(pattern)
         kind = Structure.of(flat).key if known is None else known[0]
-        key = flat.sizes, kind, _scale(flat)
+        # QPs of another scale, such as projections into the sets between those of the
+        # estimation, have a workspace of their own: a solver's step sizes, and multipliers,
+        # are of no use from one to the other, and do harm.
+        key = flat.sizes, kind, flat.key
         workspace = self._workspaces.pop(key, None)
         if workspace is None:
             workspace = _Workspace(Layout(self.style, Structure.of(flat), *flat.sizes))
@@ -192,17 +194,6 @@ class NativeSolver(Solver):
             old, new = duals[part], shifted[part]
             new[: new.size - moved * width] = old[moved * width :]
         return shifted
-
-
-def _scale(flat: FlatQP) -> int:
-    """The size of the Hessian, in steps of two decades.
-
-    QPs of other weights, such as projections into the sets between those of the estimation,
-    have a workspace of their own: a solver's scaling and step sizes, and multipliers, are of
-    no use from one to the other, and do harm.
-    """
-    diagonal = flat.numbers[: flat.gradient_at : 2 * flat.sizes[1]]
-    return math.frexp(float(np.maximum.reduce(diagonal)))[1] // 7
 
 
 def _finite(values: Array | None) -> bool:

@@ -1,0 +1,382 @@
+"""A backend in a process of its own, which it may crash or hang as it likes."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pickle
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+import weakref
+from contextlib import suppress
+from typing import IO, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .contained import ContainedSolver
+from .entry import Backend, make_solver
+from .errors import BackendError
+from .options import SolverOptions
+from .qp import QP
+from .solution import RawSolution, Solution, SolveStatus
+from .solver import Solver, expect_qp
+
+__all__ = ["IsolatedSolver"]
+
+Array = NDArray[np.float64]
+
+# Seconds in which a process has to import and make its solver.
+_START = 120.0
+# Share of the time limit that a backend with a clock of its own may take beyond it.
+_GRACE = 0.25
+_LENGTH = struct.Struct("=Q")
+_PROGRAM = (
+    "import sys; sys.path[:] = {path!r}; from qpmhe_solvers.isolated import serve; serve({parent})"
+)
+
+
+class IsolatedSolver(Solver):
+    """Solve by a backend in a child process.
+
+    The process is started once, and ends with this solver. Where it dies, or exceeds the time
+    limit, the QP has FAILED and another process takes its place. That one starts meanwhile; a
+    QP that comes before it is ready waits for it, for half of the time limit at most.
+
+    Parameters
+    ----------
+    entry : Backend
+        The backend. A factory that belongs to the main script can be sent if cloudpickle or
+        joblib is installed; otherwise it is to be in a module.
+    options : SolverOptions
+        Limits and accuracy. A backend without a clock is stopped at the time limit as well: by
+        ending its process.
+
+    Raises
+    ------
+    BackendError
+        If the backend cannot be sent to another process, or not be made there.
+
+    Notes
+    -----
+    Copying and pickling gives a solver with a process of its own. One instance serves one
+    thread.
+    """
+
+    def __init__(self, entry: Backend, options: SolverOptions) -> None:
+        super().__init__(options)
+        self._entry, self._size = entry, 0
+        self._sent = _packed(entry)
+        self._child: _Child | None = _Child(self._sent, options, 0)
+        fault = self._child.wait(_START)
+        if fault:
+            self._child.end()
+            raise BackendError(f"backend {entry.name!r} cannot be isolated: {fault}")
+
+    def __reduce__(self) -> tuple[type[IsolatedSolver], tuple[Backend, SolverOptions]]:
+        return type(self), (self._entry, self.options)
+
+    def _solve(self, qp: QP, start: Array | None) -> RawSolution:
+        solution = self.solve(qp, start)
+        return RawSolution(solution.d, solution.status is SolveStatus.SOLVED)
+
+    def solve(self, qp: QP, start: Array | None = None) -> Solution:
+        """Have the QP solved by the process; see `Solver.solve`.
+
+        Parameters
+        ----------
+        qp : QP
+            The problem.
+        start : (K, n) array, optional
+            Handed to the backend.
+
+        Returns
+        -------
+        Solution
+            The backend's; FAILED where its process died, with the name of the signal, or took
+            too long.
+
+        Raises
+        ------
+        InvalidInputError
+            If ``qp`` is no `QP`.
+        """
+        expect_qp(qp)
+        began, limit = time.monotonic(), self.time_limit
+        child = self._living()
+        # Where a process is starting, the solve has half of the time at least.
+        fault = child.wait(_START if limit is None else 0.5 * limit)
+        if fault:
+            if child.ended:
+                self._replace()
+            return Solution(None, SolveStatus.FAILED, message=fault)
+        if limit is not None:
+            limit *= 1.0 + (_GRACE if self._entry.time_limit else 0.0)
+            limit -= time.monotonic() - began
+        try:
+            answer = child.ask(("solve", qp, start, self.time_limit), limit)
+        except _DeadError as error:
+            self._replace()
+            return Solution(None, SolveStatus.FAILED, message=f"{self._entry.name}: {error}")
+        except BaseException:  # an interrupted dialogue cannot go on
+            child.end()
+            self._child = None
+            raise
+        if isinstance(answer, Solution):
+            return answer
+        message = f"the process sent a {type(answer).__name__}, not a Solution"
+        return Solution(None, SolveStatus.FAILED, message=message)
+
+    def forget(self) -> None:
+        """Forwarded; see `Solver.forget`."""
+        self._tell("forget")
+
+    def shift(self) -> None:
+        """Forwarded; see `Solver.shift`."""
+        self._tell("shift")
+
+    def prepare(self, size: int) -> None:
+        """Forwarded, and waited for; see `Solver.prepare`.
+
+        Parameters
+        ----------
+        size : int
+            Unknowns of the largest QP to come.
+        """
+        self._size = size
+        child = self._living()
+        if not child.wait(_START):
+            try:
+                child.ask(("prepare", size), None)
+            except _DeadError:
+                self._replace()
+
+    def _tell(self, what: str) -> None:
+        child = self._child
+        # A process that is starting has nothing to forget or to shift.
+        if child is not None and child.mine and child.ready:
+            with suppress(_DeadError):
+                child.send((what,))
+
+    def _living(self) -> _Child:
+        """The process; a forked copy of this one must not talk to that of its parent."""
+        if self._child is None or not self._child.mine:
+            self._replace()
+        return cast("_Child", self._child)
+
+    def _replace(self) -> None:
+        if self._child is not None:
+            self._child.end()
+        self._child = _Child(self._sent, self.options, self._size)
+
+
+class _DeadError(Exception):
+    """The process is no more; the text says why."""
+
+
+class _Child:
+    """A process with a solver, and the pipes to it."""
+
+    def __init__(self, sent: bytes, options: SolverOptions, size: int) -> None:
+        self._owner = os.getpid()
+        self._process = process = subprocess.Popen(
+            [sys.executable, "-c", _PROGRAM.format(path=sys.path, parent=self._owner)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        )
+        self._out = cast("IO[bytes]", process.stdin)
+        self._back = cast("IO[bytes]", process.stdout)
+        self.end = weakref.finalize(self, _end, process, self._owner)
+        self._fault, self._late = "", False
+        # Answered by a thread: while a process starts, steps go on without it.
+        self._answered = threading.Event()
+        threading.Thread(
+            target=_begin, args=(weakref.ref(self), self._out, self._back, (sent, options, size)),
+            daemon=True,
+        ).start()
+
+    @property
+    def mine(self) -> bool:
+        """Whether it was started by this process."""
+        return self._owner == os.getpid()
+
+    @property
+    def ready(self) -> bool:
+        """Whether the solver is made."""
+        return self._answered.is_set() and not self._fault
+
+    @property
+    def ended(self) -> bool:
+        """Whether it could not make the solver."""
+        return self._answered.is_set() and bool(self._fault)
+
+    def answered(self, fault: str | None) -> None:
+        """Take in what the process said of its start; None if it died."""
+        self._fault = self._death() if fault is None else fault
+        self._answered.set()
+
+    def wait(self, seconds: float) -> str:
+        """Wait until the solver is made; what hinders it, if anything does."""
+        if not self._answered.wait(seconds):
+            return f"the process of the backend was not ready after {seconds:g} s"
+        return self._fault
+
+    def send(self, message: object) -> None:
+        """Send a message."""
+        try:
+            _write(self._out, message)
+        except OSError as error:
+            raise _DeadError(self._death()) from error
+
+    def ask(self, message: object, seconds: float | None) -> object:
+        """Send a message and wait for the answer, at most so long."""
+        timer = None
+        if seconds is not None:
+            timer = threading.Timer(max(seconds, 0.0), self._stop)
+            timer.daemon = True
+            timer.start()
+        try:
+            self.send(message)
+            return _read(self._back)
+        except (OSError, EOFError, pickle.UnpicklingError) as error:
+            raise _DeadError(self._death()) from error
+        finally:
+            if timer is not None:
+                timer.cancel()
+
+    def _stop(self) -> None:
+        self._late = True
+        self._process.kill()
+
+    def _death(self) -> str:
+        """How it ended."""
+        try:
+            code = self._process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            return "its process does not answer"
+        if self._late:
+            return "out of time: its process was ended at the time limit"
+        if code >= 0:
+            return f"its process ended with exit code {code}"
+        try:
+            return f"its process died: {signal.Signals(-code).name}"
+        except ValueError:
+            return f"its process died of signal {-code}"
+
+
+def _begin(
+    child: weakref.ref[_Child], out: IO[bytes], back: IO[bytes], message: object
+) -> None:
+    """Have the solver made, and pass the answer on; the process may end meanwhile."""
+    fault: str | None
+    try:
+        _write(out, message)
+        fault = str(_read(back))
+    except (OSError, EOFError, ValueError, pickle.UnpicklingError):
+        fault = None
+    one = child()
+    if one is not None:
+        one.answered(fault)
+
+
+def _end(process: subprocess.Popen[bytes], owner: int) -> None:
+    """End a process, unless this is a forked copy of who started it."""
+    if os.getpid() != owner:
+        return
+    process.kill()
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        with suppress(OSError):  # what could not be sent any more
+            cast("IO[bytes]", pipe).close()
+
+
+def _packed(entry: Backend) -> bytes:
+    """The entry as bytes, by value where it belongs to the main script."""
+    try:
+        for name in ("cloudpickle", "joblib.externals.cloudpickle"):
+            try:
+                pickler: Any = importlib.import_module(name)
+            except ImportError:
+                continue
+            return cast("bytes", pickler.dumps(entry))
+        sent = pickle.dumps(entry)
+    except Exception as error:
+        raise BackendError(
+            f"backend {entry.name!r} cannot be isolated: its factory cannot be sent to another "
+            f"process ({type(error).__name__}: {error}); let it be a class or a function of a "
+            "module that can be imported."
+        ) from error
+    if b"__main__" in sent:
+        raise BackendError(
+            f"backend {entry.name!r} cannot be isolated: its factory is in the main script, "
+            "which another process cannot import; move it into a module, or install cloudpickle."
+        )
+    return sent
+
+
+def _write(pipe: IO[bytes], message: object) -> None:
+    content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
+    pipe.write(_LENGTH.pack(len(content)) + content)
+    pipe.flush()
+
+
+def _read(pipe: IO[bytes]) -> object:
+    head = pipe.read(_LENGTH.size)
+    if len(head) < _LENGTH.size:
+        raise EOFError
+    (length,) = _LENGTH.unpack(head)
+    content = pipe.read(length)
+    if len(content) < length:
+        raise EOFError
+    return pickle.loads(content)
+
+
+def serve(parent: int) -> None:
+    """What the child process does: make a solver, then answer until the pipe is closed.
+
+    Parameters
+    ----------
+    parent : int
+        Process with which it ends.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for who waits for the answer
+    # What backends print must not get between the answers.
+    back, commands = os.fdopen(os.dup(1), "wb"), os.fdopen(os.dup(0), "rb")
+    os.dup2(2, 1)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    with suppress(EOFError, OSError):
+        solver = _made(commands, back)
+        while solver is not None:
+            what, *given = cast("tuple[Any, ...]", _read(commands))
+            answer = getattr(solver, what)(*given)
+            if what in ("solve", "prepare"):
+                try:
+                    _write(back, answer)
+                except (TypeError, AttributeError, pickle.PicklingError) as error:
+                    message = f"what `solve` returned cannot be sent: {error}"
+                    _write(back, Solution(None, SolveStatus.FAILED, message=message))
+
+
+def _made(commands: IO[bytes], back: IO[bytes]) -> ContainedSolver | None:
+    sent, options, size = cast("tuple[bytes, SolverOptions, int]", _read(commands))
+    try:
+        importlib.import_module("scipy.linalg.blas")  # which the first QP would wait for
+        solver = ContainedSolver(make_solver(pickle.loads(sent), options))
+        if size:
+            solver.prepare(size)
+    except BaseException as error:  # a module may even try to leave the process
+        _write(back, f"{type(error).__name__}: {error}")
+        return None
+    _write(back, "")
+    return solver
+
+
+def _end_with(parent: int) -> None:
+    """End this process soon after its parent, even within a solve."""
+    while os.name != "posix" or os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)

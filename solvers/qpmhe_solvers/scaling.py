@@ -1,0 +1,211 @@
+"""QPs in numbers without units: what every solver is handed, and the way back."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from itertools import count
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .flat import FlatQP
+from .qp import QP
+
+__all__ = ["Scale", "Scaling"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_NOTHING = np.zeros(1, np.int64)
+
+# Scales kept at a time: for QPs of other sizes, and for projections between estimations.
+_KEPT = 4
+# A scale is held while the peaks of the scaled numbers stay between these. Steps have more room
+# below, since those of a sequence of QPs shrink as the sequence converges.
+_PEAKS = 2.0**-8, 2.0**8
+_STEP_PEAKS = 2.0**-10, 2.0**3
+# Largest exponent: products of two factors do not overflow.
+_MOST = 500
+
+
+class Scale:
+    r"""Powers of two that take QPs of one size to numbers of order one, exactly.
+
+    .. math::
+        d_k = t S d'_k, \quad H' = S H S, \quad g' = S g / t, \quad F' = R F S, \quad a' = R a / t
+
+    with a diagonal S, the same at all stages, that brings the diagonal of H' to about 1 or less,
+    for each component, or to more where a stage would be lost beside the others; a diagonal R
+    that does so for the largest entry of each row; and one number t, for the unit of the cost,
+    that does so for the gradient or the step, as `FlatQP.peaks` puts them together.
+
+    Parameters
+    ----------
+    exponents : (n + rows + 1,) array of int
+        Of the factors in S, R and t.
+    places : (2, ...) array of int
+        See `_places`.
+    flat : FlatQP
+        Any of the size.
+    key : int
+        What no other scale is called.
+
+    Attributes
+    ----------
+    key : int
+        As given.
+    sizes : tuple of int
+        Of its QPs.
+    step : (K, n) array
+        t S: the unit of d.
+    units : (K n + K rows,) array
+        Units of the constraints: t S of the bounds, and t / R of the rows.
+    duals : (K n + K rows,) array
+        Units of the multipliers: t / S, also the unit of the gradient, and t R.
+    cost : float
+        t squared, the unit of the objective.
+    """
+
+    __slots__ = (
+        "_factor", "_unknown", "cost", "duals", "key", "sizes", "step", "units",
+    )
+
+    def __init__(self, exponents: Index, places: Index, flat: FlatQP, key: int) -> None:
+        stages, n, rows = self.sizes = flat.sizes
+        self.key = key
+        self._unknown: list[int] = []
+        signed = np.concatenate((exponents, -exponents, _NOTHING))
+        factors = np.ldexp(1.0, signed[places[0]] + signed[places[1]])
+        self._factor: Array = factors[: flat.numbers.size]
+        units = factors[flat.numbers.size :].reshape(2, stages * (n + rows))
+        self.units: Array = units[0]
+        self.duals: Array = units[1]
+        self.step: Array = self.units[: stages * n].reshape(stages, n)
+        self.cost = math.ldexp(1.0, 2 * int(exponents[-1]))
+
+    def apply(self, flat: FlatQP, scaled: FlatQP) -> None:
+        """Write the scaled numbers of a QP."""
+        np.multiply(flat.numbers, self._factor, out=scaled.numbers)
+        scaled.key = self.key
+
+    def leave_out(self, peaks: list[float]) -> None:
+        """Note the parts whose unit is not known, because there is nothing but zeros."""
+        self._unknown = [at for at, peak in enumerate(peaks) if not peak > 0.0]
+
+    def fits(self, peaks: list[float]) -> bool:
+        """Whether scaled numbers with these peaks are of order one."""
+        if self._unknown and any(peaks[at] > 0.0 for at in self._unknown):
+            return False
+        last = peaks.pop()
+        least, most = _STEP_PEAKS
+        if last > 0.0 and not least <= last <= most:
+            return False
+        least, most = _PEAKS
+        return all(peak == 0.0 or least <= peak <= most for peak in peaks)
+
+
+@lru_cache(maxsize=64)
+def _places(sizes: tuple[int, int, int]) -> Index:
+    """Which two of the exponents of S, R, t, 1/S, 1/R, 1/t and 1 make up each factor.
+
+    First those of the numbers in a `FlatQP`, then the units of constraints and multipliers.
+    """
+    stages, n, rows = sizes
+    s, r, t = np.arange(n), n + np.arange(rows), np.array(n + rows)
+    one = 2 * (n + rows + 1)
+    s_less, r_less, t_less = (place + n + rows + 1 for place in (s, r, t))
+    panel = (s[:, None] + np.arange(2 * n)) % n  # the row of each of its entries
+    row, next_row = (np.broadcast_arrays(r[:, None], s) for _ in range(2))
+    parts = [
+        (s[:, None] + 0 * panel, panel), (s, t_less), row, next_row,
+        (s_less, t_less), (r, t_less), (s_less, t_less), (r, t_less),
+        (s, t), (r_less, t), (s_less, t), (r, t),
+    ]
+    made = [
+        np.tile(np.array(np.broadcast_arrays(*part)).reshape(2, -1), stages) for part in parts
+    ]
+    made.insert(4, np.full((2, 1), one))
+    return np.concatenate(made, axis=1)
+
+
+class Scaling:
+    """The scales of one solver.
+
+    Parameters
+    ----------
+    held : bool
+        Whether a scale is held as long as it fits, so that the numbers of a workspace keep
+        their meaning from QP to QP. What is held depends on the QPs since the last `forget`,
+        and on no unit. Otherwise each QP has its own.
+
+    Attributes
+    ----------
+    flat : FlatQP
+        Numbers of the last scaled QP.
+    """
+
+    def __init__(self, held: bool) -> None:
+        self._held = held
+        self._scales: list[Scale] = []  # the last used is the last one
+        self._keys = count(1)
+        self.flat = FlatQP(1, 1, 0)
+
+    def __reduce__(self) -> tuple[type[Scaling], tuple[bool]]:
+        return Scaling, (self._held,)
+
+    def forget(self) -> None:
+        """Drop the scales: the next one is that of the next QP alone."""
+        self._scales.clear()
+
+    def scale(self, flat: FlatQP, qp: QP) -> Scale:
+        """Scale a QP; its scaled numbers are in ``flat``, and it in ``flat.qp``.
+
+        Parameters
+        ----------
+        flat : FlatQP
+            Its numbers, all finite but for limits.
+        qp : QP
+            The QP itself.
+        """
+        scaled, scales = self.flat, self._scales
+        if scaled.sizes != flat.sizes:
+            scaled = self.flat = FlatQP(*flat.sizes)
+        scaled.qp.bounded = qp.bounded
+        if not self._held:
+            scales.clear()
+        for at in range(len(scales) - 1, -1, -1):
+            scale = scales[at]
+            if scale.sizes == flat.sizes:
+                scale.apply(flat, scaled)
+                if scale.fits(scaled.peaks()):
+                    if at < len(scales) - 1:
+                        scales.append(scales.pop(at))
+                    return scale
+        scale = self._ideal(flat, scaled)
+        scale.apply(flat, scaled)
+        if len(scales) == _KEPT:
+            del scales[0]
+        scales.append(scale)
+        return scale
+
+    def _ideal(self, flat: FlatQP, scaled: FlatQP) -> Scale:
+        """The best scale for one QP."""
+        _, n, rows = flat.sizes
+        places, key = _places(flat.sizes), next(self._keys)
+        exponents = np.zeros(n + rows + 1, np.int64)
+        peaks = flat.peaks()
+        # The peaks of rows depend on S, and that of the step on both.
+        for part in (slice(n), slice(n, n + rows), slice(n + rows, None)):
+            found = np.frexp(peaks[part])[1]
+            if part.start is None:
+                exponents[part] = -(found // 2)
+            else:
+                exponents[part] = found if part.stop is None else -found
+            np.clip(exponents, -_MOST, _MOST, out=exponents)
+            scale = Scale(exponents, places, flat, key)
+            if part.stop is not None:
+                scale.apply(flat, scaled)
+                peaks = scaled.peaks()
+        scale.leave_out(peaks)
+        return scale

@@ -1,0 +1,314 @@
+"""Backends in a process of their own: what they do there ends nothing here."""
+
+import copy
+import gc
+import os
+import pickle
+import subprocess
+import sys
+import textwrap
+import time
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe_solvers import (
+    QP,
+    Backend,
+    BackendError,
+    InvalidInputError,
+    OptionError,
+    SolverOptions,
+    SolveStatus,
+    create,
+)
+
+from .hostile_backend import (
+    Crashing,
+    Hanging,
+    Hostile,
+    Overriding,
+    Printing,
+    Unmakeable,
+    entry,
+)
+from .problems import CASES, WITH_INEQUALITIES, make, registered
+
+POSIX = pytest.mark.skipif(os.name != "posix", reason="signals")
+
+
+def small(sign=-1.0):
+    qp = QP(2, 1)
+    qp.bounded = False
+    qp.band[:, :, 0], qp.gradient[...] = 1.0, sign
+    return qp
+
+
+def isolated(kind, options=None):
+    with registered(entry(kind)):
+        return create(kind.__name__.lower(), options, isolated=True)
+
+
+def gone(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+@pytest.mark.parametrize("name", [n for n in WITH_INEQUALITIES if n in ("auto", "daqp", "osqp")])
+def test_the_numbers_are_those_of_the_same_process(name):
+    apart, here = create(name, isolated=True), create(name)
+    for seed in range(4):
+        qp, _ = make(**CASES["all kinds"], seed=seed)
+        start = np.full((qp.stages, qp.n), 0.1)
+        one, two = apart.solve(qp, start), here.solve(qp, start)
+        assert (one.status, one.iterations) == (two.status, two.iterations)
+        np.testing.assert_array_equal(one.d, two.d)
+        np.testing.assert_array_equal(one.bound_duals, two.bound_duals)
+        np.testing.assert_array_equal(one.row_duals, two.row_duals)
+        assert one.residuals == two.residuals
+        for solver in (apart, here):
+            solver.shift()
+    with pytest.raises(InvalidInputError, match="expected a qpmhe"):
+        apart.solve(3)
+
+
+@POSIX
+def test_a_crash_is_a_failed_qp_and_the_next_one_is_solved():
+    solver = isolated(Crashing)
+    assert solver.solve(small()).status is SolveStatus.SOLVED
+    for _ in range(2):
+        solution = solver.solve(small(1.0))
+        assert solution.status is SolveStatus.FAILED
+        assert solution.message == "crashing: its process died: SIGSEGV"
+        solution = solver.solve(small())
+        assert solution.status is SolveStatus.SOLVED, solution.message
+        np.testing.assert_array_equal(solution.d, np.ones((2, 1)))
+
+
+def test_the_time_limit_ends_a_solver_that_hangs():
+    solver = isolated(Hanging, SolverOptions(time_limit=1.0))
+    began = time.monotonic()
+    solution = solver.solve(small(1.0))
+    assert time.monotonic() - began < 30.0
+    assert solution.status is SolveStatus.FAILED
+    assert "time limit" in solution.message
+    for _ in range(100):  # within its limit each QP waits for the process that starts
+        solution = solver.solve(small())
+        if solution.status is SolveStatus.SOLVED:
+            break
+        assert "not ready after" in solution.message or "time limit" in solution.message
+    assert solution.status is SolveStatus.SOLVED
+
+
+def test_shift_forget_and_prepare_are_forwarded():
+    solver = isolated(Hostile)
+    assert solver.solve(small()).iterations == 1
+    solver.shift()
+    assert solver.solve(small()).iterations == 102
+    solver.forget()
+    assert solver.solve(small()).iterations == 1
+    solver.prepare(7)
+    assert solver.solve(small()).iterations == 7001
+
+
+@POSIX
+def test_another_process_is_prepared_as_the_first_one():
+    solver = isolated(Crashing)
+    solver.prepare(7)
+    assert solver.solve(small(1.0)).status is SolveStatus.FAILED
+    assert solver.solve(small()).iterations == 7001
+
+
+def test_what_it_prints_does_not_get_among_the_answers(capfd):
+    solver = isolated(Printing)
+    assert solver.solve(small()).status is SolveStatus.SOLVED
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "words of a solver" in err
+
+
+def test_an_overridden_solve_is_contained():
+    solver = isolated(Overriding)
+    assert "returned int, not a Solution" in solver.solve(small(1.0)).message
+    assert solver.solve(small()).message == "ValueError: what it says"
+
+
+@POSIX
+def test_the_process_ends_with_the_solver():
+    solver = isolated(Hostile)
+    pid = solver._child._process.pid
+    assert not gone(pid)
+    del solver
+    gc.collect()
+    assert gone(pid)
+
+
+@POSIX
+def test_the_process_ends_with_its_parent(tmp_path):
+    program = textwrap.dedent("""
+        import os, sys
+        from qpmhe_solvers import create
+        solver = create("banded", isolated=True)
+        print(solver._child._process.pid, flush=True)
+        if sys.argv[1] == "killed":
+            os.kill(os.getpid(), 9)
+    """)
+    for how in ("ends", "killed"):
+        ended = subprocess.run(
+            [sys.executable, "-c", program, how], capture_output=True, text=True, timeout=60
+        )
+        assert ended.stderr == ""
+        pid = int(ended.stdout)
+        for _ in range(200):
+            if gone(pid):
+                break
+            time.sleep(0.05)
+        assert gone(pid)
+
+
+@pytest.mark.parametrize("way", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_a_copy_has_a_process_of_its_own(way):
+    solver = isolated(Hostile, SolverOptions(absolute_tolerance=1e-5))
+    copied = way(solver)
+    assert copied.options == solver.options
+    assert copied._child._process.pid != solver._child._process.pid
+    assert copied.solve(small()).status is SolveStatus.SOLVED
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
+def test_a_forked_process_does_not_end_or_use_that_of_its_parent():
+    solver = isolated(Hostile)
+    pid = os.fork()
+    if pid == 0:
+        try:
+            fine = solver.solve(small()).iterations == 1
+            solver._child.end()
+        except BaseException:
+            fine = False
+        os._exit(0 if fine else 1)
+    _, status = os.waitpid(pid, 0)
+    assert status == 0
+    assert solver.solve(small()).iterations == 1
+
+
+@POSIX
+def test_an_interrupt_leaves_a_solver_that_goes_on(monkeypatch):
+    from qpmhe_solvers import isolated as module
+
+    solver = isolated(Hostile)
+    first = solver._child._process.pid
+
+    def interrupted(pipe):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as context:
+        context.setattr(module, "_read", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            solver.solve(small())
+    assert gone(first)
+    assert solver.solve(small()).iterations == 1
+
+
+def test_what_cannot_be_made_or_sent_is_refused_at_construction():
+    with pytest.raises(BackendError, match=r"cannot be isolated: .*no licence"):
+        isolated(Unmakeable)
+    lock = __import__("threading").Lock()
+    stuck = Backend("stuck", lambda options, lock=lock: Hostile(options), "theatre")
+    with registered(stuck), pytest.raises(BackendError, match=r"cannot be sent .*a module"):
+        create("stuck", isolated=True)
+    with pytest.raises(OptionError, match="isolated is 1; expected True or False"):
+        create("banded", isolated=1)
+
+
+MAIN = """
+    import numpy as np
+    from qpmhe_solvers import QP, Backend, RawSolution, Solver, create, register
+
+    class Mine(Solver):
+        def _solve(self, qp, start):
+            return RawSolution(-qp.gradient / qp.band[:, :, 0], True, 1, np.zeros(qp.size))
+
+    register(Backend("mine", Mine, "theatre"))
+    qp = QP(2, 1)
+    qp.bounded = False
+    qp.band[:, :, 0], qp.gradient[...] = 1.0, -1.0
+    HIDE
+    print(create("mine", isolated=True).solve(qp).status.name)
+"""
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_backend_of_the_main_script(hidden, tmp_path):
+    if not hidden:
+        pytest.importorskip("joblib")
+    hide = (
+        "import sys; sys.modules['cloudpickle'] = sys.modules['joblib'] = None" if hidden else ""
+    )
+    script = tmp_path / "script.py"
+    script.write_text(textwrap.dedent(MAIN).replace("HIDE", hide))
+    ended = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=60
+    )
+    if hidden:
+        assert ended.returncode == 1
+        assert "its factory is in the main script" in ended.stderr
+    else:
+        assert (ended.returncode, ended.stdout) == (0, "SOLVED\n"), ended.stderr
+
+
+def decay(x):
+    return 0.9 * x
+
+
+def itself(x):
+    return x
+
+
+def estimator(**options):
+    system = qpmhe.System(decay, itself, n=1, p=1)
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0)
+    return qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.3]), cost, horizon=4, initial_state=[0.0], **options
+    )
+
+
+@POSIX
+def test_update_falls_back_where_the_backend_crashes_and_goes_on():
+    with registered(entry(Crashing)):
+        mhe, plain = (estimator(backend=name, isolated=one) for name, one in (
+            ("crashing", True), ("banded", False)
+        ))
+        seen = set()
+        for y in [1.0, 1.0, -2.0, 3.0, -1.0, -1.0, 4.0, 0.5, 0.1, -3.0]:
+            estimate, other = mhe.update([y]), plain.update([y])
+            assert estimate.cost <= estimate.candidate_cost
+            assert estimate.candidate_cost == pytest.approx(other.candidate_cost)
+            failed = bool(estimate.status & qpmhe.Status.SOLVER_FAILED)
+            seen.add(failed)
+            assert failed == ("SIGSEGV" in estimate.message)
+            assert estimate.improved != failed
+    assert seen == {True, False}
+
+
+def test_an_isolated_estimator_continues_from_its_snapshot():
+    mhe = estimator(backend="osqp", isolated=True)
+    for y in (1.0, 0.5, 0.2, 0.8, 0.3, 0.4):
+        mhe.update([y])
+    twin = pickle.loads(pickle.dumps(mhe))
+    assert twin.settings.isolated
+    for y in (0.1, 0.9):
+        np.testing.assert_array_equal(mhe.update([y]).state, twin.update([y]).state)
+    mhe.reset()
+    assert mhe.update([1.0]).improved
+
+
+def test_isolated_is_for_backends():
+    with pytest.raises(OptionError, match=r"isolated is True, but engine='compiled' .*python"):
+        estimator(engine="compiled", isolated=True)
+    with pytest.raises(OptionError, match="isolated is 'yes'; expected True or False"):
+        estimator(isolated="yes")
