@@ -40,6 +40,10 @@ def renamed(text: str, name: str) -> str:
 def prologue() -> str:
     """Short names for what the header defines."""
     return (
+        # Before GCC 12.4 and 13.3 the vectoriser loses permutations of masked loads, which it
+        # makes of conditional ones: CasADi's functions test each argument's pointer.
+        "#if defined(__GNUC__) && !defined(__clang__)\n"
+        '#pragma GCC optimize ("no-tree-loop-if-convert")\n#endif\n'
         "#include <math.h>\n#include <string.h>\n\n"
         "#define real mhe_real\n#define NX MHE_NX\n#define NY MHE_NY\n#define NU MHE_NU\n"
         "#define SIZE(n) ((n) > 0 ? (n) : 1)\n\n"
