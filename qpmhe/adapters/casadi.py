@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codegen.comparison import Buffers, Interpreter, model_fault
+from ..codegen.comparison import Batch, Buffers, Interpreter, model_fault, points
 from ..codegen.compiler import WrongCodeError, compiled_library, find_compiler
 from ..codegen.evaluation import fixed_call, may_fail, separate_calls
 from ..codegen.expressions import CasadiModel, casadi_model, import_casadi
@@ -199,15 +199,18 @@ def _library(
     model: CasadiModel, states: ConvexSet | None, required: bool
 ) -> ctypes.PyDLL | None:
     """The model's machine code; None where CasADi is to evaluate it."""
-    made: list[Interpreter] = []
+    made: list[tuple[Interpreter, list[Batch]]] = []
 
     def fault(library: ctypes.CDLL) -> str:
-        made[:] = made or [Interpreter(model)]
+        if not made:
+            interpreter = Interpreter(model)
+            made.append((interpreter, list(points(interpreter, states, 0))))
         quick = ctypes.PyDLL(library._name)
-        return (
-            model_fault(made[0], partial(_compiled, model, quick), states)
-            or fused_fault(made[0], quick, states)
-        )
+        with np.errstate(all="ignore"):
+            return (
+                model_fault(made[0][0], partial(_compiled, model, quick), made[0][1])
+                or fused_fault(made[0][0], quick, made[0][1])
+            )
 
     try:
         library = compiled_library(model_files(model), "model.c", check=fault)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codegen.comparison import ROUNDING, Interpreter, differs, points
-from ..sets import ConvexSet
+from ..codegen.comparison import ROUNDING, Batch, Interpreter, differs
 
 __all__ = ["Fused", "fused", "fused_fault"]
 
@@ -101,7 +100,7 @@ def fused(
 
 
 def fused_fault(
-    interpreter: Interpreter, library: ctypes.PyDLL, states: ConvexSet | None
+    interpreter: Interpreter, library: ctypes.PyDLL, batches: Sequence[Batch]
 ) -> str:
     """Where the calls differ from CasADi's interpreter and NumPy; empty where they do not.
 
@@ -111,12 +110,12 @@ def fused_fault(
         The model.
     library : ctypes.PyDLL
         Its machine code.
-    states : ConvexSet or None
-        Where the model is defined.
+    batches : sequence
+        Of `qpmhe.codegen.comparison.points`.
     """
     model, generator = interpreter.model, np.random.default_rng(2)
     n, p, q = model.n, model.p, model.n + model.p
-    xs, inputs, steps, found = list(points(interpreter, states, 2))[-1]
+    xs, inputs, steps, found = batches[-1]
     count = len(xs)
     gain, weight = 0.1 * generator.standard_normal((n, p)), np.eye(q)
     weight += 0.1 / q * generator.uniform(-1.0, 1.0, (q, q))

@@ -7,7 +7,7 @@ the interpreter itself makes of arguments that differ in their last digits.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from .expressions import CasadiModel
 if TYPE_CHECKING:
     from .library import EstimatorLibrary
 
-__all__ = ["Buffers", "Interpreter", "differs", "estimator_fault", "model_fault", "points"]
+__all__ = ["Batch", "Buffers", "Interpreter", "differs", "estimator_fault", "model_fault", "points"]
 
 Array = NDArray[np.float64]
 # Fixed arrays for states, inputs and results, and what computes these from those.
@@ -30,7 +30,7 @@ Buffers = tuple[Array, Array, dict[str, Array], Callable[[], object]]
 # A difference by this share of what a result is made of is rounding.
 ROUNDING = 1e-9
 # Relative change of the arguments that shows how rounding spreads, and its weight.
-_NUDGE, _WEIGHT = 1e-11, 100.0
+_NUDGE, _WEIGHT = 1e-11, 300.0
 # States at once: vectorised loops treat remainders in code of their own.
 _COUNTS = (1, 2, 3, 4, 5, 8, 11)
 # Magnitude of the points, and the least share of it: positive ones first, where most models
@@ -41,12 +41,12 @@ _SCALES = (
 )
 _ALL = ("f", "h", "f_jacobian", "h_jacobian")
 # Samples that a compiled estimator is tried on, and how many of them by which function.
-_SAMPLES, _BY_RUN, _BY_MEMBERS = 26, 7, 2
+_SAMPLES, _BY_RUN, _BY_MEMBERS = 22, 7, 2
 _MANY_STATES, _FEW_SAMPLES = 40, 12
 
 
 class Interpreter:
-    """A model by CasADi's virtual machine, discretised in NumPy; NaN where it breaks off.
+    """A model by CasADi's virtual machine; NaN where it breaks off.
 
     Parameters
     ----------
@@ -56,50 +56,45 @@ class Interpreter:
 
     def __init__(self, model: CasadiModel) -> None:
         self.model, n = model, model.n
-        self._x, self._u = np.zeros(n), np.zeros(model.m)
-        given = (self._x, self._u) if model.m else (self._x,)
-        self._values: dict[str, tuple[Callable[[], bool], Array]] = {}
+        self._x, self._u, self._dt = np.zeros(n), np.zeros(max(model.m, 1)), np.zeros(1)
+        self._input = self._u[: model.m]
+        values = {"f": np.zeros(n), "h": np.zeros(model.p)}
+        self._values = {
+            "f": fixed_call(model.step(), (self._x, self._u, self._dt), (values["f"],)),
+            "h": fixed_call(model.h, (self._x, self._u), (values["h"],)),
+        }
+        self._found = values
         self._slopes: dict[str, tuple[Callable[[], bool], Array, Array, Array, Array]] = {}
-        for which, rows in (("f", n), ("h", model.p)):
-            value = np.zeros(rows)
-            self._values[which] = fixed_call(getattr(model, which), given, (value,)), value
+        for which, value in values.items():
             function, places = model.with_jacobian(which)
-            value, nonzeros = np.zeros(rows), np.zeros(len(places))
-            results = (value, nonzeros) if places else (value,)
+            value, nonzeros = np.zeros(len(value)), np.zeros(max(len(places), 1))
             self._slopes[which] = (
-                fixed_call(function, given, results), value, nonzeros, np.array(places, np.intp),
-                np.zeros((rows, n)),
+                fixed_call(function, (self._x, self._u), (value, nonzeros)), value,
+                nonzeros[: len(places)], np.array(places, np.intp), np.zeros((len(value), n)),
             )
+        # Relative changes without a pattern: equal ones would leave differences as they are.
+        self._nudge = 1 + _NUDGE * np.random.default_rng(0).uniform(-1.0, 1.0, n)
 
-    def _value(self, which: str, x: Array, u: Array) -> Array:
-        self._x[:], self._u[:] = x, u
-        call, value = self._values[which]
-        return value.copy() if call() else np.full_like(value, np.nan)
+    def _value(self, which: str, x: Array, u: Array, out: Array) -> None:
+        self._x[:], self._input[:] = x, u
+        out[:] = self._found[which] if self._values[which]() else np.nan
 
     def _slope(self, which: str, x: Array, u: Array) -> tuple[Array, Array]:
-        self._x[:], self._u[:] = x, u
+        self._x[:], self._input[:] = x, u
         call, value, nonzeros, places, dense = self._slopes[which]
         if not call():
             return np.full_like(value, np.nan), np.full_like(dense, np.nan)
         dense.flat[places] = nonzeros
         return value.copy(), dense.copy()
 
-    def f(self, x: Array, u: Array, dt: float) -> Array:
+    def f(self, x: Array, u: Array, dt: float, out: Array) -> None:
         """The discrete-time map at one state."""
-        method = self.model.method
-        first = self._value("f", x, u)
-        if method is None:
-            return first
-        if method == "euler":
-            return x + dt * first
-        second = self._value("f", x + dt / 2 * first, u)
-        third = self._value("f", x + dt / 2 * second, u)
-        fourth = self._value("f", x + dt * third, u)
-        return x + dt / 6 * (first + 2 * (second + third) + fourth)
+        self._dt[0] = dt
+        self._value("f", x, u, out)
 
-    def h(self, x: Array, u: Array) -> Array:
+    def h(self, x: Array, u: Array, out: Array) -> None:
         """The outputs at one state."""
-        return self._value("h", x, u)
+        self._value("h", x, u, out)
 
     def f_jacobian(self, x: Array, u: Array, dt: float) -> Array:
         """The Jacobian of `f`."""
@@ -121,29 +116,31 @@ class Interpreter:
 
     def stages(self, xs: Array, us: Array, steps: Array, jacobians: bool) -> dict[str, Array]:
         """All at many states, and under ``spread_f`` etc. how far rounding may spread."""
-        rows: list[list[Array]] = []
-        for x, u, dt in zip(xs, us, steps, strict=True):
-            rows.append([])
-            for at in (x, x * (1 + _NUDGE), x * (1 - _NUDGE)):
-                rows[-1] += [self.f(at, u, dt), self.h(at, u)]
-                if jacobians:
-                    rows[-1] += [self.f_jacobian(at, u, dt), self.h_jacobian(at, u)]
+        count, n, p = len(xs), self.model.n, self.model.p
+        shapes = {"f": (n,), "h": (p,), "f_jacobian": (n, n), "h_jacobian": (p, n)}
         names = _ALL if jacobians else _ALL[:2]
-        found = {}
-        for i, name in enumerate(names):
-            middle, up, down = (
-                np.array([row[j] for row in rows]) for j in range(i, len(rows[0]), len(names))
-            )
-            found[name] = middle
-            spread = np.fmax(abs(up - middle), abs(down - middle))
+        near = xs, xs * self._nudge
+        values = {name: np.zeros((len(near), count, *shapes[name])) for name in names}
+        for i, states in enumerate(near):
+            for k, (x, u, dt) in enumerate(zip(states, us, steps, strict=True)):
+                self.f(x, u, dt, values["f"][i, k])
+                self.h(x, u, values["h"][i, k])
+                if jacobians:
+                    values["f_jacobian"][i, k] = self.f_jacobian(x, u, dt)
+                    values["h_jacobian"][i, k] = self.h_jacobian(x, u)
+        found = {name: value[0] for name, value in values.items()}
+        for name, (middle, other) in values.items():
+            spread = abs(other - middle)
             found[f"spread_{name}"] = _WEIGHT * np.nan_to_num(spread, posinf=0.0)
         return found
 
 
-def points(
-    interpreter: Interpreter, states: ConvexSet | None, seed: int
-) -> Iterator[tuple[Array, Array, Array, dict[str, Array]]]:
-    """Batches of states within bounds, inputs, steps, and what the interpreter makes of them.
+# States, inputs, lengths of steps, and what the interpreter makes of them.
+Batch = tuple[Array, Array, Array, dict[str, Array]]
+
+
+def points(interpreter: Interpreter, states: ConvexSet | None, seed: int) -> Iterator[Batch]:
+    """Batches of states within bounds, inputs and steps, with all functions' values.
 
     Each has one magnitude. Where the model is not finite, other magnitudes are tried.
 
@@ -159,7 +156,7 @@ def points(
     model, generator = interpreter.model, np.random.default_rng(seed)
     last = 0
     for batch, count in enumerate(_COUNTS):
-        best: tuple[Array, Array, Array, dict[str, Array]] | None = None
+        best: Batch | None = None
         most = -1
         for trial in range(len(_SCALES)):
             last = (last + (trial > 0)) % len(_SCALES)
@@ -213,7 +210,7 @@ def _allowed(name: str, xs: Array, found: dict[str, Array]) -> Array:
 def model_fault(
     interpreter: Interpreter,
     maker: Callable[[bool, int, tuple[str, ...]], Buffers],
-    states: ConvexSet | None,
+    batches: Sequence[Batch],
 ) -> str:
     """Where a model's machine code differs from the interpreter; empty where it does not.
 
@@ -223,10 +220,10 @@ def model_fault(
         The model.
     maker : callable
         ``maker(timed, count, names)`` gives buffers for the machine code.
-    states : ConvexSet or None
-        Where the model is defined.
+    batches : sequence
+        Of `points`.
     """
-    for xs, us, steps, found in points(interpreter, states, 1):
+    for xs, us, steps, found in batches:
         count = len(xs)
         usual = interpreter.model.dt
         timed = usual is not None and bool((steps != usual).any())
@@ -320,9 +317,9 @@ class _Rehearsal:
         generator = np.random.default_rng(seed)
         most = _SAMPLES if n <= _MANY_STATES else _FEW_SAMPLES
         count = min(library.layout.horizon + _BY_RUN + _BY_MEMBERS, most)
-        batches = list(points(interpreter, states, seed))
-        self._start, first = batches[-1][0][:2]
-        x, scale = first, abs(first).max()
+        first = next(points(interpreter, states, seed))[0][0]
+        self._start = _within(states, first * (1 + 0.1 * generator.uniform(-1.0, 1.0, n)))
+        x, scale, following = first, abs(first).max(), np.zeros(n)
         self._us = generator.uniform(0.2, 1.0, (count, model.m))
         self._steps = np.full(count, model.dt or 0.0)
         self._ys, self._weights = np.zeros((count, p)), np.zeros((count, p, p))
@@ -330,8 +327,8 @@ class _Rehearsal:
             special = t >= _BY_RUN + _BY_MEMBERS and t % 6 == 0
             if special:
                 self._steps[t] *= 0.75
-            h = interpreter.h(x, self._us[t])
-            self._ys[t] = h * (1 + 0.1 * generator.standard_normal(p))
+            interpreter.h(x, self._us[t], self._ys[t])
+            self._ys[t] *= (1 + 0.1 * generator.standard_normal(p))
             if t % 5 == 3:
                 self._ys[t, t % p] = np.nan
             if t % 11 == 7:
@@ -339,10 +336,9 @@ class _Rehearsal:
             self._weights[t] = _observed_weight(
                 2.0 * noise if special else noise, np.isfinite(self._ys[t])
             )
-            x = interpreter.f(x, self._us[t], self._steps[t])
-            x = x * (1 + 0.05 * generator.standard_normal(n))
-            if states is not None:
-                x = np.clip(x, states.lower, states.upper)
+            interpreter.f(x, self._us[t], self._steps[t], following)
+            x = following * (1 + 0.05 * generator.standard_normal(n))
+            x = _within(states, x)
             if not abs(x).max() <= 1e3 * scale:  # NaN, too
                 x = first
         self._own_noise = 2.0 * noise
@@ -383,6 +379,8 @@ class _Rehearsal:
                 )
             else:
                 library.update(*at)
+            if t > count + 4 and t % 3:
+                continue
             found = out[0]
             length = int(found["length"])
             fault = self._step_fault(
@@ -473,20 +471,23 @@ class _Judged:
         else:  # an output that is not finite fails the model, measured or not
             v[~np.isfinite(found["h"])] = np.nan
         age = discount ** np.arange(count - 1, -1, -1.0)
-        offset = xs[0] - prior
-        self.cost, self.allowed = 0.0, 0.0
-        for r, allowed, weight in (
-            (offset, 0 * offset, discount**count * prior_weight),
-            *zip(self.w, self.allowed_w, age[:, None, None] * disturbance, strict=True),
-            *zip(v, allowed_v, age[:, None, None] * weights, strict=True),
+        self.cost = self.allowed = 0.0
+        for rows, allowed, factors, weight in (
+            ((xs[0] - prior)[None], np.zeros((1, len(prior))), np.array([discount**count]),
+             prior_weight[None]),
+            (self.w, self.allowed_w, age, disturbance[None]),
+            (v, allowed_v, age, weights),
         ):
-            self.cost += float(r @ weight @ r)
-            most = abs(r) + allowed
+            heavy = abs(weight)
+            weighted = np.matmul(weight, rows[:, :, None])[:, :, 0]
+            self.cost += float(factors @ (rows * weighted).sum(axis=1))
             # |(r + d)' W (r + d) - r' W r| for |d| <= allowed, and the sums' own rounding.
-            self.allowed += float(
-                2 * abs(weight @ r) @ allowed + allowed @ abs(weight) @ allowed
-                + ROUNDING * (most @ abs(weight) @ most)
-            )
+            most = abs(rows) + allowed
+            spread = np.matmul(heavy, allowed[:, :, None])[:, :, 0]
+            whole = np.matmul(heavy, most[:, :, None])[:, :, 0]
+            self.allowed += float(factors @ (
+                2 * abs(weighted) * allowed + allowed * spread + ROUNDING * most * whole
+            ).sum(axis=1))
         if is_candidate and not np.isfinite(self._f).all():
             self.cost = np.inf
 
@@ -500,6 +501,10 @@ class _Judged:
         finite = np.isfinite(following).all(axis=1)
         allowed = self._allowed_f + self._allowed_correction
         return bool((abs(candidate[1:] - following)[finite] > allowed[finite]).any())
+
+
+def _within(states: ConvexSet | None, x: Array) -> Array:
+    return x if states is None else np.clip(x, states.lower, states.upper)
 
 
 def _observed_weight(weight: Array, observed: NDArray[np.bool_]) -> Array:

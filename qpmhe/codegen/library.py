@@ -187,7 +187,8 @@ class EstimatorLibrary:
         def fault(library: ctypes.CDLL) -> str:
             self._bind(library)
             made[:] = made or [Interpreter(model)]
-            return estimator_fault(made[0], self, states)
+            with np.errstate(all="ignore"):
+                return estimator_fault(made[0], self, states)
 
         self._bind(compiled_library(files, "mhe.c", structure, fault))
 
