@@ -161,7 +161,8 @@ def fused_fault(
         off_ahead = ROUNDING * (abs(xs[k]) + abs(found["f"][k])) + found["spread_f"][k]
         for got, one, allowed in (
             (linear[k], true, error), (panel[k], band, off_band),
-            (own[k], squared[1:, 0], off_squared[1:, 0]), (following[k], weighted[:n, 0], off[:n, 0]),
+            (own[k], squared[1:, 0], off_squared[1:, 0]),
+            (following[k], weighted[:n, 0], off[:n, 0]),
             (z[k + 1], ahead, off_ahead + error[:n, 0]),
             (np.array(cost), squared[0, 0], off_squared[0, 0]),
         ):
