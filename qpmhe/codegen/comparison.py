@@ -288,36 +288,46 @@ def estimator_fault(
         Where the model is defined.
     """
     given, other = library.settings.copy(), library.settings.copy()
-    given["max_qps"] = np.clip(given["max_qps"], 1, 3)
-    other["max_qps"] = 2
+    given["max_qps"], other["max_qps"] = np.clip(given["max_qps"], 1, 3), 2
     other["discount"] = 1.0 if given["discount"] < 1.0 else 0.95
     other["start_at_best"] = not given["start_at_best"]
     other["reinitialize"] = not given["reinitialize"]
-    for seed, settings in enumerate((given, other)):
-        fault = _Rehearsal(interpreter, library, settings, states, seed).fault()
+    for is_wild, settings in ((False, given), (True, other)):
+        fault = _Rehearsal(interpreter, library, settings, states, is_wild).fault()
         if fault:
             return fault
     return ""
 
 
 class _Rehearsal:
-    """One record run through a compiled estimator."""
+    """One record run through a compiled estimator.
+
+    Only trials that are accepted can be seen. Of a wild record nearly all are: measurements
+    far from what the candidate predicts, with weights on all else that let trials follow them.
+    """
 
     def __init__(
         self, interpreter: Interpreter, library: EstimatorLibrary, settings: NDArray[Any],
-        states: ConvexSet | None, seed: int,
+        states: ConvexSet | None, is_wild: bool,
     ) -> None:
         model = interpreter.model
         n, p = model.n, model.p
+        generator = np.random.default_rng(int(is_wild))
+        first, _, _, values = next(points(interpreter, states, int(is_wild)))
+        first, output = first[0], values["h"][0]
+        if is_wild:
+            for name in ("prior_weight", "disturbance_weight"):
+                small = 1e-2 * output @ settings["noise_weight"].reshape(p, p) @ output
+                share = small / (first @ settings[name].reshape(n, n) @ first)
+                if share > 0 and np.isfinite(share):
+                    settings[name] *= share
         self._interpreter, self._library, self._settings = interpreter, library, settings
         self._gain = settings["gain"].reshape(n, p)
         self._prior = settings["prior_weight"].reshape(n, n)
         self._disturbance = settings["disturbance_weight"].reshape(n, n)
         noise = settings["noise_weight"].reshape(p, p)
-        generator = np.random.default_rng(seed)
         most = _SAMPLES if n <= _MANY_STATES else _FEW_SAMPLES
         count = min(library.layout.horizon + _BY_RUN + _BY_MEMBERS, most)
-        first = next(points(interpreter, states, seed))[0][0]
         self._start = _within(states, first * (1 + 0.1 * generator.uniform(-1.0, 1.0, n)))
         x, scale, following = first, abs(first).max(), np.zeros(n)
         self._us = generator.uniform(0.2, 1.0, (count, model.m))
@@ -328,7 +338,10 @@ class _Rehearsal:
             if special:
                 self._steps[t] *= 0.75
             interpreter.h(x, self._us[t], self._ys[t])
-            self._ys[t] *= (1 + 0.1 * generator.standard_normal(p))
+            self._ys[t] *= (
+                generator.uniform(-2.0, 2.0, p) if is_wild
+                else 1 + 0.1 * generator.standard_normal(p)
+            )
             if t % 5 == 3:
                 self._ys[t, t % p] = np.nan
             if t % 11 == 7:
