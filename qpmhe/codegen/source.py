@@ -40,8 +40,8 @@ def renamed(text: str, name: str) -> str:
 def prologue() -> str:
     """Short names for what the header defines."""
     return (
-        # Before GCC 12.4 and 13.3 the vectoriser loses permutations of masked loads, which it
-        # makes of conditional ones: CasADi's functions test each argument's pointer.
+        # GCC 12.2 and others lose the order of elements in masked loads (GCC bug 114375).
+        # CasADi's functions test each argument's pointer, which if-conversion makes a mask.
         "#if defined(__GNUC__) && !defined(__clang__)\n"
         '#pragma GCC optimize ("no-tree-loop-if-convert")\n#endif\n'
         "#include <math.h>\n#include <string.h>\n\n"
