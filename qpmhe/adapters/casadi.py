@@ -201,16 +201,16 @@ def _library(
     """The model's machine code; None where CasADi is to evaluate it."""
     made: list[tuple[Interpreter, list[Batch]]] = []
 
+    @np.errstate(all="ignore")
     def fault(library: ctypes.CDLL) -> str:
         if not made:
             interpreter = Interpreter(model)
             made.append((interpreter, list(points(interpreter, states, 0))))
-        quick = ctypes.PyDLL(library._name)
-        with np.errstate(all="ignore"):
-            return (
-                model_fault(made[0][0], partial(_compiled, model, quick), made[0][1])
-                or fused_fault(made[0][0], quick, made[0][1])
-            )
+        quick, (interpreter, batches) = ctypes.PyDLL(library._name), made[0]
+        return (
+            model_fault(interpreter, partial(_compiled, model, quick), batches)
+            or fused_fault(interpreter, quick, batches)
+        )
 
     try:
         library = compiled_library(model_files(model), "model.c", check=fault)

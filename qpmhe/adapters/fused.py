@@ -138,7 +138,8 @@ def fused_fault(
         true = np.zeros((q, 1 + n))
         true[:n, 0], true[n:, 0] = gain @ noises[k], noises[k]
         true[:n, 1:], true[n:, 1:] = -found["f_jacobian"][k], -found["h_jacobian"][k]
-        if not np.isfinite(true).all() or not np.isfinite(found["f"][k]).all():
+        weighted, squared = weight @ true, true.T @ weight @ true
+        if not np.isfinite(squared).all() or not np.isfinite(found["f"][k]).all():
             if np.isfinite(cost):
                 return "a stage is finite, but not by CasADi's interpreter"
             continue
@@ -148,7 +149,6 @@ def fused_fault(
             size = abs(found[name][k]).max(axis=1, keepdims=True)
             error[rows, 1:] = ROUNDING * (size + (name[0] == "f")) + found[f"spread_{name}"][k]
         most, heavy = abs(true) + error, abs(weight)
-        weighted, squared = weight @ true, true.T @ weight @ true
         off = (1 + ROUNDING) * heavy @ most - heavy @ abs(true)
         off_squared = (1 + ROUNDING) * most.T @ heavy @ most - abs(true).T @ heavy @ abs(true)
         band, off_band = np.zeros((n, 2 * n)), np.zeros((n, 2 * n))

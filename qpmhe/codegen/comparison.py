@@ -43,6 +43,8 @@ _ALL = ("f", "h", "f_jacobian", "h_jacobian")
 # Samples that a compiled estimator is tried on, and how many of them by which function.
 _SAMPLES, _BY_RUN, _BY_MEMBERS = 22, 7, 2
 _MANY_STATES, _FEW_SAMPLES = 40, 12
+# A measurement beyond is missing (LARGEST in window.c).
+_LARGEST = 1e150
 
 
 class Interpreter:
@@ -342,6 +344,7 @@ class _Rehearsal:
                 generator.uniform(-2.0, 2.0, p) if is_wild
                 else 1 + 0.1 * generator.standard_normal(p)
             )
+            self._ys[t, ~(abs(self._ys[t]) < _LARGEST)] = np.nan
             if t % 5 == 3:
                 self._ys[t, t % p] = np.nan
             if t % 11 == 7:
@@ -359,7 +362,7 @@ class _Rehearsal:
     def fault(self) -> str:
         """What is wrong; empty if nothing is."""
         library, n = self._library, self._interpreter.model.n
-        memory = np.zeros(1, library.estimator_type)
+        memory = library.estimators(self._start[None])
         workspace, out = library.workspace(), np.zeros(1, library.estimate_type)
         library.reset(memory.ctypes.data, self._settings.ctypes.data, self._start.ctypes.data)
         ys, us = np.ascontiguousarray(self._ys), np.ascontiguousarray(self._us)
@@ -449,10 +452,9 @@ class _Rehearsal:
             found = self._interpreter.stages(
                 xs[:-1], self._us[window], self._steps[window], True
             )
-            with np.errstate(all="ignore"):
-                # As in C, by the sum of squares.
-                if not all(np.isfinite((one**2).sum()) for one in found.values()):
-                    return False
+            # As in C, by the sum of squares.
+            if not all(np.isfinite((one**2).sum()) for one in found.values()):
+                return False
         return True
 
     def _judge(self, t: int, xs: Array, prior: Array, is_candidate: bool) -> _Judged:

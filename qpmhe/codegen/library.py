@@ -184,11 +184,11 @@ class EstimatorLibrary:
         model, states = system.symbolic, system.states
         made: list[Interpreter] = []  # only where there is something to check
 
+        @np.errstate(all="ignore")
         def fault(library: ctypes.CDLL) -> str:
             self._bind(library)
             made[:] = made or [Interpreter(model)]
-            with np.errstate(all="ignore"):
-                return estimator_fault(made[0], self, states)
+            return estimator_fault(made[0], self, states)
 
         self._bind(compiled_library(files, "mhe.c", structure, fault))
 
