@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -11,21 +12,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codegen.compiler import compiled_library, find_compiler
+from ..codegen.comparison import Batch, Buffers, Interpreter, model_fault, points
+from ..codegen.compiler import WrongCodeError, compiled_library, find_compiler
 from ..codegen.evaluation import fixed_call, may_fail, separate_calls
 from ..codegen.expressions import CasadiModel, casadi_model, import_casadi
 from ..codegen.source import model_files
-from ..errors import CompilationError, OptionError
+from ..errors import CompilationError, EngineWarning, OptionError
 from ..functions import Trusted
 from ..sets import ConvexSet
 from ..system import System
-from .fused import Fused, fused
+from .fused import Fused, fused, fused_fault
 
 __all__ = ["casadi_system"]
 
 Array = NDArray[np.float64]
-# Fixed arrays for states, inputs and results, and what computes these from those.
-Buffers = tuple[Array, Array, dict[str, Array], Callable[[], object]]
 # Makes buffers for a number of states and the wanted results.
 Maker = Callable[[int, tuple[str, ...]], Buffers]
 
@@ -57,7 +57,9 @@ def casadi_system(
         raise OptionError(f"compiled is {compiled!r}; expected True, False or None.")
     model = casadi_model(f, h, n=n, p=p, m=m, dt=dt, method=method)
     sets = {"states": states, "disturbances": disturbances, "noises": noises}
-    library = _library(model, compiled)
+    library: ctypes.PyDLL | None = None
+    if compiled or (compiled is None and find_compiler() is not None):
+        library = _library(model, states, compiled is True)
 
     def made(timed: bool) -> System:
         maker = (
@@ -193,15 +195,33 @@ class _Evaluator:
         return found
 
 
-def _library(model: CasadiModel, compiled: bool | None) -> ctypes.PyDLL | None:
+def _library(
+    model: CasadiModel, states: ConvexSet | None, required: bool
+) -> ctypes.PyDLL | None:
     """The model's machine code; None where CasADi is to evaluate it."""
-    if compiled is False or (compiled is None and find_compiler() is None):
-        return None
+    made: list[tuple[Interpreter, list[Batch]]] = []
+
+    @np.errstate(all="ignore")
+    def fault(library: ctypes.CDLL) -> str:
+        if not made:
+            interpreter = Interpreter(model)
+            made.append((interpreter, list(points(interpreter, states, 0))))
+        quick, (interpreter, batches) = ctypes.PyDLL(library._name), made[0]
+        return (
+            model_fault(interpreter, partial(_compiled, model, quick), batches)
+            or fused_fault(interpreter, quick, batches)
+        )
+
     try:
-        library = compiled_library(model_files(model), "model.c")
-    except CompilationError:
-        if compiled:
+        library = compiled_library(model_files(model), "model.c", check=fault)
+    except CompilationError as error:
+        if required:
             raise
+        if isinstance(error, WrongCodeError):
+            warnings.warn(
+                f"the model is evaluated by CasADi's virtual machine: {error}", EngineWarning,
+                stacklevel=4,
+            )
         return None
     # A handle that keeps the interpreter's lock: the calls are shorter than handing it over.
     return ctypes.PyDLL(library._name)

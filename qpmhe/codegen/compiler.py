@@ -1,4 +1,4 @@
-"""C source in, loaded library out, with a cache on disk."""
+"""C source in, loaded and checked library out, with a cache on disk."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -18,15 +19,22 @@ from platformdirs import user_cache_path
 
 from ..errors import CompilationError
 
-__all__ = ["cache_directory", "compiled_library", "find_compiler"]
+__all__ = ["WrongCodeError", "cache_directory", "compiled_library", "find_compiler"]
 
 # Contraction and the like may round differently, but keep infinities and NaN.
 _FLAGS = ("-std=c99", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno",
           "-fno-trapping-math")
-_FAST = ("-O3", "-march=native")
+# Tried in turn until the code is right. Without vectors, masked loads cannot go wrong.
+_LEVELS = (("-O3", "-march=native"), ("-O2", "-fno-tree-vectorize"), ("-O0",))
 # Folders of compilations in progress, in the cache; and the seconds after which none is.
 _SCRATCH = "qpmhe-making-"
 _STALE = 86400.0
+# Libraries that this process has checked: path and content.
+_checked: set[tuple[str, str]] = set()
+
+
+class WrongCodeError(CompilationError):
+    """The compiler makes wrong code of the source, however little it optimises."""
 
 
 def find_compiler() -> list[str] | None:
@@ -63,8 +71,16 @@ def _processor() -> str:
     return "\n".join((platform.machine(), platform.processor(), *sorted(wanted)))
 
 
-def compiled_library(files: dict[str, str], main: str, key: str | None = None) -> ctypes.CDLL:
+def compiled_library(
+    files: dict[str, str],
+    main: str,
+    key: str | None = None,
+    check: Callable[[ctypes.CDLL], str] | None = None,
+) -> ctypes.CDLL:
     """Compile C source and load it; a library made before is loaded from the cache.
+
+    Compilers make mistakes. What `check` finds wrong is compiled again with less
+    optimisation, and the cache remembers the level.
 
     Parameters
     ----------
@@ -73,10 +89,15 @@ def compiled_library(files: dict[str, str], main: str, key: str | None = None) -
     main : str
         Name of the file to compile.
     key : str, optional
-        What tells libraries apart, if not the files' whole text.
+        What distinguishes libraries, if not the files' whole text.
+    check : callable, optional
+        Says what is wrong with a library; an empty text if nothing is. Called once a
+        process for each library.
 
     Raises
     ------
+    WrongCodeError
+        If `check` finds the code wrong at every level of optimisation.
     CompilationError
         If there is no C compiler, or it fails.
     """
@@ -87,36 +108,96 @@ def compiled_library(files: dict[str, str], main: str, key: str | None = None) -
         )
     stamp = os.stat(compiler[0])
     parts = (
-        *compiler, str(stamp.st_size), str(stamp.st_mtime_ns), *_FLAGS, *_FAST, _processor(),
+        *compiler, str(stamp.st_size), str(stamp.st_mtime_ns), *_FLAGS, repr(_LEVELS),
+        _processor(),
         key if key is not None else "".join(f"{name}\0{files[name]}\0" for name in sorted(files)),
     )
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
     folder = _usable_folder()
-    path, seal = folder / f"{digest}.so", folder / f"{digest}.sha256"
-    if not _intact(path, seal):
+    note = folder / f"{digest}.level"
+    first, fault = _remembered(note)
+    message = ""
+    for level in range(first, len(_LEVELS)):
+        path, seal = folder / f"{digest}-{level}.so", folder / f"{digest}-{level}.sha256"
+        if not _intact(path, seal):
+            try:
+                message = _make(compiler, files, main, level, path, seal)
+            except OSError as error:  # no output, no space left
+                raise CompilationError(f"{path} cannot be made ({error}).") from error
+            if message:  # not every compiler knows its machine by these flags
+                continue
         try:
-            _make(compiler, files, main, path, seal)
-        except OSError as error:  # no output, no space left
-            raise CompilationError(f"{path} cannot be made ({error}).") from error
+            library = ctypes.CDLL(str(path))
+        except OSError as error:
+            raise CompilationError(f"{path} cannot be loaded ({error}).") from error
+        found = _fault(library, seal, check)
+        if not found:
+            if level > first:
+                _remember(note, level, fault)
+            return library
+        fault = found
+        _remember(note, level + 1, fault)
+    if not fault:
+        raise CompilationError(f"{' '.join(compiler)} failed: {message}")
+    raise WrongCodeError(
+        f"{' '.join(compiler)} makes wrong code ({fault}); set CC to another compiler, or "
+        "update this one."
+    )
+
+
+def _fault(
+    library: ctypes.CDLL, seal: Path, check: Callable[[ctypes.CDLL], str] | None
+) -> str:
+    """What is wrong with a library; an empty text if nothing is, or it was checked before."""
+    if check is None:
+        return ""
     try:
-        return ctypes.CDLL(str(path))
-    except OSError as error:
-        raise CompilationError(f"{path} cannot be loaded ({error}).") from error
+        content = seal.read_text("ascii")
+    except (OSError, UnicodeError):  # another process is replacing it
+        content = ""
+    if (library._name, content) in _checked:
+        return ""
+    fault = check(library)
+    if not fault and content:
+        _checked.add((library._name, content))
+    return fault
+
+
+def _remembered(note: Path) -> tuple[int, str]:
+    """The first level that is not known to fail, and what was wrong with those before."""
+    try:
+        level, _, fault = note.read_text(encoding="utf-8").partition("\n")
+        return min(max(int(level), 0), len(_LEVELS)), fault
+    except (OSError, ValueError):  # there is none, or it is damaged
+        return 0, ""
+
+
+def _remember(note: Path, level: int, fault: str) -> None:
+    """Write the note in one motion; without it the next process tries all levels again."""
+    scratch = note.with_name(f"{note.name}.{os.getpid()}")
+    try:
+        scratch.write_text(f"{level}\n{fault}", encoding="utf-8")
+        os.replace(scratch, note)
+    except OSError:
+        scratch.unlink(missing_ok=True)
 
 
 def _make(
-    compiler: list[str], files: dict[str, str], main: str, path: Path, seal: Path
-) -> None:
+    compiler: list[str], files: dict[str, str], main: str, level: int, path: Path, seal: Path
+) -> str:
+    """Put the library into the cache; the compiler's message if it fails, else nothing."""
     _remove_stale(path.parent)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=_SCRATCH) as scratch:
         for name, text in files.items():
             Path(scratch, name).write_text(text, encoding="ascii")
         made, sealed = Path(scratch, "library.so"), Path(scratch, "seal")
-        _run(compiler, Path(scratch, main), made)
-        sealed.write_text(hashlib.sha256(made.read_bytes()).hexdigest(), encoding="ascii")
-        # Each in one motion; a process that sees the one without the other compiles, too.
-        os.replace(made, path)
-        os.replace(sealed, seal)
+        message = _run(compiler, level, Path(scratch, main), made)
+        if not message:
+            sealed.write_text(hashlib.sha256(made.read_bytes()).hexdigest(), encoding="ascii")
+            # Each in one motion; a process that sees the one without the other compiles, too.
+            os.replace(made, path)
+            os.replace(sealed, seal)
+        return message
 
 
 def _remove_stale(folder: Path) -> None:
@@ -151,19 +232,15 @@ def _usable_folder() -> Path:
     )
 
 
-def _run(compiler: list[str], source: Path, target: Path) -> None:
-    message = ""
-    # Not every compiler knows its machine by this flag.
-    for flags in (_FAST, ("-O2",)):
-        command = [*compiler, *_FLAGS, *flags, "-o", str(target), str(source), "-lm"]
-        try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, errors="replace", timeout=600, check=False
-            )
-        except (OSError, subprocess.TimeoutExpired) as error:
-            message = str(error)
-            continue
-        if done.returncode == 0:
-            return
-        message = (done.stderr or done.stdout).strip()[-2000:]
-    raise CompilationError(f"{' '.join(compiler)} failed: {message}")
+def _run(compiler: list[str], level: int, source: Path, target: Path) -> str:
+    """Compile; what went wrong, or nothing."""
+    command = [*compiler, *_FLAGS, *_LEVELS[level], "-o", str(target), str(source), "-lm"]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", timeout=600, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return str(error)
+    if done.returncode == 0:
+        return ""
+    return (done.stderr or done.stdout).strip()[-2000:] or f"exit status {done.returncode}"

@@ -15,6 +15,7 @@ from ..observers import HighGain, Luenberger, Observer, SteadyStateKalman
 from ..sets import ConvexSet
 from ..settings import Settings
 from ..system import System
+from .comparison import Interpreter, estimator_fault
 from .compiler import compiled_library
 from .layout import SET_NAMES, Layout, settings_record
 from .source import CONTINUOUS, estimator_files
@@ -178,11 +179,22 @@ class EstimatorLibrary:
     ) -> None:
         files, structure, layout, record = generated(system, observer, cost, settings)
         self.layout, self.settings = layout, record
-        library = compiled_library(files, "mhe.c", structure)
+        self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
+        assert system.symbolic is not None
+        model, states = system.symbolic, system.states
+        made: list[Interpreter] = []  # only where there is something to check
+
+        @np.errstate(all="ignore")
+        def fault(library: ctypes.CDLL) -> str:
+            self._bind(library)
+            made[:] = made or [Interpreter(model)]
+            return estimator_fault(made[0], self, states)
+
+        self._bind(compiled_library(files, "mhe.c", structure, fault))
+
+    def _bind(self, library: ctypes.CDLL) -> None:
         # Single steps are shorter than handing the interpreter's lock over; runs are not.
         quick = ctypes.PyDLL(library._name)
-        self.estimator_type = layout.estimator_type()
-        self.estimate_type = layout.estimate_type()
         self.workspace_size = self._check_sizes(quick)
         pointer, integer = ctypes.c_void_p, ctypes.c_int64
         self.update, self.update_special = quick.mhe_update, quick.mhe_update_special

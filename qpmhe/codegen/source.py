@@ -40,6 +40,10 @@ def renamed(text: str, name: str) -> str:
 def prologue() -> str:
     """Short names for what the header defines."""
     return (
+        # GCC 12.2 and others lose the order of elements in masked loads (GCC bug 114375).
+        # CasADi's functions test each argument's pointer, which if-conversion makes a mask.
+        "#if defined(__GNUC__) && !defined(__clang__)\n"
+        '#pragma GCC optimize ("no-tree-loop-if-convert")\n#endif\n'
         "#include <math.h>\n#include <string.h>\n\n"
         "#define real mhe_real\n#define NX MHE_NX\n#define NY MHE_NY\n#define NU MHE_NU\n"
         "#define SIZE(n) ((n) > 0 ? (n) : 1)\n\n"

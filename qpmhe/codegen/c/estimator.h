@@ -3,7 +3,10 @@
  *     x(t+1) = f(x(t), u(t)) + w(t),   y(t) = h(x(t), u(t)) + v(t)
  *
  * Plain C99 without libraries but libm, no memory allocation, bounded loops. Compile
- * $name.c with any C99 compiler (cc -O2) and link with -lm:
+ * $name.c with any C99 compiler (cc -O2) and link with -lm. Never use -ffast-math, -Ofast or
+ * -ffinite-math-only: NaN and infinity have a meaning here. GCC without the fix of its bug 114375,
+ * such as 12.2, compiles masked loads wrongly, with AVX even at -O2. $name.c switches these off by
+ * a pragma; a build that drops it must pass -fno-tree-loop-if-convert.
  *
  *     static mhe_estimator estimator;      all that is remembered
  *     static mhe_workspace workspace;      scratch, may be shared by estimators of one thread

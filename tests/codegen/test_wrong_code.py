@@ -1,0 +1,229 @@
+"""Compilers that make wrong code: less optimisation, and CasADi's interpreter at last."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.codegen import compiler
+from qpmhe.errors import CompilationError, EngineWarning
+
+ca = pytest.importorskip("casadi")
+CC = shutil.which("cc")
+pytestmark = [
+    pytest.mark.skipif(CC is None, reason="there is no C compiler"),
+    pytest.mark.skipif(os.name != "posix", reason="the compilers here are shell scripts"),
+]
+FAST, MIDDLE, PLAIN = (" ".join(flags) for flags in compiler._LEVELS)
+A = np.array([[-0.9, 0.2], [-0.1, -0.8]])
+C = np.array([[1.0, 0.3], [0.2, 1.0]])
+
+MODEL_LIES = {
+    "residuals": "s/= y\\[j\\] - h\\[j\\]/= y[j] + h[j]/",
+    "the next state": "s/= x\\[NX + j\\] - f\\[j\\]/= x[j] - f[j]/",
+    "later states of a batch": "s/if (h) mhe_h(x, u, h + k \\* NY)/if (h) mhe_h(x, u, h)/",
+    "Jacobian": "s/A\\[j \\* NX + j\\] += 1;/A[j * NX + j] += 1.0001;/",
+    "lengths of steps": "s/step ? step\\[k\\] : usual/usual/",
+    "an entered stage": "s/next\\[j\\] += sum;/next[j] -= sum;/",
+    "the cost of a trajectory": "s/cost += weighted/cost -= weighted/",
+    "NaN": "s/= x\\[NX + j\\] - f\\[j\\]/= NAN/",
+}
+STEP_LIES = {
+    "noises": "s/v\\[j\\] = stage->y\\[j\\] - output/v[j] = stage->y[j] + output/",
+    "disturbances": "s/w\\[j\\] = x\\[NX + j\\] - predicted/w[j] = x[NX + j] + predicted/",
+    "the candidate": "s/next\\[j\\] = predicted\\[j\\] + w/next[j] = predicted[j] - w/",
+    "its cost": "s/mhe_form(NX, s->disturbance_weight, w) + mhe_form(NY, stage/mhe_form(NY, stage/",
+    "discount": "s/trial->cost += k->factors\\[i + 1\\] \\*/trial->cost +=/",
+    "prior": "s/cost += factors\\[0\\] \\*/cost += 0 */",
+    "missing components": "s/R\\[i \\* NY + j\\] -= share/R[i * NY + j] += share/",
+    "a step's length": "s/stage->step = step > 0 ? step :/stage->step =/",
+    "a noise weight": "s/stage->has_own_noise ? stage->own_noise_weight : //",
+    "failures": "s/int held = !isfinite(stage->cost)/int held = 1/",
+    "the verdict": "s/if (o->spare->cost < target) break/break/;"
+                   "s/if (!(o->spare->cost < target)) {/if (0) {/;s/= -k->gradient/= k->gradient/",
+}
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(folder))
+    monkeypatch.setattr(compiler, "_checked", set())
+    return folder
+
+
+@pytest.fixture
+def liar(tmp_path, monkeypatch, cache):
+    """A compiler that compiles another text at some levels; it counts its calls."""
+    def make(edit, levels):
+        path, log = tmp_path / "liar", tmp_path / "calls"
+        cases = "|".join(f"*'{level}'*" for level in levels)
+        path.write_text(
+            f"#!/bin/sh\necho \"$*\" >> '{log}'\n"
+            f"case \"$*\" in {cases})\n"
+            "for source; do case \"$source\" in *.c) break;; esac; done\n"
+            f"cp \"$source\" \"$source.true\"\nsed '{edit}' \"$source.true\" > \"$source\"\n"
+            "cmp -s \"$source\" \"$source.true\" && { echo 'no lie' >&2; exit 1; }\n;; esac\n"
+            f"exec '{CC}' \"$@\"\n"
+        )
+        path.chmod(0o755)
+        monkeypatch.setenv("CC", str(path))
+        return lambda: log.read_text().splitlines() if log.exists() else []
+
+    return make
+
+
+def linear(compiled=None, a=A, c=C, dt=0.1):
+    return qpmhe.System.from_casadi(
+        lambda x: ca.mtimes(ca.DM(a), x), lambda x: ca.mtimes(ca.DM(c), x), n=len(a), dt=dt,
+        method="rk4", compiled=compiled,
+    )
+
+
+def estimator(system, engine="compiled"):
+    n, p = system.n, system.p
+    return qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(0.1 * np.eye(n, p)),
+        qpmhe.QuadraticCost(prior=np.eye(n), disturbance=5 * np.eye(n),
+                            noise=2 * np.eye(p) + 0.5),
+        horizon=6, initial_state=np.ones(n), max_qps=2, engine=engine,
+    )
+
+
+def is_right(system):
+    rng, true = np.random.default_rng(3), linear(False)
+    for count in (1, 2, 5, 8):
+        x, y, u = rng.normal(size=(count + 1, 2)), rng.normal(size=(count, 2)), np.zeros((count, 0))
+        assert system.joint.residuals(x, y, u) == pytest.approx(
+            true.joint.residuals(x, y, u), rel=1e-9, abs=1e-12
+        )
+        assert system.h(x, None) == pytest.approx(true.h(x, None), rel=1e-9)
+
+
+def costs_are_right(mhe):
+    rng, true = np.random.default_rng(4), estimator(linear(False), "python")
+    for t in range(12):
+        y = rng.normal(size=2)
+        y[t % 2] *= np.nan if t % 5 == 2 else 1.0
+        one, two = mhe.update(y), true.update(y)
+        assert one.cost == pytest.approx(two.cost, rel=1e-6)
+        assert one.candidate_cost == pytest.approx(two.candidate_cost, rel=1e-9)
+
+
+def notes(cache):
+    return [path.read_text() for path in cache.glob("*.level")]
+
+
+@pytest.mark.parametrize("lie", MODEL_LIES)
+def test_a_wrong_model_is_compiled_with_less_optimisation(lie, liar, cache, monkeypatch):
+    calls = liar(MODEL_LIES[lie], [FAST])
+    is_right(linear())
+    assert [FAST in calls()[0], MIDDLE in calls()[1], len(calls())] == [True, True, 2]
+    assert notes(cache)[0].startswith("1\n")
+    assert "interpreter" in notes(cache)[0]
+    monkeypatch.setattr(compiler, "_checked", set())  # as in another process
+    is_right(linear())
+    assert len(calls()) == 2
+
+
+@pytest.mark.parametrize("lie", STEP_LIES)
+def test_a_wrong_estimator_is_compiled_with_less_optimisation(lie, liar, cache, monkeypatch):
+    calls = liar(STEP_LIES[lie], [FAST, MIDDLE])
+    system = linear(False)
+    mhe = estimator(system)
+    assert mhe.engine == "compiled"
+    costs_are_right(mhe)
+    assert [PLAIN in call for call in calls()] == [False, False, True]
+    assert notes(cache)[0].startswith("2\n")
+    monkeypatch.setattr(compiler, "_checked", set())
+    costs_are_right(estimator(system))
+    assert len(calls()) == 3
+
+
+def test_a_model_that_is_always_wrong_is_interpreted(liar, monkeypatch):
+    calls = liar(MODEL_LIES["residuals"], [FAST, MIDDLE, PLAIN])
+    for _ in range(2):
+        with pytest.warns(EngineWarning, match=r"virtual machine.*residuals"):
+            system = linear()
+        is_right(system)
+        assert len(calls()) == 3  # what is known to be wrong is not compiled again
+        monkeypatch.setattr(compiler, "_checked", set())
+    with pytest.raises(CompilationError, match="wrong code"):
+        linear(compiled=True)
+    assert len(calls()) == 3
+
+
+def test_an_estimator_that_is_always_wrong_is_the_python_step(liar):
+    # Of both libraries; the Python step must not use the model's.
+    calls = liar(f"{STEP_LIES['noises']};{MODEL_LIES['residuals']}", [FAST, MIDDLE, PLAIN])
+    with pytest.warns(EngineWarning, match="virtual machine"):
+        system = linear()
+    for _ in range(2):
+        with pytest.warns(EngineWarning, match="Python step"):
+            mhe = estimator(system)
+        assert mhe.engine == "python"
+        costs_are_right(mhe)
+        assert len(calls()) == 6
+
+
+def test_processes_at_once_with_a_compiler_that_lies(liar, cache):
+    calls = liar(MODEL_LIES["residuals"], [FAST])
+    program = (
+        "import numpy as np, casadi as ca, qpmhe\n"
+        f"s = qpmhe.System.from_casadi(lambda x: ca.mtimes(ca.DM({A.tolist()}), x), lambda x: x, "
+        "n=2, compiled=True)\n"
+        "print(s.joint.residuals(np.ones((3, 2)), 3 * np.ones((2, 2)), np.zeros((2, 0)))[1, 3])\n"
+    )
+    both = [
+        subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    assert [one.communicate(timeout=120)[0] for one in both] == ["2.0\n", "2.0\n"]
+    before = len(calls())
+    assert 2 <= before <= 4
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "2.0\n"
+    assert len(calls()) == before
+    assert not [path for path in cache.iterdir() if path.suffix not in (".so", ".sha256", ".level")]
+
+
+@pytest.mark.parametrize("note", ["", "x", "-1\n", "99\nall of it", "1"])
+def test_damaged_notes(note, cache):
+    linear(compiled=True)
+    path = next(cache.glob("*.so"))
+    (cache / f"{path.stem[:-2]}.level").write_text(note)
+    if note.startswith("99"):
+        with pytest.raises(CompilationError, match="all of it"):
+            linear(compiled=True)
+    else:
+        is_right(linear(compiled=True))
+
+
+@pytest.mark.parametrize("level", range(len(compiler._LEVELS)))
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_linear_models_at_every_level(n, level, cache, monkeypatch):
+    """The vectoriser of GCC 12.2 gets these wrong where nothing keeps it from masked loads."""
+    monkeypatch.setattr(compiler, "_LEVELS", (compiler._LEVELS[level],))
+    rng = np.random.default_rng(n)
+    for p in range(1, 5):
+        a, c = 0.5 * rng.normal(size=(n, n)), rng.normal(size=(p, n))
+        system = linear(True, a, c, None)
+        for count in range(1, 10):
+            x, y = rng.normal(size=(count + 1, n)), rng.normal(size=(count, p))
+            true = np.hstack((x[1:] - x[:-1] @ a.T, y - x[:-1] @ c.T))
+            found = system.joint.residuals(x, y, np.zeros((count, 0)))
+            assert found == pytest.approx(true, rel=1e-9, abs=1e-12)
+            assert system.f(x, None) == pytest.approx(x @ a.T, rel=1e-9, abs=1e-12)
+            assert system.h(x, None) == pytest.approx(x @ c.T, rel=1e-9, abs=1e-12)
+        if p == n:
+            mhe, other = estimator(system), estimator(linear(False, a, c, None), "python")
+            for y in rng.normal(size=(10, p)):
+                one, two = mhe.update(y), other.update(y)
+                assert one.cost == pytest.approx(two.cost, rel=1e-6)
+            assert mhe.engine == "compiled"
