@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from .. import __version__
 from ..errors import QpmheError
-from .estimate_command import estimate
+from .estimate import estimate
 
 __all__ = ["app", "main"]
 

@@ -2,69 +2,121 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
+from collections.abc import Iterator
+from enum import StrEnum
 from time import monotonic
-from typing import Any
+from typing import Annotated, Any, BinaryIO
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ..errors import OptionError
-from ..records import Summary, estimate_record
-from ..records.errors import WriteError
 
-__all__ = ["run"]
+__all__ = ["estimate", "run"]
 
-# Seconds until a bar appears, and from one of its pictures to the next.
-_LONG, _REFRESH = 1.0, 0.1
+# Seconds until the progress bar appears, and between two refreshes.
+_BAR_AFTER, _REFRESH = 1.0, 0.1
 
 
-def run(
-    console: Console,
-    model: str,
-    record: str,
-    out: str,
-    *,
-    max_qps: str | None = None,
-    max_solver_iterations: str | None = None,
-    initial_state: str | None = None,
-    horizon: int | None = None,
-    backend: str | None = None,
-    engine: str | None = None,
-    quiet: bool = False,
-    **reading: Any,
+class Uncertainty(StrEnum):
+    """Values of --covariances."""
+
+    NONE = "none"
+    STD = "std"
+    FULL = "full"
+
+
+class DecimalMark(StrEnum):
+    """Values of --decimal."""
+
+    AUTO = "auto"
+    POINT = "."
+    COMMA = ","
+
+
+def estimate(
+    model: Annotated[
+        str,
+        typer.Argument(help="Model of the zoo, package.module:function or file.py:function."),
+    ],
+    record: Annotated[
+        str,
+        typer.Argument(help="CSV (also .gz) or Parquet file with a time column; - is standard "
+                       "input."),
+    ],
+    out: Annotated[
+        str, typer.Option(help="What to write: .csv, .parquet, or - for standard output.")
+    ] = "-",
+    time: Annotated[str | None, typer.Option(help="Column of the time.")] = None,
+    outputs: Annotated[
+        str | None, typer.Option(help="Columns of the outputs: y1=COLUMN,y2=COLUMN.")
+    ] = None,
+    inputs: Annotated[
+        str | None, typer.Option(help="Columns of the inputs: u1=COLUMN,u2=COLUMN.")
+    ] = None,
+    horizon: Annotated[int | None, typer.Option(help="N; default is the model's.")] = None,
+    backend: Annotated[str | None, typer.Option(help="QP backend.")] = None,
+    max_qps: Annotated[
+        str | None, typer.Option(help="QPs per sample; 0 is the observer, or: converged.")
+    ] = None,
+    max_solver_iterations: Annotated[
+        str | None, typer.Option(help="Cap on the iterations inside each QP, or: none.")
+    ] = None,
+    initial_state: Annotated[
+        str | None, typer.Option(help="Numbers between commas; default is the model's.")
+    ] = None,
+    engine: Annotated[str | None, typer.Option(help="python or compiled.")] = None,
+    covariances: Annotated[
+        Uncertainty, typer.Option(help="Standard deviations or covariances of the estimates.")
+    ] = Uncertainty.NONE,
+    step_time: Annotated[
+        bool, typer.Option(help="Whether to write the seconds of each step.")
+    ] = True,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue an estimation that was interrupted.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace existing files.")
+    ] = False,
+    checkpoint_every: Annotated[
+        int | None, typer.Option(min=1, help="Samples between checkpoints; default 100.")
+    ] = None,
+    dt: Annotated[
+        float | None, typer.Option(help="Usual step of a discrete-time model, in its time unit.")
+    ] = None,
+    time_scale: Annotated[
+        float, typer.Option(help="The record's unit of time in the model's.")
+    ] = 1.0,
+    equal_steps: Annotated[
+        bool,
+        typer.Option("--equal-steps", help="Require equal steps; each row is written at once."),
+    ] = False,
+    max_gap: Annotated[
+        int | None,
+        typer.Option(min=0, help="Most samples in a row that may be missing; default 1000."),
+    ] = None,
+    skip_repeated: Annotated[
+        bool, typer.Option("--skip-repeated", help="Skip lines that repeat the time before.")
+    ] = False,
+    separator: Annotated[
+        str | None, typer.Option(help="Of a CSV file: a character, comma, semicolon, tab, ...")
+    ] = None,
+    decimal: Annotated[DecimalMark, typer.Option(help="Decimal mark.")] = DecimalMark.AUTO,
+    encoding: Annotated[str, typer.Option(help="Of a CSV file.")] = "utf-8",
+    missing: Annotated[
+        list[str] | None,
+        typer.Option(metavar="WORD", help="Word for a missing value; may be repeated."),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
 ) -> None:
-    """Estimate a record, with a bar if it takes long, and tell what became of it.
-
-    Parameters
-    ----------
-    console : rich.console.Console
-        Where to tell; not standard output, which may hold the results.
-    model, record, out
-        As of `qpmhe.records.estimate_record`.
-    max_qps, max_solver_iterations : str, optional
-        Numbers; ``converged`` and ``none`` stand for None.
-    initial_state : str, optional
-        Numbers between commas.
-    horizon, backend, engine : optional
-        Options of the estimator.
-    quiet : bool
-        Tell nothing but errors.
-    **reading
-        All else that `qpmhe.records.estimate_record` takes.
-
-    Raises
-    ------
-    QpmheError
-        If something does not fit, or the record cannot be read on.
-    SystemExit
-        With 1 if whoever read the rows has gone; with 3 if the record was estimated to its end
-        with a model that is wrong, or failed at most of the samples.
-    """
+    """Estimate the states of a measured record; in a pipe, line by line."""
     options: dict[str, Any] = {"horizon": horizon, "backend": backend, "engine": engine}
     options = {name: value for name, value in options.items() if value is not None}
     if max_qps is not None:
@@ -75,24 +127,45 @@ def run(
         )
     if initial_state is not None:
         options["initial_state"] = _vector(initial_state)
+    run(
+        Console(stderr=True), model, record, out, quiet=quiet, time=time, outputs=outputs,
+        inputs=inputs, separator=separator, decimal=decimal.value, encoding=encoding,
+        missing=missing or (), dt=dt, time_scale=time_scale, equal_steps=equal_steps,
+        max_gap=max_gap, skip_repeated=skip_repeated, covariances=covariances.value,
+        step_time=step_time, resume=resume, overwrite=overwrite,
+        checkpoint_every=checkpoint_every, **options,
+    )
+
+
+def run(
+    console: Console, model: str, record: str, out: str, *, quiet: bool = False, **options: Any
+) -> None:
+    """Call `qpmhe.records.estimate_record` with the options, and print what happened.
+
+    Raises
+    ------
+    QpmheError
+        As `estimate_record`.
+    SystemExit
+        With 1 if the reader of the rows has gone; with 3 if the whole record was estimated
+        with a model that is wrong, or failed at most of the samples.
+    """
+    from ..records import estimate_record
+
     # A bar would stand among the rows.
     mixed = out == "-" and sys.stdout is not None and sys.stdout.isatty()
     bar = _Bar(console) if console.is_terminal and not (quiet or mixed) else None
     try:
-        summary = estimate_record(
-            model, record, out, progress=None if bar is None else bar.show,
-            tell=None if quiet else lambda text: _warn(console, text), **reading, **options
-        )
-    except BrokenPipeError:  # whoever read the rows has had enough
-        _leave_standard_output()
+        with _rows_apart(out) as target:
+            summary = estimate_record(
+                model, record, target, progress=None if bar is None else bar.show,
+                report=None if quiet else lambda text: _warn(console, text), **options,
+            )
+    except BrokenPipeError:
         raise SystemExit(1) from None
-    except WriteError:
-        if out == "-":
-            _leave_standard_output()
-        raise
     except KeyboardInterrupt:
         if out != "-":
-            console.print("stopped; --resume goes on.", highlight=False)
+            console.print("interrupted; continue by --resume.", highlight=False)
         raise
     finally:
         if bar is not None:
@@ -100,44 +173,58 @@ def run(
     most_failed = 2 * summary.failed > summary.samples + summary.inserted
     is_broken = summary.model_is_wrong or most_failed
     if not quiet:
-        _tell(console, summary, out)
+        _print(console, summary, out)
     if summary.failure and (is_broken or not quiet):
         _warn(console, summary.failure)
     if is_broken:
         raise SystemExit(3)
 
 
+@contextlib.contextmanager
+def _rows_apart(out: str) -> Iterator[str | BinaryIO]:
+    """Keep standard output for rows: what models and solvers print goes to standard error."""
+    try:
+        if out != "-" or sys.stderr is None:
+            raise OSError
+        descriptor = sys.stdout.fileno()
+    except (OSError, AttributeError):  # a file, a closed stream, or one inside Python
+        yield out
+        return
+    sys.stdout.flush()
+    with open(os.dup(descriptor), "wb", buffering=0) as rows:
+        os.dup2(2, descriptor)
+        try:
+            with contextlib.redirect_stdout(sys.stderr):
+                yield rows
+        finally:
+            os.dup2(rows.fileno(), descriptor)
+
+
 def _warn(console: Console, text: str) -> None:
     console.print(f"[bold yellow]warning:[/] {escape(text)}", highlight=False, soft_wrap=True)
 
 
-def _leave_standard_output() -> None:
-    """Write nothing more there; Python would try once more at its end, and complain."""
-    if sys.stdout is not None:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _tell(console: Console, summary: Summary, out: str) -> None:
-    told = [f"{summary.samples} samples"]
+def _print(console: Console, summary: Any, out: str) -> None:
+    words = [f"{summary.samples} samples"]
     if summary.before:
-        told[0] += f" after {summary.before} before"
-    told.append(f"{summary.improved} improved on the observer")
+        words[0] += f" after {summary.before} before"
+    words.append(f"{summary.improved} improved on the observer")
     for number, text in (
-        (summary.incomplete, "with outputs missing"),
-        (summary.inserted, "more put into gaps"),
-        (summary.held, "blank inputs held"),
-        (summary.repeated, "passed over, since their times were there already"),
+        (summary.incomplete, "with missing outputs"),
+        (summary.inserted, "inserted into gaps"),
+        (summary.held, "missing inputs held"),
+        (summary.repeated, "skipped because they repeat a time"),
     ):
         if number:
-            told.append(f"{number} {text}")
+            words.append(f"{number} {text}")
     where = "" if out == "-" else f"; wrote {escape(out)}"
-    console.print(", ".join(told) + where, highlight=False, soft_wrap=True)
-    for note in summary.notes or ():
+    console.print(", ".join(words) + where, highlight=False, soft_wrap=True)
+    for note in summary.notes:
         console.print(f"[yellow]note:[/] {escape(note)}", highlight=False, soft_wrap=True)
 
 
 class _Bar:
-    """A bar that appears if there is time to look at it."""
+    """A progress bar that appears in long runs only."""
 
     def __init__(self, console: Console) -> None:
         self._bar = Progress(
@@ -145,10 +232,9 @@ class _Bar:
             TimeRemainingColumn(), console=console, transient=True, auto_refresh=False,
         )
         self._task = self._bar.add_task("", total=None)
-        self._due, self._samples = monotonic() + _LONG, 0
+        self._due, self._samples = monotonic() + _BAR_AFTER, 0
 
     def show(self, position: int, total: int | None) -> None:
-        """Show how far it is, now and then."""
         self._samples += 1
         if monotonic() < self._due:
             return
@@ -160,7 +246,6 @@ class _Bar:
         self._due = monotonic() + _REFRESH
 
     def close(self) -> None:
-        """Take it away."""
         self._bar.stop()
 
 

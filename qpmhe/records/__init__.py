@@ -1,6 +1,7 @@
 """Measured records: estimates from a table of samples, file to file or line by line."""
 
-from .errors import CheckpointError, RecordError, WriteError
-from .run import Summary, estimate_record
+from .checkpoints import CheckpointError, WriteError
+from .session import Summary, estimate_record
+from .tables import RecordError
 
 __all__ = ["CheckpointError", "RecordError", "Summary", "WriteError", "estimate_record"]

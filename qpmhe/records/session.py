@@ -1,235 +1,517 @@
-"""Sample in, row out, and a checkpoint now and then."""
+"""A record in, a row of results out for each sample, and a checkpoint now and then."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from typing import Any
+import hashlib
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from pathlib import Path
+from time import monotonic
+from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..estimate import Estimate, Status
-from ..estimator import MovingHorizonEstimator
-from .checkpoint import Checkpoint
-from .errors import RecordError, WriteError
-from .failures import Failures
-from .keeper import Keeper, versions
-from .results import Results
-from .resuming import known_sample, remaining
-from .samples import Record, Sample
-from .sink import Sink
+from .._checks import count
+from ..errors import InvalidInputError, OptionError
+from ..estimate import Status
+from .checkpoints import Checkpoint, CheckpointError, WriteError, load, save, versions
+from .columns import ColumnNames
+from .measurements import Measurement, RecordReader
+from .model_failures import ModelFailures
+from .output import Output, RowFormat
+from .record_model import RecordModel, load_record_model
 from .steps import OnlyGapsError, Step, Steps
-from .summary import Summary
-from .times import spacing
+from .tables import RecordError
+from .values import FieldReader, seconds_between
 
-__all__ = ["Session"]
+__all__ = ["Summary", "estimate_record"]
+
+_EVERY = 100
 
 
-class Session:
-    """One run over a record.
-
-    Checkpoints are taken at fixed numbers of samples, whatever happens in between: a solver
-    forgets its warm start there, and a run that goes on from one forgets nothing else.
+@dataclass
+class Summary:
+    """What happened in a record.
 
     Parameters
     ----------
-    estimator : MovingHorizonEstimator
-        Before its first measurement.
-    results, steps, record, sink, failures
-        The parts.
-    identity : dict
-        What a checkpoint must have been made with.
-    every : int
-        Samples from checkpoint to checkpoint.
-    seconds : float
-        Least time from one that is written to the disk to the next.
-    tell : callable, optional
-        Called with what should be known at once.
+    samples : int
+        Samples of this run.
+    before : int
+        Samples of the earlier run that this one resumed.
+    improved, incomplete : int
+        How many of the samples improved on the observer, and how many lacked outputs.
+    inserted : int
+        Samples without measurement that fill gaps.
+    held : int
+        Missing inputs that were replaced by the last value.
+    repeated : int
+        Lines that were skipped because their time was there already.
+    failed, stale : int
+        Steps at which the model failed (``MODEL_FAILED``), and others whose window still has
+        such a step (``FAILED_STAGE``).
+    failure : str
+        Where it failed first, and why; blank if it did not.
+    model_is_wrong : bool
+        Whether the model's code is wrong, rather than undefined at some states.
+    notes : list of str
+        What else the user should know.
+    """
+
+    samples: int = 0
+    before: int = 0
+    improved: int = 0
+    incomplete: int = 0
+    inserted: int = 0
+    held: int = 0
+    repeated: int = 0
+    failed: int = 0
+    stale: int = 0
+    failure: str = ""
+    model_is_wrong: bool = False
+    notes: list[str] = field(default_factory=list)
+
+
+def estimate_record(
+    model: str,
+    record: str | Path,
+    out: str | Path | BinaryIO,
+    *,
+    time: str | None = None,
+    outputs: str | None = None,
+    inputs: str | None = None,
+    separator: str | None = None,
+    decimal: str = "auto",
+    encoding: str = "utf-8",
+    missing: Sequence[str] = (),
+    dt: float | None = None,
+    time_scale: float = 1.0,
+    equal_steps: bool = False,
+    max_gap: int | None = None,
+    skip_repeated: bool = False,
+    covariances: str = "none",
+    step_time: bool = True,
+    resume: bool = False,
+    overwrite: bool = False,
+    checkpoint_every: int | None = None,
+    checkpoint_seconds: float = 1.0,
+    progress: Callable[[int, int | None], None] | None = None,
+    report: Callable[[str], None] | None = None,
+    **options: Any,
+) -> Summary:
+    """Estimate the states of a measured record, and write them sample by sample.
+
+    Where the model was made by `qpmhe.System.from_ode`, each step has the length that the
+    record says, so a row is written when the time of the next sample is known. Otherwise, or
+    with ``equal_steps``, the times must be those of equal steps. A gap of k steps is filled
+    by k - 1 samples without measurement, with the inputs held.
+
+    Parameters
+    ----------
+    model : str
+        Name in the catalogue, ``package.module:function`` or ``path/file.py:function``.
+    record : str or Path
+        CSV (or gzip of it) or Parquet file with a header; ``-`` is standard input.
+    out : str, Path or binary stream
+        File in .csv or .parquet, which must not exist yet; ``-`` is standard output.
+    time : str, optional
+        Column of the time, numbers or ISO dates (whose differences count in seconds).
+    outputs, inputs : str, optional
+        Columns of y and u, as ``y1=column,y2=column``, or columns in order.
+    separator, decimal, encoding : str, optional
+        How a CSV file is written, where the file does not show it.
+    missing : sequence of str
+        Words (or numbers) that stand for a missing value, besides the usual ones.
+    dt : float, optional
+        Usual step of a discrete-time model, in its unit of time.
+    time_scale : float
+        The record's unit of time in the model's.
+    equal_steps : bool
+        Whether steps must be equal also where the model takes any.
+    max_gap : int, optional
+        Most samples without measurement in a row. If left out, 1000, and a record that
+        consists of gaps of one size is refused: its unit of time is not the model's.
+    skip_repeated : bool
+        Whether to skip lines whose time is that of the line before.
+    covariances : {"none", "std", "full"}
+        What to write of the covariances.
+    step_time : bool
+        Whether to write the seconds of each step.
+    resume : bool
+        Whether to resume at the checkpoint beside ``out``, if there is one.
+    overwrite : bool
+        Whether to replace existing files.
+    checkpoint_every : int, optional
+        Samples from checkpoint to checkpoint, 100 if left out. A solver forgets its warm
+        start there, so the number affects the last bits of the results.
+    checkpoint_seconds : float
+        Least time between two writes of the checkpoint.
+    progress : callable, optional
+        Called after each sample with the bytes (or rows) read and their total, if it is known.
+    report : callable, optional
+        Called with a text when the model fails for the first time; the run continues.
+    **options
+        Options of `qpmhe.MovingHorizonEstimator` that replace the model's own.
+
+    Returns
+    -------
+    Summary
+        Counts.
+
+    Raises
+    ------
+    RecordError
+        If the record cannot be read or used; the rows before stay, and can be resumed.
+    CheckpointError
+        If the checkpoint does not fit.
+    WriteError
+        If results cannot be written, as on a full disk; the rows before stay.
+    InvalidInputError
+        If model, options or files do not fit, or a file exists already; nothing has been
+        written then.
+    """
+    output = Output(out)
+    _check_files(str(record), output)
+    found = _found(output, resume, overwrite)
+    every = _EVERY if checkpoint_every is None else count("--checkpoint-every", checkpoint_every, 1)
+    if found is not None:
+        if checkpoint_every not in (None, found.every):
+            raise CheckpointError(
+                f"the checkpoint was made with --checkpoint-every {found.every}, not {every}; "
+                "leave the option out."
+            )
+        every = found.every
+    with contextlib.ExitStack() as stack:
+        stack.callback(output.close)
+        if output.is_standard_output:  # a model that prints must not print among the rows
+            stack.enter_context(contextlib.redirect_stdout(sys.stderr))
+        loaded = load_record_model(model, **options)
+        steps = Steps(
+            loaded.estimator.system, usual=loaded.dt if dt is None else dt, scale=time_scale,
+            equal=equal_steps, max_gap=max_gap,
+        )
+        rows = RowFormat(loaded.states, covariances, step_time)
+        reader = RecordReader(
+            str(record), ColumnNames(loaded.outputs, loaded.inputs, time, outputs, inputs),
+            separator=separator, decimal=decimal, encoding=encoding, skip_repeated=skip_repeated,
+            missing=(missing,) if isinstance(missing, str) else missing,
+        )
+        stack.callback(reader.close)
+        identity = loaded.identity | {
+            "dt": dt, "time_scale": time_scale, "equal_steps": equal_steps,
+            "max_gap": steps.max_gap, "columns": rows.header,
+        }
+        session = _Session(
+            loaded, rows, steps, reader, output, Checkpoint(identity, every),
+            seconds=checkpoint_seconds, report=report, progress=progress,
+        )
+        return session.run(found)
+
+
+def _check_files(record: str, output: Output) -> None:
+    for path in filter(None, (output.path, output.target)):
+        if os.path.exists(path) and os.path.exists(record) and os.path.samefile(path, record):
+            raise OptionError(
+                f"--out would overwrite the record itself, {record}; name another file."
+            )
+
+
+def _found(output: Output, resume: bool, overwrite: bool) -> Checkpoint | None:
+    """The checkpoint to resume at, if that is wanted; no results are lost without asking."""
+    if output.checkpoint is None:
+        if resume:
+            raise OptionError("--resume needs a file: give --out a name in .csv or .parquet.")
+        return None
+    if overwrite:
+        return None
+    found = load(output.checkpoint)
+    if found is None:
+        for path in filter(None, (output.path, output.target)):
+            if os.path.isfile(path) and path.stat().st_size:
+                raise InvalidInputError(
+                    f"{path} exists already, without a checkpoint to resume at; give another "
+                    "--out, or replace it by --overwrite."
+                )
+        return None
+    if not found.samples and not output.times_after(0):
+        return None
+    if resume:
+        return found
+    if found.finished:
+        raise CheckpointError(
+            f"{output.name} holds a finished estimation; replace it by --overwrite, continue by "
+            "--resume if the record has grown, or give another --out."
+        )
+    raise CheckpointError(
+        f"{output.name} holds an estimation that was interrupted (its checkpoint was taken after "
+        f"{found.samples} samples); continue by --resume, or start again by --overwrite."
+    )
+
+
+class _Session:
+    """One run over a record.
+
+    Checkpoints are taken after fixed numbers of samples, whether they are written or not: a
+    solver forgets its warm start there, and a run that resumes forgets nothing else.
     """
 
     def __init__(
-        self,
-        estimator: MovingHorizonEstimator,
-        results: Results,
-        steps: Steps,
-        record: Record,
-        sink: Sink,
-        failures: Failures,
-        *,
-        identity: dict[str, Any],
-        every: int,
-        seconds: float,
-        tell: Callable[[str], None] | None = None,
+        self, model: RecordModel, rows: RowFormat, steps: Steps, reader: RecordReader,
+        output: Output, checkpoint: Checkpoint, *, seconds: float,
+        report: Callable[[str], None] | None, progress: Callable[[int, int | None], None] | None,
     ) -> None:
-        self._mhe, self._results, self._steps = estimator, results, steps
-        self._record, self._sink, self._failures = record, sink, failures
-        self._keeper = Keeper(sink, identity, every, seconds)
-        self._tell = tell
+        self._mhe, self._rows, self._steps = model.estimator, rows, steps
+        self._reader, self._output = reader, output
+        self._failures = ModelFailures(self._mhe.system, self._mhe.horizon, model.file)
+        self._report, self._progress = report, progress
         self._summary = Summary()
-        self._taken = 0  # samples, with those of former runs
         self._inserted = 0  # since the last row
+        self._digest = ""  # of all samples so far
+        self._newest, self._is_saved = checkpoint, False
+        self._seconds, self._saved_at = seconds, monotonic()
 
-    def run(
-        self, found: Checkpoint | None, progress: Callable[[int, int | None], None] | None
-    ) -> Summary:
-        """Take all samples in.
+    @property
+    def _taken(self) -> int:
+        return self._summary.before + self._summary.samples
 
-        Parameters
-        ----------
-        found : Checkpoint or None
-            Where to go on.
-        progress : callable or None
-            Called after each sample with what was read and its total.
-        """
-        record, sink, keeper = self._record, self._sink, self._keeper
-        before: Sample | None = None
-        if found is None:
-            samples = record.samples()
-            sink.begin(self._results.header, keeper.begin if sink.checkpoint else None)
-        else:
-            before = self._restore(found)
-            samples = remaining(found, before, record, sink, keeper)
-            sink.go_on(self._results.header, found.offset, found.written)
+    def run(self, found: Checkpoint | None) -> Summary:
+        reader, output = self._reader, self._output
+        samples, last = self._begin() if found is None else self._resume(found)
         try:
-            self._take_all(samples, before, progress)
-            self._insist_on_samples()
-            keeper.finish()
-        except (RecordError, WriteError) as error:
-            with contextlib.suppress(WriteError):  # the one before is good, too
-                keeper.keep()
-            error.args = (f"{error}{self._how_to_go_on(error)}",)
+            self._estimate(samples, last)
+            if not self._taken:
+                raise RecordError(
+                    "it has a header and no samples; expected a line for each.", reader.name
+                )
+            try:
+                self._steps.finish()
+            except OnlyGapsError as error:
+                raise reader.error(f"{error}.", None) from error
+            self._newest, self._is_saved = replace(self._newest, finished=True), False
+            self._save()
+        except BaseException as error:
+            with contextlib.suppress(WriteError):  # the checkpoint before is good, too
+                self._save()
+            if isinstance(error, (RecordError, WriteError)):
+                error.args = (f"{error}{self._remedy(error)}",)
             raise
-        except BaseException:
-            with contextlib.suppress(WriteError):
-                keeper.keep()
-            raise
-        sink.finish(record.time_type)
+        output.finish(reader.time_type)
         return self._finished()
 
-    def _how_to_go_on(self, error: RecordError | WriteError) -> str:
-        """What to add to an error that stopped the run."""
-        if self._sink.checkpoint is None or not self._taken:
-            return ""
-        there = f" The {self._taken} samples before are in {self._sink.name}; "
-        if isinstance(error, WriteError):
-            return f"{there}when there is room again, --resume goes on."
-        if isinstance(error.__cause__, OnlyGapsError):
-            return f"{there}start again by --overwrite."
-        return f"{there}with the record mended, --resume goes on."
-
-    def _insist_on_samples(self) -> None:
-        if not self._taken:
-            raise RecordError(
-                "it has a header and no samples; expected a line for each.", self._record.name
-            )
+    def _begin(self) -> tuple[Iterator[Measurement], None]:
+        self._output.begin()
         try:
-            self._steps.finish()
-        except OnlyGapsError as error:
-            raise self._record.fail(f"{error}.", None) from error
+            self._save()  # no row is in the file without a checkpoint beside it
+            self._output.write(self._rows.header)
+        except WriteError as error:
+            self._output.discard()
+            raise WriteError(f"{error} Make room, or name another place by --out.") from error
+        return self._reader.samples(), None
 
-    def _finished(self) -> Summary:
-        record, summary, failures = self._record, self._summary, self._failures
-        summary.held, summary.repeated = record.held, record.repeated
-        summary.failed, summary.stale = failures.failed, failures.stale
-        summary.failure = failures.told(summary.samples + summary.inserted)
-        summary.model_is_wrong = failures.is_mistake
-        if record.cut is not None:
-            summary.notes.append(
-                f"the last line of {record.name}, {record.cut}, has no end of line and may be cut "
-                "off: its numbers were taken as they stand. If more comes, --resume reads it again."
+    def _resume(self, found: Checkpoint) -> tuple[Iterator[Measurement], Measurement | None]:
+        """The samples after the checkpoint, and the last one before it."""
+        identity, output, reader = self._newest.identity, self._output, self._reader
+        differing = [
+            f"{key} {found.identity.get(key)!r}, now {value!r}"
+            for key, value in identity.items() if found.identity.get(key) != value
+        ]
+        if differing:
+            raise CheckpointError(
+                f"the checkpoint {output.checkpoint} was made with {'; '.join(differing)}. Use "
+                "the same model and options, or start again by --overwrite."
             )
-        if record.blank:
-            summary.notes.append(
-                f"{record.blank} rows without any value at the end of {record.name} were passed "
-                "over."
+        last = self._last_sample(found)
+        samples = reader.samples(last.u if last is not None and reader.is_stream else None)
+        if not reader.is_stream:
+            self._skip_known(samples, found)
+        elif last is not None:
+            samples = self._after(samples, last)
+        if reader.is_stream or last is None:
+            # The only row of a file that was cut off may have a time that was cut off, too.
+            samples = self._check_rows(samples, found, 1 if reader.is_stream else 2)
+        self._digest = found.samples_digest
+        self._summary.before = found.samples
+        if found.versions != versions():
+            self._summary.notes.append(
+                f"the checkpoint was made with {found.versions}, and this is {versions()}: the "
+                "last bits of the results may differ."
             )
-        return summary
+        if last is None:
+            self._begin()
+        else:
+            output.resume(found.offset, found.results_digest)
+            self._steps.resume(found.usual_step)
+            self._newest, self._is_saved = found, True
+        return samples, last
 
-    def _take_all(
-        self, samples: Iterator[Sample], before: Sample | None,
-        progress: Callable[[int, int | None], None] | None,
-    ) -> None:
-        waits = self._steps.measured
-        pending: Sample | None = None
+    def _last_sample(self, found: Checkpoint) -> Measurement | None:
+        """Restore the estimator; the last sample that it knows."""
+        if not found.samples:
+            return None
+        try:
+            self._mhe.load_state_dict(found.state)
+            time = FieldReader(".").time(found.time)
+            inputs = np.array(found.inputs, np.float64).reshape(self._mhe.system.m)
+        except (InvalidInputError, TypeError, ValueError) as error:
+            raise CheckpointError(
+                f"the checkpoint {self._output.checkpoint} does not fit: {error}"
+            ) from error
+        return Measurement(0, time, np.empty(0), inputs)
+
+    def _skip_known(self, samples: Iterator[Measurement], found: Checkpoint) -> None:
+        """Skip the samples that the checkpoint knows, and compare them with it."""
+        name, digest = self._reader.name, ""
+        for number in range(found.samples):
+            sample = next(samples, None)
+            if sample is None:
+                raise CheckpointError(
+                    f"{name} has {number} samples, and the checkpoint was taken after "
+                    f"{found.samples}; give the same record."
+                )
+            digest = _digest(digest, sample)
+        if digest != found.samples_digest:
+            raise CheckpointError(
+                f"the first {found.samples} samples of {name} are not those of the checkpoint (or "
+                "other columns are read); give the same record and columns, or start again by "
+                "--overwrite."
+            )
+        self._reader.held = self._reader.repeated = 0
+
+    def _after(self, samples: Iterator[Measurement], last: Measurement) -> Iterator[Measurement]:
         for sample in samples:
-            step = Step(None, 0)
-            if pending is not None:
-                step = self._step(pending, sample)
-                # A time that was cut off gives the step before it a wrong length, too.
-                self._advance(replace(pending, whole=sample.whole), step.length)
-                before, pending = pending, None
-            elif before is not None:
-                step = self._step(before, sample)
-            if before is not None:
+            if sample.time.kind != last.time.kind:
+                raise CheckpointError(
+                    f"the times of {self._reader.name} are of another kind than {last.time.text} "
+                    "in the results; give the same record, or start again by --overwrite."
+                )
+            if sample.time.value > last.time.value:
+                yield sample
+
+    def _check_rows(
+        self, samples: Iterator[Measurement], found: Checkpoint, least: int
+    ) -> Iterator[Measurement]:
+        """The same samples, if they give the rows again that the checkpoint does not know."""
+        first, times = next(samples, None), self._output.times_after(found.offset)
+        if len(times) >= least:
+            due = FieldReader(".").time(times[0])
+            if first is None or first.time.kind != due.kind or first.time.value > due.value:
+                known = f"those up to {found.time}" if found.samples else "no sample"
+                raise CheckpointError(
+                    f"{self._reader.name} does not contain the sample of time {times[0]}; its row "
+                    f"and those after it would be lost, since the checkpoint knows {known}. Give "
+                    "the record from there, or from its beginning; or another --out; or start "
+                    "again by --overwrite."
+                )
+        return samples if first is None else chain((first,), samples)
+
+    def _estimate(self, samples: Iterator[Measurement], last: Measurement | None) -> None:
+        waits = self._steps.any_length
+        pending: Measurement | None = None
+        for sample in samples:
+            if last is not None:
+                step = self._step(last, sample)
+                if pending is not None:
+                    # A time that was cut off gives the step before it a wrong length.
+                    pending.complete = sample.complete
+                    self._advance(pending, step.length)
                 for _ in range(step.inserted):
-                    self._update(None, before, step.length)
+                    self._update(None, last, step.length)
                 self._inserted = step.inserted
                 self._summary.inserted += step.inserted
             if waits:
                 pending = sample
             else:
                 self._advance(sample, None)
-                before = sample
-            if progress is not None:
-                progress(self._record.position, self._record.total)
+            last = sample
+            if self._progress is not None:
+                self._progress(self._reader.position, self._reader.total)
         if pending is not None:
-            # The length of its step is not known yet: a longer record will do it again.
-            self._advance(replace(pending, whole=False), None)
+            pending.complete = False  # in a longer record its step has another length
+            self._advance(pending, None)
 
-    def _step(self, before: Sample, after: Sample) -> Step:
-        magnitude = abs(after.time) if isinstance(after.time, float) else 0.0
+    def _step(self, before: Measurement, after: Measurement) -> Step:
+        magnitude = abs(after.time.value) if isinstance(after.time.value, float) else 0.0
         try:
-            return self._steps.between(spacing(before.time, after.time), magnitude)
+            return self._steps.between(seconds_between(before.time, after.time), magnitude)
         except ValueError as error:
-            raise self._record.fail(f"{error}.", after.line) from error
+            raise self._reader.error(f"{error}.", after.line) from error
 
-    def _update(
-        self, y: NDArray[np.float64] | None, sample: Sample, length: float | None
-    ) -> Estimate:
+    def _update(self, y: Any, sample: Measurement, length: float | None) -> Any:
         estimate = self._mhe.update(y, sample.u if sample.u.size else None, dt=length)
-        failures = self._failures
-        if failures.note(estimate, sample.u, length):
-            failures.where = self._record.place(sample)
-            if self._tell is not None:
-                self._tell(
-                    f"the model failed at {failures.reason} The run goes on; the status marks "
-                    "such rows."
+        if self._failures.note(estimate, sample.u, length):
+            self._failures.place = self._reader.place(sample)
+            if self._report is not None:
+                self._report(
+                    f"the model failed at {self._failures.reason} The run continues; the status "
+                    "marks such rows."
                 )
         return estimate
 
-    def _advance(self, sample: Sample, length: float | None) -> None:
-        """Take a sample in, and write its row."""
+    def _advance(self, sample: Measurement, length: float | None) -> None:
+        """Estimate a sample, and write its row."""
         estimate = self._update(sample.y, sample, length)
-        self._sink.write(self._results.row(sample.text, estimate, self._mhe, self._inserted))
+        self._output.write(
+            self._rows.row(sample.time.text, estimate, self._mhe, self._inserted)
+        )
         summary = self._summary
-        self._taken += 1
         summary.samples += 1
         summary.improved += estimate.improved
         summary.incomplete += Status.MISSING in estimate.status
-        self._keeper.remember(sample)
-        if self._taken % self._keeper.every == 0:
-            self._check(sample)
+        self._digest = _digest(self._digest, sample)
+        if self._taken % self._newest.every == 0:
+            state = self._mhe.state_dict()  # in any case: the solver forgets its warm start
+            if sample.complete and self._steps.settled:
+                self._newest = replace(
+                    self._newest, samples=self._taken, offset=self._output.offset,
+                    time=sample.time.text, inputs=sample.u.tolist(), state=state,
+                    usual_step=self._steps.usual, samples_digest=self._digest,
+                    results_digest=self._output.digest, finished=False, versions=versions(),
+                )
+                self._is_saved = False
+                if monotonic() - self._saved_at >= self._seconds:
+                    self._save()
 
-    def _check(self, sample: Sample) -> None:
-        """Take a checkpoint where what was taken in is sure to be right."""
-        self._keeper.close_segment()
-        # Also where nothing is kept: the solver forgets its warm start at the same samples.
-        state = self._mhe.state_dict()
-        if self._sink.checkpoint is not None and sample.whole and self._steps.settled:
-            self._keeper.take(sample, self._taken, self._steps.usual, state)
+    def _save(self) -> None:
+        """Write the newest checkpoint, after the rows that belong to it."""
+        if self._is_saved or self._output.checkpoint is None:
+            return
+        self._output.sync()
+        save(self._output.checkpoint, self._newest)
+        self._is_saved, self._saved_at = True, monotonic()
 
-    def _restore(self, found: Checkpoint) -> Sample | None:
-        """Take a checkpoint over; the last sample that it knows."""
-        before = known_sample(found, self._sink, self._keeper, self._mhe)
-        self._keeper.go_on(found)
-        self._taken = self._summary.before = found.samples
-        if before is not None:
-            self._steps.restore(found.usual)
-        if found.versions != versions():
-            self._summary.notes.append(
-                f"the checkpoint is of {found.versions}, this is {versions()}: the last bits of "
-                "the results may differ."
+    def _remedy(self, error: RecordError | WriteError) -> str:
+        if self._output.checkpoint is None or not self._taken:
+            return ""
+        there = f" The {self._taken} samples before are in {self._output.name}; "
+        if isinstance(error, WriteError):
+            return f"{there}make room, and continue by --resume."
+        if isinstance(error.__cause__, OnlyGapsError):
+            return f"{there}start again by --overwrite."
+        return f"{there}correct the record, and continue by --resume."
+
+    def _finished(self) -> Summary:
+        reader, summary, failures = self._reader, self._summary, self._failures
+        summary.held, summary.repeated = reader.held, reader.repeated
+        summary.failed, summary.stale = failures.failed, failures.stale
+        summary.failure = failures.report(summary.samples + summary.inserted)
+        summary.model_is_wrong = failures.is_mistake
+        if reader.cut is not None:
+            summary.notes.append(
+                f"the last line of {reader.name}, {reader.cut}, has no end of line and may be cut "
+                "off: its numbers were used as they are. If more follows, --resume reads it again."
             )
-        return before
+        if reader.blank:
+            summary.notes.append(
+                f"{reader.blank} rows without any value at the end of {reader.name} were skipped."
+            )
+        return summary
+
+
+def _digest(before: str, sample: Measurement) -> str:
+    """Digest of all samples, from that of those before."""
+    content = f"{before} {sample.time.text} ".encode() + sample.y.tobytes() + sample.u.tobytes()
+    return hashlib.sha256(content).hexdigest()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qpmhe.records import CheckpointError, RecordError, estimate_record
-from qpmhe.records.checkpoint import load, save
+from qpmhe.records.checkpoints import load, save
 
 from .conftest import CONTINUOUS
 from .oscillator import lines

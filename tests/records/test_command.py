@@ -6,7 +6,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from qpmhe.cli.estimate_command import estimate
+from qpmhe.cli.estimate import estimate
 from qpmhe.errors import OptionError
 from qpmhe.records import CheckpointError, estimate_record
 

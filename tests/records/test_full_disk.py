@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from qpmhe.records import WriteError, estimate_record
-from qpmhe.records.checkpoint import load
+from qpmhe.records.checkpoints import load
 
 from . import process
 from .conftest import DISCRETE

@@ -71,7 +71,7 @@ def model(body, system=DISCRETE):
 def test_it_is_told(record, body, words, is_mistake, system):
     name, number = model(body, system)
     told = []
-    summary = estimate_record(name, "record.csv", "out.csv", tell=told.append)
+    summary = estimate_record(name, "record.csv", "out.csv", report=told.append)
     text = Path("out.csv").read_text().splitlines()[1:]
     failed = [k for k, row in enumerate(text) if "MODEL_FAILED" in row]
     stale = [k for k, row in enumerate(text) if "FAILED_STAGE" in row]
@@ -118,7 +118,7 @@ def test_exit_codes(record, body, expected, quiet):
 
 def test_a_model_that_is_not_asked_in_vain(here):
     """What cannot be found out is said, too."""
-    from qpmhe.records.failures import Failures
+    from qpmhe.records.model_failures import ModelFailures as Failures
 
     system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1)
     failures = Failures(system, 5)
@@ -129,9 +129,9 @@ def test_a_model_that_is_not_asked_in_vain(here):
     )
     estimate = mhe.update([1.0])
     assert not failures.note(estimate, np.empty(0), None)
-    assert failures.told(1) == ""
+    assert failures.report(1) == ""
     estimate.status |= qpmhe.Status.MODEL_FAILED
     assert failures.note(estimate, np.empty(0), None)
     assert not failures.note(estimate, np.empty(0), None)
     assert failures.failed == 2
-    assert "asked again, it has values there" in failures.told(3)
+    assert "asked again, it has values there" in failures.report(3)

@@ -8,9 +8,9 @@ import pytest
 
 import qpmhe
 from qpmhe.errors import InvalidInputError, OptionError
-from qpmhe.records.model import load_model
-from qpmhe.records.places import place
-from qpmhe.studies.errors import StudyError
+from qpmhe.records.record_model import load_record_model as load_model
+from qpmhe.models.loading import code_place as place
+from qpmhe.errors import ModelError
 
 BEGIN = """
 import numpy as np, qpmhe
@@ -116,7 +116,7 @@ def test_models_that_do_not_fit(make, function, words):
 )
 def test_files_that_cannot_be_imported(make, begin, words):
     model = make("return 1", begin=begin)
-    with pytest.raises(StudyError) as caught:
+    with pytest.raises(ModelError) as caught:
         load_model(model)
     for word in [model.partition(":")[0], *words]:
         assert word in str(caught.value)
@@ -124,12 +124,12 @@ def test_files_that_cannot_be_imported(make, begin, words):
 
 def test_no_such_function(make):
     model = make("return 1")
-    with pytest.raises(StudyError, match="has no function other"):
+    with pytest.raises(ModelError, match="has no function other"):
         load_model(model.replace(":make", ":other"))
-    with pytest.raises(StudyError, match="cannot read"):
+    with pytest.raises(ModelError, match="cannot read"):
         load_model("nowhere.py:make")
     assert qpmhe.models.catalogue()  # and a name without a colon is one of these
-    with pytest.raises(StudyError, match="battery_cell"):
+    with pytest.raises(ModelError, match="battery_cell"):
         load_model("nowhere")
 
 
@@ -169,7 +169,7 @@ def test_the_line_of_a_mistake_in_the_model(here, monkeypatch, form, f, h, line,
         f"\ndef f(x):\n    return {f}\n\ndef h(x):\n    return {h}\n\n"
         "def system():\n    return qpmhe.System(f, h, n=1, p=1)\n"
     )
-    with pytest.raises(StudyError) as caught:
+    with pytest.raises(ModelError) as caught:
         load_model(form.format(name))
     assert f"{here / name}.py, line {line}: " in str(caught.value)
     assert words in str(caught.value)

@@ -9,7 +9,7 @@ import pytest
 
 from qpmhe.errors import InvalidInputError, OptionError
 from qpmhe.records import CheckpointError, RecordError, WriteError, estimate_record
-from qpmhe.records.checkpoint import load
+from qpmhe.records.checkpoints import load
 
 from . import process
 from .conftest import CONTINUOUS, DISCRETE

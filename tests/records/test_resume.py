@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from qpmhe.records import CheckpointError, RecordError, estimate_record
-from qpmhe.records.checkpoint import load
+from qpmhe.records.checkpoints import load
 
 from . import process
 from .conftest import CONTINUOUS, DISCRETE

@@ -1,25 +1,37 @@
-"""The checkpoint of a record: all that it takes to go on, in one file, written atomically."""
+"""The checkpoint beside the results: all that it takes to resume, written atomically."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import os
+import platform
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .errors import CheckpointError, WriteError
+from .. import __version__
+from ..errors import InvalidInputError, QpmheError
 
-__all__ = ["Checkpoint", "load", "save"]
+__all__ = ["Checkpoint", "CheckpointError", "WriteError", "load", "save", "versions"]
 
-Array = NDArray[Any]
+_FORMAT = 3
 
-_FORMAT = 2
+
+class CheckpointError(QpmheError):
+    """A checkpoint that is damaged, or does not fit the record, the results or the options."""
+
+
+class WriteError(InvalidInputError):
+    """Results or a checkpoint that cannot be written; what was written before stays."""
+
+
+def versions() -> dict[str, str]:
+    """Of what computes the results."""
+    return {"qpmhe": __version__, "numpy": np.__version__, "machine": platform.machine()}
 
 
 @dataclass(frozen=True)
@@ -29,68 +41,55 @@ class Checkpoint:
     Parameters
     ----------
     identity : dict
-        Model and options; whoever goes on must have the same ones.
+        Model and options; a run that resumes must have the same ones.
     every : int
-        Checkpoints are taken each time that this many samples were taken in.
+        Samples from checkpoint to checkpoint.
     samples : int
-        Samples taken in.
+        Samples so far.
     offset : int
         Bytes of the results that belong to them.
     time : str
         Time of the last one; blank before the first.
     inputs : list of float
         Its inputs.
-    usual : float or None
+    usual_step : float or None
         The usual step.
-    digest, written : str
+    samples_digest, results_digest : str
         Of all samples so far, and of the results that belong to them.
+    state : dict
+        The estimator's ``state_dict``.
     finished : bool
         Whether the record had come to its end.
     versions : dict
         Of what computed it.
-    state : dict
-        The estimator's ``state_dict``.
     """
 
     identity: dict[str, Any]
     every: int
-    samples: int
-    offset: int
-    time: str
-    inputs: list[float]
-    usual: float | None
-    digest: str
-    written: str
-    finished: bool
-    versions: dict[str, str]
-    state: dict[str, Any]
+    samples: int = 0
+    offset: int = 0
+    time: str = ""
+    inputs: list[float] = field(default_factory=list)
+    usual_step: float | None = None
+    samples_digest: str = ""
+    results_digest: str = ""
+    state: dict[str, Any] = field(default_factory=dict)
+    finished: bool = False
+    versions: dict[str, str] = field(default_factory=versions)
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; whatever happens, the former or the new one is there.
+    """Write a checkpoint; whatever happens, the old or the new one is there.
 
-    An ``.npz`` file without pickled objects: arrays, and all else as one JSON text.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    checkpoint : Checkpoint
-        What to write.
-
-    Raises
-    ------
-    WriteError
-        If it cannot be written.
+    The file is an ``.npz`` of arrays, and a JSON text of everything else: nothing in it can run.
     """
-    arrays: dict[str, Array] = {}
-    content = {field.name: getattr(checkpoint, field.name) for field in fields(checkpoint)}
-    content["state"] = _flat(checkpoint.state, arrays)
+    arrays: dict[str, Any] = {}
+    content = vars(checkpoint) | {"state": _without_arrays(checkpoint.state, arrays)}
     text = json.dumps({"format": _FORMAT, **content})
     temporary = path.with_name(f"{path.name}.tmp")
     try:
         with temporary.open("wb") as file:
-            np.savez(file, content=np.array(text), **arrays)  # type: ignore[arg-type]
+            np.savez(file, content=np.array(text), **arrays)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -103,33 +102,17 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def load(path: Path) -> Checkpoint | None:
-    """Read a checkpoint.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    Checkpoint or None
-        None if there is no such file.
-
-    Raises
-    ------
-    CheckpointError
-        If it is damaged, or of another version.
-    """
+    """Read a checkpoint; None if there is no such file."""
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             content = json.loads(str(file["content"]))
             version = content.pop("format")
             if version != _FORMAT:
                 raise CheckpointError(
-                    f"the checkpoint {path} is of format {version!r}; expected {_FORMAT}. Go on "
+                    f"the checkpoint {path} has format {version!r}; expected {_FORMAT}. Resume "
                     "with the version of qpmhe that made it, or start again by --overwrite."
                 )
-            content["state"] = _full(content["state"], file)
+            content["state"] = _with_arrays(content["state"], file)
             return Checkpoint(**content)
     except (FileNotFoundError, NotADirectoryError):
         return None
@@ -142,28 +125,28 @@ def load(path: Path) -> Checkpoint | None:
         ) from error
 
 
-def _flat(value: Any, arrays: dict[str, Array]) -> Any:
-    """A tree of JSON, with its arrays gathered beside it."""
+def _without_arrays(value: Any, arrays: dict[str, Any]) -> Any:
+    """A tree of JSON in place of a value, with its arrays in `arrays`."""
     if isinstance(value, (np.ndarray, np.generic)):
         name = f"a{len(arrays)}"
         arrays[name] = np.asarray(value)
         return {"array": name}
     if isinstance(value, dict):
-        return {"dict": [[key, _flat(item, arrays)] for key, item in value.items()]}
+        return {"dict": [[key, _without_arrays(item, arrays)] for key, item in value.items()]}
     if isinstance(value, (tuple, list)):
         kind = "tuple" if isinstance(value, tuple) else "list"
-        return {kind: [_flat(item, arrays) for item in value]}
+        return {kind: [_without_arrays(item, arrays) for item in value]}
     return value
 
 
-def _full(value: Any, arrays: Any) -> Any:
-    """What `_flat` was given."""
+def _with_arrays(value: Any, arrays: Any) -> Any:
+    """The value that `_without_arrays` was given."""
     if not isinstance(value, dict):
         return value
     (kind, content), = value.items()
     if kind == "array":
         return arrays[content]
     if kind == "dict":
-        return {key: _full(item, arrays) for key, item in content}
-    items = [_full(item, arrays) for item in content]
+        return {key: _with_arrays(item, arrays) for key, item in content}
+    items = [_with_arrays(item, arrays) for item in content]
     return tuple(items) if kind == "tuple" else items

@@ -1,0 +1,288 @@
+"""Rows of results: their columns, and the file or stream that they go to."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import hashlib
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+
+from .._checks import need
+from ..errors import InvalidInputError, OptionError
+from ..estimate import Estimate
+from ..estimator import MovingHorizonEstimator
+from .checkpoints import CheckpointError, WriteError
+
+__all__ = ["Output", "RowFormat"]
+
+_COVARIANCES = ("none", "std", "full")
+_PIECE = 1 << 20
+
+
+class RowFormat:
+    """What is written for each sample.
+
+    Parameters
+    ----------
+    states : tuple of str
+        Names of the states.
+    covariances : {"none", "std", "full"}
+        Standard deviations of the states, or the upper triangles of their covariances.
+    step_time : bool
+        Whether to write the seconds of each step, which never repeat.
+    """
+
+    def __init__(self, states: tuple[str, ...], covariances: str, step_time: bool) -> None:
+        if covariances not in _COVARIANCES:
+            raise OptionError(
+                f"--covariances is {covariances!r}; expected {', '.join(_COVARIANCES)}."
+            )
+        self._covariances, self._step_time = covariances, step_time
+        self._upper = np.triu_indices(len(states))
+        kinds = ("filtered", "predicted")
+        self.header = ["time", *(f"{kind}_{name}" for kind in kinds for name in states)]
+        if covariances == "std":
+            self.header += [f"std_{kind}_{name}" for kind in kinds for name in states]
+        elif covariances == "full":
+            self.header += [
+                f"cov_{kind}_{states[i]}_{states[j]}"
+                for kind in kinds for i, j in zip(*self._upper, strict=True)
+            ]
+        self.header += ["cost", "candidate_cost", "status", "qps", "inserted"]
+        if step_time:
+            self.header.append("step_time")
+
+    def row(
+        self, time: str, estimate: Estimate, estimator: MovingHorizonEstimator, inserted: int
+    ) -> list[str]:
+        """The fields of a sample: numbers with all their digits, blank where there is none."""
+        numbers = [*estimate.filtered.tolist(), *estimate.state.tolist()]
+        if self._covariances != "none":
+            numbers += self._uncertainties(estimator)
+        numbers += [estimate.cost, estimate.candidate_cost]
+        fields = [time, *("" if value != value else repr(value) for value in numbers)]
+        status = str(estimate.status).removeprefix("Status.")
+        fields += [status, str(estimate.qps), str(inserted)]
+        if self._step_time:
+            fields.append(f"{estimate.step_time:.3g}")
+        return fields
+
+    def _uncertainties(self, estimator: MovingHorizonEstimator) -> list[float]:
+        try:
+            both = estimator.covariances()[-2:]
+        except (InvalidInputError, np.linalg.LinAlgError):  # bad luck: the run continues
+            both = np.full((2, estimator.system.n, estimator.system.n), np.nan)
+        if self._covariances == "full":
+            return cast(list[float], both[:, *self._upper].ravel().tolist())
+        with np.errstate(invalid="ignore"):
+            deviations = np.sqrt(np.diagonal(both, axis1=1, axis2=2))
+        return cast(list[float], deviations.ravel().tolist())
+
+
+class _Echo:
+    def write(self, text: str) -> str:
+        return text
+
+
+class Output:
+    """Rows to a file or a stream, each written whole and at once.
+
+    A Parquet file cannot be continued: its rows are gathered in a CSV file beside it, named
+    with ``.part.csv`` at the end, which `finish` converts.
+
+    Parameters
+    ----------
+    out : str, Path or binary stream
+        A name in .csv or .parquet, ``-`` for standard output, or what to write to.
+
+    Attributes
+    ----------
+    path, target : Path or None
+        The file that rows go to, and the one wanted; None for a stream.
+    checkpoint : Path or None
+        The checkpoint's file.
+    offset : int
+        Bytes of the results so far.
+    """
+
+    def __init__(self, out: str | Path | BinaryIO) -> None:
+        self.path: Path | None = None
+        self.target: Path | None = None
+        self.checkpoint: Path | None = None
+        self.offset = 0
+        self._stream: BinaryIO | None = None
+        self._hash = hashlib.sha256()
+        self._rows: Any = csv.writer(cast(Any, _Echo()), lineterminator="\n")
+        self.is_standard_output = str(out) == "-"
+        if self.is_standard_output:
+            if sys.stdout is None:
+                raise OptionError("standard output is closed; name a file by --out.")
+            self._stream = sys.stdout.buffer
+        elif not isinstance(out, (str, Path)):
+            self._stream = out
+        else:
+            self.path = self.target = path = Path(out)
+            if path.suffix not in (".csv", ".parquet"):
+                raise OptionError(
+                    f"--out is {str(out)!r}; expected a name in .csv or .parquet, or - for "
+                    "standard output."
+                )
+            if path.suffix == ".parquet":
+                need("pyarrow", "a Parquet file")
+                self.path = path.with_name(f"{path.name}.part.csv")
+            if os.path.exists(path) and not os.path.isfile(path):
+                raise OptionError(f"--out is {str(out)!r}, which is no file; give another name.")
+            self.checkpoint = path.with_name(f"{path.name}.checkpoint")
+
+    @property
+    def name(self) -> str:
+        """What texts call the place where rows are."""
+        return "standard output" if self.path is None else str(self.path)
+
+    @property
+    def digest(self) -> str:
+        """Of all bytes so far."""
+        return self._hash.hexdigest()
+
+    def begin(self) -> None:
+        """Open a file anew; its old checkpoint goes."""
+        if self.path is None or self.checkpoint is None:
+            return
+        try:
+            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+                self.checkpoint.unlink()
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._stream = self.path.open("wb", buffering=0)
+        except OSError as error:
+            raise self._failed(error, " Name another place by --out.") from error
+
+    def discard(self) -> None:
+        """Remove a file that could not be begun, and its checkpoint."""
+        self.close()
+        for path in filter(None, (self.path, self.checkpoint)):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+    def resume(self, offset: int, digest: str) -> None:
+        """Open a file to continue after `offset` bytes, of which `digest` is known."""
+        assert self.path is not None
+        again = "start again by --overwrite."
+        try:
+            stream = cast(BinaryIO, self.path.open("r+b", buffering=0))
+            self._stream = stream
+            if self.path.stat().st_size < offset:
+                raise CheckpointError(f"{self.path} is shorter than its checkpoint says; {again}")
+            while (left := offset - stream.tell()) > 0:
+                self._hash.update(stream.read(min(left, _PIECE)))
+            if self.digest != digest:
+                raise CheckpointError(
+                    f"{self.path} was changed after its checkpoint was written; undo that, or "
+                    f"{again}"
+                )
+            stream.truncate()
+            self.offset = offset
+        except FileNotFoundError as error:
+            raise CheckpointError(
+                f"{self.path} is gone, but its checkpoint {self.checkpoint} is there; {again}"
+            ) from error
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def times_after(self, offset: int) -> list[str]:
+        """Times of the first two rows after `offset` bytes of the file, as far as they exist."""
+        assert self.path is not None
+        try:
+            with self.path.open("rb") as file:
+                file.seek(offset)
+                if offset == 0:
+                    file.readline()  # the header
+                lines = [file.readline().decode() for _ in range(2)]
+        except OSError:  # opening it to write reports the error
+            return []
+        return [next(csv.reader([line]))[0] for line in lines if line.endswith("\n")]
+
+    def write(self, fields: Sequence[str]) -> None:
+        """Write a row at once; where that fails, the file still ends with a whole row."""
+        stream = self._stream
+        assert stream is not None
+        line = self._rows.writerow(fields).encode()
+        try:
+            done = 0
+            while done < len(line):
+                done += stream.write(line[done:])
+            if self.path is None:
+                stream.flush()
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            if self.path is not None:
+                with contextlib.suppress(OSError):
+                    stream.truncate(self.offset)
+            raise self._failed(error) from error
+        self.offset += len(line)
+        self._hash.update(line)
+
+    def sync(self) -> None:
+        """Wait until all rows are on the disk."""
+        assert self._stream is not None
+        try:
+            os.fsync(self._stream.fileno())
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def close(self) -> None:
+        """Close the file."""
+        if self.path is not None and self._stream is not None:
+            self._stream.close()
+        self._stream = None
+
+    def finish(self, time_type: Any = None) -> None:
+        """Convert to Parquet if that is wanted; the CSV file and the checkpoint go."""
+        self.close()
+        if self.target is None or self.path is None or self.path == self.target:
+            return
+        arrow = need("pyarrow", "a Parquet file")
+        temporary = self.target.with_name(f"{self.target.name}.tmp")
+        try:
+            _to_parquet(self.path, temporary, time_type)
+            os.replace(temporary, self.target)
+        except (OSError, arrow.ArrowException) as error:
+            temporary.unlink(missing_ok=True)
+            raise WriteError(
+                f"cannot write {self.target}: {getattr(error, 'strerror', None) or error}. All "
+                f"rows are in {self.path}; make room, and --resume converts them."
+            ) from error
+        for path in filter(None, (self.path, self.checkpoint)):
+            path.unlink(missing_ok=True)
+
+    def _failed(self, error: OSError, remedy: str = "") -> WriteError:
+        return WriteError(f"cannot write {self.name}: {error.strerror or error}.{remedy}")
+
+
+def _to_parquet(source: Path, target: Path, time_type: Any) -> None:
+    """Convert a CSV file of results; the type of its times is inferred if it is None."""
+    arrow, arrow_csv, parquet = (
+        need(module, "a Parquet file") for module in ("pyarrow", "pyarrow.csv", "pyarrow.parquet")
+    )
+    if time_type is None:
+        only_time = arrow_csv.ConvertOptions(include_columns=["time"])
+        time_type = arrow_csv.read_csv(source, convert_options=only_time).schema.types[0]
+    with source.open(encoding="utf-8", newline="") as file:
+        types = dict.fromkeys(next(csv.reader(file)), arrow.float64())
+    types |= {
+        "time": time_type, "status": arrow.string(), "qps": arrow.int32(),
+        "inserted": arrow.int32(),
+    }
+    options = arrow_csv.ConvertOptions(column_types=types)
+    with (
+        arrow_csv.open_csv(source, convert_options=options) as reader,
+        parquet.ParquetWriter(target, reader.schema) as writer,
+    ):
+        for batch in reader:
+            writer.write_batch(batch)

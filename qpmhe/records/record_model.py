@@ -1,0 +1,155 @@
+"""The user's model as an estimator, with the names of its signals."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..costs import Cost
+from ..errors import ModelError, OptionError, QpmheError
+from ..estimator import MovingHorizonEstimator
+from ..models import Scenario
+from ..models.loading import build, code_place, find
+from ..observers import Observer
+from ..system import System
+
+__all__ = ["RecordModel", "load_record_model"]
+
+_PARTS = ((System, "system"), (Observer, "observer"), (Cost, "cost"))
+_SIZES = {"states": "n", "outputs": "p", "inputs": "m"}
+_OPTIONS = tuple(
+    name
+    for name, parameter in inspect.signature(MovingHorizonEstimator).parameters.items()
+    if parameter.kind is parameter.KEYWORD_ONLY
+)
+_EXPECTED = (
+    "expected (system, observer, cost), optionally followed by a scenario or a dict of options; "
+    "or a MovingHorizonEstimator"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordModel:
+    """An estimator before its first measurement, and what its signals are called.
+
+    Parameters
+    ----------
+    estimator : MovingHorizonEstimator
+        The estimator.
+    states, outputs, inputs : tuple of str
+        Names of x, y and u.
+    dt : float or None
+        Usual step, if the model gives one.
+    identity : dict
+        What must be equal where a run resumes.
+    file : Path or None
+        The model's file; None for the catalogue.
+    """
+
+    estimator: MovingHorizonEstimator
+    states: tuple[str, ...]
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+    dt: float | None
+    identity: dict[str, Any]
+    file: Path | None
+
+
+def load_record_model(text: str, **options: Any) -> RecordModel:
+    """Make the estimator of a model; `options` replace the model's own.
+
+    Raises
+    ------
+    ModelError
+        If the model cannot be imported or made, or has another form; the text names the
+        line of the file.
+    OptionError
+        If an option is missing or unknown.
+    """
+    source = find(text)
+    name = source.name
+    parts, given = _parts(name, build(source))
+    signals = {kind: given.pop(kind, None) for kind in _SIZES}
+    dt = given.pop("dt", None)
+    for key in given:
+        if key not in _OPTIONS:
+            raise OptionError(
+                f"model {name!r} gave the option {key!r}; expected {', '.join(_OPTIONS)}, dt, "
+                "or names of states, outputs and inputs."
+            )
+    chosen = given | options
+    for key in ("horizon", "initial_state"):
+        if key not in chosen:
+            raise OptionError(
+                f"model {name!r} does not give its {key}; give --{key.replace('_', '-')}, or let "
+                f"the function return (system, observer, cost, {{{key!r}: ...}})."
+            )
+    try:
+        estimator = MovingHorizonEstimator(*parts, **chosen)
+    except QpmheError as error:
+        place = code_place(error, source.file)
+        raise ModelError(f"{place}model {name!r} makes no estimator: {error}") from error
+    identity = {
+        # A file may be moved; its fingerprint identifies it.
+        "model": source.where.rpartition(":")[2] if source.is_file else source.where,
+        "arguments": source.arguments,
+        "file": source.fingerprint,
+        "engine at work": estimator.engine,
+        "initial_state": estimator.initial_state.tolist(),
+        **{
+            key: value.item() if hasattr(value, "item") else value
+            for key, value in vars(estimator.settings).items()
+        },
+    }
+    names = {
+        kind: _names(name, kind, signals[kind], getattr(estimator.system, size))
+        for kind, size in _SIZES.items()
+    }
+    return RecordModel(estimator, **names, dt=dt, identity=identity, file=source.file)
+
+
+def _parts(name: str, made: Any) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """System, observer and cost, and the model's own options."""
+    if isinstance(made, MovingHorizonEstimator):
+        options = {**vars(made.settings), "initial_state": made.initial_state}
+        return (made.system, made.observer, made.cost), options
+    if not isinstance(made, (tuple, list)) or not 3 <= len(made) <= 5:
+        shape = f" of {len(made)}" if isinstance(made, (tuple, list)) else ""
+        raise ModelError(f"model {name!r} gave a {type(made).__name__}{shape}; {_EXPECTED}.")
+    for part, (kind, what) in zip(made, _PARTS, strict=False):
+        if not isinstance(part, kind):
+            raise ModelError(
+                f"model {name!r} gave a {type(part).__name__} for its {what}; expected "
+                f"qpmhe's {kind.__name__}. In all, {_EXPECTED}."
+            )
+    options = {}
+    for extra in made[3:]:
+        if isinstance(extra, Scenario):
+            options |= {
+                "horizon": extra.horizon, "initial_state": extra.initial_estimate,
+                "states": extra.labels, "dt": extra.dt,
+            }
+        elif isinstance(extra, Mapping):
+            options |= {str(key): value for key, value in extra.items()}
+        else:
+            raise ModelError(
+                f"model {name!r} gave a {type(extra).__name__} after its cost; "
+                "expected a qpmhe.models.Scenario or a dict of options."
+            )
+    return tuple(made[:3]), options
+
+
+def _names(model: str, kind: str, names: Any, size: int) -> tuple[str, ...]:
+    if names is None:
+        letter = {"states": "x", "outputs": "y", "inputs": "u"}[kind]
+        return tuple(f"{letter}{i + 1}" for i in range(size))
+    given = tuple(str(one).strip() for one in ((names,) if isinstance(names, str) else names))
+    if len(given) != size or len(set(given)) != size or not all(given):
+        raise OptionError(
+            f"model {model!r} names its {kind} {list(given)}; expected {size} different names "
+            f"({_SIZES[kind]} = {size})."
+        )
+    return given
