@@ -38,30 +38,8 @@ def versions() -> dict[str, str]:
 class Checkpoint:
     """Where an estimation stands after a number of samples.
 
-    Parameters
-    ----------
-    identity : dict
-        Model and options; a run that resumes must have the same ones.
-    every : int
-        Samples from checkpoint to checkpoint.
-    samples : int
-        Samples so far.
-    offset : int
-        Bytes of the results that belong to them.
-    time : str
-        Time of the last one; blank before the first.
-    inputs : list of float
-        Its inputs.
-    usual_step : float or None
-        The usual step.
-    samples_digest, results_digest : str
-        Of all samples so far, and of the results that belong to them.
-    state : dict
-        The estimator's ``state_dict``.
-    finished : bool
-        Whether the record had come to its end.
-    versions : dict
-        Of what computed it.
+    `identity` is the model and the options, which a run that resumes must share; `offset` is
+    the length of the results; `time` and `inputs` are those of the last sample.
     """
 
     identity: dict[str, Any]

@@ -30,17 +30,7 @@ class Columns(NamedTuple):
 
 @dataclass(frozen=True)
 class ColumnNames:
-    """The model's names of y and u, and the user's options about columns.
-
-    Parameters
-    ----------
-    outputs, inputs : tuple of str
-        The model's names of y and u.
-    time : str, optional
-        Name of the time's column.
-    output_columns, input_columns : str, optional
-        ``name=column`` or columns in order, between commas.
-    """
+    """The model's names of y and u, and the options --time, --outputs and --inputs."""
 
     outputs: tuple[str, ...]
     inputs: tuple[str, ...]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InvalidInputError
 from .columns import ColumnNames
 from .tables import RecordError, Row, open_table
 from .values import FieldReader, Time
@@ -20,20 +21,10 @@ Array = NDArray[np.float64]
 
 @dataclass(eq=False)
 class Measurement:
-    """One sample of a record.
+    """One sample: y is NaN where it is missing, u holds its last value there.
 
-    Parameters
-    ----------
-    line : int
-        Its line; 0 if it comes from a checkpoint.
-    time : Time
-        Its time.
-    y : (p,) array
-        Outputs, NaN where they are missing.
-    u : (m,) array
-        Inputs; the last value is held where one is missing.
-    complete : bool
-        Whether nothing that comes later in the record can change it or its step.
+    `complete` says that nothing that comes later in the record can change it or its step;
+    `line` is 0 if it comes from a checkpoint.
     """
 
     line: int
@@ -44,27 +35,9 @@ class Measurement:
 
 
 class RecordReader:
-    """A CSV or Parquet file, or standard input.
+    """A CSV or Parquet file, or standard input; counts what it holds and skips.
 
-    Parameters
-    ----------
-    path : str
-        The file; ``-`` is standard input.
-    names : ColumnNames
-        The columns to look for.
-    separator, encoding, decimal, missing
-        As of `estimate_record`.
-    skip_repeated : bool
-        Whether to skip samples whose time is that of the one before.
-
-    Attributes
-    ----------
-    held, repeated : int
-        Missing inputs that were held so far, and samples that were skipped.
-    blank : int
-        Rows at the end that hold nothing.
-    cut : int or None
-        The last line, if it has no end.
+    `cut` is the last line, if it has no end; `blank` counts rows at the end that hold nothing.
     """
 
     def __init__(
@@ -81,12 +54,10 @@ class RecordReader:
         self.name, self.total = table.name, table.total
         try:
             self._columns = names.find(table.header, table.name, table.header_line)
-        except RecordError as error:
-            explained = table.explain(
-                lambda header, line: names.find(header, table.name, line)
-            )
+        except InvalidInputError as error:
+            if isinstance(error, RecordError):
+                error.args = (f"{error}{table.explain(names.find)}",)
             table.close()
-            error.args = (f"{error}{explained}",)
             raise
 
     @property

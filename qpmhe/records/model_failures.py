@@ -25,27 +25,10 @@ _ATTEMPTS = 10
 
 
 class ModelFailures:
-    """Steps whose status has MODEL_FAILED or FAILED_STAGE.
+    """Counts steps with MODEL_FAILED (`failed`), and others with FAILED_STAGE (`stale`).
 
-    Parameters
-    ----------
-    system : System
-        The model.
-    horizon : int
-        Stages in the window.
-    file : Path, optional
-        The model's file.
-
-    Attributes
-    ----------
-    failed : int
-        Steps at which the model failed.
-    stale : int
-        Steps without such a failure whose window still has one.
-    is_mistake : bool
-        Whether the model's code is wrong, rather than undefined at some states.
-    place : str
-        Place in the record of the first failure, which the caller fills in.
+    `is_mistake` says that the model's code is wrong, rather than undefined at some states;
+    `place` is where the first failure lies in the record, which the caller fills in.
     """
 
     def __init__(self, system: System, horizon: int, file: Path | None = None) -> None:

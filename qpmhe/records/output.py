@@ -26,17 +26,7 @@ _PIECE = 1 << 20
 
 
 class RowFormat:
-    """What is written for each sample.
-
-    Parameters
-    ----------
-    states : tuple of str
-        Names of the states.
-    covariances : {"none", "std", "full"}
-        Standard deviations of the states, or the upper triangles of their covariances.
-    step_time : bool
-        Whether to write the seconds of each step, which never repeat.
-    """
+    """What is written for each sample."""
 
     def __init__(self, states: tuple[str, ...], covariances: str, step_time: bool) -> None:
         if covariances not in _COVARIANCES:
@@ -94,21 +84,8 @@ class Output:
     """Rows to a file or a stream, each written whole and at once.
 
     A Parquet file cannot be continued: its rows are gathered in a CSV file beside it, named
-    with ``.part.csv`` at the end, which `finish` converts.
-
-    Parameters
-    ----------
-    out : str, Path or binary stream
-        A name in .csv or .parquet, ``-`` for standard output, or what to write to.
-
-    Attributes
-    ----------
-    path, target : Path or None
-        The file that rows go to, and the one wanted; None for a stream.
-    checkpoint : Path or None
-        The checkpoint's file.
-    offset : int
-        Bytes of the results so far.
+    with ``.part.csv`` at the end (`path`), which `finish` converts to `target`. For a stream
+    both and `checkpoint` are None. `offset` counts the bytes of the results.
     """
 
     def __init__(self, out: str | Path | BinaryIO) -> None:

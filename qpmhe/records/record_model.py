@@ -33,21 +33,7 @@ _EXPECTED = (
 
 @dataclass(frozen=True, eq=False)
 class RecordModel:
-    """An estimator before its first measurement, and what its signals are called.
-
-    Parameters
-    ----------
-    estimator : MovingHorizonEstimator
-        The estimator.
-    states, outputs, inputs : tuple of str
-        Names of x, y and u.
-    dt : float or None
-        Usual step, if the model gives one.
-    identity : dict
-        What must be equal where a run resumes.
-    file : Path or None
-        The model's file; None for the catalogue.
-    """
+    """An estimator, the names of its signals, its usual step, and what identifies it."""
 
     estimator: MovingHorizonEstimator
     states: tuple[str, ...]
@@ -59,16 +45,7 @@ class RecordModel:
 
 
 def load_record_model(text: str, **options: Any) -> RecordModel:
-    """Make the estimator of a model; `options` replace the model's own.
-
-    Raises
-    ------
-    ModelError
-        If the model cannot be imported or made, or has another form; the text names the
-        line of the file.
-    OptionError
-        If an option is missing or unknown.
-    """
+    """Make the estimator of a model from its name; `options` replace the model's own."""
     source = find(text)
     name = source.name
     parts, given = _parts(name, build(source))
@@ -91,7 +68,8 @@ def load_record_model(text: str, **options: Any) -> RecordModel:
         estimator = MovingHorizonEstimator(*parts, **chosen)
     except QpmheError as error:
         place = code_place(error, source.file)
-        raise ModelError(f"{place}model {name!r} makes no estimator: {error}") from error
+        kind = OptionError if isinstance(error, OptionError) else ModelError
+        raise kind(f"{place}model {name!r} makes no estimator: {error}") from error
     identity = {
         # A file may be moved; its fingerprint identifies it.
         "model": source.where.rpartition(":")[2] if source.is_file else source.where,

@@ -203,7 +203,8 @@ def estimate_record(
         stack.callback(reader.close)
         identity = loaded.identity | {
             "dt": dt, "time_scale": time_scale, "equal_steps": equal_steps,
-            "max_gap": steps.max_gap, "columns": rows.header,
+            "max_gap": steps.max_gap, "states": list(loaded.states),
+            "covariances": covariances, "step_time": step_time,
         }
         session = _Session(
             loaded, rows, steps, reader, output, Checkpoint(identity, every),
@@ -214,7 +215,12 @@ def estimate_record(
 
 def _check_files(record: str, output: Output) -> None:
     for path in filter(None, (output.path, output.target)):
-        if os.path.exists(path) and os.path.exists(record) and os.path.samefile(path, record):
+        try:
+            read = os.fstat(sys.stdin.fileno()) if record == "-" else os.stat(record)
+            is_same = os.path.samestat(path.stat(), read)
+        except (OSError, ValueError, AttributeError):  # one of them is no file
+            continue
+        if is_same:
             raise OptionError(
                 f"--out would overwrite the record itself, {record}; name another file."
             )
@@ -287,10 +293,6 @@ class _Session:
                 raise RecordError(
                     "it has a header and no samples; expected a line for each.", reader.name
                 )
-            try:
-                self._steps.finish()
-            except OnlyGapsError as error:
-                raise reader.error(f"{error}.", None) from error
             self._newest, self._is_saved = replace(self._newest, finished=True), False
             self._save()
         except BaseException as error:

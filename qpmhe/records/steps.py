@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from statistics import median
 from typing import NamedTuple
 
 from .._checks import count, positive
@@ -17,9 +16,8 @@ _JITTER = 0.3
 # Steps that differ by less are equal: times are rounded.
 _ROUNDING = 1e-6
 _MAX_GAP = 1000
-# So many steps at the record's beginning must not be gaps of one size, nor all steps of a
-# record that is shorter; sizes that differ by less are one.
-_TRIAL, _SHORTEST, _SIZE_TOLERANCE = 8, 3, 0.1
+# So many steps at the beginning must not be gaps of one size; sizes that differ by less are one.
+_TRIAL, _SIZE_TOLERANCE = 3, 0.1
 
 
 class OnlyGapsError(ValueError):
@@ -34,30 +32,7 @@ class Step(NamedTuple):
 
 
 class Steps:
-    """The steps of a record.
-
-    Parameters
-    ----------
-    system : System
-        The model; made by `System.from_ode`, it takes steps of any length.
-    usual : float, optional
-        Usual step in the model's unit; the system's, or else the record's first step, if left
-        out.
-    scale : float
-        The record's unit of time in the model's.
-    equal : bool
-        Whether the steps must be equal although the system takes any.
-    max_gap : int, optional
-        Most samples without measurement in a row. If left out, 1000, and a record that
-        consists of gaps of one size is refused.
-
-    Attributes
-    ----------
-    usual : float or None
-        The usual step, as soon as it is known.
-    any_length : bool
-        Whether steps have the lengths that the record says.
-    """
+    """The steps of a record: of any length (`any_length`), or multiples of the usual one."""
 
     def __init__(
         self, system: System, *, usual: float | None = None, scale: float = 1.0,
@@ -87,21 +62,10 @@ class Steps:
         self.usual, self._trial = usual, None
 
     def between(self, spacing: float, magnitude: float) -> Step:
-        """The step from one sample to the next.
+        """The step from one sample to the next, whose times differ by `spacing`.
 
-        Parameters
-        ----------
-        spacing : float
-            Difference of their times, positive.
-        magnitude : float
-            Size of the times, which are rounded to some digits.
-
-        Raises
-        ------
-        ValueError
-            If it is no step; the text says why and what to do.
-        OnlyGapsError
-            If all steps so far are gaps of one size.
+        `magnitude` is the size of the times, which are rounded to some digits. Raises
+        ValueError if it is no step, with what to do.
         """
         length = spacing * self._scale
         if self.usual is None:
@@ -126,33 +90,22 @@ class Steps:
             )
         return Step(None, number - 1)
 
-    def finish(self) -> None:
-        """Raise OnlyGapsError if a short record has nothing but gaps of one size."""
-        if self._trial:
-            self._check_trial(_SHORTEST, exceptions=0)
-
     def _try(self, number: int) -> None:
         if self._trial is None:
             return
         self._trial.append(number)
-        if self._trial.count(1) > 1:
-            self._trial = None
-        elif len(self._trial) == _TRIAL:
-            self._check_trial(_TRIAL, exceptions=1)
-            self._trial = None
-
-    def _check_trial(self, enough: int, exceptions: int) -> None:
-        trial = self._trial or []
-        size = int(median(trial))
-        same = sum(abs(number - size) <= _SIZE_TOLERANCE * size for number in trial)
-        if size < 2 or len(trial) < enough or same < len(trial) - exceptions:
+        if len(self._trial) < _TRIAL:
+            return
+        trial, self._trial = self._trial, None
+        size = sorted(trial)[_TRIAL // 2]
+        if size < 2 or any(abs(one - size) > _SIZE_TOLERANCE * size for one in trial):
             return
         assert self.usual is not None
         raise OnlyGapsError(
-            f"the record has nothing but gaps of about {size} usual steps, {self.usual:.6g} "
-            f"each, from its beginning; give --time-scale {self._scale / size:.4g} or so if its "
-            "unit of time is not the model's, or a model (or --dt) with another usual step; if "
-            f"the samples really are that rare, give --max-gap {max(trial)}"
+            f"the record begins with nothing but gaps of about {size} usual steps, "
+            f"{self.usual:.6g} each; give --time-scale {self._scale / size:.4g} or so if its unit "
+            "of time is not the model's, or a model (or --dt) with another usual step; if the "
+            f"samples really are that rare, give --max-gap {max(trial)} or more"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import gzip
 import io
@@ -12,8 +13,8 @@ import re
 import stat
 import sys
 import zlib
-from collections.abc import Iterator
-from typing import Any, BinaryIO, NamedTuple, cast
+from collections.abc import Callable, Iterator
+from typing import Any, BinaryIO, NamedTuple
 
 from .._checks import need
 from ..errors import InvalidInputError, OptionError
@@ -32,6 +33,7 @@ _BATCH = 4096
 _GZIP, _PARQUET = b"\x1f\x8b", b"PAR1"
 _ZCAT = "give '{} FILE | qpmhe estimate MODEL -', or compress it by gzip, which qpmhe reads."
 _UNREADABLE = {
+    _PARQUET: "it is a Parquet file, which cannot be read line by line; name the file instead.",
     b"PK\x03\x04": "it is a zip archive or a spreadsheet; save it as CSV.",
     b"BZh": f"it is compressed by bzip2; {_ZCAT.format('bzcat')}",
     b"\xfd7zXZ": f"it is compressed by xz; {_ZCAT.format('xzcat')}",
@@ -79,30 +81,28 @@ def open_table(record: str, separator: str | None, encoding: str) -> CsvTable | 
     name = "standard input" if piped else record
     if piped and sys.stdin is None:
         raise RecordError("it is closed; pipe a record into it, or name a file.", name)
-    try:
-        stream = sys.stdin.buffer if piped else open(record, "rb")  # noqa: SIM115
-        if not hasattr(stream, "peek"):
-            stream = io.BufferedReader(cast(Any, stream))
-        head, total = cast(Any, stream).peek(6)[:6], None
-        if not piped and stat.S_ISREG((status := os.fstat(stream.fileno())).st_mode):
-            total = status.st_size
-    except OSError as error:
-        raise RecordError(f"it cannot be read ({error.strerror or error}).", name) from error
-    if total is not None and (
-        head.startswith(_PARQUET) or record.lower().endswith((".parquet", ".pq"))
-    ):
-        stream.close()
-        return ParquetTable(name)
-    if head.startswith(_PARQUET):
-        raise RecordError(
-            "it is a Parquet file, which cannot be read line by line; name the file instead.", name
-        )
-    for magic, remedy in _UNREADABLE.items():
-        if head.startswith(magic):
-            raise RecordError(remedy, name)
-    if head.startswith(_GZIP):
-        stream, total = cast(BinaryIO, gzip.GzipFile(fileobj=stream)), None
-    return CsvTable(stream, name, separator, encoding, total)
+    with contextlib.ExitStack() as opened:
+        try:
+            stream: Any = sys.stdin.buffer if piped else opened.enter_context(open(record, "rb"))
+            if not hasattr(stream, "peek"):
+                stream = io.BufferedReader(stream)
+            head, total = stream.peek(6)[:6], None
+            if not piped and stat.S_ISREG((status := os.fstat(stream.fileno())).st_mode):
+                total = status.st_size
+        except OSError as error:
+            raise RecordError(f"it cannot be read ({error.strerror or error}).", name) from error
+        if total is not None and (
+            head.startswith(_PARQUET) or record.lower().endswith((".parquet", ".pq"))
+        ):
+            return ParquetTable(name)
+        for magic, remedy in _UNREADABLE.items():
+            if head.startswith(magic):
+                raise RecordError(remedy, name)
+        if head.startswith(_GZIP):
+            stream, total = gzip.GzipFile(fileobj=stream), None
+        table = CsvTable(stream, name, separator, encoding, total)
+        table.close = opened.pop_all().close
+        return table
 
 
 class CsvTable:
@@ -133,6 +133,7 @@ class CsvTable:
                 "latin-1 or cp1252."
             )
         self.position = self.line = 0
+        self.close: Callable[[], None] = stream.close
         self._row_begins: float = math.inf
         self._ended = True
         self._lines = self._read_lines()
@@ -155,10 +156,6 @@ class CsvTable:
                 name, self.line,
             )
 
-    def close(self) -> None:
-        if self.name != "standard input":
-            self._stream.close()
-
     def __iter__(self) -> Iterator[Row]:
         assert self._separator is not None
         reader = csv.reader(self._lines, delimiter=self._separator, strict=True)
@@ -177,19 +174,19 @@ class CsvTable:
                 fields = self._fitted(fields, line)
             yield Row(line, fields, self._ended)
 
-    def explain(self, missing: Any) -> str:
-        """What to add where `missing`, called with a header and its line, did not find columns."""
+    def explain(self, find: Callable[..., Any]) -> str:
+        """What to add to an error of `find(header, file, line)`, which finds the columns."""
         word = _SEPARATORS.get(self._separator or "", repr(self._separator))
         hint = f" The separator is taken to be {word}; choose another one by --separator."
         if self.name != "standard input":  # a pipe would keep waiting
             for text in itertools.islice(self._lines, _PREAMBLE):
                 try:
-                    missing(self._split_header(text)[1], self.line)
+                    find(self._split_header(text)[1], self.name, self.line)
                 except RecordError:
                     continue
                 return f"{hint} Line {self.line} looks like the header; delete the lines above it."
         if _is_comment(self.header):
-            return f"{hint} Comments and other lines above the header are not supported; delete them."
+            return f"{hint} Comments above the header are not supported; delete them."
         return hint
 
     def _read_lines(self) -> Iterator[str]:
@@ -227,11 +224,8 @@ class CsvTable:
     def _split_header(self, text: str) -> tuple[str, list[str]]:
         """The separator and the names; the separator is the first that separates anything."""
         marks = list(_SEPARATORS) if self._separator is None else [self._separator]
-        for mark in [*marks, self._separator or ","]:
-            names = self._split(text.rstrip("\r\n"), mark)
-            if len(names) > 1:
-                break
-        return mark, names
+        mark = next((mark for mark in marks if mark in text), self._separator or ",")
+        return mark, self._split(text.rstrip("\r\n"), mark)
 
     def _split(self, text: str, separator: str) -> list[str]:
         try:
@@ -315,7 +309,7 @@ class ParquetTable:
                 self.position += 1
                 yield Row(self.position, list(values), True)
 
-    def explain(self, missing: Any) -> str:
+    def explain(self, find: Callable[..., Any]) -> str:
         return ""
 
     def _texts(self, column: Any) -> list[str]:

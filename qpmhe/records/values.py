@@ -36,15 +36,7 @@ def seconds_between(before: Time, after: Time) -> float:
 
 
 class FieldReader:
-    """Reads fields, with one decimal mark in the whole record.
-
-    Parameters
-    ----------
-    decimal : {"auto", ".", ","}
-        Decimal mark; ``auto`` is the first one that occurs.
-    missing : sequence of str
-        Words or numbers that stand for a missing value, besides the usual words.
-    """
+    """Reads fields, with one decimal mark in the whole record: the first one, if ``auto``."""
 
     def __init__(self, decimal: str = "auto", missing: Sequence[str] = ()) -> None:
         self._mark = "" if decimal == "auto" else decimal

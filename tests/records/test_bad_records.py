@@ -42,15 +42,15 @@ def after(wrong, end="\n"):
         ("0.3,1 2,0", ["'1 2' is not a number"]),
         ("0.3,\"1,5\",0", ["column 'y'", "decimal mark ','", "--decimal"]),
         ("0.3,\"1,000.5\",0", ["column 'y'", "two kinds of decimal marks"]),
-        ("0.2,0.5,0", ["column 'time'", "time 0.2 stands in line 4 already", "keep one"]),
-        ("0.15,0.5,0", ["column 'time'", "time 0.15 is before 0.2 of line 4", "sort"]),
+        ("0.2,0.5,0", ["column 'time'", "time 0.2 is in line 4 already", "keep one"]),
+        ("0.15,0.5,0", ["column 'time'", "time 0.15 is before 0.2 in line 4", "sort"]),
         (",0.5,0", ["column 'time'", "blank"]),
         ("inf,0.5,0", ["column 'time'", "not finite"]),
         ("noon,0.5,0", ["column 'time'", "'noon' is not a number", "2026-05-04T12:00:00"]),
-        ("2026-01-01 00:00:00,0.5,0", ["column 'time'", "cannot be compared", "line 4"]),
+        ("2026-01-01 00:00:00,0.5,0", ["column 'time'", "a date, and in line 4 a number"]),
         ("0.3;0.5;0", ["separated by semicolon, the header by comma"]),
         ("0.3\t0.5\t0", ["separated by tab, the header by comma"]),
-        ("0.3,0.5", ["it has 2 fields, and the header 3", "mend"]),
+        ("0.3,0.5", ["it has 2 fields, and the header 3", "correct"]),
         ("0,3,0,5,0", ["it has 5 fields", "decimal commas"]),
         ("0.3,\"0.5,0", ["quotation marks", "close"]),
         ("900.0,0.5,0", ["gap", "--max-gap", "--time-scale"]),
@@ -101,7 +101,7 @@ def test_bytes_that_are_no_text(here):
         (b"time,y (V),y (mV),u\n0,1,1,2\n", "'y (V)', 'y (mV)' could all be"),
         (b"time,y;u\n0,1;2\n", "--separator"),
         (b"time y u\n0 1 2\n", "--separator"),
-        (b"time,y,u\n0,1,\n", "none stands before"),
+        (b"time,y,u\n0,1,\n", "no earlier value"),
         (GOOD.encode("utf-16"), "UTF-16"),
     ],
 )
@@ -135,7 +135,7 @@ def test_a_parquet_file_counts_rows(here):
     pd = pytest.importorskip("pandas")
     frame = pd.DataFrame({"time": [0.0, 0.1, 0.1], "y": ["1", "2", "x"], "u": 0.0})
     frame.to_parquet("record.parquet")
-    with pytest.raises(RecordError, match=r"row 3, column 'time': time 0\.1 stands in row 2"):
+    with pytest.raises(RecordError, match=r"row 3, column 'time': time 0\.1 is in row 2"):
         estimate_record(CONTINUOUS, "record.parquet", "out.csv")
     frame["time"] = [0.0, 0.1, 0.2]
     frame.to_parquet("record.parquet")

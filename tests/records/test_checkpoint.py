@@ -33,7 +33,7 @@ def cut(here):
         ({"max_qps": None}, "max_qps 2, now None"),
         ({"equal_steps": True}, "equal_steps"),
         ({"checkpoint_every": 30}, "checkpoint-every 20"),
-        ({"covariances": "std"}, "other columns"),
+        ({"covariances": "std"}, "covariances 'none', now 'std'"),
         ({"outputs": "y=u"}, "not those"),
     ],
 )
@@ -122,7 +122,7 @@ def test_a_checkpoint_keeps_every_bit(cut):
     path = Path("out.csv.checkpoint")
     found = load(path)
     state = {"a": np.array([np.nan, -0.0, 5e-324]), 3: (1, None, [True, "x"]), "b": np.float64(0.1)}
-    save(path, replace(found, state=state, inputs=[0.1 + 0.2], usual=None))
+    save(path, replace(found, state=state, inputs=[0.1 + 0.2], usual_step=None))
     again = load(path)
     assert again.state["a"].tobytes() == state["a"].tobytes()
     assert again.state[3] == state[3]

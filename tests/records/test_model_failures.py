@@ -134,4 +134,4 @@ def test_a_model_that_is_not_asked_in_vain(here):
     assert failures.note(estimate, np.empty(0), None)
     assert not failures.note(estimate, np.empty(0), None)
     assert failures.failed == 2
-    assert "asked again, it has values there" in failures.report(3)
+    assert "evaluated again, it has values there" in failures.report(3)

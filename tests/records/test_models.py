@@ -84,7 +84,7 @@ def test_modules(make, monkeypatch, here):
         ("return 3", ["gave a int", "(system, observer, cost)"]),
         ("return system, observer", ["gave a tuple of 2"]),
         ("return observer, system, cost", ["gave a Luenberger for its system"]),
-        ("return system, observer, cost, 3", ["gave a int behind its cost"]),
+        ("return system, observer, cost, 3", ["gave a int after its cost"]),
         ("return system, observer, cost, dict(horzon=3)", ["'horzon'", "horizon"]),
         ("return system, observer, cost, dict(horizon=3, initial_state=[0, 1])", ["(2,)", "(1,)"]),
         ("return system, observer, cost, dict(horizon=3, initial_state=0, states=['a', 'b'])",

@@ -61,7 +61,7 @@ def test_gzip_that_is_cut_off(record):
     whole = gzip.compress(Path("record.csv").read_bytes())
     for content in (whole[: len(whole) // 2], whole[:10] + b"\xff" * 30 + whole[40:]):
         Path("cut.csv.gz").write_bytes(content)
-        with pytest.raises(RecordError, match="cannot be read on"):
+        with pytest.raises(RecordError, match="cannot be read any further"):
             estimate_record(CONTINUOUS, "cut.csv.gz", "out.csv", overwrite=True, **OPTIONS)
     Path("cut.csv.gz").write_bytes(whole)
     estimate_record(CONTINUOUS, "cut.csv.gz", "out.csv", resume=True, **OPTIONS)
@@ -102,7 +102,7 @@ def test_blank_rows_at_the_end(here):
         assert found == expected
         count = end.count(",,") + end.count(" , ,")
         assert f"{count} rows without any value" in told.notes[0]
-    assert "line 5: the line is blank, and others are behind it" in refused(SHORT + ",,\n3,1,1\n")
+    assert "line 5: the line is blank, and others follow it" in refused(SHORT + ",,\n3,1,1\n")
 
 
 def test_an_end_that_may_be_cut_off(here):
@@ -136,7 +136,7 @@ def test_lines_above_the_header(here):
         number = above.count("\n") + 1
         assert f"Line {number} looks like the header; delete the lines above it" in message
     assert "Comments" in refused("# logger\n")
-    assert "comments are not understood" in refused(SHORT + "# stopped\n")
+    assert "comments are not supported" in refused(SHORT + "# stopped\n")
     code, _, error = process.shell(
         f"printf '# logger\\n0,1,2\\n' | qpmhe estimate {DISCRETE} -"
     )
@@ -160,13 +160,13 @@ def test_fields_over_several_lines(here):
     # Lines are counted as they stand in the file.
     assert "line 9, column 'y1'" in refused(text + "3,none,high,2\n")
     assert "line 9, column 'y1'" in refused(text + '3,"no\nne",high,2\n')
-    assert "line 9: its quotation marks" in refused(text + '3,"never closed,1,2\n' * 50)
+    assert "line 9: its quotation marks are not balanced" in refused(text + '3,"never closed,1,2\n' * 50)
 
 
 def test_the_time_is_no_output(here):
     Path("record.csv").write_text(SHORT)
     for options in ({"outputs": "y1=time"}, {"outputs": "y1=time,y2=y1"}):
-        with pytest.raises(OptionError, match="'time' is taken for the time"):
+        with pytest.raises(OptionError, match="'time' is both the time and"):
             estimate_record(DISCRETE, "record.csv", "out.csv", **options)
 
 

@@ -45,7 +45,7 @@ def test_killed_before_the_first_checkpoint_by_number(text, here, monkeypatch):
     assert load(here / "live.csv.checkpoint").samples == 0
     # The stream that goes on would take the rows away.
     piped(monkeypatch, [text[0], *text[41:]])
-    with pytest.raises(CheckpointError, match="time 0 again") as caught:
+    with pytest.raises(CheckpointError, match="does not contain the sample of time 0;") as caught:
         estimate_record(DISCRETE, "-", out, resume=True, **OPTIONS)
     assert "--overwrite" in str(caught.value)
     assert out.read_bytes() == written
@@ -65,7 +65,7 @@ def test_a_finished_short_stream_is_not_lost_either(text, monkeypatch):
     estimate_record(DISCRETE, "-", "live.csv", **OPTIONS)
     written = Path("live.csv").read_bytes()
     piped(monkeypatch, [text[0], *text[31:]])
-    with pytest.raises(CheckpointError, match="time 0 again"):
+    with pytest.raises(CheckpointError, match="does not contain the sample of time 0;"):
         estimate_record(DISCRETE, "-", "live.csv", resume=True, **OPTIONS)
     assert Path("live.csv").read_bytes() == written
 
@@ -73,7 +73,7 @@ def test_a_finished_short_stream_is_not_lost_either(text, monkeypatch):
 def test_another_record_does_not_take_the_rows_of_a_short_one(text):
     estimate_record(DISCRETE, "record.csv", "out.csv", **OPTIONS)
     put("later.csv", [text[0], *text[31:]])
-    with pytest.raises(CheckpointError, match="time 0 again"):
+    with pytest.raises(CheckpointError, match="does not contain the sample of time 0;"):
         estimate_record(DISCRETE, "later.csv", "out.csv", resume=True, **OPTIONS)
     assert rows(Path("out.csv")) == 61
 
@@ -84,7 +84,7 @@ def test_files_of_others(text, name, resume):
     pytest.importorskip("pyarrow")
     Path(name).write_text("precious\n")
     out = name.removesuffix(".part.csv")
-    with pytest.raises(InvalidInputError, match=f"{name} is there already.*--overwrite"):
+    with pytest.raises(InvalidInputError, match=f"{name} exists already.*--overwrite"):
         estimate_record(DISCRETE, "record.csv", out, resume=resume, **OPTIONS)
     assert Path(name).read_text() == "precious\n"
     estimate_record(DISCRETE, "record.csv", out, overwrite=True, **OPTIONS)
@@ -129,29 +129,16 @@ def test_a_record_by_another_name(text):
     assert Path("record.csv").read_bytes() == content
 
 
-def test_a_pipe_that_has_a_name(text):
-    os.mkfifo("fifo.csv")
-    code, out, error = process.shell(
-        f"cat fifo.csv & qpmhe estimate {DISCRETE} record.csv --out fifo.csv --no-step-time; wait"
-    )
-    assert "Traceback" not in error
-    assert code == 0
-    estimate_record(DISCRETE, "record.csv", "out.csv", **OPTIONS)
-    assert out == Path("out.csv").read_text()
-    assert not Path("fifo.csv.checkpoint").exists()
-    with pytest.raises(OptionError, match="--resume needs a file"):
-        estimate_record(DISCRETE, "record.csv", "fifo.csv", resume=True, **OPTIONS)
-
-
 def test_places_where_nothing_can_be(text):
     Path("file").touch()
     for out in ("/proc/nowhere/out.csv", "file/out.csv"):
         with pytest.raises(WriteError, match=f"cannot write {out}: .*--out"):
             estimate_record(DISCRETE, "record.csv", out, **OPTIONS)
-    Path("folder.parquet").mkdir()
-    pytest.importorskip("pyarrow")
-    with pytest.raises(OptionError, match="no file"):
-        estimate_record(DISCRETE, "record.csv", "folder.parquet", **OPTIONS)
+    Path("folder.csv").mkdir()
+    os.mkfifo("pipe.csv")
+    for out in ("folder.csv", "pipe.csv"):
+        with pytest.raises(OptionError, match="no file"):
+            estimate_record(DISCRETE, "record.csv", out, **OPTIONS)
 
 
 @pytest.mark.parametrize("place", [30, -30])
@@ -166,8 +153,7 @@ def test_results_that_were_edited(here, place):
     edited = bytearray(before)
     edited[place] ^= 1
     Path("out.csv").write_bytes(edited)
-    message = "other columns" if place == 30 else "was changed"
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises(CheckpointError, match="was changed"):
         estimate_record(CONTINUOUS, "record.csv", "out.csv", resume=True, **options)
     assert Path("out.csv").read_bytes() == edited
     # What stands behind the checkpoint is computed again in any case.

@@ -205,7 +205,7 @@ def test_standard_input_that_leaves_rows_out(here, monkeypatch):
     for rest in (text[31:], []):
         stream = io.TextIOWrapper(io.BytesIO("\n".join([text[0], *rest, ""]).encode()))
         monkeypatch.setattr("sys.stdin", stream)
-        with pytest.raises(CheckpointError, match=f"time {text[21].split(',')[0]} again"):
+        with pytest.raises(CheckpointError, match=f"sample of time {text[21].split(',')[0]};"):
             estimate_record(CONTINUOUS, "-", "out.csv", resume=True, **OPTIONS)
         assert Path("out.csv").read_bytes() == before
 

@@ -28,7 +28,6 @@ def record(times):
     [
         range(0, 50_000, 1000),
         [*range(0, 3000, 999), *range(3000, 40_000, 1000)],
-        [0, 1, *range(1001, 40_000, 1000)],  # one is the usual step
         range(0, 100, 2),
         range(0, 4000, 1000),  # a record too short to be judged before its end
     ],
@@ -81,26 +80,24 @@ def test_a_continuous_model_in_seconds_and_a_record_in_milliseconds(here):
         [5, 5, 1, 5, 1, 5, 5, 5, 5, 5, 5],  # two usual ones
         [2, 9, 4, 30, 2, 7, 3, 12],  # gaps of all sizes
         [5, 5],
-        [1, 1, *[5] * 30],
+        [1, *[5] * 30],
         [],
     ],
 )
 def test_gaps_that_are_gaps(spacings):
     found = steps()
     assert [found.between(float(one), 0.0).inserted + 1 for one in spacings] == spacings
-    found.finish()
 
 
 def test_within_a_record_nothing_is_judged():
     found = steps()
-    found.restore(1.0)
+    found.resume(1.0)
     assert found.settled
     assert [found.between(1000.0, 0.0).inserted for _ in range(20)] == [999] * 20
-    found.finish()
 
 
 def test_clocks_stray():
     found, generator = steps(), np.random.default_rng(0)
     spacings = (60 + generator.uniform(-2, 2, 20)).round().tolist()
-    with pytest.raises(ValueError, match="nothing but gaps of about 60"):
+    with pytest.raises(ValueError, match="nothing but gaps of about (59|60|61) "):
         [found.between(one, 0.0) for one in spacings]
