@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import sys
-from collections.abc import Iterator
 from enum import StrEnum
 from time import monotonic
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -156,11 +153,10 @@ def run(
     mixed = out == "-" and sys.stdout is not None and sys.stdout.isatty()
     bar = _Bar(console) if console.is_terminal and not (quiet or mixed) else None
     try:
-        with _rows_apart(out) as target:
-            summary = estimate_record(
-                model, record, target, progress=None if bar is None else bar.show,
-                report=None if quiet else lambda text: _warn(console, text), **options,
-            )
+        summary = estimate_record(
+            model, record, out, progress=None if bar is None else bar.show,
+            report=None if quiet else lambda text: _warn(console, text), **options,
+        )
     except BrokenPipeError:
         raise SystemExit(1) from None
     except KeyboardInterrupt:
@@ -178,26 +174,6 @@ def run(
         _warn(console, summary.failure)
     if is_broken:
         raise SystemExit(3)
-
-
-@contextlib.contextmanager
-def _rows_apart(out: str) -> Iterator[str | BinaryIO]:
-    """Keep standard output for rows: what models and solvers print goes to standard error."""
-    try:
-        if out != "-" or sys.stderr is None:
-            raise OSError
-        descriptor = sys.stdout.fileno()
-    except (OSError, AttributeError):  # a file, a closed stream, or one inside Python
-        yield out
-        return
-    sys.stdout.flush()
-    with open(os.dup(descriptor), "wb", buffering=0) as rows:
-        os.dup2(2, descriptor)
-        try:
-            with contextlib.redirect_stdout(sys.stderr):
-                yield rows
-        finally:
-            os.dup2(rows.fileno(), descriptor)
 
 
 def _warn(console: Console, text: str) -> None:

@@ -81,14 +81,14 @@ class _Echo:
 
 
 class Output:
-    """Rows to a file or a stream, each written whole and at once.
+    """Rows to a file or standard output, each written whole and at once.
 
     A Parquet file cannot be continued: its rows are gathered in a CSV file beside it, named
-    with ``.part.csv`` at the end (`path`), which `finish` converts to `target`. For a stream
-    both and `checkpoint` are None. `offset` counts the bytes of the results.
+    with ``.part.csv`` at the end (`path`), which `finish` converts to `target`. For
+    standard output both and `checkpoint` are None. `offset` counts the bytes of the results.
     """
 
-    def __init__(self, out: str | Path | BinaryIO) -> None:
+    def __init__(self, out: str | Path) -> None:
         self.path: Path | None = None
         self.target: Path | None = None
         self.checkpoint: Path | None = None
@@ -96,26 +96,22 @@ class Output:
         self._stream: BinaryIO | None = None
         self._hash = hashlib.sha256()
         self._rows: Any = csv.writer(cast(Any, _Echo()), lineterminator="\n")
-        self.is_standard_output = str(out) == "-"
-        if self.is_standard_output:
+        if str(out) == "-":
             if sys.stdout is None:
                 raise OptionError("standard output is closed; name a file by --out.")
-            self._stream = sys.stdout.buffer
-        elif not isinstance(out, (str, Path)):
-            self._stream = out
-        else:
-            self.path = self.target = path = Path(out)
-            if path.suffix not in (".csv", ".parquet"):
-                raise OptionError(
-                    f"--out is {str(out)!r}; expected a name in .csv or .parquet, or - for "
-                    "standard output."
-                )
-            if path.suffix == ".parquet":
-                need("pyarrow", "a Parquet file")
-                self.path = path.with_name(f"{path.name}.part.csv")
-            if os.path.exists(path) and not os.path.isfile(path):
-                raise OptionError(f"--out is {str(out)!r}, which is no file; give another name.")
-            self.checkpoint = path.with_name(f"{path.name}.checkpoint")
+            return
+        self.path = self.target = path = Path(out)
+        if path.suffix not in (".csv", ".parquet"):
+            raise OptionError(
+                f"--out is {str(out)!r}; expected a name in .csv or .parquet, or - for standard "
+                "output."
+            )
+        if path.suffix == ".parquet":
+            need("pyarrow", "a Parquet file")
+            self.path = path.with_name(f"{path.name}.part.csv")
+        if os.path.exists(path) and not os.path.isfile(path):
+            raise OptionError(f"--out is {str(out)!r}, which is no file; give another name.")
+        self.checkpoint = path.with_name(f"{path.name}.checkpoint")
 
     @property
     def name(self) -> str:
@@ -126,6 +122,10 @@ class Output:
     def digest(self) -> str:
         """Of all bytes so far."""
         return self._hash.hexdigest()
+
+    def use(self, stream: BinaryIO) -> None:
+        """Write to this stream, which leads to standard output."""
+        self._stream = stream
 
     def begin(self) -> None:
         """Open a file anew; its old checkpoint goes."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +19,6 @@ __all__ = ["RecordModel", "load_record_model"]
 
 _PARTS = ((System, "system"), (Observer, "observer"), (Cost, "cost"))
 _SIZES = {"states": "n", "outputs": "p", "inputs": "m"}
-_OPTIONS = tuple(
-    name
-    for name, parameter in inspect.signature(MovingHorizonEstimator).parameters.items()
-    if parameter.kind is parameter.KEYWORD_ONLY
-)
 _EXPECTED = (
     "expected (system, observer, cost), optionally followed by a scenario or a dict of options; "
     "or a MovingHorizonEstimator"
@@ -51,17 +45,12 @@ def load_record_model(text: str, **options: Any) -> RecordModel:
     parts, given = _parts(name, build(source))
     signals = {kind: given.pop(kind, None) for kind in _SIZES}
     dt = given.pop("dt", None)
-    for key in given:
-        if key not in _OPTIONS:
-            raise OptionError(
-                f"model {name!r} gave the option {key!r}; expected {', '.join(_OPTIONS)}, dt, "
-                "or names of states, outputs and inputs."
-            )
     chosen = given | options
     for key in ("horizon", "initial_state"):
         if key not in chosen:
             raise OptionError(
-                f"model {name!r} does not give its {key}; give --{key.replace('_', '-')}, or let "
+                f"model {name!r} does not give its {key} (its options: "
+                f"{', '.join(map(repr, given)) or 'none'}); give --{key.replace('_', '-')}, or let "
                 f"the function return (system, observer, cost, {{{key!r}: ...}})."
             )
     try:

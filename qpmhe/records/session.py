@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from time import monotonic
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from .measurements import Measurement, RecordReader
 from .model_failures import ModelFailures
 from .output import Output, RowFormat
 from .record_model import RecordModel, load_record_model
+from .standard_output import standard_output_for_rows
 from .steps import OnlyGapsError, Step, Steps
 from .tables import RecordError
 from .values import FieldReader, seconds_between
@@ -79,7 +80,7 @@ class Summary:
 def estimate_record(
     model: str,
     record: str | Path,
-    out: str | Path | BinaryIO,
+    out: str | Path,
     *,
     time: str | None = None,
     outputs: str | None = None,
@@ -116,7 +117,7 @@ def estimate_record(
         Name in the catalogue, ``package.module:function`` or ``path/file.py:function``.
     record : str or Path
         CSV (or gzip of it) or Parquet file with a header; ``-`` is standard input.
-    out : str, Path or binary stream
+    out : str or Path
         File in .csv or .parquet, which must not exist yet; ``-`` is standard output.
     time : str, optional
         Column of the time, numbers or ISO dates (whose differences count in seconds).
@@ -187,8 +188,8 @@ def estimate_record(
         every = found.every
     with contextlib.ExitStack() as stack:
         stack.callback(output.close)
-        if output.is_standard_output:  # a model that prints must not print among the rows
-            stack.enter_context(contextlib.redirect_stdout(sys.stderr))
+        if output.path is None:  # neither a model nor a solver may print among the rows
+            output.use(stack.enter_context(standard_output_for_rows()))
         loaded = load_record_model(model, **options)
         steps = Steps(
             loaded.estimator.system, usual=loaded.dt if dt is None else dt, scale=time_scale,

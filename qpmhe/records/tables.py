@@ -241,7 +241,6 @@ class CsvTable:
 
     def _fitted(self, fields: list[str], line: int) -> list[str]:
         """The fields of a line that has more or fewer than the header."""
-        assert self._separator is not None
         width, found = len(self.header), len(fields)
         if found > width and not "".join(fields[width:]).strip():
             return fields[:width]
@@ -251,14 +250,6 @@ class CsvTable:
                 "Complete or delete it.", self.name, line,
             )
         what = f"it has {found} field{'s' if found > 1 else ''}, and the header {width}; "
-        text = self._separator.join(fields)
-        for mark, word in _SEPARATORS.items():
-            if mark != self._separator and text.count(mark) == width - 1:
-                usual = _SEPARATORS.get(self._separator, repr(self._separator))
-                raise RecordError(
-                    f"{what}this line is separated by {word}, the header by {usual}. Use one "
-                    "separator in all lines.", self.name, line,
-                )
         remedy = "correct the line."
         if _is_comment(fields):
             remedy = "comments are not supported; delete such lines."
@@ -286,12 +277,10 @@ class ParquetTable:
             raise RecordError(f"it cannot be read as Parquet ({_first_line(error)}).", name) from (
                 error
             )
+        self.close: Callable[[], None] = self._file.close
         self.types = self._file.schema_arrow.types
         self.header: list[str] = list(self._file.schema_arrow.names)
         self.total = int(self._file.metadata.num_rows)
-
-    def close(self) -> None:
-        self._file.close()
 
     def __iter__(self) -> Iterator[Row]:
         batches = self._file.iter_batches(batch_size=_BATCH)
@@ -310,6 +299,7 @@ class ParquetTable:
                 yield Row(self.position, list(values), True)
 
     def explain(self, find: Callable[..., Any]) -> str:
+        """Nothing to add: a Parquet file has its columns in one place."""
         return ""
 
     def _texts(self, column: Any) -> list[str]:

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.errors import InvalidInputError, OptionError
-from qpmhe.records.record_model import load_record_model as load_model
+from qpmhe.errors import InvalidInputError, ModelError, OptionError
 from qpmhe.models.loading import code_place as place
-from qpmhe.errors import ModelError
+from qpmhe.records.record_model import load_record_model as load_model
 
 BEGIN = """
 import numpy as np, qpmhe

@@ -99,5 +99,5 @@ def test_within_a_record_nothing_is_judged():
 def test_clocks_stray():
     found, generator = steps(), np.random.default_rng(0)
     spacings = (60 + generator.uniform(-2, 2, 20)).round().tolist()
-    with pytest.raises(ValueError, match="nothing but gaps of about (59|60|61) "):
+    with pytest.raises(ValueError, match=r"nothing but gaps of about (59|60|61) "):
         [found.between(one, 0.0) for one in spacings]
