@@ -72,7 +72,7 @@ class RowFormat:
             return cast(list[float], both[:, *self._upper].ravel().tolist())
         with np.errstate(invalid="ignore"):
             deviations = np.sqrt(np.diagonal(both, axis1=1, axis2=2))
-        return cast(list[float], deviations.ravel().tolist())
+        return deviations.ravel().tolist()
 
 
 class _Echo:
@@ -227,7 +227,10 @@ class Output:
         arrow = need("pyarrow", "a Parquet file")
         temporary = self.target.with_name(f"{self.target.name}.tmp")
         try:
-            _to_parquet(self.path, temporary, time_type)
+            try:
+                _to_parquet(self.path, temporary, time_type)
+            except arrow.ArrowNotImplementedError:  # CSV cannot be converted to this type
+                _to_parquet(self.path, temporary, None)
             os.replace(temporary, self.target)
         except (OSError, arrow.ArrowException) as error:
             temporary.unlink(missing_ok=True)

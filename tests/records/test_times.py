@@ -77,6 +77,12 @@ def test_parquet_to_parquet(here, time, dt, scale):
         ]
 
 
+def test_a_type_of_time_that_text_cannot_be_converted_to(here):
+    pq.write_table(table(pa.array(np.arange(12), pa.float16())), "record.parquet")
+    estimate_record(DISCRETE, "record.parquet", "out.parquet", **OPTIONS)
+    assert pq.read_table("out.parquet").column("time").to_pylist() == list(range(12))
+
+
 def test_the_hour_that_comes_twice(here):
     first = int(datetime(2026, 10, 24, 23, 30, tzinfo=UTC).timestamp())
     kind = pa.timestamp("ms", "Europe/Berlin")
