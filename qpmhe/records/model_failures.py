@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import traceback
 from collections import deque
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import functions
 from ..estimate import Estimate, Status
+from ..functions import EvaluationError
 from ..models.loading import code_place
 from ..system import System
 
@@ -69,13 +68,16 @@ class ModelFailures:
                     try:
                         with np.errstate(all="ignore"):
                             value = np.asarray(function(x.copy(), u.copy()), dtype=np.float64)
+                    except EvaluationError as error:
+                        self.is_mistake = error.__cause__ is None  # a wrong shape or type
+                        return f"{error} {at}"
                     except Exception as error:  # a user's function may raise anything
-                        self.is_mistake = isinstance(error, _MISTAKES) or _is_shape(error)
+                        self.is_mistake = isinstance(error, _MISTAKES)
                         place = code_place(error, self._file)
                         return f"{place}{name} raised {type(error).__name__}: {error} {at}"
                     if value.shape != shape:
                         self.is_mistake = True
-                        return f"{name} returned shape {value.shape} {at}; expected {shape}"
+                        return f"{name} returned shape {value.shape}; expected {shape} {at}"
                     if not np.isfinite(value).all():
                         return f"{name} is {value.tolist()} {at}"
         return ""
@@ -98,9 +100,3 @@ class ModelFailures:
             else "Bound the states, or make the model defined on all of them."
         )
         return f"{self.place}: {why}. {remedy}"
-
-
-def _is_shape(error: Exception) -> bool:
-    """Whether a function's value could not be brought into the expected shape."""
-    frames = traceback.extract_tb(error.__traceback__)
-    return bool(frames) and frames[-1].filename == functions.__file__

@@ -69,7 +69,7 @@ class RowFormat:
         except (InvalidInputError, np.linalg.LinAlgError):  # bad luck: the run continues
             both = np.full((2, estimator.system.n, estimator.system.n), np.nan)
         if self._covariances == "full":
-            return cast(list[float], both[:, *self._upper].ravel().tolist())
+            return both[:, *self._upper].ravel().tolist()
         with np.errstate(invalid="ignore"):
             deviations = np.sqrt(np.diagonal(both, axis1=1, axis2=2))
         return deviations.ravel().tolist()

@@ -63,9 +63,9 @@ def model(body, system=DISCRETE):
     [
         (BEYOND, "h raised ValueError: beyond the table at x = [", False),
         (MISTAKE, "h raised NameError: name 'ofset' is not defined at x = [", True),
-        (WRONG_SHAPE, "h returned shape (2,) at x = [", True),
+        (WRONG_SHAPE, "h returned shape (2,); expected (1,) at x = [", True),
         (INFINITE, "h is [inf] at x = [", False),
-        (LATE_SHAPE, "h returned shape (2,) at x = [", True),
+        (LATE_SHAPE, "h returned shape (2,); expected (1,) at x = [", True),
     ],
 )
 def test_it_is_told(record, body, words, is_mistake, system):
