@@ -1,4 +1,4 @@
-"""A user's model: what it may give, and what is told where it does not."""
+"""A user's model: what its function may return, and the errors where it does not fit."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Nothing that stands there is lost, unless the user says so."""
+"""Existing files are never lost without --overwrite."""
 
 import io
 import os
