@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -105,3 +107,14 @@ def check_problem(state: Any, mine: tuple[int, ...]) -> None:
         raise InvalidInputError(
             f"the state is of a problem with (n, p, m, horizon) = {found!r}; expected {mine}."
         )
+
+
+def need(module: str, purpose: str, extra: str = "studies") -> ModuleType:
+    """Import an optional package, or raise with the extra that installs it."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        raise InvalidInputError(
+            f"{purpose} needs {package}, which is not installed; pip install 'qpmhe[{extra}]'."
+        ) from error

@@ -27,7 +27,7 @@ __all__ = [
 
 
 class ModelError(InvalidInputError):
-    """A model function that returns what it must not, or breaks where it must work."""
+    """A model that cannot be loaded, or a function of it with a wrong value or an error."""
 
 
 class WeightError(InvalidInputError):

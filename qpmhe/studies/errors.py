@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from types import ModuleType
-
-from ..errors import InvalidInputError, OptionError, QpmheError
+from .._checks import need
+from ..errors import OptionError, QpmheError
 
 __all__ = ["SchedulerError", "StoreError", "StudyError", "need"]
 
@@ -20,29 +18,3 @@ class StoreError(QpmheError):
 
 class SchedulerError(QpmheError):
     """A cluster that cannot be reached, or no longer; what is stored stays stored."""
-
-
-def need(module: str, purpose: str, extra: str = "studies") -> ModuleType:
-    """Import an optional package, at the time it is needed.
-
-    Parameters
-    ----------
-    module : str
-        What is imported.
-    purpose : str
-        Who asks, as the beginning of the error text.
-    extra : str
-        Name of the extra that brings it.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is not installed; the text has the command that installs it.
-    """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        package = module.partition(".")[0]
-        raise InvalidInputError(
-            f"{purpose} needs {package}, which is not installed; pip install 'qpmhe[{extra}]'."
-        ) from error

@@ -1,0 +1,443 @@
+"""A model from a name of the catalogue, from a module, or from a file."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import hashlib
+import importlib
+import importlib.util
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import qpmhe_solvers
+
+from ..costs import Cost
+from ..errors import ModelError, QpmheError
+from ..observers import Observer
+from ..system import System
+from .catalogue import catalogue
+from .example import Example
+from .scenario import Scenario
+
+__all__ = [
+    "ModelSource", "build", "code_place", "find", "fingerprint", "imported", "load", "module_file",
+]
+
+_FORM = re.compile(r"(?P<where>[^()]+)(?:\((?P<arguments>.*)\))?", re.DOTALL)
+_PARTS = (
+    (System, "system"), (Observer, "observer"), (Cost, "cost"), (Scenario, "scenario"),
+)
+_EXPECTED = (
+    "expected a name of the catalogue, name(keyword=value), package.module:function or "
+    "path/file.py:function"
+)
+_PACKAGES = (Path(__file__).parents[1], Path(qpmhe_solvers.__file__).parent)
+# Fingerprint at the time when this process imported a place.
+_imported_as: dict[str, str] = {}
+
+
+@dataclass(frozen=True)
+class ModelSource:
+    """Where a model comes from.
+
+    Parameters
+    ----------
+    name : str
+        As the user writes it, without superfluous blanks.
+    where : str
+        Name in the catalogue, or ``module:function``, or ``/absolute/file.py:function``.
+    arguments : str
+        Keyword arguments of the function, as ``key=value, key=value``.
+    fingerprint : str
+        Digest of the file, and of the files that it imports from its own folder; empty for
+        the catalogue.
+    """
+
+    name: str
+    where: str
+    arguments: str = ""
+    fingerprint: str = ""
+
+    @property
+    def is_file(self) -> bool:
+        """Whether the model is named by the path of a file."""
+        return self.where.rpartition(":")[0].endswith(".py")
+
+    @property
+    def file(self) -> Path | None:
+        """The model's file; None for the catalogue, and for a module that is not imported."""
+        place = self.where.rpartition(":")[0]
+        if self.is_file:
+            return Path(place)
+        path = getattr(sys.modules.get(place), "__file__", None)
+        return Path(path) if path else None
+
+
+def find(text: Any, folder: Path | None = None) -> ModelSource:
+    """Find a model by its name, without importing its file.
+
+    Parameters
+    ----------
+    text : str
+        ``name``, ``name(keyword=value)``, ``package.module:function`` or
+        ``path/file.py:function``.
+    folder : Path, optional
+        What a file's path is relative to; the working directory if left out.
+
+    Raises
+    ------
+    ModelError
+        If the text has another form, or there is no such model or file.
+    """
+    match = _FORM.fullmatch(text.strip()) if isinstance(text, str) else None
+    if match is None:
+        raise ModelError(f"the model is {text!r}; {_EXPECTED}.")
+    written = match["where"].strip()
+    given = _arguments(text, match["arguments"] or "")
+    arguments = ", ".join(f"{key}={value!r}" for key, value in given.items())
+    name = f"{written}({arguments})" if arguments else written
+    if ":" not in written:
+        if written not in catalogue():
+            raise ModelError(
+                f"model {written!r} is not known; expected one of {', '.join(catalogue())}, or "
+                "package.module:function, or path/file.py:function."
+            )
+        return ModelSource(name, written, arguments)
+    place, _, function = written.rpartition(":")
+    if not function.isidentifier() or not place:
+        raise ModelError(f"the model is {text!r}; {_EXPECTED}.")
+    path: Path | None
+    if place.endswith(".py"):
+        path = (folder or Path()).joinpath(place).resolve()
+        place = str(path)
+    else:
+        path = module_file(place)
+    try:
+        digest = "" if path is None else fingerprint(path)
+    except OSError as error:
+        raise ModelError(
+            f"model {name!r}: cannot read {error.filename} ({error.strerror})."
+        ) from error
+    return ModelSource(name, f"{place}:{function}", arguments, digest)
+
+
+def build(source: ModelSource) -> Any:
+    """Call the model's function, and return whatever it returns.
+
+    A file can import the files beside it, as it can when Python runs it.
+
+    Parameters
+    ----------
+    source : ModelSource
+        From `find`.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be imported, has changed since it was found, or lacks the function,
+        or if the function raises; the text names the line in the user's file.
+    """
+    with _neighbours(source):
+        function = _function(source)
+        try:
+            return function(**_arguments(source.name, source.arguments))
+        except (Exception, SystemExit) as error:  # a user's function may raise anything
+            raise _failure(source, " cannot be made", error) from error
+
+
+@lru_cache(maxsize=16)
+def load(source: ModelSource) -> Example:
+    """Make a model with its scenario; the same object for the same source within a process.
+
+    Parameters
+    ----------
+    source : ModelSource
+        From `find`.
+
+    Raises
+    ------
+    ModelError
+        If the model cannot be built, or is anything but (system, observer, cost, scenario).
+    """
+    name, parts = source.name, build(source)
+    if not isinstance(parts, tuple) or len(parts) != 4:
+        raise ModelError(
+            f"model {name!r} gave {type(parts).__name__}; expected (system, observer, cost, "
+            "scenario), as qpmhe.models.Example."
+        )
+    for part, (kind, what) in zip(parts, _PARTS, strict=True):
+        if not isinstance(part, kind):
+            raise ModelError(
+                f"model {name!r} gave a {type(part).__name__} for its {what}; expected "
+                f"qpmhe's {kind.__name__}."
+            )
+    return Example(*parts)
+
+
+def code_place(error: BaseException, file: Path | None) -> str:
+    """File and line of the user's code that raised an error, as ``file, line 3: ``.
+
+    Parameters
+    ----------
+    error : BaseException
+        What was raised; its first cause counts.
+    file : Path or None
+        The model's file. Files of its folder count as the user's, this package's do not.
+
+    Returns
+    -------
+    str
+        Empty where no line of the user's is involved.
+    """
+    chain: list[BaseException] = []
+    one: BaseException | None = error
+    while one is not None and one not in chain:
+        chain.append(one)
+        one = one.__cause__
+    for one in reversed(chain):
+        if isinstance(one, SyntaxError) and one.filename and one.lineno:
+            return f"{one.filename}, line {one.lineno}: "
+        frames = [
+            frame for frame in traceback.extract_tb(one.__traceback__)
+            if file is not None and _is_users(Path(frame.filename), file)
+        ]
+        if frames:
+            return f"{frames[-1].filename}, line {frames[-1].lineno}: "
+    return ""
+
+
+def _is_users(code: Path, file: Path) -> bool:
+    if code == file:
+        return True
+    if any(code.is_relative_to(folder) for folder in _PACKAGES):
+        return False
+    # A folder may have an environment with other people's packages in it.
+    return code.is_relative_to(file.parent) and not (
+        {"site-packages", "dist-packages"} & set(code.relative_to(file.parent).parts)
+    )
+
+
+def _arguments(text: str, inside: str) -> dict[str, Any]:
+    try:
+        call = ast.parse(f"f({inside})", mode="eval").body
+        if not isinstance(call, ast.Call) or call.args:
+            raise ValueError("a value without keyword")
+        pairs = [(item.arg, ast.literal_eval(item.value)) for item in call.keywords]
+        if any(key is None for key, _ in pairs):
+            raise ValueError("two asterisks")
+    except (SyntaxError, ValueError) as error:
+        raise ModelError(
+            f"the arguments of model {text!r} cannot be read ({error}); expected plain values "
+            "by keyword, as in chain_of_masses(masses=2)."
+        ) from error
+    return {str(key): value for key, value in pairs}
+
+
+def _function(source: ModelSource) -> Callable[..., Any]:
+    name = source.name
+    if ":" not in source.where:
+        return catalogue()[source.where]
+    place, _, attribute = source.where.rpartition(":")
+    try:
+        module, now = imported(place)
+    except (Exception, SystemExit) as error:
+        raise _failure(source, f": cannot import {place}", error) from error
+    if source.fingerprint and now != source.fingerprint:
+        raise ModelError(
+            f"model {name!r}: {place}, or a file that it imports, is another here than where the "
+            "study was started, or was changed since; bring the same files to all machines, and "
+            "give the command again."
+        )
+    function = getattr(module, attribute, None)
+    if not callable(function):
+        raise ModelError(f"model {name!r}: {place} has no function {attribute}.")
+    found: Callable[..., Any] = function
+    return found
+
+
+def _failure(source: ModelSource, what: str, error: BaseException) -> ModelError:
+    if isinstance(error, SystemExit):
+        said = "it ends the program; put what is not the model behind if __name__ == '__main__'"
+    elif isinstance(error, QpmheError):
+        said = str(error)
+    else:
+        said = f"{type(error).__name__}: {error}"
+    place = code_place(error, source.file)
+    return ModelError(f"{place}model {source.name!r}{what}: {said.rstrip('.')}.")
+
+
+def module_file(place: str) -> Path | None:
+    """The file of a module, found without importing it; packages above it are imported.
+
+    Parameters
+    ----------
+    place : str
+        Such as ``package.module``.
+
+    Returns
+    -------
+    Path or None
+        None where there is no such module, or it has no file.
+    """
+    importlib.invalidate_caches()
+    try:
+        with _working_directory():
+            specification = importlib.util.find_spec(place)
+    except Exception:  # importing the module reports what is wrong
+        return None
+    if specification is None or not specification.has_location or specification.origin is None:
+        return None
+    path = Path(specification.origin).resolve()
+    return path if path.is_file() else None
+
+
+def fingerprint(path: Path) -> str:
+    """Digest of a file, and of the files of its own folder that it imports.
+
+    Parameters
+    ----------
+    path : Path
+        The file. Only statements ``import`` and ``from ... import`` are followed.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be read.
+    """
+    digest = hashlib.sha256(path.read_bytes())
+    for file in sorted(_files(path)[1:]):
+        digest.update(f"\0{file.relative_to(path.parent).as_posix()}\0".encode())
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()[:16]
+
+
+def imported(place: str) -> tuple[ModuleType, str]:
+    """Import a module as its files are now, again if they have changed in this process.
+
+    Parameters
+    ----------
+    place : str
+        ``package.module``, or the absolute path of a file in .py.
+
+    Returns
+    -------
+    module : ModuleType
+        The module.
+    fingerprint : str
+        Of its file; empty if it has none.
+
+    Raises
+    ------
+    Exception
+        Whatever the import raises.
+    """
+    path = Path(place) if place.endswith(".py") else module_file(place)
+    now = "" if path is None else fingerprint(path)
+    if path is not None and _imported_as.get(place, now) != now:
+        _forget(set(_files(path)))
+    _imported_as[place] = now
+    if place.endswith(".py"):
+        return _import_file(Path(place)), now
+    with _working_directory():
+        return importlib.import_module(place), now
+
+
+def _files(path: Path) -> list[Path]:
+    """A file, first, and those of its folder that it imports, at whatever depth."""
+    top = next(one for one in path.parents if not (one / "__init__.py").is_file())
+    found, waiting = [path], [path]
+    while waiting:
+        for candidate in _candidates(waiting.pop(), {path.parent, top}):
+            if (
+                candidate not in found
+                and candidate.is_relative_to(path.parent) and candidate.is_file()
+            ):
+                found.append(candidate)
+                waiting.append(candidate)
+    return found
+
+
+def _candidates(file: Path, roots: set[Path]) -> Iterator[Path]:
+    """Where the modules would be that a file imports."""
+    try:
+        nodes = list(ast.walk(ast.parse(file.read_bytes()))) if file.suffix == ".py" else []
+    except (SyntaxError, ValueError):  # the import reports it
+        return
+    for node in nodes:
+        bases = roots
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [f"{node.module or ''}.{alias.name}" for alias in node.names]
+            if node.level:
+                bases = set(file.parents[node.level - 1 : node.level])
+        else:
+            continue
+        for base in bases:
+            for name in names:
+                place = base
+                for part in filter(None, name.split(".")):
+                    yield place / f"{part}.py"
+                    place /= part
+                    yield place / "__init__.py"
+
+
+def _forget(files: set[Path]) -> None:
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if isinstance(file, str) and Path(file).resolve() in files:
+            del sys.modules[name]
+
+
+@contextlib.contextmanager
+def _neighbours(source: ModelSource) -> Iterator[None]:
+    """Let a file import those beside it."""
+    if not source.is_file:
+        yield
+        return
+    folder = str(Path(source.where.rpartition(":")[0]).parent)
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ValueError):  # the model may have changed the path
+            sys.path.remove(folder)
+
+
+@contextlib.contextmanager
+def _working_directory() -> Iterator[None]:
+    """A console script has its own folder in the path, not the one it is called from."""
+    here = str(Path.cwd())
+    if "" in sys.path or here in sys.path:
+        yield
+        return
+    sys.path.append(here)
+    try:
+        yield
+    finally:
+        sys.path.remove(here)
+
+
+def _import_file(path: Path) -> ModuleType:
+    name = f"qpmhe_model_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    specification = importlib.util.spec_from_file_location(name, path)
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[name] = module
+    try:
+        specification.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
