@@ -9,7 +9,10 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
+from threading import Thread
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -137,13 +140,16 @@ class _Processes:
     """Processes of this machine, each with one thread."""
 
     def __init__(self, jobs: int) -> None:
-        self._loky = need("joblib.externals.loky", "a study")
+        need("joblib", "a study")
+        from joblib.externals.loky import ProcessPoolExecutor
+
+        self._make = partial(ProcessPoolExecutor, jobs, timeout=_IDLE, env=_THREADS)
         self.jobs = jobs
         self._executor: Any = None
 
     def submit(self, task: Task) -> Future[Result]:
         if self._executor is None:
-            self._executor = self._loky.ProcessPoolExecutor(self.jobs, timeout=_IDLE, env=_THREADS)
+            self._executor = self._make()
         future: Future[Result] = self._executor.submit(compute, task)
         return future
 
@@ -165,11 +171,16 @@ class _Cluster:
         distributed = need("distributed", "a study on a cluster", "dask")
         self._address = address
         try:
-            self._client = distributed.Client(address, timeout=_CONNECT, set_as_default=False)
+            if not isinstance(address, str) or not address:
+                raise TypeError("expected a text")
+            self._client = _within(2 * _CONNECT, partial(
+                distributed.Client, address, timeout=_CONNECT, set_as_default=False
+            ))
             self._client.wait_for_workers(1, timeout=_CONNECT)
         except Exception as error:  # anything may answer at an address
             raise StudyError(
-                f"the scheduler is {address!r}, which gives no Dask workers ({error}); start one "
+                f"the scheduler is {address!r}, which gives no Dask workers "
+                f"({str(error) or type(error).__name__}); start one "
                 "with 'dask scheduler' and workers with 'dask worker ADDRESS --nthreads 1', and "
                 "give the address that it shows, such as tcp://10.0.0.1:8786."
             ) from error
@@ -203,6 +214,20 @@ class _Cluster:
             self._client.close(timeout=5)
 
 
+def _within(seconds: float, call: Callable[[], Any]) -> Any:
+    """A call's result; Dask waits for ever for a program that answers and is no scheduler."""
+    future: Future[Any] = Future()
+
+    def answer() -> None:
+        try:
+            future.set_result(call())
+        except Exception as error:
+            future.set_exception(error)
+
+    Thread(target=answer, daemon=True).start()
+    return future.result(seconds)
+
+
 def _workers(study: Study, jobs: int | None, scheduler: str | None) -> Workers:
     if scheduler is not None:
         return _Cluster(scheduler)
@@ -212,32 +237,36 @@ def _workers(study: Study, jobs: int | None, scheduler: str | None) -> Workers:
 def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
     """The row of each task, in the order in which they end."""
     waiting, suspects = deque(tasks), deque[Task]()
-    running: dict[Future[Result], tuple[Task, float]] = {}
-    while waiting or running or suspects:
-        # After a death nothing new starts until the one that caused it is found.
-        while waiting and not suspects and len(running) < workers.jobs:
+    sent: dict[Future[Result], Task] = {}
+    began: dict[Future[Result], float] = {}
+    while waiting or sent or suspects:
+        # No worker waits for us; but after a death nothing new starts until its cause is found.
+        while waiting and not suspects and len(sent) < 2 * workers.jobs:
             try:
-                running[workers.submit(waiting[0])] = waiting[0], monotonic()
+                sent[workers.submit(waiting[0])] = waiting[0]
                 waiting.popleft()
             except BrokenExecutor:
                 break
-        ended, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
+        for future in islice(sent, workers.jobs):  # tasks start in the order of their sending
+            began.setdefault(future, monotonic())
+        ended, _ = wait(sent, timeout=1.0, return_when=FIRST_COMPLETED)
         for future in ended:
-            task, began = running.pop(future)
-            answer = _answer(workers, task, future, began)
+            task, start = sent.pop(future), began.pop(future, None)
+            answer = _answer(workers, task, future, start)
             if isinstance(answer, dict):
                 yield answer
+            elif start is None:
+                waiting.appendleft(task)
             else:
                 suspects.append(task)
-        now = monotonic()
         if not workers.ready():  # what ran before starts anew with the next worker
-            running = {future: (task, now) for future, (task, _) in running.items()}
-        for future, (task, began) in list(running.items()):
-            if now - began > task.hard_limit + _GRACE:
-                del running[future]
+            began = dict.fromkeys(began, monotonic())
+        for future, start in list(began.items()):
+            if monotonic() - start > sent[future].hard_limit + _GRACE:
+                del began[future]
                 future.cancel()
-                yield failure(task, _HUNG)
-        if not running:
+                yield failure(sent.pop(future), _HUNG)
+        if not sent:
             if suspects or waiting:
                 workers.restart()
             while suspects:
@@ -245,9 +274,9 @@ def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
 
 
 def _answer(
-    workers: Workers, task: Task, future: Future[Result], began: float
+    workers: Workers, task: Task, future: Future[Result], start: float | None
 ) -> Result | Exception:
-    """The row of a task that ended, or the error where its process died."""
+    """The row of a task that ended, or the error where the process died that may have run it."""
     try:
         return future.result()
     except CancelledError as error:
@@ -257,7 +286,8 @@ def _answer(
     except Exception as error:
         if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
             return failure(task, f"{type(error).__name__}: {error}")
-        return failure(task, _HUNG) if monotonic() - began >= task.hard_limit else error
+        hung = start is not None and monotonic() - start >= task.hard_limit
+        return failure(task, _HUNG) if hung else error
 
 
 def _again(workers: Workers, task: Task) -> Result:
@@ -265,12 +295,12 @@ def _again(workers: Workers, task: Task) -> Result:
     words = ""
     for isolated in (False, True) if _CAN_ISOLATE else (False,):
         workers.restart()
-        began = monotonic()
+        start = monotonic()
         future = workers.submit(replace(task, isolated=isolated))
         if not wait([future], task.hard_limit + _GRACE).done:
             future.cancel()
             return failure(task, _HUNG)
-        answer = _answer(workers, task, future, began)
+        answer = _answer(workers, task, future, start)
         if isinstance(answer, dict):
             if isolated and answer["outcome"] == "done":
                 answer["reason"] = (
