@@ -292,8 +292,8 @@ def _answer(
 
 def _again(workers: Workers, task: Task) -> Result:
     """Run a cell alone at which a process may have died, at last with its solver isolated."""
-    words = ""
-    for isolated in (False, True) if _CAN_ISOLATE else (False,):
+    words, can_isolate = "", _CAN_ISOLATE and task.cell.backend != OBSERVER
+    for isolated in (False, True) if can_isolate else (False,):
         workers.restart()
         start = monotonic()
         future = workers.submit(replace(task, isolated=isolated))
@@ -304,8 +304,7 @@ def _again(workers: Workers, task: Task) -> Result:
         if isinstance(answer, dict):
             if isolated and answer["outcome"] == "done":
                 answer["reason"] = (
-                    f"its process died, twice{words}; measured with the solver in a process of its "
-                    "own"
+                    f"the backend ran in a process of its own, since the cell's died, twice{words}"
                 )
             return answer
         signals = _SIGNALS.search(str(answer))

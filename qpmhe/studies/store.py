@@ -223,14 +223,16 @@ class Store:
             If it is no store of this version, damaged, read-only, or another study writes.
         """
         _check_file(self.path)
-        with _alone(self.path), _explained(self.path):
-            with closing(_connect(self.path, "rwc")) as connection:
-                _check(connection, self.path, empty=True)
-                (answer,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-                if answer != "ok":
-                    raise StoreError(f"the store {self.path}: {_DAMAGED} ({answer}).")
-                _create(connection)
-                yield Writer(self.path, connection)
+        with (
+            _alone(self.path), _explained(self.path),
+            closing(_connect(self.path, "rwc")) as connection,
+        ):
+            _check(connection, self.path, empty=True)
+            (answer,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+            if answer != "ok":
+                raise StoreError(f"the store {self.path}: {_DAMAGED} ({answer}).")
+            _create(connection)
+            yield Writer(self.path, connection)
 
 
 class Writer:
@@ -270,7 +272,7 @@ class Writer:
             )
 
     def present(self, retry_failed: bool) -> dict[str, frozenset[str]]:
-        """The parts that each cell has; cells that failed count as absent if they are to be retried."""
+        """The parts that each cell has; if failed cells are to be retried, without those."""
         where = "WHERE outcome = 'done'" if retry_failed else ""
         with _explained(self._path):
             rows = self._connection.execute(f"SELECT key, parts FROM cells {where}").fetchall()

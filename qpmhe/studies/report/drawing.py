@@ -157,7 +157,9 @@ class Drawing:
     deadline : float, optional
         A vertical line.
     note : str
-        What stands above the figure in a file, or at its bottom if ``note_below``.
+        What stands below the figure in a file, in place of the axes' titles.
+    gap : float
+        Between two panels, relative to their height.
     """
 
     panels: list[Panel]
@@ -189,7 +191,7 @@ def interactive(drawing: Drawing, drawn: Mapping[str, Style]) -> dict[str, Any]:
         "hoverlabel": {"align": "left", "bgcolor": "white", "font": {"size": 12}},
         "hovermode": "closest",
     }
-    data = []
+    data: list[dict[str, Any]] = []
     part = 1 / (count + drawing.gap * (count - 1))
     for place, panel in enumerate(drawing.panels):
         suffix = str(place + 1) if place else ""
@@ -198,9 +200,10 @@ def interactive(drawing: Drawing, drawn: Mapping[str, Style]) -> dict[str, Any]:
         layout[f"yaxis{suffix}"] = {
             **_plotly_axis(panel.y), "domain": [max(0.0, top - part), min(1.0, top)]
         }
-        for mark in panel.marks:
-            for trace in _traces(mark, drawn.get(mark.backend, _OBSERVER)):
-                data.append({**trace, "xaxis": f"x{suffix}", "yaxis": f"y{suffix}"})
+        data += [
+            {**trace, "xaxis": f"x{suffix}", "yaxis": f"y{suffix}"} for mark in panel.marks
+            for trace in _traces(mark, drawn.get(mark.backend, _OBSERVER))
+        ]
     low, high = drawing.panels[0].x.limits() if drawing.deadline else (1.0, 0.0)
     if drawing.deadline is not None and low <= drawing.deadline <= high:
         layout["shapes"] = [{
@@ -362,10 +365,12 @@ def _draw(axes: Any, mark: Mark, panel: Panel, style: Style) -> None:
             axes.annotate(str(number), point, xytext=(0, 9), ha="center", color="0.2", fontsize=8,
                           textcoords="offset points")
     elif mark.kind == "points":
-        for one in zip(x, y, mark.sizes, mark.hollow, mark.pale, strict=True):
+        for px, py, size, hollow, pale in zip(
+            x, y, mark.sizes, mark.hollow, mark.pale, strict=True
+        ):
             axes.scatter(
-                one[0], one[1], marker=style.marker, s=one[2] ** 2, edgecolors=color,
-                facecolors="none" if one[3] else color, linewidths=1.0, alpha=0.3 if one[4] else 0.9,
+                px, py, marker=style.marker, s=size**2, edgecolors=color, linewidths=1.0,
+                facecolors="none" if hollow else color, alpha=0.3 if pale else 0.9,
             )
     elif mark.kind == "box":
         low, first, median, third, high, most = x

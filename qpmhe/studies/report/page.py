@@ -1,4 +1,4 @@
-"""The report: one HTML file that needs no network, figures as PNG and SVG, and the summary as CSV."""
+"""The report: an HTML file that needs no network, figures as PNG and SVG, the summary as CSV."""
 
 from __future__ import annotations
 
