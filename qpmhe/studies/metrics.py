@@ -1,4 +1,4 @@
-"""What is told of a run: errors, costs, outcomes and times."""
+"""The metrics of a run: errors, costs, outcomes and times."""
 
 from __future__ import annotations
 
@@ -114,13 +114,13 @@ def outcomes(run: Run) -> dict[str, Any]:
         lowered the cost; ``cap_hits``, where a QP ended at its cap or unconfirmed. Further
         ``reasons``, the number of steps of each flag of `qpmhe.Status`, and the means
         ``qps_mean`` and ``solver_iterations_mean`` per step, NaN where the solver does not
-        tell.
+        report them.
     """
     flags, total = run.flags, max(1, len(run))
     improved = (flags & Status.IMPROVED.value) != 0
     failed = ~improved & ((flags & _FAILURES.value) != 0)
     counts = {str(flag.name): int(((flags & flag.value) != 0).sum()) for flag in Status}
-    told = run.solver_iterations[run.solver_iterations >= 0]
+    known = run.solver_iterations[run.solver_iterations >= 0]
     return {
         "improved": float(improved.sum() / total),
         "kept": float((~improved & ~failed).sum() / total),
@@ -128,7 +128,7 @@ def outcomes(run: Run) -> dict[str, Any]:
         "cap_hits": counts[str(Status.SOLVER_STOPPED.name)] / total,
         "reasons": {name: number for name, number in counts.items() if number},
         "qps_mean": float(run.qps.mean()),
-        "solver_iterations_mean": float(told.mean()) if told.size else float("nan"),
+        "solver_iterations_mean": float(known.mean()) if known.size else float("nan"),
     }
 
 
