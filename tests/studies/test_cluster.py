@@ -25,7 +25,11 @@ SMALL = {"backends": ["banded"], "qps": [0, 1], "seeds": 4, "steps": 12}
 
 @pytest.fixture(scope="module")
 def address():
-    with warnings.catch_warnings():
+    import dask
+
+    # A busy machine restarts workers slowly, and such a cluster takes that for their end.
+    patient = dask.config.set({"distributed.deploy.lost-worker-timeout": "600s"})
+    with warnings.catch_warnings(), patient:
         warnings.simplefilter("ignore")
         with distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None,
