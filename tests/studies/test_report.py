@@ -15,7 +15,7 @@ from qpmhe.studies.report import cases, write_report
 from qpmhe.studies.report.answers import failures, limitations
 from qpmhe.studies.report.drawing import styles
 from qpmhe.studies.report.figures import profiles, spreads
-from qpmhe.studies.report.page import Part, choose, files
+from qpmhe.studies.report.page import Part, choose_runs, files
 from qpmhe.studies.report.words import configuration_words, number, percent, seconds
 from qpmhe.studies.summary import summarise
 
@@ -179,7 +179,7 @@ def test_no_text_is_clipped_or_covered():
     parts = []
     for case in cases(summarise(rows)):
         cells = rows[rows.horizon == case.summary.horizon.iloc[0]]
-        runs = choose(stored(), cells, case, 100_000)
+        runs = choose_runs(stored(), cells, case, 100_000)
         assert runs.observer is not None
         parts.append(Part(case, cells, 1e-3, runs))
     found = files(parts, styles(rows.backend), profiles(rows))
@@ -221,10 +221,10 @@ def test_report_is_whole_and_needs_no_network():
 def test_runs_for_which_there_is_no_room_are_counted():
     rows = frame().query("horizon == 10")
     case = next(one for one in cases(summarise(rows)))
-    runs = choose(stored(), rows, case, 0)
+    runs = choose_runs(stored(), rows, case, 0)
     assert runs.left_out == 7 - len(runs.all)
     assert 2 <= len(runs.all) < 7
-    assert choose(stored(), rows, case, 10**6).left_out == 0
+    assert choose_runs(stored(), rows, case, 10**6).left_out == 0
 
 
 def test_frame_and_meta_do(tmp_path):

@@ -22,15 +22,7 @@ _FEW_SEEDS = 10
 
 @dataclass(frozen=True)
 class Answer:
-    """One answer.
-
-    Parameters
-    ----------
-    question : str
-        What it answers, in a few words.
-    text : str
-        The answer.
-    """
+    """A question in a few words, and its answer."""
 
     question: str
     text: str
@@ -40,14 +32,8 @@ class Answer:
 class Case:
     """The configurations that can be compared: those of one model, horizon and record length.
 
-    Parameters
-    ----------
-    key : str
-        A short name for files and links.
-    title : str
-        Model, horizon, and length of the records where there are several.
-    summary : pandas.DataFrame
-        Their rows of `qpmhe.studies.summarise`.
+    ``key`` names files and links, ``title`` is for reading, and ``summary`` has their rows of
+    `qpmhe.studies.summarise`.
     """
 
     key: str
@@ -175,18 +161,8 @@ def chosen(summary: DataFrame) -> tuple[Any | None, Any] | None:
     """The fastest configuration near the best RMSE, and the most accurate one.
 
     Where several have the best RMSE within `qpmhe.studies.summary.TOLERANCE`, the fastest of
-    these stands for them.
-
-    Parameters
-    ----------
-    summary : pandas.DataFrame
-        Rows of one problem.
-
-    Returns
-    -------
-    tuple of row or None
-        The first is None where there are no times; None in all where no configuration
-        finished all its runs.
+    these is taken. The first is None where there are no times; all is None where no
+    configuration finished all its runs.
     """
     rows = summary[(summary["failures"] == 0) & np.isfinite(summary["rmse"].astype(float))]
     if rows.empty:
@@ -203,18 +179,7 @@ def chosen(summary: DataFrame) -> tuple[Any | None, Any] | None:
 
 
 def failures(frame: DataFrame) -> list[dict[str, Any]]:
-    """Failed cells by configuration and reason, the most frequent first.
-
-    Parameters
-    ----------
-    frame : pandas.DataFrame
-        One row a cell.
-
-    Returns
-    -------
-    list of dict
-        ``model``, ``configuration``, ``reason``, ``seeds``.
-    """
+    """Failed cells by ``model``, ``configuration`` and ``reason``, the most frequent first."""
     found: dict[tuple[str, str, str], list[int]] = {}
     for _, row in frame[frame["outcome"] != "done"].iterrows():
         reason = "unknown" if missing(row["reason"]) or not row["reason"] else str(row["reason"])
@@ -228,15 +193,7 @@ def failures(frame: DataFrame) -> list[dict[str, Any]]:
 
 
 def limitations(frame: DataFrame, summary: DataFrame) -> list[str]:
-    """What the reader must know before trusting the figures.
-
-    Parameters
-    ----------
-    frame : pandas.DataFrame
-        One row a cell.
-    summary : pandas.DataFrame
-        Its summary.
-    """
+    """What the reader must know before trusting the figures."""
     seeds = int(summary["seeds"].max())
     notes = [
         "A time covers a whole update: the observer's step, building the QPs, the solver, and the "

@@ -127,7 +127,7 @@ def write_report(
     ]
     if not isinstance(source, tuple):
         for part in found:
-            part.runs = choose(source, part.cells, part.case, _TRAJECTORY_BYTES // len(found))
+            part.runs = choose_runs(source, part.cells, part.case, _TRAJECTORY_BYTES // len(found))
     drawn, profile = styles(summary["backend"]), figures.profiles(frame)
     page = folder / "index.html"
     page.write_text(_page(frame, meta, found, drawn, profile), encoding="utf-8")
@@ -139,30 +139,14 @@ def write_report(
 
 @dataclass
 class Runs:
-    """The runs of one case that a report holds.
+    """The runs of one case that a report holds, the best first."""
 
-    Attributes
-    ----------
-    first : mapping, optional
-        The trajectory whose real states are drawn.
-    observer : list or None
-        The observer's estimates, an encoded array a state.
-    all : dict of str to list
-        The same for each run that can be chosen, by the cell's key.
-    entries : list of (key, text)
-        The runs in words, the best first.
-    static : list of (text, trajectory)
-        What the file draws.
-    left_out : int
-        Runs for which there was no room.
-    """
-
-    first: Mapping[str, Any] | None = None
-    observer: list[Any] | None = None
-    all: dict[str, list[Any]] = field(default_factory=dict)
-    entries: list[tuple[str, str]] = field(default_factory=list)
-    static: list[tuple[str, Any]] = field(default_factory=list)
-    left_out: int = 0
+    first: Mapping[str, Any] | None = None  # has the real states
+    observer: list[Any] | None = None  # an encoded array for each state
+    all: dict[str, list[Any]] = field(default_factory=dict)  # the same, by the cell's key
+    entries: list[tuple[str, str]] = field(default_factory=list)  # key and words
+    static: list[tuple[str, Any]] = field(default_factory=list)  # words and trajectory
+    left_out: int = 0  # runs for which there was no room
 
 
 @dataclass
@@ -175,7 +159,7 @@ class Part:
     runs: Runs = field(default_factory=Runs)
 
 
-def choose(source: Source, cells: DataFrame, case: Case, most: int) -> Runs:
+def choose_runs(source: Source, cells: DataFrame, case: Case, most: int) -> Runs:
     """The runs of one case: the best configurations' first, up to this many bytes."""
     runs = Runs()
     seed = cells["seed"].min()

@@ -74,13 +74,7 @@ def bundle() -> str:
 
 
 def table(cases: list[Case]) -> str:
-    """HTML of the table; numbers are sorted as numbers, whatever is shown.
-
-    Parameters
-    ----------
-    cases : list of Case
-        The study's cases; their keys are in a hidden first column.
-    """
+    """HTML of the table; numbers are sorted as numbers, whatever is shown."""
     import pandas as pd
     from itables import JavascriptFunction, to_html_datatable
 
