@@ -214,13 +214,12 @@ def _register(entry: Backend) -> None:
 def _estimator(example: Example, task: Task) -> MovingHorizonEstimator:
     system, observer, cost, scenario = example
     cell = task.cell
-    isolated: dict[str, Any] = {"isolated": True} if task.isolated else {}
     return MovingHorizonEstimator(
         system, observer, cost,
         horizon=cell.horizon, initial_state=scenario.initial_estimate,
         backend="banded" if cell.backend == OBSERVER else cell.backend,
         max_qps=cell.qps, max_solver_iterations=cell.solver_iterations, start=cell.start,
-        **isolated,
+        isolated=task.isolated,
     )
 
 

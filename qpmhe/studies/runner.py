@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -20,7 +19,6 @@ from qpmhe_solvers import backend
 
 from .._checks import count, need
 from ..errors import OptionError
-from ..estimator import MovingHorizonEstimator
 from .cell import OBSERVER, Result, Task, compute, failure
 from .environment import environment, revision
 from .errors import StudyError
@@ -292,8 +290,8 @@ def _answer(
 
 def _again(workers: Workers, task: Task) -> Result:
     """Run a cell alone at which a process may have died, at last with its solver isolated."""
-    words, can_isolate = "", _CAN_ISOLATE and task.cell.backend != OBSERVER
-    for isolated in (False, True) if can_isolate else (False,):
+    words = ""
+    for isolated in (False, True) if task.cell.backend != OBSERVER else (False,):
         workers.restart()
         start = monotonic()
         future = workers.submit(replace(task, isolated=isolated))
@@ -310,9 +308,6 @@ def _again(workers: Workers, task: Task) -> Result:
         signals = _SIGNALS.search(str(answer))
         words = f" ({signals[1]})" if signals else ""
     return failure(task, f"the process that ran it died, twice{words}")
-
-
-_CAN_ISOLATE = "isolated" in inspect.signature(MovingHorizonEstimator).parameters
 
 
 def _tasks(

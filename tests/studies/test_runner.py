@@ -157,8 +157,7 @@ def test_a_cell_whose_backend_crashes_is_run_again_with_the_backend_apart(path):
             assert row.reason == ""
             continue
         assert row.reason == (
-            "the backend ran in a process of its own, since the first one died "
-            "(Segmentation fault)"
+            "the backend ran in a process of its own, since the cell's died, twice (SIGSEGV(-11))"
         )
         assert sum(n for flags, n in row.reasons.items() if "SOLVER_FAILED" in flags) == 1
 
