@@ -39,7 +39,7 @@ inequalities. This page is made of a run of that command, with all backends that
 
 One QP brings the error from the observer's to within a few per cent of the converged one, two QPs
 to within what the seeds can tell. Without inequalities nearly all backends come to the same RMSE,
-so that what tells them apart is time, and how much a cap costs.
+so that they differ in time, and in how much a cap costs.
 
 ![Error and cost against the cap]({prefix}-anytime.png)
 
@@ -51,7 +51,7 @@ true cost rejects the iterates: the dashed line, the observer, is the worst that
 
 Read ratios, not microseconds: these are times of whole updates in Python, while cores were shared.
 A problem with inequalities, or of another size, has another order; run the command on yours, as
-[Compare backends and settings](how-to/compare.md) tells.
+[Compare backends and settings](how-to/compare.md) describes.
 
 Measured on {date} with {cpu}, {versions}.
 """

@@ -17,8 +17,8 @@ from ..certificates.properties import Detectability, ObserverStability
 from ..certificates.regions import Region
 from ..certificates.report import LABELS, Report, certify_model
 from ..errors import InvalidInputError, OptionError
+from ..models.loading import find, load
 from ..sets import Box
-from ..studies.sources import find, load
 
 __all__ = ["certify"]
 

@@ -1,190 +1,152 @@
-"""``qpmhe compare``, ``qpmhe study`` and ``qpmhe export``: studies from the command line."""
+"""``qpmhe compare`` and ``qpmhe study``: run a study, show its summary, write its report."""
 
 from __future__ import annotations
 
 import signal
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import sys
+from enum import StrEnum
 from pathlib import Path
-from types import FrameType
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from rich.console import Console
 
 from ..errors import InvalidInputError, OptionError
-from ..studies.errors import StudyError
-from ..studies.grid import Study
-from ..studies.runner import run
-from ..studies.store import Store
-from ..studies.study_file import WORDS
-from ..studies.table_file import export as write_table
+from ..studies import Store, Study, StudyError, run
+from ..studies.grid import WORDS
+from .report import show_report
 
-__all__ = ["compare", "export", "study"]
+__all__ = ["compare", "study"]
+
+_JOBS = typer.Option(min=1, help="Cells at a time; all cores if left out. Times want 1.")
+_SCHEDULER = typer.Option(help="Address of a Dask scheduler whose workers run the cells.")
+_RETRY = typer.Option("--retry-failed", help="Run cells that failed before once more.")
+
+
+class Measure(StrEnum):
+    """Values of --measure."""
+
+    BOTH = "both"
+    ACCURACY = "accuracy"
+    TIME = "time"
 
 
 def compare(
-    console: Console,
-    *,
-    store: Path,
-    out: Path,
-    models: Sequence[str] = ("batch_reactor",),
-    backends: Sequence[str] | None = None,
-    qps: str = "0,1,2,5,converged",
-    solver_iterations: str = "1,2,5,10,none",
-    horizons: str = "default",
-    starts: Sequence[str] = ("candidate",),
-    seeds: int = 20,
-    steps: int | None = None,
-    measure: str = "both",
-    deadline: float | None = None,
-    covariances: bool = False,
-    cell_timeout: float = 60.0,
-    jobs: int | None = None,
-    scheduler: str | None = None,
-    retry_failed: bool = False,
+    model: Annotated[
+        list[str] | None,
+        typer.Option(help="Model of the zoo, package.module:function or file.py:function; may be "
+                     "repeated. The paper's reactor if left out."),
+    ] = None,
+    backend: Annotated[
+        list[str] | None,
+        typer.Option(help="QP backend; may be repeated. All installed ones if left out."),
+    ] = None,
+    qps: Annotated[
+        str, typer.Option(help="QPs per sample, between commas; 0 is the observer.")
+    ] = "0,1,2,5,converged",
+    solver_iterations: Annotated[
+        str, typer.Option(help="Caps on the iterations inside each QP, between commas.")
+    ] = "1,2,5,10,none",
+    horizons: Annotated[
+        str, typer.Option(help="Horizons N, between commas; default is the model's own.")
+    ] = "default",
+    start: Annotated[
+        list[str] | None, typer.Option(help="candidate or best; may be repeated.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 20,
+    steps: Annotated[
+        int | None,
+        typer.Option(min=1, help="Samples of each record; if left out, the model's own, and 100 "
+                     "where no model is named."),
+    ] = None,
+    measure: Annotated[
+        Measure, typer.Option(help="What to measure; times alone run one cell at a time.")
+    ] = Measure.BOTH,
+    deadline: Annotated[
+        float | None, typer.Option(help="Seconds for a step; shows the share that takes longer.")
+    ] = None,
+    covariances: Annotated[
+        bool, typer.Option("--covariances", help="Compute covariances and the NEES, too.")
+    ] = False,
+    cell_timeout: Annotated[
+        float, typer.Option(help="Seconds after which a cell is given up.")
+    ] = 60.0,
+    store: Annotated[
+        Path, typer.Option(help="File of the results; a run that was stopped resumes from it.")
+    ] = Path("results/compare.sqlite"),
+    out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("results/compare"),
+    jobs: Annotated[int | None, _JOBS] = None,
+    scheduler: Annotated[str | None, _SCHEDULER] = None,
+    retry_failed: Annotated[bool, _RETRY] = False,
 ) -> None:
-    """Run a study given by options, show its summary, and write its report.
-
-    Parameters
-    ----------
-    console : rich.console.Console
-        Where to print.
-    store : Path
-        Where the results go; a run that was ended goes on from there.
-    out : Path
-        Folder of the report.
-    models, backends, starts, seeds, steps, measure, deadline, covariances, cell_timeout
-        As of `qpmhe.studies.Study`; no backends stand for all installed ones.
-    qps, solver_iterations, horizons : str
-        Numbers between commas; ``converged``, ``none`` and ``default`` stand for None.
-    jobs, scheduler, retry_failed
-        As of `qpmhe.studies.run`.
-
-    Raises
-    ------
-    QpmheError
-        If an option does not fit, the store or cluster cannot be used, or all cells failed.
-    """
-    _run(
-        console,
-        Study(
-            models=models, backends=backends or None,
-            qps=_numbers("qps", qps),
-            solver_iterations=_numbers("solver_iterations", solver_iterations),
-            horizons=_numbers("horizons", horizons),
-            starts=starts, seeds=seeds, steps=steps, measure=measure, deadline=deadline,
-            covariances=covariances, cell_timeout=cell_timeout,
-        ),
-        store, out, jobs=jobs, scheduler=scheduler, retry_failed=retry_failed,
+    """Which QP backend, at which cap, gives which accuracy in which time: table and report."""
+    if model is None and steps is None:
+        steps = 100  # all backends at all caps are to be done within ten minutes
+    what = Study(
+        models=model or ("batch_reactor",), backends=backend or None,
+        qps=_numbers("qps", qps),
+        solver_iterations=_numbers("solver_iterations", solver_iterations),
+        horizons=_numbers("horizons", horizons),
+        starts=start or ("candidate",), seeds=seeds, steps=steps, measure=measure.value,
+        deadline=deadline, covariances=covariances, cell_timeout=cell_timeout,
     )
+    _run(what, store, out, jobs=jobs, scheduler=scheduler, retry_failed=retry_failed)
 
 
 def study(
-    console: Console,
-    file: Path,
-    *,
-    store: Path | None = None,
-    out: Path | None = None,
-    jobs: int | None = None,
-    scheduler: str | None = None,
-    retry_failed: bool = False,
+    file: Annotated[Path, typer.Argument(help="The study, a TOML file.")],
+    store: Annotated[
+        Path | None, typer.Option(help="File of the results; beside the study if left out.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the report; beside the store if left out.")
+    ] = None,
+    jobs: Annotated[int | None, _JOBS] = None,
+    scheduler: Annotated[str | None, _SCHEDULER] = None,
+    retry_failed: Annotated[bool, _RETRY] = False,
 ) -> None:
-    """Run a study given by a TOML file, show its summary, and write its report.
-
-    Parameters
-    ----------
-    console : rich.console.Console
-        Where to print.
-    file : Path
-        The study; see `qpmhe.studies.study_file`.
-    store : Path, optional
-        Where the results go; if left out, beside the file, with its name in .sqlite.
-    out : Path, optional
-        Folder of the report; if left out, beside the store, named after it.
-    jobs, scheduler, retry_failed
-        As of `qpmhe.studies.run`.
-
-    Raises
-    ------
-    QpmheError
-        If the file does not fit, the store or cluster cannot be used, or all cells failed.
-    """
+    """Run the study of a file; if it is stopped, the same command resumes it."""
     target = file.with_suffix(".sqlite") if store is None else store
     _run(
-        console, Study.from_toml(file), target,
+        Study.from_toml(file), target,
         target.with_name(f"{target.stem}-report") if out is None else out,
         jobs=jobs, scheduler=scheduler, retry_failed=retry_failed,
     )
 
 
-def export(console: Console, store: Path, file: Path) -> None:
-    """Write a store's rows into a CSV or Parquet file.
-
-    Parameters
-    ----------
-    console : rich.console.Console
-        Where to print.
-    store : Path
-        The store.
-    file : Path
-        The file, in .csv or .parquet.
-
-    Raises
-    ------
-    QpmheError
-        If the store cannot be read, or the file not written.
-    """
-    console.print(f"wrote {write_table(store, file)}", highlight=False)
-
-
-def _run(console: Console, what: Study, store: Path, out: Path, **options: Any) -> None:
-    from .report import report
-
+def _run(what: Study, store: Path, out: Path, **options: Any) -> None:
+    console = Console()
     try:
         store.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError(
             f"cannot make the folder {store.parent}: {error.strerror}."
         ) from error
-    target = Store(store)
+    # As after Ctrl-C, worker processes and progress bar end before this process.
+    before = signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
     try:
-        with _terminated_as_interrupted():
-            run(what, target, progress=console, **options)
+        frame = run(what, Store(store), progress=console, **options).frame()
     except (KeyboardInterrupt, SystemExit):
-        console.print(f"stopped; what was finished is in {store}: the same command goes on.")
+        console.print(
+            f"stopped; all finished cells are in {store}, and the same command resumes the study."
+        )
         raise
-    frame = target.frame()
+    finally:
+        signal.signal(signal.SIGTERM, before)
     cells = frame[frame["key"].isin({cell.key for cell in what.cells()})]
     failed = cells[cells["outcome"] == "failed"]
     if 0 < len(failed) < len(cells):
         console.print(
-            f"[yellow]{len(failed)} of {len(cells)} cells failed; their rows tell why.[/]",
+            f"[yellow]{len(failed)} of {len(cells)} cells failed; the report gives the reasons.[/]",
             highlight=False,
         )
-    report(console, store, out)
+    show_report(console, store, out)
     if 0 < len(failed) == len(cells):
         raise StudyError(
-            f"no cell of the study was finished, {len(failed)} failed; the first for this reason: "
-            f"{failed['reason'].iloc[0].rstrip('.')}. When that is put right, give the same "
-            "command with --retry-failed."
+            f"no cell of the study finished, {len(failed)} failed; the first because of: "
+            f"{failed['reason'].iloc[0].rstrip('.')}. Correct that, then give the same command "
+            "with --retry-failed."
         )
-
-
-@contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """Within the block SIGTERM ends worker processes and progress bar before this process."""
-    def leave(number: int, _frame: FrameType | None) -> None:
-        raise SystemExit(128 + number)
-
-    if threading.current_thread() is not threading.main_thread():  # signals are not for it
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _numbers(name: str, text: str) -> list[int | None]:

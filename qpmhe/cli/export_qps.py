@@ -2,39 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
+from typing import Annotated
 
+import typer
 from rich.console import Console
 from rich.markup import escape
 
-from ..studies.qpbenchmark_set import Matrices, export_qpbenchmark
+from ..studies.qpbenchmark_set import export_qpbenchmark
 
-__all__ = ["run"]
+__all__ = ["export_qps"]
 
 
-def run(
-    console: Console, paths: Sequence[Path], out: Path, *, matrices: Matrices = "sparse"
+class Matrices(StrEnum):
+    """Values of --matrices."""
+
+    SPARSE = "sparse"
+    DENSE = "dense"
+
+
+def export_qps(
+    files: Annotated[
+        list[Path], typer.Argument(help="Files of qpmhe.solvers.dump, or folders of them.")
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Folder of the test set.")
+    ] = Path("results/qpbenchmark"),
+    matrices: Annotated[
+        Matrices, typer.Option(help="What solvers that take both kinds are given.")
+    ] = Matrices.SPARSE,
 ) -> None:
-    """Export the QPs, and print how to run qpbenchmark on them.
-
-    Parameters
-    ----------
-    console : rich.console.Console
-        Where to print.
-    paths : sequence of Path
-        Files of `qpmhe.solvers.dump`, or folders of such.
-    out : Path
-        The folder to write.
-    matrices : {"sparse", "dense"}
-        What solvers that take both kinds are given.
-
-    Raises
-    ------
-    InvalidInputError, OptionError
-        As `qpmhe.studies.export_qpbenchmark` says.
-    """
-    exported = export_qpbenchmark(paths, out, matrices=matrices)
+    """Write dumped QPs as a test set of qpbenchmark."""
+    console = Console()
+    exported = export_qpbenchmark(files, out, matrices=matrices.value)
     for path, reason in exported.skipped.items():
         console.print(f"[yellow]left out[/] {escape(str(path))}: {reason}", highlight=False)
     console.print(

@@ -1,18 +1,20 @@
-"""``qpmhe report``: a study's results on screen, and as a page with figures."""
+"""``qpmhe report`` and ``qpmhe export``: a study's results on screen, as a page, as a table."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import typer
 from rich import box
 from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
+from .. import studies
 from ..studies.report.answers import Case, cases, chosen
 from ..studies.report.words import cap_words, number, percent, qps_words, seconds
 from ..studies.summary import TOLERANCE
@@ -20,7 +22,7 @@ from ..studies.summary import TOLERANCE
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["report", "show"]
+__all__ = ["export", "report", "show", "show_report"]
 
 _MOST_ROWS = 40
 _BEST = "[bold green]{}*[/]"
@@ -63,56 +65,35 @@ _THEN = (
 )
 
 
-def report(console: Console, store_path: str | Path, out: str | Path) -> Path:
-    """Show a store's answers and summary, and write its report.
+def report(
+    store: Annotated[Path, typer.Argument(help="File of the results.")],
+    out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("results/report"),
+) -> None:
+    """Summary of a store on screen, and its report: one HTML page, and figures."""
+    show_report(Console(), store, out)
 
-    Parameters
-    ----------
-    console : rich.console.Console
-        Where to print.
-    store_path : path
-        The store.
-    out : path
-        Folder of the report; it is made.
 
-    Returns
-    -------
-    Path
-        The HTML file.
+def export(
+    store: Annotated[Path, typer.Argument(help="File of the results.")],
+    file: Annotated[Path, typer.Argument(help="What to write: .csv or .parquet.")],
+) -> None:
+    """Write the rows of a store into a CSV or Parquet file."""
+    Console().print(f"wrote {studies.export(store, file)}", highlight=False)
 
-    Raises
-    ------
-    StoreError
-        If there is no such store, or it cannot be read.
-    InvalidInputError
-        If it holds nothing yet, the folder cannot be made, or a library is missing.
-    """
-    from ..studies.report import write_report
-    from ..studies.store import Store
-    from ..studies.summary import summarise
 
-    store = Store(store_path)
-    page = write_report(store, out)
-    show(console, summarise(store.frame()))
+def show_report(console: Console, store: Path, out: Path) -> None:
+    """Write a store's report, and print its answers and tables."""
+    page = studies.write_report(store, out)
+    show(console, studies.summarise(studies.Store(store).frame()))
     console.print(f"wrote {page}, and its figures as PNG and SVG beside it", highlight=False)
-    return page
 
 
 def show(console: Console, summary: DataFrame, *, every: bool = False) -> None:
     """Print the answers and a table for each model and horizon, the best of a column marked.
 
     What was asked for (a deadline, covariances) is always shown, further columns as there is
-    room.
-
-    Parameters
-    ----------
-    console : rich.console.Console
-        Where to print.
-    summary : pandas.DataFrame
-        See `qpmhe.studies.summarise`.
-    every : bool
-        All configurations, however many. Otherwise, of more than 40, those of the Pareto
-        front, of the answers, and the fastest near the best of each backend.
+    room. Of more than 40 configurations, those of the Pareto front, of the answers, and the
+    fastest near the best of each backend are shown, or all with ``every``.
     """
     for case in cases(summary):
         console.print()
@@ -122,13 +103,13 @@ def show(console: Console, summary: DataFrame, *, every: bool = False) -> None:
         rows = case.summary.assign(
             rmse_half=(case.summary["rmse_high"] - case.summary["rmse_low"]) / 2
         )
-        told = {one.name for one in _COLUMNS if rows[one.name].notna().any()}
-        chosen_ones = told & set(_ALWAYS)
+        filled = {one.name for one in _COLUMNS if rows[one.name].notna().any()}
+        chosen_ones = filled & set(_ALWAYS)
         for name in _THEN:
             more = chosen_ones | {name}
-            if name in told and _width(console, _table(case, rows, every, more)) <= console.width:
+            if name in filled and _width(console, _table(case, rows, every, more)) <= console.width:
                 chosen_ones = more
-        console.print(_table(case, rows, every, chosen_ones, told - chosen_ones))
+        console.print(_table(case, rows, every, chosen_ones, filled - chosen_ones))
 
 
 def _width(console: Console, table: Table) -> int:
@@ -186,7 +167,7 @@ def _table(
 
 
 def _best(rows: DataFrame, name: str, less: bool | None) -> int:
-    """Index of the best value's row; -1 where all agree, as then nothing is told."""
+    """Index of the best value's row; -1 where all agree."""
     if less is None:
         return -1
     values = rows[name].astype(float) * (1.0 if less else -1.0)

@@ -1,26 +1,25 @@
 """Scripted studies: grids of estimators with their results, and the paper's example."""
 
+from .errors import StoreError, StudyError
 from .grid import Study
-from .paper import IpoptComparison, PaperStudy, Row, backend_rows, ipopt_rows, paper_rows
+from .paper import PaperStudy, Reproduction, reproduce
 from .qpbenchmark_set import ExportedSet, export_qpbenchmark
 from .report import write_report
 from .runner import run
-from .store import Store
+from .store import Store, export
 from .summary import summarise
-from .table_file import export
 
 __all__ = [
     "ExportedSet",
-    "IpoptComparison",
     "PaperStudy",
-    "Row",
+    "Reproduction",
     "Store",
+    "StoreError",
     "Study",
-    "backend_rows",
+    "StudyError",
     "export",
     "export_qpbenchmark",
-    "ipopt_rows",
-    "paper_rows",
+    "reproduce",
     "run",
     "summarise",
     "write_report",

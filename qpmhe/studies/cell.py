@@ -1,41 +1,56 @@
-"""One cell of a study: an estimator on a record."""
+"""One cell of a study: an estimator on one record, run in a worker process."""
 
 from __future__ import annotations
 
+import faulthandler
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
+from time import perf_counter
+from typing import Any
 
-from qpmhe_solvers import Backend
+import numpy as np
+from numpy.typing import NDArray
 
-from .sources import Source
+from qpmhe_solvers import Backend, BackendError, backend, register
 
-__all__ = ["OBSERVER", "Cell", "Task"]
+from ..estimate import Estimate
+from ..estimator import MovingHorizonEstimator
+from ..models import Example, Record
+from ..models.loading import ModelSource, load
+from ..run import Run
+from . import metrics
+from .environment import environment
 
-#: What the backend of a cell without QPs is called.
+__all__ = ["OBSERVER", "Cell", "Result", "Task", "compute", "failure"]
+
+Array = NDArray[np.float64]
+Result = dict[str, Any]
+
+#: Backend of a cell that solves no QP.
 OBSERVER = "observer"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What tells one run from all others.
+    """What distinguishes one run from all others of a study.
 
-    Parameters
+    Attributes
     ----------
-    model : str
-        As the study names it.
-    backend : str
-        QP backend; `OBSERVER` where no QP is solved.
+    model, backend : str
+        Names; the backend is `OBSERVER` where no QP is solved.
     qps : int or None
-        QPs per sample; None is convergence.
+        QPs per sample; None iterates to convergence.
     solver_iterations : int or None
         Cap inside each QP; None is the solver's default.
     horizon : int
         N.
     start : str
         Where the sequences of QPs start.
-    seed : int
-        Seed of the record.
-    steps : int
-        Samples of the record.
+    seed, steps : int
+        Seed and number of samples of the record.
     """
 
     model: str
@@ -49,10 +64,11 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """A text that only this cell has."""
+        """A text that identifies the cell."""
+        qps = "converged" if self.qps is None else self.qps
+        cap = "none" if self.solver_iterations is None else self.solver_iterations
         return (
-            f"{self.model}/{self.backend}/i={_or(self.qps, 'converged')}"
-            f"/cap={_or(self.solver_iterations, 'none')}/N={self.horizon}/{self.start}"
+            f"{self.model}/{self.backend}/i={qps}/cap={cap}/N={self.horizon}/{self.start}"
             f"/T={self.steps}/seed={self.seed}"
         )
 
@@ -67,48 +83,201 @@ class Cell:
 
 @dataclass(frozen=True)
 class Task:
-    """A cell on its way to a worker.
+    """A cell as it is sent to a worker.
 
-    Parameters
+    Attributes
     ----------
     cell : Cell
         What to run.
-    source : Source
+    source : ModelSource
         Where its model comes from.
     parts : frozenset of str
-        What is wanted: "accuracy", "time", "covariance".
+        What to measure: "accuracy", "time", "covariance".
     timeout : float
         Seconds after which the cell gives up between two steps.
     keep : bool
-        Whether the trajectory is wanted.
+        Whether to return the trajectory.
     shared : bool
         Whether other cells run on the same machine at the same time.
-    entry : Backend, optional
-        The backend's entry, for workers where it is not registered.
-    notes : str, optional
-        Folder in which the worker notes what it is at.
-    parent : int, optional
-        Process with which the worker ends.
-    isolated : str
-        Why its backend runs in a process of its own; empty where it does not.
+    registered : Backend, optional
+        The backend, for workers in which it is not registered.
+    isolated : bool
+        Whether the solver runs in a process of its own, which may crash alone.
     """
 
     cell: Cell
-    source: Source
+    source: ModelSource
     parts: frozenset[str]
     timeout: float
     keep: bool = False
     shared: bool = False
-    entry: Backend | None = None
-    notes: str | None = None
-    parent: int | None = None
-    isolated: str = ""
+    registered: Backend | None = None
+    isolated: bool = False
 
     @property
     def hard_limit(self) -> float:
-        """Seconds after which the process that runs it is ended."""
+        """Seconds after which a process that hangs in the cell is ended."""
         return 1.5 * self.timeout + 1.0
 
 
-def _or(value: int | None, nothing: str) -> str:
-    return nothing if value is None else str(value)
+class OutOfTimeError(Exception):
+    """The cell's time is up."""
+
+
+def compute(task: Task) -> Result:
+    """Run a cell; whatever is raised in it becomes a row.
+
+    Returns
+    -------
+    dict
+        The row: the cell's fields, ``outcome``, ``reason``, the metrics, ``environment``, and
+        ``trajectory`` where the task asks for it.
+    """
+    began = perf_counter()
+    with _ended_after(task.hard_limit):
+        try:
+            return _measured(task, began + task.timeout)
+        except KeyboardInterrupt:
+            raise
+        except OutOfTimeError as error:
+            return failure(task, f"out of time: {error}")
+        except BaseException as error:  # a solver may even try to leave the process
+            return failure(task, f"{type(error).__name__}: {error}")
+
+
+def failure(task: Task, reason: str) -> Result:
+    """The row of a cell that failed."""
+    return {
+        **_fields(task), "outcome": "failed", "reason": " ".join(reason.split())[:500],
+        "environment": environment(),
+    }
+
+
+@contextmanager
+def _ended_after(seconds: float) -> Iterator[None]:
+    """End this process if the block hangs; this clock needs no turn of the interpreter."""
+    if sys.__stderr__ is not None:
+        faulthandler.dump_traceback_later(seconds, exit=True, file=sys.__stderr__)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+def _fields(task: Task) -> Result:
+    return {"key": task.cell.key, **vars(task.cell), "parts": task.parts, "shared": task.shared}
+
+
+def _measured(task: Task, limit: float) -> Result:
+    cell, example = task.cell, load(task.source)
+    if task.registered is not None:
+        _register(task.registered)
+    record = _record(task.source, cell.seed, cell.steps)
+    if "time" in task.parts:
+        _warm_up(task, limit)
+    run = _run(_estimator(example, task), record, limit, "covariance" in task.parts)
+    scenario = example.scenario
+    settled = int(np.ceil(scenario.settling_time / scenario.dt - 1e-9))
+    row: Result = {
+        **_fields(task), "outcome": "done", "reason": "", "environment": environment(),
+        **metrics.accuracy(run.states, record.states, settled), **metrics.outcomes(run),
+    }
+    if "time" in task.parts:
+        row |= metrics.timing(run.times)
+    if run.covariances is not None:
+        row["nees"] = metrics.consistency(run.states, record.states, run.covariances)
+    if "accuracy" in task.parts:
+        try:
+            reference = _reference(task, record, limit)
+        except OutOfTimeError as error:
+            row["reason"] = f"no cost ratio: the converged reference ran out of time, {error}"
+            reference = None
+        row["cost_ratio"] = metrics.cost_ratio(run.costs, reference)
+    if task.keep:
+        row["trajectory"] = {
+            "times": scenario.dt * np.arange(cell.steps + 1, dtype=np.float64),
+            "states": record.states, "estimates": run.states,
+            "labels": list(scenario.labels), "title": scenario.title,
+            "time_unit": scenario.time_unit,
+        }
+    return row
+
+
+def _register(entry: Backend) -> None:
+    """Register a backend that was registered where the study was started."""
+    try:
+        backend(entry.name)
+    except BackendError:
+        register(entry)
+
+
+def _estimator(example: Example, task: Task) -> MovingHorizonEstimator:
+    system, observer, cost, scenario = example
+    cell = task.cell
+    return MovingHorizonEstimator(
+        system, observer, cost,
+        horizon=cell.horizon, initial_state=scenario.initial_estimate,
+        backend="banded" if cell.backend == OBSERVER else cell.backend,
+        max_qps=cell.qps, max_solver_iterations=cell.solver_iterations, start=cell.start,
+        isolated=task.isolated,
+    )
+
+
+def _run(
+    mhe: MovingHorizonEstimator, record: Record, limit: float, covariances: bool = False
+) -> Run:
+    start, estimates, collected = mhe.state.copy(), [], []
+    inputs = [None] * len(record.measurements) if record.inputs is None else record.inputs
+    for y, u in zip(record.measurements, inputs, strict=True):
+        estimate: Estimate = mhe.update(y, u)
+        estimates.append(estimate)
+        if covariances:
+            collected.append(_newest_covariance(mhe))
+        if perf_counter() > limit:
+            raise OutOfTimeError(f"{len(estimates)} of {len(record.measurements)} steps were done.")
+    return Run.of(start, estimates, np.array(collected) if covariances else None)
+
+
+def _newest_covariance(mhe: MovingHorizonEstimator) -> Array:
+    try:
+        value: Array = mhe.covariances()[-1]
+    except (ValueError, np.linalg.LinAlgError):
+        value = np.full((mhe.system.n, mhe.system.n), np.nan)
+    return value
+
+
+@lru_cache(maxsize=8)
+def _record(source: ModelSource, seed: int, steps: int) -> Record:
+    return load(source).scenario.simulate(seed, steps)
+
+
+_WARM: set[tuple[object, ...]] = set()
+
+
+def _warm_up(task: Task, limit: float) -> None:
+    """Imports and first calls happen before the first measured run, as they belong to no step."""
+    cell, source = task.cell, task.source
+    key = (source, task.isolated, *cell.configuration)
+    if key not in _WARM:
+        steps = min(cell.steps, cell.horizon + 2)
+        _run(_estimator(load(source), task), _record(source, cell.seed, steps), limit)
+        _WARM.add(key)
+
+
+_REFERENCES: dict[tuple[object, ...], Array | None] = {}
+
+
+def _reference(task: Task, record: Record, limit: float) -> Array | None:
+    """J of the converged solutions, which all cells on the same record share."""
+    cell, source = task.cell, task.source
+    key = (source, cell.horizon, cell.start, cell.seed, cell.steps)
+    if key not in _REFERENCES:
+        if len(_REFERENCES) >= 8:
+            del _REFERENCES[next(iter(_REFERENCES))]
+        converged = Task(
+            Cell(cell.model, "auto", None, None, cell.horizon, cell.start, cell.seed, cell.steps),
+            source, frozenset(), task.timeout,
+        )
+        _REFERENCES[key] = None  # where it runs out of time, it does so once
+        _REFERENCES[key] = _run(_estimator(load(source), converged), record, limit).costs
+    return _REFERENCES[key]

@@ -1,9 +1,24 @@
-"""The grid of a study: which models, backends, caps, horizons and seeds are compared."""
+"""What a study compares: models, backends, caps, horizons and seeds; in Python or in a TOML file.
+
+In a TOML file the keys are the parameters of `Study`. TOML has no None: ``"converged"`` stands for
+it in ``qps``, ``"none"`` in ``solver_iterations``, ``"default"`` in ``horizons``::
+
+    models = ["batch_reactor", "chain_of_masses(masses=2)", "my_model.py:make"]
+    backends = ["daqp", "osqp"]
+    qps = [0, 1, 2, "converged"]
+    solver_iterations = [1, 5, "none"]
+    seeds = 20
+
+Paths of models are relative to the file.
+"""
 
 from __future__ import annotations
 
+import re
+import tomllib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
+from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -12,15 +27,17 @@ from qpmhe_solvers import available, backend
 from qpmhe_solvers.errors import tell_unknown_options
 
 from .._checks import count, positive
-from ..errors import BackendError
+from ..errors import BackendError, InvalidInputError
+from ..models.loading import ModelSource, find, load
 from ..settings import Start
 from .cell import OBSERVER, Cell
 from .errors import StudyError
-from .sources import Source, find, load
 
-__all__ = ["Measure", "Study"]
+__all__ = ["WORDS", "Measure", "Study"]
 
 Measure = Literal["both", "accuracy", "time"]
+#: What stands for None in files and on the command line.
+WORDS = {"qps": "converged", "solver_iterations": "none", "horizons": "default"}
 
 
 @tell_unknown_options
@@ -42,7 +59,7 @@ class Study:
         QP backends; if left out, all that are installed, without the generic forms
         (``qpsolvers:...``) of those that have one of their own.
     qps : sequence of int or None
-        QPs per sample, the paper's i; None goes on to convergence, 0 is the observer.
+        QPs per sample, the paper's i; None iterates to convergence, 0 is the observer.
     solver_iterations : sequence of int or None
         Caps on the solver's own iterations in each QP; None leaves the solver's default.
     horizons : sequence of int or None
@@ -56,15 +73,17 @@ class Study:
     measure : {"both", "accuracy", "time"}
         What is recorded. With "time" one cell runs at a time, unless more jobs are asked for.
     deadline : float, optional
-        Seconds; the share of steps that take longer is told.
+        Seconds; the results report the share of steps that take longer.
     covariances : bool
         Whether covariances are computed, and errors judged by them (NEES).
     cell_timeout : float
         Seconds for one cell.
+    folder : str or Path, optional
+        What the paths of models are relative to; the working directory if left out.
 
     Raises
     ------
-    StudyError, OptionError, BackendError
+    StudyError, OptionError, BackendError, ModelError
         If the grid is empty, or a value is unknown, out of range or not installed.
 
     Examples
@@ -87,14 +106,13 @@ class Study:
     deadline: float | None = None
     covariances: bool = False
     cell_timeout: float = 60.0
-    sources: tuple[Source, ...] = field(init=False, repr=False, compare=False)
+    folder: str | Path | None = field(default=None, repr=False, compare=False)
+    sources: tuple[ModelSource, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        self._prepare(None)
-
-    def _prepare(self, folder: Path | None) -> None:
-        for name, check in CHECKS.items():
+        for name, check in _CHECKS.items():
             object.__setattr__(self, name, check(getattr(self, name)))
+        folder = None if self.folder is None else Path(self.folder)
         sources = _distinct(find(text, folder) for text in self.models)
         for source in sources:
             load(source)
@@ -103,51 +121,57 @@ class Study:
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Study:
-        """Read a study from a file; see `qpmhe.studies.study_file`.
+        """Read a study from a file, and check it before anything runs.
 
         Parameters
         ----------
         path : str or Path
-            A TOML file whose keys are the parameters of this class.
+            A TOML file whose keys are the parameters of this class, without ``folder``.
 
         Raises
         ------
         StudyError
-            If it cannot be read, has an unknown key or a value that does not fit; the text
-            has the line.
+            If it cannot be read, is empty, has an unknown key or a value that does not fit;
+            the text has the file and the line.
         """
-        from .study_file import read
-
-        return read(Path(path))
-
-    @classmethod
-    def within(cls, folder: Path, **options: Any) -> Study:
-        """A study whose files are relative to a folder.
-
-        Parameters
-        ----------
-        folder : Path
-            What the paths of models are relative to.
-        **options
-            The parameters of the class.
-        """
-        study = object.__new__(cls)
-        known = {item.name: item.default for item in fields(cls) if item.init}
-        for name, value in {**known, **options}.items():
-            object.__setattr__(study, name, value)
-        study._prepare(folder)
-        return study
+        path = Path(path)
+        text = _read(path)
+        lines = text.splitlines()
+        try:
+            found = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            words = str(error).replace("end of document", f"line {len(lines)}, the end")
+            raise StudyError(f"the study file {path} is no valid TOML: {words}.") from error
+        for key in found:
+            if key not in _CHECKS:
+                near = get_close_matches(key, _CHECKS, 1)
+                raise StudyError(
+                    f"{_place(path, lines, key)}: unknown key {key!r}; expected some of "
+                    f"{', '.join(_CHECKS)}.{f' Did you mean {near[0]}?' if near else ''}"
+                )
+        if not found:
+            raise StudyError(
+                f"the study file {path} is empty; name at least one of {', '.join(_CHECKS)}; "
+                "what is left out has its default."
+            )
+        options = {key: _translated(key, value) for key, value in found.items()}
+        for key, value in options.items():
+            _check_items(path, lines, key, value)
+        try:
+            return cls(**options, folder=path.parent)
+        except InvalidInputError as error:
+            raise StudyError(f"{path}: {error}") from error
 
     def settings(self) -> dict[str, Any]:
         """The grid as plain lists and numbers; what the store keeps of it."""
-        found = {name: getattr(self, name) for name in CHECKS}
+        found = {name: getattr(self, name) for name in _CHECKS}
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in found.items()
         }
 
     def cells(self) -> tuple[Cell, ...]:
-        """All cells, each once, seed by seed: what is there early covers the whole grid."""
+        """All cells, each once, seed by seed, so that the first results cover the whole grid."""
         assert self.backends is not None
         assert not isinstance(self.seeds, int)
         made: dict[Cell, None] = {}
@@ -170,15 +194,56 @@ class Study:
                 made[cell] = None
         return tuple(made)
 
-    def source(self, cell: Cell) -> Source:
-        """Where a cell's model comes from.
 
-        Parameters
-        ----------
-        cell : Cell
-            One of this study.
-        """
-        return next(source for source in self.sources if source.name == cell.model)
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise StudyError(f"cannot read the study file {path}: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise StudyError(f"the study file {path} is no text in UTF-8 ({error}).") from error
+
+
+def _translated(key: str, value: Any) -> Any:
+    """A value of a file with None in place of the words."""
+    word = WORDS.get(key)
+    if word is None:
+        return value
+    return [None if item == word else item for item in (
+        value if isinstance(value, list) else [value]
+    )]
+
+
+def _check_items(path: Path, lines: list[str], key: str, value: Any) -> None:
+    """Check the items of an option one by one, so that the error names the line."""
+    several = isinstance(value, list) and len(value) > 0
+    for item in value if several else [value]:
+        try:
+            _CHECKS[key]([item] if several else item)
+            if key == "models":
+                load(find(item, path.parent))
+        except InvalidInputError as error:
+            shown = str(error)
+            if key in WORDS:
+                shown = shown.replace(" None ", f' "{WORDS[key]}" ')
+            raise StudyError(f"{_place(path, lines, key, item)}: {shown}") from error
+
+
+def _place(path: Path, lines: list[str], key: str, item: Any = None) -> str:
+    """File and line of a key, or of an item of its value, which tomllib does not keep."""
+    begins = re.compile(rf"""\s*(\[+\s*)?["']?{re.escape(key)}["']?\s*(=|\]|\.)""")
+    other = re.compile(r"""\s*["']?[A-Za-z0-9_-]+["']?\s*=""")
+    first = next((i for i, line in enumerate(lines) if begins.match(line)), None)
+    if first is None:
+        return str(path)
+    value = item if isinstance(item, str) else repr(item).lower()
+    for i in range(first, len(lines)):
+        if i > first and other.match(lines[i]):
+            break
+        text = lines[i].partition("=")[2] if i == first else lines[i]
+        if item is not None and re.search(rf"(?<![\w.]){re.escape(value)}(?![\w.])", text):
+            return f"{path}, line {i + 1}"
+    return f"{path}, line {first + 1}"
 
 
 def _distinct(values: Iterable[Any]) -> tuple[Any, ...]:
@@ -250,8 +315,8 @@ def _switch(value: Any) -> bool:
     return value
 
 
-#: The check of each option, in order; each gives the value in its standard form.
-CHECKS: dict[str, Callable[[Any], Any]] = {
+# The check of each option, in order; each returns the value in its standard form.
+_CHECKS: dict[str, Callable[[Any], Any]] = {
     "models": _models,
     "backends": _backends,
     "qps": _numbers("qps", 0, " None stands for convergence."),

@@ -1,4 +1,4 @@
-"""What is told of a run: errors, costs, outcomes and times."""
+"""The metrics of a run: errors, costs, outcomes and times."""
 
 from __future__ import annotations
 
@@ -26,19 +26,9 @@ def accuracy(estimates: Array, states: Array, settled: int) -> dict[str, Any]:
     .. math::
         \mathrm{rmse} = \Bigl(\frac1{T+1} \sum_{t=0}^{T} |\hat x(t) - x(t)|^2\Bigr)^{1/2}
 
-    Parameters
-    ----------
-    estimates, states : (T + 1, n) array
-        What was estimated, and what was true; row 0 is the start.
-    settled : int
-        First index that counts as settled.
-
-    Returns
-    -------
-    dict
-        ``rmse``, ``rmse_settled`` over t >= settled, and ``rmse_states``,
-        ``rmse_settled_states``, lists of the same for each state alone. NaN where no time
-        counts as settled.
+    Both arrays are (T + 1, n). Returns ``rmse``, ``rmse_settled`` over t >= settled, and
+    ``rmse_states``, ``rmse_settled_states``, lists of the same for each state alone. NaN where
+    no time counts as settled.
     """
     with np.errstate(all="ignore"):
         squares = (estimates - states) ** 2
@@ -61,12 +51,8 @@ def consistency(estimates: Array, states: Array, covariances: Array) -> float:
     .. math::
         \frac1T \sum_{t=1}^{T} (\hat x(t) - x(t))^\top P(t)^{-1} (\hat x(t) - x(t))
 
-    Parameters
-    ----------
-    estimates, states : (T + 1, n) array
-        What was estimated, and what was true.
-    covariances : (T, n, n) array
-        P(1), ..., P(T). Times where it is not finite or singular are left out.
+    The covariances P(1), ..., P(T) are (T, n, n); times where one is not finite or singular are
+    left out.
     """
     values = []
     for error, covariance in zip(estimates[1:] - states[1:], covariances, strict=True):
@@ -81,14 +67,8 @@ def consistency(estimates: Array, states: Array, covariances: Array) -> float:
 def cost_ratio(costs: Array, reference: Array | None) -> float:
     r"""The mean of J(t) / J*(t), with J* of the converged solution of the same problem P_t.
 
-    Below 1 where the reference is a local minimum and the run found a better one.
-
-    Parameters
-    ----------
-    costs : (T,) array
-        J of the estimates.
-    reference : (T,) array or None
-        J*. Times where either is not finite, or J* is zero, are left out.
+    Below 1 where the reference is a local minimum and the run found a better one. Times where
+    either is not finite, or J* is zero, are left out.
     """
     if reference is None:
         return float("nan")
@@ -99,28 +79,19 @@ def cost_ratio(costs: Array, reference: Array | None) -> float:
 
 
 def outcomes(run: Run) -> dict[str, Any]:
-    """How the steps ended, and what they took.
+    """How the steps ended, and how many QPs and iterations they used.
 
-    Parameters
-    ----------
-    run : Run
-        The run.
-
-    Returns
-    -------
-    dict
-        Shares of steps: ``improved``; ``kept``, where the candidate is the estimate and
-        nothing failed; ``fallback``, where it is because something failed or no iterate
-        lowered the cost; ``cap_hits``, where a QP ended at its cap or unconfirmed. Further
-        ``reasons``, the number of steps of each flag of `qpmhe.Status`, and the means
-        ``qps_mean`` and ``solver_iterations_mean`` per step, NaN where the solver does not
-        tell.
+    Shares of steps: ``improved``; ``kept``, where the candidate is the estimate and nothing
+    failed; ``fallback``, where it is because something failed or no iterate lowered the cost;
+    ``cap_hits``, where a QP ended at its cap or unconfirmed. Further ``reasons``, the number of
+    steps of each flag of `qpmhe.Status`, and the means ``qps_mean`` and
+    ``solver_iterations_mean`` per step, NaN where the solver does not report them.
     """
     flags, total = run.flags, max(1, len(run))
     improved = (flags & Status.IMPROVED.value) != 0
     failed = ~improved & ((flags & _FAILURES.value) != 0)
     counts = {str(flag.name): int(((flags & flag.value) != 0).sum()) for flag in Status}
-    told = run.solver_iterations[run.solver_iterations >= 0]
+    known = run.solver_iterations[run.solver_iterations >= 0]
     return {
         "improved": float(improved.sum() / total),
         "kept": float((~improved & ~failed).sum() / total),
@@ -128,18 +99,12 @@ def outcomes(run: Run) -> dict[str, Any]:
         "cap_hits": counts[str(Status.SOLVER_STOPPED.name)] / total,
         "reasons": {name: number for name, number in counts.items() if number},
         "qps_mean": float(run.qps.mean()),
-        "solver_iterations_mean": float(told.mean()) if told.size else float("nan"),
+        "solver_iterations_mean": float(known.mean()) if known.size else float("nan"),
     }
 
 
 def timing(times: Array) -> dict[str, Any]:
-    """Quantiles of the seconds per step, and the seconds themselves.
-
-    Parameters
-    ----------
-    times : (T,) array
-        Seconds per step.
-    """
+    """Quantiles of the seconds per step, and the seconds themselves."""
     median, p95, p99 = np.percentile(times, (50.0, 95.0, 99.0)).tolist()
     return {
         "time_median": median,

@@ -1,42 +1,47 @@
-"""The paper's simulation example (section 4), and what the QP backends make of it."""
+"""The paper's simulation example (section 4), with every installed QP backend."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import csv
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qpmhe_solvers import available, backend
+from qpmhe_solvers import available, backend, create
 
 from ..discretize import discretize
+from ..errors import InvalidInputError
 from ..estimate import Status
 from ..estimator import MovingHorizonEstimator
 from ..models import Example
 from ..models.batch_reactor import batch_reactor, casadi_output, casadi_rate
 from ..models.scenario import Record
+from ..plots import save, trajectories
 from ..run import Run
 from .ipopt import IpoptEstimator
 
-__all__ = ["IpoptComparison", "PaperStudy", "Row", "backend_rows", "ipopt_rows", "paper_rows"]
+__all__ = ["SETTLED", "PaperStudy", "Reproduction", "Row", "reproduce"]
 
 Array = NDArray[np.float64]
-Tick = Callable[[], None]
 
-#: The paper's i = 0, 2, 5 and fully converged, with i = 1 beside them.
-ITERATIONS: tuple[int | None, ...] = (0, 1, 2, 5, None)
-#: Caps on the iterations inside each QP.
-CAPS: tuple[int | None, ...] = (1, 5, None)
+# The paper's i = 0, 2, 5 and converged, and i = 1 beside them; the paper's own of Ipopt.
+_ITERATIONS: tuple[int | None, ...] = (0, 1, 2, 5, None)
+_IPOPT_ITERATIONS: tuple[int | None, ...] = (0, 2, 5, None)
+# QPs per sample, and caps on the iterations inside each, where backends are compared.
+_COMPARED, _CAPS = 2, (1, 5, None)
+_DRAWN = ("i = 0", "i = 2", "i = 5", "converged")
 #: From here on the initial error has decayed, in the scenario's unit of time.
 SETTLED = 2.0
 
 
 @dataclass(frozen=True)
 class PaperStudy:
-    """One record of the example, which all rows share.
+    """One record of the example, and estimators on it.
 
     Parameters
     ----------
@@ -61,36 +66,38 @@ class PaperStudy:
         """The simulated states and measurements."""
         return self.model.scenario.simulate(self.seed, self.steps)
 
-    def run(
-        self,
-        iterations: int | None,
-        backend_name: str,
-        cap: int | None = None,
-        tick: Tick | None = None,
-    ) -> Run:
-        """Estimate the record with at most this many QPs per sample."""
+    def estimator(
+        self, iterations: int | None, backend_name: str = "auto", cap: int | None = None
+    ) -> MovingHorizonEstimator:
+        """The estimator with at most this many QPs per sample."""
         system, observer, cost, scenario = self.model
-        mhe = MovingHorizonEstimator(
+        return MovingHorizonEstimator(
             system, observer, cost,
             horizon=scenario.horizon, initial_state=scenario.initial_estimate,
             backend=backend_name, max_qps=iterations, max_solver_iterations=cap,
         )
-        estimates = []
-        for y in self.record().measurements:
-            estimates.append(mhe.update(y))
-            if tick:
-                tick()
-        return Run.of(scenario.initial_estimate, estimates)
+
+    def ipopt(self, iterations: int | None) -> IpoptEstimator:
+        """The paper's tool: CasADi with Ipopt, terminated after this many iterations."""
+        system, observer, cost, scenario = self.model
+        step, _ = discretize(casadi_rate, None, self.method)
+        return IpoptEstimator(
+            system, observer, cost, f=partial(step, scenario.dt), h=casadi_output,
+            horizon=scenario.horizon, initial_state=scenario.initial_estimate,
+            max_iterations=iterations,
+        )
 
 
 @dataclass(frozen=True)
 class Row:
     """Accuracy, time and outcome of one run.
 
-    Parameters
+    Attributes
     ----------
     label : str
         What was run.
+    cap : int or None
+        Cap on the iterations inside each QP.
     states : (T + 1, n) array
         The estimates.
     rmse, rmse_settled : float
@@ -106,6 +113,7 @@ class Row:
     """
 
     label: str
+    cap: int | None
     states: Array
     rmse: float
     rmse_settled: float
@@ -115,23 +123,132 @@ class Row:
     mean_cost: float
     stopped: str
 
-    @staticmethod
-    def of(label: str, run: Run, record: Record, dt: float) -> Row:
-        """Summarise a run against the true states."""
-        squares = np.sum((run.states - record.states) ** 2, axis=1)
-        settled = round(SETTLED / dt)
-        return Row(
-            label=label,
-            states=run.states,
-            rmse=float(np.sqrt(squares.mean())),
-            rmse_settled=float(np.sqrt(squares[settled:].mean())) if squares[settled:].size
-            else float("nan"),
-            median_time=float(np.median(run.times)),
-            high_time=float(np.percentile(run.times, 95)),
-            improved=run.share(Status.IMPROVED),
-            mean_cost=float(run.costs.mean()),
-            stopped=_stopped(run),
-        )
+
+@dataclass(frozen=True)
+class Reproduction:
+    """Results of `reproduce`.
+
+    Attributes
+    ----------
+    study : PaperStudy
+        The record.
+    backend : str
+        Backend of ``rows``.
+    rows : list of Row
+        i = 0, 1, 2, 5 and converged; then Ipopt's, where it was asked for.
+    backends : list of Row
+        Every installed backend at each cap, with i = 2.
+    files : list of Path
+        What was written.
+    """
+
+    study: PaperStudy
+    backend: str
+    rows: list[Row]
+    backends: list[Row]
+    files: list[Path]
+
+    def excess(self, row: Row) -> float:
+        """Mean cost of a row above that of the converged one, relative."""
+        converged = next(one for one in self.rows if one.label == "converged")
+        return row.mean_cost / converged.mean_cost - 1.0
+
+
+def reproduce(
+    out: str | Path | None = None,
+    *,
+    seed: int = 0,
+    steps: int = 150,
+    method: str = "euler",
+    backend_name: str = "auto",
+    ipopt: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Reproduction:
+    """Reproduce the paper's figure, and compare every installed backend on the same record.
+
+    Parameters
+    ----------
+    out : path, optional
+        Folder for the figure (PNG, SVG) and tables (CSV); it is made. Nothing is written if
+        left out.
+    seed, steps, method
+        As of `PaperStudy`.
+    backend_name : str
+        QP backend of the paper's rows.
+    ipopt : bool
+        Whether CasADi with Ipopt, the paper's tool, runs beside.
+    progress : callable, optional
+        Is given the number of steps that are done and of all steps.
+
+    Returns
+    -------
+    Reproduction
+        The rows, and the files.
+
+    Raises
+    ------
+    BackendError
+        If the backend is unknown or not installed.
+    InvalidInputError
+        If the folder cannot be made, or CasADi is missing though asked for.
+    """
+    create(backend_name)  # before any work: a wrong name must not cost a minute
+    folder = None if out is None else Path(out)
+    if folder is not None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InvalidInputError(
+                f"cannot make the folder {folder}: {error.strerror}."
+            ) from error
+    study = PaperStudy(seed, steps, method)
+    runs: list[tuple[str, int | None, Callable[[], Any]]] = [
+        ("converged" if i is None else f"i = {i}", None, partial(study.estimator, i, backend_name))
+        for i in _ITERATIONS
+    ]
+    if ipopt:
+        runs += [
+            ("Ipopt converged" if i is None else f"Ipopt i = {i}", None, partial(study.ipopt, i))
+            for i in _IPOPT_ITERATIONS
+        ]
+    first = len(runs)
+    runs += [
+        (name, cap, partial(study.estimator, _COMPARED, name, cap))
+        for name in available() if name != "auto" and ":" not in name
+        for cap in (_CAPS if backend(name).iteration_cap else (None,))
+    ]
+    record, model = study.record(), study.model
+    rows, done = [], 0
+    for label, cap, make in runs:
+        mhe, estimates = make(), []
+        for y in record.measurements:
+            estimates.append(mhe.update(y))
+            done += 1
+            if progress is not None:
+                progress(done, len(runs) * steps)
+        run = Run.of(model.scenario.initial_estimate, estimates)
+        rows.append(_row(label, cap, run, record, model.scenario.dt))
+    found = Reproduction(study, backend_name, rows[:first], rows[first:], [])
+    if folder is not None:
+        found.files.extend(_write(found, record, folder))
+    return found
+
+
+def _row(label: str, cap: int | None, run: Run, record: Record, dt: float) -> Row:
+    squares = np.sum((run.states - record.states) ** 2, axis=1)
+    late = squares[round(SETTLED / dt) :]
+    return Row(
+        label=label,
+        cap=cap,
+        states=run.states,
+        rmse=float(np.sqrt(squares.mean())),
+        rmse_settled=float(np.sqrt(late.mean())) if late.size else float("nan"),
+        median_time=float(np.median(run.times)),
+        high_time=float(np.percentile(run.times, 95)),
+        improved=run.share(Status.IMPROVED),
+        mean_cost=float(run.costs.mean()),
+        stopped=_stopped(run),
+    )
 
 
 def _stopped(run: Run) -> str:
@@ -147,76 +264,40 @@ def _stopped(run: Run) -> str:
     for status in run.statuses:
         counts[next((word for flag, word in words.items() if flag in status), "QP cap")] += 1
     total = max(1, len(run))
-    ranked = sorted(counts.items(), key=lambda item: -item[1])
-    return ", ".join(f"{word} {count / total:.0%}" for word, count in ranked if count)
+    order = sorted(counts.items(), key=lambda item: -item[1])
+    return ", ".join(f"{word} {count / total:.0%}" for word, count in order if count)
 
 
-def paper_rows(study: PaperStudy, backend_name: str, tick: Tick | None = None) -> list[Row]:
-    """The paper's figure as rows: i = 0, 1, 2, 5 and converged, on one record."""
-    record, dt = study.record(), study.model.scenario.dt
-    return [
-        Row.of(
-            "converged" if i is None else f"i = {i}",
-            study.run(i, backend_name, None, tick), record, dt,
-        )
-        for i in ITERATIONS
-    ]
-
-
-def compared_backends() -> tuple[str, ...]:
-    """The installed backends, without ``auto`` and generic forms of those with their own."""
-    return tuple(name for name in available() if name != "auto" and ":" not in name)
-
-
-def backend_rows(
-    study: PaperStudy, iterations: int = 2, tick: Tick | None = None
-) -> Iterator[tuple[str, int | None, Row]]:
-    """Every installed backend at each cap on its own iterations, at the same i and record."""
-    record, dt = study.record(), study.model.scenario.dt
-    for name in compared_backends():
-        for cap in CAPS if backend(name).iteration_cap else (None,):
-            yield name, cap, Row.of(name, study.run(iterations, name, cap, tick), record, dt)
-
-
-@dataclass(frozen=True)
-class IpoptComparison:
-    """CasADi with Ipopt on the same record.
-
-    Parameters
-    ----------
-    study : PaperStudy
-        The record and the model.
-    """
-
-    study: PaperStudy
-
-    def estimator(self, iterations: int | None) -> IpoptEstimator:
-        """Ipopt, terminated after this many iterations."""
-        system, observer, cost, scenario = self.study.model
-        step, _ = discretize(casadi_rate, None, self.study.method)
-        return IpoptEstimator(
-            system, observer, cost, f=partial(step, scenario.dt), h=casadi_output,
-            horizon=scenario.horizon, initial_state=scenario.initial_estimate,
-            max_iterations=iterations,
-        )
-
-    def run(self, iterations: int | None, tick: Tick | None = None) -> Run:
-        """Estimate the record."""
-        mhe = self.estimator(iterations)
-        estimates: list[Any] = []
-        for y in self.study.record().measurements:
-            estimates.append(mhe.update(y))
-            if tick:
-                tick()
-        return Run.of(self.study.model.scenario.initial_estimate, estimates)
-
-
-def ipopt_rows(study: PaperStudy, tick: Tick | None = None) -> list[Row]:
-    """The paper's own runs: Ipopt after 0, 2, 5 iterations and converged."""
-    record, dt = study.record(), study.model.scenario.dt
-    comparison = IpoptComparison(study)
-    rows = []
-    for i in (0, 2, 5, None):
-        label = "Ipopt converged" if i is None else f"Ipopt i = {i}"
-        rows.append(Row.of(label, comparison.run(i, tick), record, dt))
-    return rows
+def _write(found: Reproduction, record: Record, folder: Path) -> list[Path]:
+    scenario = found.study.model.scenario
+    times = scenario.dt * np.arange(found.study.steps + 1, dtype=np.float64)
+    axes = trajectories(
+        times, record.states, {row.label: row.states for row in found.rows if row.label in _DRAWN},
+        scenario.labels, f"time t ({scenario.time_unit})",
+    )
+    paths = save(axes[0].figure, folder / "reproduce")
+    columns = {"t": times}
+    for j in range(record.states.shape[1]):
+        columns[f"real_x{j + 1}"] = record.states[:, j]
+    columns["y"] = np.append(record.measurements[:, 0], np.nan)
+    for row in found.rows:
+        for j in range(row.states.shape[1]):
+            columns[f"{row.label.replace(' ', '_').replace('=', 'is')}_x{j + 1}"] = row.states[:, j]
+    tables: dict[str, list[list[Any]]] = {
+        "reproduce": [[*columns], *np.column_stack(list(columns.values())).tolist()],
+        "reproduce_summary": [
+            ["run", "rmse", "rmse_settled", "median_s", "p95_s", "improved", "mean_J", "stopped"],
+            *([row.label, row.rmse, row.rmse_settled, row.median_time, row.high_time,
+               row.improved, row.mean_cost, row.stopped] for row in found.rows),
+        ],
+        "reproduce_backends": [
+            ["backend", "cap", "rmse", "J_excess", "improved", "median_s", "stopped"],
+            *([row.label, row.cap, row.rmse, found.excess(row), row.improved, row.median_time,
+               row.stopped] for row in found.backends),
+        ],
+    }
+    for name, lines in tables.items():
+        paths.append(folder / f"{name}.csv")
+        with paths[-1].open("w", newline="") as file:
+            csv.writer(file).writerows(lines)
+    return paths

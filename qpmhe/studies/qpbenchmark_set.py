@@ -183,15 +183,15 @@ def _description(chosen: list[StoredQP]) -> str:
     span = f"{unknowns[0]} to {unknowns[-1]}" if len(unknowns) > 1 else str(unknowns[0])
     backends = Counter(one.backend or "unknown" for one in chosen)
     answers = Counter(
-        one.solution.status.name if one.solution is not None else "not told" for one in chosen
+        one.solution.status.name if one.solution is not None else "not recorded" for one in chosen
     )
     return (
         f"{len(chosen)} QPs from the steps of qpmhe's moving horizon estimators, with {span} "
         "unknowns: increments of a state trajectory, with a block-tridiagonal Hessian. "
-        f"Recorded with the backend {_told(backends)}; its verdicts: {_told(answers)}. Every "
+        f"Recorded with the backend {_counted(backends)}; its verdicts: {_counted(answers)}. Every "
         "solver starts cold here."
     )
 
 
-def _told(counts: Counter[str]) -> str:
+def _counted(counts: Counter[str]) -> str:
     return ", ".join(f"{name} ({count})" for name, count in counts.most_common())

@@ -1,27 +1,47 @@
-"""Run a study: the missing cells, on the cores of this machine or on a cluster."""
+"""Run a study: the missing cells, in processes of this machine or on a Dask cluster."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import re
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from threading import Thread
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Protocol
 
 from qpmhe_solvers import backend
 
-from .._checks import count
+from .._checks import count, need
 from ..errors import OptionError
-from .cell import OBSERVER, Task
-from .environment import revision
+from .cell import OBSERVER, Result, Task, compute, failure
+from .environment import environment, revision
 from .errors import StudyError
 from .grid import Study
-from .pool import Pool, local
 from .store import Store
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 __all__ = ["run"]
+
+# Seconds to reach a scheduler, and without any worker before giving up.
+_CONNECT, _PATIENCE = 15.0, 60.0
+# Seconds for which a worker process waits for work; those of a killed study end then.
+_IDLE = 20.0
+# Seconds beyond its hard limit after which a cell of a cluster is given up.
+_GRACE = 10.0
+_THREADS = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
+     "NUMEXPR_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
+)
+_HUNG = "out of time: the process that ran it did not answer and was ended"
+_SIGNALS = re.compile(r"exit codes of the workers are \{(.*?)\}")
 
 
 def run(
@@ -35,8 +55,9 @@ def run(
 ) -> Store:
     """Run the cells of a study that the store does not have, and store each as it ends.
 
-    Ended at any moment, in whatever way, it loses no finished cell; the same call goes on. A
-    cell that fails is a row with its reason.
+    A study that is stopped or killed loses no finished cell; the same call resumes it. A cell
+    that fails is a row with its reason. Where a cell kills its worker process, it runs once
+    more alone, then with the solver in a process of its own; no other cell is lost.
 
     Parameters
     ----------
@@ -48,9 +69,10 @@ def run(
         Cells at a time on this machine; as many as there are cores if left out, one if only
         times are measured.
     scheduler : str, optional
-        Address of a Dask scheduler, whose workers run the cells in place of this machine.
+        Address of a Dask scheduler, such as ``tcp://10.0.0.1:8786``, whose workers run the
+        cells in place of this machine; best with one thread each.
     progress : bool or rich.console.Console
-        Whether (and where) a progress bar is shown; on the standard error stream by default.
+        Whether (and where) to show a progress bar; on the standard error stream by default.
     retry_failed : bool
         Whether cells that failed before run again.
 
@@ -63,7 +85,7 @@ def run(
     ------
     StoreError
         If the store cannot be used, or no longer.
-    SchedulerError
+    StudyError
         If the cluster cannot be reached, or no longer.
     InvalidInputError
         If an argument does not fit, or a package is missing.
@@ -75,29 +97,217 @@ def run(
         if scheduler is not None:
             raise OptionError("jobs is for this machine; with a scheduler, leave it out.")
     target = store if isinstance(store, Store) else Store(store)
-    pool = local(study, jobs) if scheduler is None else _cluster(scheduler)
-    try:
-        with target.writing() as writer:
-            writer.begin(
-                {**study.settings(), "jobs": pool.jobs, "scheduler": scheduler},
-                {source.name: source.fingerprint for source in study.sources},
-            )
-            tasks, found = _tasks(study, writer.present(retry_failed), pool.jobs > 1)
-            git = revision()
-            with _shown(progress, len(tasks), found) as advance:
-                for result in pool.results(tasks):
-                    result["environment"] = {**result["environment"], "git": git}
-                    writer.put(result)
-                    advance(result["outcome"] == "failed")
-    finally:
-        pool.close()
+    with closing(_workers(study, jobs, scheduler)) as workers, target.writing() as writer:
+        writer.begin(
+            {**study.settings(), "jobs": workers.jobs, "scheduler": scheduler},
+            {source.name: source.fingerprint for source in study.sources},
+        )
+        tasks, found = _tasks(study, writer.present(retry_failed), workers.jobs > 1)
+        git = revision()
+        with _shown(progress, len(tasks), found) as advance:
+            for result in _results(workers, tasks):
+                result["environment"] = {**result["environment"], "git": git}
+                writer.put(result)
+                advance(result["outcome"] == "failed")
     return target
 
 
-def _cluster(address: str) -> Pool:
-    from .cluster import ClusterPool
+class Workers(Protocol):
+    """Where cells run."""
 
-    return ClusterPool(address)
+    jobs: int
+
+    def submit(self, task: Task) -> Future[Result]:
+        """Send a task."""
+        ...
+
+    def ready(self) -> bool:
+        """Whether there are workers at all."""
+        ...
+
+    def restart(self) -> None:
+        """Replace workers that may have died."""
+        ...
+
+    def close(self) -> None:
+        """Leave nothing running."""
+        ...
+
+
+class _Processes:
+    """Processes of this machine, each with one thread."""
+
+    def __init__(self, jobs: int) -> None:
+        need("joblib", "a study")
+        from joblib.externals.loky import ProcessPoolExecutor
+
+        self._make = partial(ProcessPoolExecutor, jobs, timeout=_IDLE, env=_THREADS)
+        self.jobs = jobs
+        self._executor: Any = None
+
+    def submit(self, task: Task) -> Future[Result]:
+        if self._executor is None:
+            self._executor = self._make()
+        future: Future[Result] = self._executor.submit(compute, task)
+        return future
+
+    def ready(self) -> bool:
+        return True
+
+    def restart(self) -> None:
+        if self._executor is not None:
+            self._executor.shutdown(wait=True, kill_workers=True)
+            self._executor = None
+
+    close = restart
+
+
+class _Cluster:
+    """Workers of a Dask cluster, which replaces those that die."""
+
+    def __init__(self, address: str) -> None:
+        distributed = need("distributed", "a study on a cluster", "dask")
+        self._address = address
+        try:
+            if not isinstance(address, str) or not address:
+                raise TypeError("expected a text")
+            self._client = _within(2 * _CONNECT, partial(
+                distributed.Client, address, timeout=_CONNECT, set_as_default=False
+            ))
+            self._client.wait_for_workers(1, timeout=_CONNECT)
+        except Exception as error:  # anything may answer at an address
+            raise StudyError(
+                f"the scheduler is {address!r}, which gives no Dask workers "
+                f"({str(error) or type(error).__name__}); start one "
+                "with 'dask scheduler' and workers with 'dask worker ADDRESS --nthreads 1', and "
+                "give the address that it shows, such as tcp://10.0.0.1:8786."
+            ) from error
+        self.jobs = sum(self._client.ncores().values())
+        self._executor = self._client.get_executor(pure=False)
+        self._seen = monotonic()
+
+    def submit(self, task: Task) -> Future[Result]:
+        future: Future[Result] = self._executor.submit(compute, task)
+        return future
+
+    def ready(self) -> bool:
+        if self._client.status == "running" and self._client.scheduler_info()["workers"]:
+            self._seen = monotonic()
+            return True
+        if monotonic() - self._seen > _PATIENCE:
+            raise self.lost(f"there was no worker for {_PATIENCE:g} s")
+        return False
+
+    def lost(self, reason: str) -> StudyError:
+        return StudyError(
+            f"the cluster of the scheduler at {self._address!r} is gone: {reason}. All cells that "
+            "were finished are stored; give the same command again when the cluster is back."
+        )
+
+    def restart(self) -> None:
+        pass
+
+    def close(self) -> None:
+        with suppress(Exception):  # a cluster that is gone has nothing to tidy up
+            self._client.close(timeout=5)
+
+
+def _within(seconds: float, call: Callable[[], Any]) -> Any:
+    """A call's result; Dask waits for ever for a program that answers and is no scheduler."""
+    future: Future[Any] = Future()
+
+    def answer() -> None:
+        try:
+            future.set_result(call())
+        except Exception as error:
+            future.set_exception(error)
+
+    Thread(target=answer, daemon=True).start()
+    return future.result(seconds)
+
+
+def _workers(study: Study, jobs: int | None, scheduler: str | None) -> Workers:
+    if scheduler is not None:
+        return _Cluster(scheduler)
+    return _Processes(jobs or (1 if study.measure == "time" else environment()["cores"]))
+
+
+def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
+    """The row of each task, in the order in which they end."""
+    waiting, suspects = deque(tasks), deque[Task]()
+    sent: dict[Future[Result], Task] = {}
+    began: dict[Future[Result], float] = {}
+    while waiting or sent or suspects:
+        # No worker waits for us; but after a death nothing new starts until its cause is found.
+        while waiting and not suspects and len(sent) < 2 * workers.jobs:
+            try:
+                sent[workers.submit(waiting[0])] = waiting[0]
+                waiting.popleft()
+            except BrokenExecutor:
+                break
+        for future in islice(sent, workers.jobs):  # tasks start in the order of their sending
+            began.setdefault(future, monotonic())
+        ended, _ = wait(sent, timeout=1.0, return_when=FIRST_COMPLETED)
+        for future in ended:
+            task, start = sent.pop(future), began.pop(future, None)
+            answer = _answer(workers, task, future, start)
+            if isinstance(answer, dict):
+                yield answer
+            elif start is None:
+                waiting.appendleft(task)
+            else:
+                suspects.append(task)
+        if not workers.ready():  # what ran before starts anew with the next worker
+            began = dict.fromkeys(began, monotonic())
+        for future, start in list(began.items()):
+            if monotonic() - start > sent[future].hard_limit + _GRACE:
+                del began[future]
+                future.cancel()
+                yield failure(sent.pop(future), _HUNG)
+        if not sent:
+            if suspects or waiting:
+                workers.restart()
+            while suspects:
+                yield _again(workers, suspects.popleft())
+
+
+def _answer(
+    workers: Workers, task: Task, future: Future[Result], start: float | None
+) -> Result | Exception:
+    """The row of a task that ended, or the error where the process died that may have run it."""
+    try:
+        return future.result()
+    except CancelledError as error:
+        if isinstance(workers, _Cluster):
+            raise workers.lost("the connection to the scheduler was lost") from error
+        raise
+    except Exception as error:
+        if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
+            return failure(task, f"{type(error).__name__}: {error}")
+        hung = start is not None and monotonic() - start >= task.hard_limit
+        return failure(task, _HUNG) if hung else error
+
+
+def _again(workers: Workers, task: Task) -> Result:
+    """Run a cell alone at which a process may have died, at last with its solver isolated."""
+    words = ""
+    for isolated in (False, True) if task.cell.backend != OBSERVER else (False,):
+        workers.restart()
+        start = monotonic()
+        future = workers.submit(replace(task, isolated=isolated))
+        if not wait([future], task.hard_limit + _GRACE).done:
+            future.cancel()
+            return failure(task, _HUNG)
+        answer = _answer(workers, task, future, start)
+        if isinstance(answer, dict):
+            if isolated and answer["outcome"] == "done":
+                answer["reason"] = (
+                    f"the backend ran in a process of its own, since the cell's died, twice{words}"
+                )
+            return answer
+        signals = _SIGNALS.search(str(answer))
+        words = f" ({signals[1]})" if signals else ""
+    return failure(task, f"the process that ran it died, twice{words}")
 
 
 def _tasks(
@@ -115,11 +325,11 @@ def _tasks(
         if not missing:
             found += 1
             continue
-        entry = None if cell.backend == OBSERVER else backend(cell.backend)
+        registered = None if cell.backend == OBSERVER else backend(cell.backend)
         tasks.append(
             Task(
                 cell, sources[cell.model], missing, study.cell_timeout,
-                keep=first, shared=shared, entry=entry,
+                keep=first, shared=shared, registered=registered,
             )
         )
     return tasks, found

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CONFIGURATION", "METRICS", "PROBLEM", "TOLERANCE", "pareto_front", "summarise"]
 
-#: What tells configurations apart.
+#: What distinguishes configurations.
 CONFIGURATION = (
     "model", "backend", "qps", "solver_iterations", "horizon", "start", "steps",
 )

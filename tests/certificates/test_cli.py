@@ -14,7 +14,7 @@ from qpmhe.certificates import report as report_module
 from qpmhe.certificates.evidence import OutOfTimeError
 from qpmhe.cli.certify import certify
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError, SetError
-from qpmhe.studies.sources import find, load
+from qpmhe.models.loading import find, load
 
 MODEL = '''
 import numpy as np

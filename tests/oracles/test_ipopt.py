@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.studies import IpoptComparison, PaperStudy
+from qpmhe.studies import PaperStudy
 
 pytest.importorskip("casadi")
 
@@ -14,7 +14,7 @@ pytest.importorskip("casadi")
 def test_converged_sequence_reaches_ipopts_minimum_on_every_window(seed, method):
     study = PaperStudy(seed, 40, method)
     system, observer, cost, scenario = study.model
-    ipopt = IpoptComparison(study).estimator(None)
+    ipopt = study.ipopt(None)
     mhe = qpmhe.MovingHorizonEstimator(
         system, observer, cost, horizon=10, initial_state=scenario.initial_estimate, max_qps=None
     )

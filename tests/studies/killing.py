@@ -16,15 +16,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from qpmhe.studies.errors import StoreError
-from qpmhe.studies.store import Store
+from qpmhe.studies import Store, StoreError
 
 # From so many rows on it waits for a file: however fast the machine, it is met in the middle.
 _CODE = """
 import os, sys, time
-from qpmhe.studies.grid import Study
-from qpmhe.studies.runner import run
-from qpmhe.studies.writer import Writer
+from qpmhe.studies import Study, run
+from qpmhe.studies.store import Writer
 
 options, path, rows, release = sys.argv[1:]
 put = Writer.put

@@ -10,10 +10,7 @@ from tempfile import mkdtemp
 
 import pandas as pd
 
-from qpmhe.studies.grid import Study
-from qpmhe.studies.report import write_report
-from qpmhe.studies.runner import run
-from qpmhe.studies.store import Store
+from qpmhe.studies import Store, Study, run, write_report
 
 BACKENDS = ("daqp", "osqp", "proxqp")
 

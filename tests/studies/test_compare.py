@@ -1,39 +1,43 @@
 """The work of ``qpmhe compare``, ``study`` and ``export``."""
 
-import io
 import signal
 import subprocess
 import sys
 
 import pandas as pd
 import pytest
-from rich.console import Console
+from typer.testing import CliRunner
 
 from qpmhe.cli import compare as commands
+from qpmhe.cli.app import app
 from qpmhe.errors import OptionError, QpmheError
-from qpmhe.studies.store import Store
+from qpmhe.studies import Store
+
+ODD = f'{__file__.rpartition("/")[0]}/odd_models.py'
 
 
-@pytest.fixture
-def console():
-    return Console(file=io.StringIO(), width=140)
+def command(*words):
+    """Output of a command, in one line; its error is raised."""
+    answer = CliRunner().invoke(app, [str(word) for word in words])
+    if answer.exception is not None:
+        raise answer.exception
+    return " ".join(answer.output.split())
 
 
 @pytest.fixture
 def shown(monkeypatch):
     """Calls of the report, which has tests of its own."""
     calls = []
-    monkeypatch.setattr(
-        "qpmhe.cli.report.report", lambda console, store, out: calls.append((store, out))
-    )
+    monkeypatch.setattr(commands, "show_report", lambda _, store, out: calls.append((store, out)))
     return calls
 
 
-def test_compare_runs_the_study_of_its_options(tmp_path, console, shown):
+def test_compare_runs_the_study_of_its_options(tmp_path, shown):
     path, out = tmp_path / "store.sqlite", tmp_path / "report"
-    commands.compare(
-        console, store=path, out=out, backends=["daqp"], qps="0,2, converged",
-        solver_iterations="none", horizons="default,3", seeds=1, steps=10, jobs=1,
+    text = command(
+        "compare", "--store", path, "--out", out, "--backend", "daqp", "--qps", "0,2, converged",
+        "--solver-iterations", "none", "--horizons", "default,3", "--seeds", 1, "--steps", 10,
+        "--jobs", 1,
     )
     frame = Store(path).frame()
     assert set(frame["outcome"]) == {"done"}
@@ -41,72 +45,66 @@ def test_compare_runs_the_study_of_its_options(tmp_path, console, shown):
     assert set(frame["qps"].dropna()) == {0, 2}
     assert len(frame) == 2 * 3
     assert shown == [(path, out)]
-    assert "6/6" in console.file.getvalue()
+    assert "6/6" in text
 
 
 @pytest.mark.parametrize(
-    ("option", "words"),
+    ("option", "value", "words"),
     [
-        ({"qps": "0,two"}, "--qps has 'two'; expected integers between commas, or 'converged'"),
-        ({"qps": "none"}, "--qps has 'none'"),
-        ({"solver_iterations": ""}, "--solver-iterations has ''"),
-        ({"horizons": "converged"}, "--horizons has 'converged'"),
+        ("--qps", "0,two", "--qps has 'two'; expected integers between commas, or 'converged'"),
+        ("--qps", "none", "--qps has 'none'"),
+        ("--solver-iterations", "", "--solver-iterations has ''"),
+        ("--horizons", "converged", "--horizons has 'converged'"),
     ],
 )
-def test_options_that_do_not_fit_are_refused(tmp_path, console, option, words):
+def test_options_that_do_not_fit_are_refused(tmp_path, option, value, words):
     with pytest.raises(OptionError, match=words):
-        commands.compare(console, store=tmp_path / "s.sqlite", out=tmp_path, **option)
+        command("compare", "--store", tmp_path / "s.sqlite", "--out", tmp_path, option, value)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_study_file_names_store_and_report(tmp_path, console, shown):
+def study_file(tmp_path, **options):
     file = tmp_path / "mine.toml"
-    file.write_text('backends = ["banded"]\nqps = [1]\nseeds = 2\nsteps = 10\n')
-    commands.study(console, file)
-    assert len(Store(tmp_path / "mine.sqlite").frame()) == 2
-    commands.study(console, file, out=tmp_path / "there")
-    assert "2 of 2 cells were there already" in console.file.getvalue()
-    store = tmp_path / "mine.sqlite"
+    settings = {"backends": ["banded"], "qps": [1], "seeds": 2, "steps": 10, **options}
+    file.write_text("".join(f"{key} = {value!r}\n" for key, value in settings.items()))
+    return file
+
+
+def test_a_study_file_names_store_and_report(tmp_path, shown):
+    file, store = study_file(tmp_path), tmp_path / "mine.sqlite"
+    command("study", file)
+    assert len(Store(store).frame()) == 2
+    assert "2 of 2 cells were there already" in command("study", file, "--out", tmp_path / "there")
     assert shown == [(store, tmp_path / "mine-report"), (store, tmp_path / "there")]
-    commands.export(console, store, tmp_path / "cells.csv")
+    command("export", store, tmp_path / "cells.csv")
     assert len(pd.read_csv(tmp_path / "cells.csv")) == 2
 
 
-ODD = f'{__file__.rpartition("/")[0]}/odd_models.py'
-
-
-def test_failed_cells_are_told(tmp_path, console, shown):
-    file = tmp_path / "mine.toml"
-    file.write_text(
-        f'models = ["{ODD}:raises"]\nbackends = ["banded"]\nqps = [1]\nseeds = 2\nsteps = 10\n'
-    )
-    commands.study(console, file)
-    assert "1 of 2 cells failed; their rows tell why." in console.file.getvalue()
+def test_failed_cells_are_reported(tmp_path, shown):
+    text = command("study", study_file(tmp_path, models=[f"{ODD}:raises"]))
+    assert "1 of 2 cells failed; the report gives the reasons." in text
     assert len(shown) == 1
 
 
-def test_a_study_of_which_every_cell_failed_is_an_error(tmp_path, console, shown):
-    options = {
-        "store": tmp_path / "s.sqlite", "out": tmp_path, "backends": ["banded"], "qps": "1",
-        "solver_iterations": "none", "steps": 10, "jobs": 1,
-    }
-    commands.compare(console, **options, seeds=1)  # cells of other studies do not count
-    file = tmp_path / "mine.toml"
-    file.write_text(
-        f'models = ["{ODD}:raises"]\nbackends = ["banded"]\nqps = [1]\nseeds = [1]\nsteps = 10\n'
+def test_a_study_of_which_every_cell_failed_is_an_error(tmp_path, shown):
+    store = tmp_path / "s.sqlite"
+    command(  # cells of other studies do not count
+        "compare", "--store", store, "--out", tmp_path, "--backend", "banded", "--qps", 1,
+        "--solver-iterations", "none", "--steps", 10, "--jobs", 1, "--seeds", 1,
     )
-    words = "no cell of the study was finished, 1 failed;.*ZeroDivisionError.*--retry-failed"
+    file = study_file(tmp_path, models=[f"{ODD}:raises"], seeds=[1])
+    words = "no cell of the study finished, 1 failed;.*ZeroDivisionError.*--retry-failed"
     for _ in range(2):  # also where they had failed before
         with pytest.raises(QpmheError, match=words):
-            commands.study(console, file, store=options["store"], jobs=1)
+            command("study", file, "--store", store, "--jobs", 1)
     assert len(shown) == 3  # the report is there all the same
 
 
-def test_an_ended_study_leaves_in_good_order(tmp_path):
+def test_a_terminated_study_ends_its_workers_and_says_how_to_resume(tmp_path):
     code = """
 import os, signal, sys
 from qpmhe.cli import app
-from qpmhe.studies.writer import Writer
+from qpmhe.studies.store import Writer
 put = Writer.put
 def last(writer, result):
     put(writer, result)
@@ -122,17 +120,20 @@ app.main()
         capture_output=True, text=True, timeout=300, check=False,
     )
     assert ended.returncode == 128 + signal.SIGTERM
-    assert "the same command goes on" in " ".join(ended.stdout.split())
+    assert "the same command resumes the study" in " ".join(ended.stdout.split())
     assert "resource_tracker" not in ended.stderr
     assert "Traceback" not in ended.stderr
     assert 1 <= len(Store(path).frame()) < 50
 
 
-def test_an_interrupted_study_tells_how_to_go_on(tmp_path, console, monkeypatch):
+def test_an_interrupted_study_says_how_to_resume(tmp_path, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(commands, "run", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        commands.compare(console, store=tmp_path / "s.sqlite", out=tmp_path, backends=["banded"])
-    assert "the same command goes on" in " ".join(console.file.getvalue().split())
+    answer = CliRunner().invoke(app, [
+        "compare", "--store", str(tmp_path / "s.sqlite"), "--out", str(tmp_path),
+        "--backend", "banded",
+    ])
+    assert answer.exit_code != 0
+    assert "the same command resumes the study" in " ".join(answer.output.split())

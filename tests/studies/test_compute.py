@@ -7,10 +7,9 @@ import pytest
 
 import qpmhe_solvers
 from qpmhe.models import batch_reactor
-from qpmhe.studies import compute as module
-from qpmhe.studies.cell import Cell, Task
-from qpmhe.studies.compute import compute
-from qpmhe.studies.sources import find
+from qpmhe.models.loading import find
+from qpmhe.studies import cell as module
+from qpmhe.studies.cell import Cell, Task, compute
 
 ODD = "tests/studies/odd_models.py"
 
@@ -73,7 +72,7 @@ def test_the_trajectory_is_kept_where_it_is_wanted():
 def test_a_users_backend_travels_with_the_task():
     banded = qpmhe_solvers.backend("banded")
     entry = qpmhe_solvers.Backend("mine", banded.factory, "banded", inequalities=False)
-    sent = pickle.loads(pickle.dumps(task(backend="mine", entry=entry)))
+    sent = pickle.loads(pickle.dumps(task(backend="mine", registered=entry)))
     try:
         row = compute(sent)
         assert (row["outcome"], row["backend"]) == ("done", "mine")

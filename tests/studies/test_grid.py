@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from qpmhe.errors import BackendError, OptionError, QpmheError, UnknownOptionError
+from qpmhe.errors import BackendError, ModelError, OptionError, QpmheError, UnknownOptionError
 from qpmhe.models import batch_reactor
 from qpmhe.studies.errors import StudyError
 from qpmhe.studies.grid import Study
@@ -70,20 +70,20 @@ def test_lists_may_be_any_iterable_and_single_values_stand_for_lists():
     ("options", "error", "words"),
     [
         ({"models": []}, StudyError, "models is empty"),
-        ({"models": ["reactor"]}, StudyError, "expected one of batch_reactor"),
-        ({"models": [3]}, StudyError, "the model is 3"),
-        ({"models": ["chain_of_masses(2)"]}, StudyError, "plain values by keyword"),
-        ({"models": ["chain_of_masses(masses=open)"]}, StudyError, "plain values"),
-        ({"models": ["chain_of_masses(mases=2)"]}, StudyError, "mases"),
-        ({"models": ["chain_of_masses(masses=0)"]}, StudyError, "masses is 0"),
-        ({"models": ["nowhere.py:make"]}, StudyError, "nowhere.py"),
-        ({"models": ["no.such.module:make"]}, StudyError, "cannot import no.such.module"),
-        ({"models": ["os.path:no_such"]}, StudyError, "has no function no_such"),
-        ({"models": ["os:3"]}, StudyError, "expected a name of the catalogue"),
-        ({"models": [f"{ODD}:not_callable"]}, StudyError, "no function not_callable"),
-        ({"models": [f"{ODD}:cannot_be_made"]}, StudyError, "RuntimeError: no such reactor"),
-        ({"models": [f"{ODD}:three_parts"]}, StudyError, "expected (system, observer, cost"),
-        ({"models": [f"{ODD}:wrong_part"]}, StudyError, "gave a str for its cost"),
+        ({"models": ["reactor"]}, ModelError, "expected one of batch_reactor"),
+        ({"models": [3]}, ModelError, "the model is 3"),
+        ({"models": ["chain_of_masses(2)"]}, ModelError, "plain values by keyword"),
+        ({"models": ["chain_of_masses(masses=open)"]}, ModelError, "plain values"),
+        ({"models": ["chain_of_masses(mases=2)"]}, ModelError, "mases"),
+        ({"models": ["chain_of_masses(masses=0)"]}, ModelError, "masses is 0"),
+        ({"models": ["nowhere.py:make"]}, ModelError, "nowhere.py"),
+        ({"models": ["no.such.module:make"]}, ModelError, "cannot import no.such.module"),
+        ({"models": ["os.path:no_such"]}, ModelError, "has no function no_such"),
+        ({"models": ["os:3"]}, ModelError, "expected a name of the catalogue"),
+        ({"models": [f"{ODD}:not_callable"]}, ModelError, "no function not_callable"),
+        ({"models": [f"{ODD}:cannot_be_made"]}, ModelError, "RuntimeError: no such reactor"),
+        ({"models": [f"{ODD}:three_parts"]}, ModelError, "expected (system, observer, cost"),
+        ({"models": [f"{ODD}:wrong_part"]}, ModelError, "gave a str for its cost"),
         ({"backends": []}, StudyError, "backends is empty"),
         ({"backends": ["osq"]}, BackendError, "'osq' is not known"),
         ({"backends": [None]}, BackendError, "None is not known"),

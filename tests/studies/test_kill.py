@@ -1,14 +1,13 @@
 import subprocess
 import sys
 
-from qpmhe.studies.grid import Study
+from qpmhe.studies import Study
 
 from .killing import kill_and_finish, start
 
 _READ = """
 import sys
-from qpmhe.studies.errors import StoreError
-from qpmhe.studies.store import Store
+from qpmhe.studies import Store, StoreError
 
 rows, reads = 0, 0
 while rows < int(sys.argv[2]):

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.models.loading import find
 from qpmhe.studies import metrics
-from qpmhe.studies.cell import OBSERVER, Cell, Task
-from qpmhe.studies.compute import compute
-from qpmhe.studies.sources import find
+from qpmhe.studies.cell import OBSERVER, Cell, Task, compute
 
 ALL = frozenset({"accuracy", "time", "covariance"})
 STEPS = 40

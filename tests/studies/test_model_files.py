@@ -7,14 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qpmhe.errors import QpmheError
-from qpmhe.studies.cell import Task
-from qpmhe.studies.compute import compute
-from qpmhe.studies.errors import StoreError, StudyError
-from qpmhe.studies.grid import Study
-from qpmhe.studies.model_files import fingerprint, module_file
-from qpmhe.studies.runner import run
-from qpmhe.studies.sources import find, load
+from qpmhe.errors import ModelError, QpmheError
+from qpmhe.models.loading import find, fingerprint, load, module_file
+from qpmhe.studies import StoreError, Study, run
+from qpmhe.studies.cell import Task, compute
 
 OWN = "from qpmhe.models import batch_reactor\n\ndef make():\n    return batch_reactor({})\n"
 HELPER = "method = {!r}\n"
@@ -126,7 +122,7 @@ def test_modules_without_a_file_of_their_own(here):
     assert module_file("changing.nothing") is None
     assert module_file("changing") == (here / "changing.py").resolve()
     assert find("batch_reactor").fingerprint == ""
-    with pytest.raises(StudyError, match=r"cannot import sys\.no"):
+    with pytest.raises(ModelError, match=r"cannot import sys\.no"):
         load(find("sys.no:make"))
     with pytest.raises(QpmheError, match="changing"):
         find("changing.py/x.py:make")

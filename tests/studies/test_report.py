@@ -1,3 +1,4 @@
+import json
 import re
 import subprocess
 import sys
@@ -12,12 +13,9 @@ from matplotlib.image import imread
 from qpmhe.errors import InvalidInputError
 from qpmhe.studies.report import cases, write_report
 from qpmhe.studies.report.answers import failures, limitations
-from qpmhe.studies.report.profile import profiles
-from qpmhe.studies.report.runs import choose
-from qpmhe.studies.report.static import figures
-from qpmhe.studies.report.static_time import performance
-from qpmhe.studies.report.style import styles
-from qpmhe.studies.report.times import spreads
+from qpmhe.studies.report.drawing import styles
+from qpmhe.studies.report.figures import profiles, spreads
+from qpmhe.studies.report.page import Part, choose_runs, files
 from qpmhe.studies.report.words import configuration_words, number, percent, seconds
 from qpmhe.studies.summary import summarise
 
@@ -118,7 +116,9 @@ def test_spreads_are_quantiles_of_all_steps():
     times = np.concatenate(list(mine.times)).astype(float)
     one = found["daqp", "2"]
     assert one.steps == 120 == times.size
-    assert (one.median, one.most) == pytest.approx((np.median(times), times.max()))
+    assert one.quantiles == pytest.approx(
+        np.quantile(times, (0.01, 0.25, 0.5, 0.75, 0.99, 1.0)).tolist()
+    )
 
 
 def test_profile_against_its_definition():
@@ -176,15 +176,15 @@ def test_thirty_backends_look_different():
 
 def test_no_text_is_clipped_or_covered():
     rows = frame()
-    drawn = styles(rows.backend)
-    found = [performance(profiles(rows), drawn)]
+    parts = []
     for case in cases(summarise(rows)):
         cells = rows[rows.horizon == case.summary.horizon.iloc[0]]
-        runs = choose(stored(), cells, case, 100_000)
+        runs = choose_runs(stored(), cells, case, 100_000)
         assert runs.observer is not None
-        found += figures(case, cells, drawn, 1e-3, runs).values()
+        parts.append(Part(case, cells, 1e-3, runs))
+    found = files(parts, styles(rows.backend), profiles(rows))
     assert len(found) == 9
-    for figure in found:
+    for figure in found.values():
         figure.draw_without_rendering()
         drawn_box, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
         assert drawn_box.x0 >= -0.01
@@ -221,10 +221,10 @@ def test_report_is_whole_and_needs_no_network():
 def test_runs_for_which_there_is_no_room_are_counted():
     rows = frame().query("horizon == 10")
     case = next(one for one in cases(summarise(rows)))
-    runs = choose(stored(), rows, case, 0)
+    runs = choose_runs(stored(), rows, case, 0)
     assert runs.left_out == 7 - len(runs.all)
     assert 2 <= len(runs.all) < 7
-    assert choose(stored(), rows, case, 10**6).left_out == 0
+    assert choose_runs(stored(), rows, case, 10**6).left_out == 0
 
 
 def test_frame_and_meta_do(tmp_path):
@@ -238,6 +238,43 @@ def test_failed_runs_are_listed_and_escaped(tmp_path):
     text = page.read_text(encoding="utf-8")
     assert "&lt;/script&gt;&lt;b&gt;out of time" in text
     assert "</script><b>" not in text
+
+
+def embedded(page):
+    """The texts of the page's script elements, as a browser ends them, and the figures' data."""
+    text = page.read_text(encoding="utf-8")
+    scripts = re.findall(r"<script[^>]*>(.*?)</script>", text, re.DOTALL)
+    return scripts, next(json.loads(one) for one in scripts if one.startswith('{"cases"'))
+
+
+def test_the_figures_are_what_plotly_takes():
+    graph_objects = pytest.importorskip("plotly.graph_objects")
+    _, data = embedded(written())
+    for case in data["cases"].values():
+        figures = [case[name] for name in ("anytime", "times", "profile", "trajectories")]
+        for figure in [*figures, *case["accuracy"].values()]:
+            graph_objects.Figure(figure)  # raises where plotly does not know a property
+            assert figure["data"]
+
+
+@pytest.mark.parametrize("label", ["<!--<script>", "</script>", "]]><!--"])
+def test_no_text_of_a_user_reaches_into_the_script_elements(tmp_path, label):
+    class Labelled(Altered):
+        def trajectory(self, key):
+            return {**stored().trajectory(key), "labels": [label, "y"]}
+
+    rows = frame()
+    rows.loc[rows.horizon == 4, "model"] = f"m.py:make(label={label!r})"
+    scripts, data = embedded(write_report(Labelled(rows), tmp_path))
+    plain, _ = embedded(written())
+    assert len(scripts) == len(plain)
+    # "<!--" and then "<script" would keep a browser within the element beyond its end.
+    assert [one.count("<!--") for one in scripts] == [one.count("<!--") for one in plain]
+    titles = [
+        axis["title"]["text"] for case in data["cases"].values()
+        for name, axis in case["trajectories"]["layout"].items() if name.startswith("yaxis")
+    ]
+    assert titles == [label, "y"] * 2
 
 
 def test_nothing_to_report(tmp_path):
@@ -262,6 +299,6 @@ def test_libraries_are_loaded_late():
 
 
 def test_missing_library_is_named(monkeypatch, tmp_path):
-    monkeypatch.setattr("qpmhe.studies.report.write.find_spec", lambda name: name != "itables")
+    monkeypatch.setattr("qpmhe.studies.report.page.find_spec", lambda name: name != "itables")
     with pytest.raises(InvalidInputError, match=r"itables.*qpmhe\[studies\]"):
         write_report(stored(), tmp_path)

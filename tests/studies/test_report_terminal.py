@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from qpmhe.cli.report import report, show
+from qpmhe.cli.report import show, show_report
 from qpmhe.errors import QpmheError
 from qpmhe.studies.summary import summarise
 
@@ -92,8 +92,8 @@ def test_many_configurations_are_cut_to_the_telling_ones():
 
 def test_report_shows_and_writes(tmp_path):
     console = recorder(120)
-    page = report(console, stored().path, tmp_path / "out")
-    assert page.is_file()
+    show_report(console, stored().path, tmp_path / "out")
+    assert (tmp_path / "out" / "index.html").is_file()
     text = console.export_text()
     assert "Fastest within 1 % of the best RMSE" in text
     assert "index.html" in text.replace("\n", "")
@@ -101,5 +101,5 @@ def test_report_shows_and_writes(tmp_path):
 
 def test_no_store(tmp_path):
     with pytest.raises(QpmheError, match=r"none\.sqlite"):
-        report(recorder(80), tmp_path / "none.sqlite", tmp_path / "out")
+        show_report(recorder(80), tmp_path / "none.sqlite", tmp_path / "out")
     assert not (tmp_path / "out").exists()

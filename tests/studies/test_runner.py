@@ -11,11 +11,8 @@ from solvers.problems import registered
 import qpmhe
 import qpmhe_solvers
 from qpmhe.errors import InvalidInputError, OptionError
-from qpmhe.studies import database, runner
-from qpmhe.studies.errors import StoreError, StudyError
-from qpmhe.studies.grid import Study
-from qpmhe.studies.runner import run
-from qpmhe.studies.store import Store
+from qpmhe.studies import Store, StoreError, Study, StudyError, run, runner
+from qpmhe.studies import store as store_module
 
 ODD = "tests/studies/odd_models.py"
 SMALL = {"backends": ["banded"], "qps": [0, 1], "seeds": 2, "steps": 12}
@@ -31,21 +28,14 @@ def console():
 
 
 def counted(monkeypatch):
-    """Cells that are handed to the pool."""
-    handed, plain = [], runner.local
+    """Cells that are handed to the workers."""
+    handed, plain = [], runner._results
 
-    def local(study, jobs):
-        pool = plain(study, jobs)
-        results = pool.results
+    def results(workers, tasks):
+        handed.extend(task.cell.key for task in tasks)
+        return plain(workers, tasks)
 
-        def noting(tasks):
-            handed.extend(task.cell.key for task in tasks)
-            return results(tasks)
-
-        pool.results = noting
-        return pool
-
-    monkeypatch.setattr(runner, "local", local)
+    monkeypatch.setattr(runner, "_results", results)
     return handed
 
 
@@ -106,9 +96,9 @@ def test_cells_that_are_timed_side_by_side_are_marked(path):
 @pytest.mark.parametrize(
     ("model", "words", "timeout"),
     [
-        ("crashes", "died, twice (Segmentation fault), in", 60.0),
-        ("is_killed", "the process that ran it died, twice", 60.0),
-        ("hangs", "out of time: the process that ran it was ended", 6.0),
+        ("crashes", "the process that ran it died, twice (SIGSEGV", 60.0),
+        ("is_killed", "the process that ran it died, twice (SIGKILL", 60.0),
+        ("hangs", "out of time: the process that ran it did not answer", 6.0),
     ],
 )
 def test_a_cell_that_ends_its_process_is_a_row(path, model, words, timeout):
@@ -167,14 +157,13 @@ def test_a_cell_whose_backend_crashes_is_run_again_with_the_backend_apart(path):
             assert row.reason == ""
             continue
         assert row.reason == (
-            "the backend ran in a process of its own, since the first one died "
-            "(Segmentation fault)"
+            "the backend ran in a process of its own, since the cell's died, twice (SIGSEGV(-11))"
         )
         assert sum(n for flags, n in row.reasons.items() if "SOLVER_FAILED" in flags) == 1
 
 
 def test_a_full_disk_in_the_middle_is_told_and_the_same_call_goes_on(path, monkeypatch):
-    plain = database.create
+    plain = store_module._create
 
     def small(connection):
         plain(connection)
@@ -182,7 +171,7 @@ def test_a_full_disk_in_the_middle_is_told_and_the_same_call_goes_on(path, monke
         connection.execute(f"PRAGMA max_page_count = {pages + 3}")
 
     study = Study(**{**SMALL, "seeds": 20})
-    monkeypatch.setattr(database, "create", small)
+    monkeypatch.setattr(store_module, "_create", small)
     with pytest.raises(StoreError, match="disk is full; all cells that were stored are safe"):
         run(study, path, progress=False)
     monkeypatch.undo()

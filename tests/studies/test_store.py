@@ -8,13 +8,10 @@ import pandas as pd
 import pytest
 
 from qpmhe.errors import InvalidInputError, OptionError
-from qpmhe.studies import database, export, rows
-from qpmhe.studies.cell import Cell, Task
-from qpmhe.studies.compute import compute, failure
-from qpmhe.studies.errors import StoreError
-from qpmhe.studies.grid import Study
-from qpmhe.studies.sources import find
-from qpmhe.studies.store import Store
+from qpmhe.models.loading import find
+from qpmhe.studies import Store, StoreError, Study, export
+from qpmhe.studies import store as module
+from qpmhe.studies.cell import Cell, Task, compute, failure
 
 SETTINGS = Study(backends=["banded"], deadline=1e-6).settings()
 BOTH = ("accuracy", "time")
@@ -45,7 +42,7 @@ def test_a_row_comes_back_as_it_was_put(path):
     frame = store.frame()
     assert list(frame["seed"]) == [0, 1]
     row = frame.iloc[0]
-    for name in rows.COLUMNS:
+    for name in module.COLUMNS:
         if name in ("environment", "finished", "parts"):
             continue
         if name == "times":
@@ -69,7 +66,7 @@ def test_a_reader_sees_one_moment(path, monkeypatch):
     """The writer makes its tables while a reader asks whether there are any."""
     with closing(sqlite3.connect(path)) as connection:  # or the reader's lock holds it up
         connection.execute("PRAGMA journal_mode = WAL")
-    tables = database._tables
+    tables = module._tables
 
     def written_meanwhile(connection):
         monkeypatch.undo()
@@ -77,7 +74,7 @@ def test_a_reader_sees_one_moment(path, monkeypatch):
         stored(path)
         return found
 
-    monkeypatch.setattr(database, "_tables", written_meanwhile)
+    monkeypatch.setattr(module, "_tables", written_meanwhile)
     with pytest.raises(StoreError, match="is empty"):
         Store(path).frame()
     assert Store(path).frame().empty
@@ -89,7 +86,7 @@ def test_meta_tells_settings_and_environments(path):
     store = stored(path, result, other, compute(task(2)))
     meta = store.meta()
     assert meta["study"] == SETTINGS
-    assert meta["schema"] == database.SCHEMA
+    assert meta["schema"] == module.SCHEMA
     assert meta["environments"] == [result["environment"], other["environment"]]
     assert list(store.frame()["environment"]) == [0, 1, 0]
     stored(path, settings={**SETTINGS, "deadline": None})
@@ -170,9 +167,9 @@ def test_a_file_that_is_not_there_is_told_to_readers(path):
 def test_what_is_no_file_is_told_with_the_remedy(path):
     os.mkfifo(path)
     before = sorted(path.parent.iterdir())
-    for store, what in ((path, "a device or the like"), (path.parent, "a folder")):
+    for store in (path, path.parent):
         for use in (Store(store).frame, lambda at=store: Store(at).writing().__enter__()):
-            with pytest.raises(StoreError, match=f"is {what}; name a file"):
+            with pytest.raises(StoreError, match="is no regular file; name one"):
                 use()
     assert sorted(path.parent.iterdir()) == before
 
@@ -190,9 +187,9 @@ def test_a_file_that_is_no_store_is_refused(path):
 def test_a_store_of_another_version_is_refused(path):
     stored(path)
     with sqlite3.connect(path) as connection:
-        connection.execute(f"PRAGMA user_version = {database.SCHEMA + 1}")
+        connection.execute(f"PRAGMA user_version = {module.SCHEMA + 1}")
     connection.close()
-    refused(path, f"schema version {database.SCHEMA + 1}; this qpmhe reads")
+    refused(path, f"schema version {module.SCHEMA + 1}; this qpmhe reads")
 
 
 @pytest.mark.parametrize("share", [0.001, 0.02, 0.3, 0.6, 0.9, 0.999])
@@ -230,7 +227,7 @@ def test_one_process_writes(path):
 
 
 def test_a_store_locked_by_another_program_is_told(path, monkeypatch):
-    monkeypatch.setattr(database, "_PATIENCE", 0.05)
+    monkeypatch.setattr(module, "_PATIENCE", 0.05)
     store, result = stored(path, compute(task())), compute(task(1))
     other = sqlite3.connect(path, isolation_level=None)
     try:
@@ -246,9 +243,9 @@ def test_a_store_locked_by_another_program_is_told(path, monkeypatch):
 
 
 def test_a_store_that_cannot_be_written_is_told(path, monkeypatch):
-    store, plain = stored(path, compute(task())), database.connect
+    store, plain = stored(path, compute(task())), module._connect
     monkeypatch.setattr(
-        database, "connect",
+        module, "_connect",
         lambda path, mode: plain(path, "ro" if path.suffix == ".sqlite" else mode),
     )
     with pytest.raises(StoreError, match="make file and folder writable"), store.writing() as one:

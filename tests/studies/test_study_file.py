@@ -2,8 +2,7 @@ import re
 
 import pytest
 
-from qpmhe.studies.errors import StudyError
-from qpmhe.studies.grid import Study
+from qpmhe.studies import Study, StudyError
 
 GOOD = """\
 # every option

@@ -22,15 +22,7 @@ _FEW_SEEDS = 10
 
 @dataclass(frozen=True)
 class Answer:
-    """One answer.
-
-    Parameters
-    ----------
-    question : str
-        What it answers, in a few words.
-    text : str
-        The answer.
-    """
+    """A question in a few words, and its answer."""
 
     question: str
     text: str
@@ -40,14 +32,8 @@ class Answer:
 class Case:
     """The configurations that can be compared: those of one model, horizon and record length.
 
-    Parameters
-    ----------
-    key : str
-        A short name for files and links.
-    title : str
-        Model, horizon, and length of the records where there are several.
-    summary : pandas.DataFrame
-        Their rows of `qpmhe.studies.summarise`.
+    ``key`` names files and links, ``title`` is for reading, and ``summary`` has their rows of
+    `qpmhe.studies.summarise`.
     """
 
     key: str
@@ -74,7 +60,7 @@ class Case:
                 f"(median), RMSE {_limited(fastest, 'rmse')}.",
             ))
         else:
-            found.append(Answer("Fastest", "The study holds no times: it measured accuracy only."))
+            found.append(Answer("Fastest", "The study has no times: it measured accuracy only."))
         found.append(Answer("Most accurate", self._accurate(accurate, fastest)))
         observer = self._observer(fastest if fastest is not None else accurate)
         return [*found, *([observer] if observer else []), self._failed()]
@@ -91,7 +77,7 @@ class Case:
     def _accurate(self, accurate: Any, fastest: Any) -> str:
         same = fastest is not None and fastest.name == accurate.name
         text = (
-            "That one too" if same
+            "The same one" if same
             else f"{configuration_words(accurate)}: RMSE {_limited(accurate, 'rmse')}"
             + ("" if fastest is None else f", {seconds(accurate['time_median'])} per step")
         )
@@ -127,22 +113,22 @@ class Case:
 
     def _failed(self) -> Answer:
         rows = self.summary[self.summary["backend"] != "observer"]
-        never, told = [], []
+        never, failures = [], []
         for backend, mine in rows.groupby("backend"):
             cells, failed = int(mine["seeds"].sum()), int(mine["failures"].sum())
             share = mine["failed_steps"].max()
             if failed:
-                told.append(f"{backend}: {failed} of {cells} runs failed")
+                failures.append(f"{backend}: {failed} of {cells} runs failed")
             elif share > 0:
                 worst = configuration_words(mine.loc[mine["failed_steps"].idxmax()])
-                told.append(f"{worst}: no run, but {percent(share)} of the steps")
+                failures.append(f"{worst}: no run, but {percent(share)} of the steps")
             else:
                 never.append(str(backend))
-        if not told:
+        if not failures:
             everyone = "No backend failed" if len(never) != 1 else f"{never[0]} did not fail"
             return Answer("Failures", f"{everyone}, in any run or step.")
         text = f"Never: {listed(never)}. " if never else "Every backend failed somewhere. "
-        return Answer("Failures", f"{text}Failed: {'; '.join(told)}.")
+        return Answer("Failures", f"{text}Failed: {'; '.join(failures)}.")
 
 
 def _limited(row: Any, name: str) -> str:
@@ -175,18 +161,8 @@ def chosen(summary: DataFrame) -> tuple[Any | None, Any] | None:
     """The fastest configuration near the best RMSE, and the most accurate one.
 
     Where several have the best RMSE within `qpmhe.studies.summary.TOLERANCE`, the fastest of
-    these stands for them.
-
-    Parameters
-    ----------
-    summary : pandas.DataFrame
-        Rows of one problem.
-
-    Returns
-    -------
-    tuple of row or None
-        The first is None where there are no times; None in all where no configuration
-        finished all its runs.
+    these is taken. The first is None where there are no times; all is None where no
+    configuration finished all its runs.
     """
     rows = summary[(summary["failures"] == 0) & np.isfinite(summary["rmse"].astype(float))]
     if rows.empty:
@@ -203,21 +179,10 @@ def chosen(summary: DataFrame) -> tuple[Any | None, Any] | None:
 
 
 def failures(frame: DataFrame) -> list[dict[str, Any]]:
-    """Failed cells by configuration and reason, the most frequent first.
-
-    Parameters
-    ----------
-    frame : pandas.DataFrame
-        One row a cell.
-
-    Returns
-    -------
-    list of dict
-        ``model``, ``configuration``, ``reason``, ``seeds``.
-    """
+    """Failed cells by ``model``, ``configuration`` and ``reason``, the most frequent first."""
     found: dict[tuple[str, str, str], list[int]] = {}
     for _, row in frame[frame["outcome"] != "done"].iterrows():
-        reason = "not told" if missing(row["reason"]) or not row["reason"] else str(row["reason"])
+        reason = "unknown" if missing(row["reason"]) or not row["reason"] else str(row["reason"])
         key = (str(row["model"]), configuration_words(row), reason)
         found.setdefault(key, []).append(int(row["seed"]))
     ranked = sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))
@@ -228,23 +193,15 @@ def failures(frame: DataFrame) -> list[dict[str, Any]]:
 
 
 def limitations(frame: DataFrame, summary: DataFrame) -> list[str]:
-    """What the reader must know before trusting the figures.
-
-    Parameters
-    ----------
-    frame : pandas.DataFrame
-        One row a cell.
-    summary : pandas.DataFrame
-        Its summary.
-    """
+    """What the reader must know before trusting the figures."""
     seeds = int(summary["seeds"].max())
     notes = [
-        "A time is that of a whole update: the observer's step, building the QPs, the solver, "
-        "and the verdict on its iterate. It is not the solver's own.",
-        "An RMSE is that of the whole state vector, in the states' own units; where these "
-        "differ in size, the largest rules. The table gives it for each state.",
-        "Confidence limits are those of the mean over seeds (Student's, 95 %). They tell how "
-        "far other noise may move a figure, not another machine, model or tuning.",
+        "A time covers a whole update: the observer's step, building the QPs, the solver, and the "
+        "verdict on its iterate.",
+        "An RMSE covers the whole state vector, in the states' own units; where these differ in "
+        "size, the largest dominates. The table gives it for each state.",
+        "Confidence limits are of the mean over seeds (Student's, 95 %). They cover other noise, "
+        "not another machine, model or tuning.",
         f"RMSEs within {percent(TOLERANCE)} count as equal on the Pareto front.",
     ]
     timed = frame[frame["time_median"].notna()]
@@ -263,7 +220,7 @@ def limitations(frame: DataFrame, summary: DataFrame) -> list[str]:
             "below); times of one are not comparable to those of another."
         )
     if seeds == 1:
-        notes.append("There is one seed only: no confidence limits, no way to tell luck.")
+        notes.append("There is one seed only: no confidence limits, and luck cannot be ruled out.")
     elif seeds < _FEW_SEEDS:
         notes.append(f"There are {seeds} seeds only: the confidence limits are wide.")
     short = int((summary["seeds"] < seeds).sum())

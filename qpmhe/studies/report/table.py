@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from .words import cap_words, missing, percent, qps_words
+from .words import cap_words, missing, percent, qps_words, ranked
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -74,13 +74,7 @@ def bundle() -> str:
 
 
 def table(cases: list[Case]) -> str:
-    """HTML of the table; numbers are sorted as numbers, whatever is shown.
-
-    Parameters
-    ----------
-    cases : list of Case
-        The study's cases; their keys are in a hidden first column.
-    """
+    """HTML of the table; numbers are sorted as numbers, whatever is shown."""
     import pandas as pd
     from itables import JavascriptFunction, to_html_datatable
 
@@ -149,8 +143,8 @@ def _columns(case: Case) -> DataFrame:
         "model": rows["model"].astype(str),
         "N": ["usual" if missing(one) else str(int(one)) for one in rows["horizon"]],
         "start": rows["start"].astype(str),
-        "QPs": _ranked([qps_words(one) for one in rows["qps"]]),
-        "cap": _ranked([cap_words(one) for one in rows["solver_iterations"]]),
+        "QPs": _ordered([qps_words(one) for one in rows["qps"]]),
+        "cap": _ordered([cap_words(one) for one in rows["solver_iterations"]]),
         "front": ["front" if one else "" for one in rows["pareto"]],
     })
     for name, heading, scale in _NUMBERS:
@@ -160,12 +154,10 @@ def _columns(case: Case) -> DataFrame:
     return frame
 
 
-def _ranked(words: list[str]) -> Any:
-    """Numbers in their order, words after them."""
+def _ordered(words: list[str]) -> Any:
     import pandas as pd
 
-    order = sorted(set(words), key=lambda word: (not word.isdigit(), word.zfill(9)))
-    return pd.Categorical(words, order, ordered=True)
+    return pd.Categorical(words, ranked(words), ordered=True)
 
 
 def _numbers(values: Any) -> str:

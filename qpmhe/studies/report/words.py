@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 __all__ = [
@@ -12,7 +13,9 @@ __all__ = [
     "missing",
     "number",
     "percent",
+    "qps_heading",
     "qps_words",
+    "ranked",
     "seconds",
     "time_tick",
     "usual_first",
@@ -33,19 +36,23 @@ def qps_words(qps: Any) -> str:
     return "converged" if missing(qps) else str(int(qps))
 
 
+def qps_heading(words: str) -> str:
+    """The heading of a column with so many QPs per sample."""
+    return "QPs to convergence" if words == "converged" else f"{words} QP{'s' * (words != '1')}"
+
+
+def ranked(words: Iterable[str]) -> list[str]:
+    """Numbers in their order, words after them; each once."""
+    return sorted(set(words), key=lambda word: (not word.isdigit(), word.zfill(9)))
+
+
 def cap_words(cap: Any) -> str:
     """The cap on a solver's iterations; NA is none."""
     return "none" if missing(cap) else str(int(cap))
 
 
 def configuration_words(row: Any) -> str:
-    """A configuration in a few words: backend, QPs per sample, cap, start if it is not usual.
-
-    Parameters
-    ----------
-    row : mapping
-        A row of the summary or of the frame.
-    """
+    """A row's backend, QPs per sample, cap, and start if it is not the usual one."""
     backend = str(row["backend"])
     if backend == "observer":
         return backend

@@ -1,0 +1,252 @@
+"""The figures of a report, each described once: see `drawing`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..summary import CONFIGURATION, PROBLEM
+from .drawing import Axis, Drawing, Mark, Panel
+from .words import cap_words, configuration_words, missing, number, percent, qps_words, seconds
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+__all__ = ["SOLVED", "Profile", "Spread", "accuracy", "anytime", "performance", "profiles",
+           "spreads", "times"]
+
+Array = NDArray[np.float64]
+
+#: A problem counts as solved if J is on average within this part of the converged one.
+SOLVED = 0.01
+_QUANTILES = (0.01, 0.25, 0.5, 0.75, 0.99, 1.0)
+# Diameters of points, by QPs per sample.
+_SIZES, _LARGEST = {"0": 9.5, "1": 5.1, "2": 6.5}, 8.1
+
+
+def accuracy(summary: DataFrame, metric: str, label: str, front: Any) -> Drawing | None:
+    """Accuracy against time, a point a configuration; ``front`` marks the rows on the front."""
+    usable = summary["time_median"].notna() & np.isfinite(summary[metric].astype(float))
+    rows, best = summary[usable], summary[usable & np.asarray(front, dtype=bool)]
+    if rows.empty:
+        return None
+    best = best.sort_values("time_median")
+    marks = [Mark(
+        "front", best["time_median"].tolist(), best[metric].tolist(),
+        hover=[configuration_words(row) for _, row in best.iterrows()], meta={"role": "front"},
+    )]
+    for backend, mine in rows.groupby("backend", sort=False):
+        marks.append(Mark(
+            "points", mine["time_median"].tolist(), mine[metric].tolist(), str(backend),
+            [_hover(row) for _, row in mine.iterrows()], _bars(mine, metric),
+            sizes=[_SIZES.get(qps_words(one), _LARGEST) for one in mine["qps"]],
+            hollow=mine["solver_iterations"].notna().tolist(),
+            pale=(mine["failures"] > 0).tolist(), meta={"backend": str(backend)},
+        ))
+    return Drawing([Panel(
+        Axis("median time per step", "time", rows["time_median"].tolist()),
+        Axis(label, "error", rows[metric].tolist()), marks,
+    )], 480)
+
+
+def anytime(summary: DataFrame) -> Drawing | None:
+    """RMSE and cost ratio against the cap, a line for each backend and number of QPs per sample."""
+    rest = summary[(summary["backend"] != "observer") & (summary["failures"] == 0)]
+    if rest.empty:
+        return None
+    observer = summary[summary["backend"] == "observer"]
+    caps = sorted({int(cap) for cap in rest["solver_iterations"] if not missing(cap)})
+    order = [*map(str, caps), "none"]
+    panels = []
+    for metric, label in (("rmse", "RMSE"), ("cost_ratio", "J / converged J")):
+        marks = [
+            Mark("level", order, [float(row[metric])] * len(order), "observer",
+                 [_hover(row)] * len(order), meta={"backend": "observer"})
+            for _, row in observer.iterrows() if not missing(row[metric])
+        ]
+        for (backend, qps, start), rows in rest.groupby(
+            ["backend", "qps", "start"], dropna=False, sort=False
+        ):
+            marks.append(Mark(
+                "line", [cap_words(one) for one in rows["solver_iterations"]],
+                rows[metric].astype(float).tolist(), str(backend),
+                [_hover(row) for _, row in rows.iterrows()], _bars(rows, metric),
+                meta={"backend": str(backend), "qps": qps_words(qps), "start": str(start)},
+            ))
+        title = "cap on the solver's iterations" if metric == "cost_ratio" else ""
+        panels.append(Panel(
+            Axis(title, "category", order),
+            Axis(label, "error", summary[metric].astype(float).tolist()), marks,
+        ))
+    return Drawing(panels, 560)
+
+
+def times(found: list[Spread], deadline: float | None) -> Drawing | None:
+    """Step times: boxes of quartiles with 1 % and 99 % whiskers, and the longest step."""
+    if not found:
+        return None
+    backends = sorted({one.backend for one in found} - {"observer"}, reverse=True)
+    names = ["observer"] * any(one.backend == "observer" for one in found) + backends
+    marks = []
+    for one in found:
+        low, first, median, third, high, most = map(seconds, one.quantiles)
+        observer = one.backend == "observer"
+        marks.append(Mark(
+            "box", one.quantiles, [one.backend], one.backend,
+            [f"<b>{one.backend}</b>, {one.steps} steps<br>1 % {low}, 25 % {first}, median {median},"
+             f"<br>75 % {third}, 99 % {high}, longest {most}"],
+            meta={"backend": one.backend, **({} if observer else {
+                "qps": one.qps, "cap": one.cap, "start": one.start})},
+        ))
+    values = [value for one in found for value in one.quantiles]
+    return Drawing(
+        [Panel(Axis("time per step", "time", values), Axis("", "category", names), marks)],
+        180 + 34 * len(names), deadline,
+        "time per step (box: quartiles; whiskers: 1 % and 99 %; tick: longest)"
+        + ("" if deadline is None else "; dotted: deadline"),
+    )
+
+
+def performance(found: list[Profile]) -> Drawing | None:
+    """Performance profiles as steps over a logarithmic axis of time ratios."""
+    if not found:
+        return None
+    largest = max((float(one.ratios[-1]) for one in found if one.ratios.size), default=1.0)
+    last = max(2.0, 1.15 * largest)
+    marks = []
+    for one in found:
+        x, y = one.steps(last)
+        marks.append(Mark(
+            "steps", x.tolist(), y.tolist(), one.backend,
+            [f"<b>{one.words}</b><br>{percent(share)} of {one.problems} problems within "
+             f"{number(ratio)} times the fastest" for ratio, share in zip(x, y, strict=True)],
+            meta={"backend": one.backend}, label=one.words,
+        ))
+    return Drawing([Panel(
+        Axis("time relative to the fastest backend on the problem", "ratio", [1.0, last]),
+        Axis(f"share of {found[0].problems} problems solved", "share"), marks,
+    )], 420)
+
+
+def _hover(row: Any) -> str:
+    lines = [
+        f"<b>{configuration_words(row)}</b>" + (" (Pareto front)" if row["pareto"] else ""),
+        f"RMSE {number(row['rmse'])} ({number(row['rmse_low'])} to {number(row['rmse_high'])})",
+        f"RMSE settled {number(row['rmse_settled'])}, J / converged {number(row['cost_ratio'])}",
+        f"time median {seconds(row['time_median'])} ({seconds(row['time_median_low'])} to "
+        f"{seconds(row['time_median_high'])}), 99 % {seconds(row['time_p99'])}",
+        f"improved {percent(row['improved'])} of the steps, {row['seeds']} seeds"
+        + (f", {row['failures']} failed" if row["failures"] else ""),
+    ]
+    return "<br>".join(lines)
+
+
+def _bars(rows: DataFrame, name: str) -> tuple[list[float], list[float]]:
+    """Confidence limits as error bars, none where runs failed."""
+    mean = rows[name].astype(float).where(rows["failures"] == 0)
+    low, high = (mean - rows[f"{name}_low"]).fillna(0.0), (rows[f"{name}_high"] - mean).fillna(0.0)
+    return low.tolist(), high.tolist()
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Quantiles of all step times of one configuration: 1, 25, 50, 75, 99 %, and the longest."""
+
+    backend: str
+    qps: str
+    cap: str
+    start: str
+    quantiles: list[float]
+    steps: int
+
+
+def spreads(frame: DataFrame) -> list[Spread]:
+    """Quantiles over the steps of all seeds, for each backend, QPs per sample, cap and start."""
+    found = []
+    for (backend, qps, cap, start), rows in frame.groupby(
+        ["backend", "qps", "solver_iterations", "start"], dropna=False
+    ):
+        parts = [np.asarray(one, dtype=float) for one in rows["times"] if one is not None]
+        parts = [one[np.isfinite(one)] for one in parts if one.ndim == 1]
+        values = np.concatenate(parts) if parts else np.empty(0)
+        if values.size:
+            found.append(Spread(
+                str(backend), qps_words(qps), cap_words(cap), str(start),
+                np.quantile(values, _QUANTILES).tolist(), values.size,
+            ))
+    return found
+
+
+@dataclass(frozen=True)
+class Profile:
+    r"""Share of problems that a solver solves within a factor of the fastest one's time.
+
+    :math:`\rho_s(\tau) = |\{p : t_{p,s} \le \tau \min_{s'} t_{p,s'}\}| / |P|`
+    (Dolan and More, Mathematical Programming 91, 2002, doi 10.1007/s101070100263).
+
+    Attributes
+    ----------
+    backend, words : str
+        The solver, and its configuration.
+    ratios : (k,) array
+        Sorted time ratios of the k problems that it solves.
+    problems : int
+        |P|.
+    """
+
+    backend: str
+    words: str
+    ratios: Array
+    problems: int
+
+    def steps(self, last: float) -> tuple[Array, Array]:
+        """Corners of the curve up to the ratio ``last``: ratios and shares."""
+        x = np.concatenate(([1.0], self.ratios, [last]))
+        y = np.concatenate(([0.0], np.arange(1, self.ratios.size + 1), [self.ratios.size]))
+        return x, y / self.problems
+
+
+def profiles(frame: DataFrame) -> list[Profile]:
+    """A profile for each backend over the problems: model, horizon, length of the record, and seed.
+
+    A backend is represented by the one of its configurations that solves most problems, of
+    several such by the one with the lowest geometric mean time. Solved means: the run
+    finished and its J is on average within `SOLVED` of the converged one. The time is the
+    median per step. There are none where fewer than two problems or no times are there.
+    """
+    problems = [*PROBLEM, "seed"]
+    cells = frame[frame["backend"] != "observer"]
+    names = [tuple(row) for row in cells[problems].astype(str).to_numpy()]
+    count = len(set(names))
+    if count < 2 or not cells["time_median"].notna().any():
+        return []
+    solved = (
+        (cells["outcome"] == "done") & (cells["cost_ratio"].astype(float) <= 1 + SOLVED)
+        & cells["time_median"].notna()
+    )
+    cells = cells.assign(problem=names, solved=solved, time=cells["time_median"].astype(float))
+    # The same settings on different problems are one configuration here.
+    keys = [key for key in CONFIGURATION if key not in problems]
+    best: dict[str, tuple[tuple[float, float], Any, DataFrame]] = {}
+    for _, rows in cells.groupby(keys, dropna=False):
+        mine = rows[rows["solved"]]
+        mean = float(np.log(mine["time"]).mean()) if len(mine) else np.inf
+        rank = (-len(mine), mean)
+        backend = str(rows["backend"].iloc[0])
+        if backend not in best or rank < best[backend][0]:
+            best[backend] = rank, rows.iloc[0], mine
+    fastest: dict[Any, float] = {}
+    for _, _, mine in best.values():
+        for problem, time in zip(mine["problem"], mine["time"], strict=True):
+            fastest[problem] = min(time, fastest.get(problem, np.inf))
+    return [
+        Profile(
+            backend, configuration_words(row),
+            np.sort([t / fastest[p] for p, t in zip(mine["problem"], mine["time"], strict=True)]),
+            count,
+        )
+        for backend, (_, row, mine) in sorted(best.items())
+    ]

@@ -1,0 +1,423 @@
+"""The report: an HTML file that needs no network, figures as PNG and SVG, the summary as CSV."""
+
+from __future__ import annotations
+
+import json
+from base64 import b64encode
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from ...errors import InvalidInputError
+from ...plots import save, trajectories
+from ..store import Store
+from ..summary import TOLERANCE, pareto_front, summarise
+from . import figures
+from .answers import Case, cases, chosen, failures, limitations
+from .drawing import Axis, Drawing, Mark, Panel, Style, interactive, static, styles
+from .figures import SOLVED, Profile
+from .table import bundle, table
+from .words import (
+    cap_words,
+    configuration_words,
+    listed,
+    missing,
+    percent,
+    qps_heading,
+    qps_words,
+    ranked,
+    usual_first,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+__all__ = ["Source", "write_report"]
+
+#: States that the page draws, and a file.
+MOST_STATES, _MOST_STATIC = 12, 6
+# Bytes of trajectories that the page may hold.
+_TRAJECTORY_BYTES = 1_000_000
+_METRICS = (
+    ("rmse", "RMSE"),
+    ("rmse_settled", "RMSE after settling"),
+    ("rmse_excess", f"RMSE above the best (%, at least {100 * TOLERANCE:g})"),
+    ("cost_ratio", "J / converged J"),
+)
+# Settings with a unit, and what None means in a setting.
+_HEADINGS = {"deadline": "deadline (s)", "cell_timeout": "cell timeout (s)", "qps": "QPs"}
+_NONE = {
+    "qps": "converged", "horizons": "the model's", "steps": "the model's", "backends": "all",
+    "git": "not in a repository", "threads": "not limited",
+}
+# How the lines of a trajectory look.
+_ROLES = {
+    "real": Style("#bbbbbb", "circle", "o", "", "solid", "-"),
+    "observer": Style("#222222", "circle", "o", "", "dot", ":"),
+    "estimate": Style("#D55E00", "circle", "o", "", "solid", "-"),
+}
+
+
+class Source(Protocol):
+    """What a report is made of; `qpmhe.studies.Store` is one."""
+
+    def frame(self) -> DataFrame:
+        """One row a cell."""
+        ...
+
+    def meta(self) -> Mapping[str, Any]:
+        """``study`` (settings), ``environments`` (list of mappings)."""
+        ...
+
+    def trajectory(self, key: str) -> Mapping[str, Any] | None:
+        """Times, states, estimates, labels, title and time_unit of a cell; None if not kept."""
+        ...
+
+
+def write_report(
+    source: Source | str | Path | tuple[DataFrame, Mapping[str, Any]], out: str | Path
+) -> Path:
+    """Write ``index.html``, figures as PNG and SVG, and ``summary.csv`` into a folder.
+
+    Parameters
+    ----------
+    source : Source, path or (frame, meta)
+        A store or its file; or its frame and meta alone, then without trajectories.
+    out : path
+        The folder; it is made.
+
+    Returns
+    -------
+    Path
+        The HTML file. It holds all that it shows and asks for nothing over the network.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be read.
+    InvalidInputError
+        If there is no finished cell, the folder cannot be made, or a library is missing.
+    """
+    absent = [name for name in ("pandas", "plotly", "itables", "jinja2") if not find_spec(name)]
+    if absent:
+        raise InvalidInputError(
+            f"the report needs {listed(absent)}, not installed here: pip install 'qpmhe[studies]'."
+        )
+    if isinstance(source, (str, Path)):
+        source = Store(source)
+    frame, meta = source if isinstance(source, tuple) else (source.frame(), source.meta())
+    if not len(frame):
+        raise InvalidInputError(
+            "the study has no finished cell, so that there is nothing to report; run it first."
+        )
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(f"cannot make the folder {folder}: {error.strerror}.") from error
+    summary = summarise(frame)
+    found = [
+        Part(case, _cells(frame, case), (meta.get("study") or {}).get("deadline"))
+        for case in cases(summary)
+    ]
+    if not isinstance(source, tuple):
+        for part in found:
+            part.runs = choose_runs(source, part.cells, part.case, _TRAJECTORY_BYTES // len(found))
+    drawn, profile = styles(summary["backend"]), figures.profiles(frame)
+    page = folder / "index.html"
+    page.write_text(_page(frame, meta, found, drawn, profile), encoding="utf-8")
+    summary.to_csv(folder / "summary.csv", index=False)
+    for name, figure in files(found, drawn, profile).items():
+        save(figure, folder / name)
+    return page
+
+
+@dataclass
+class Runs:
+    """The runs of one case that a report holds, the best first."""
+
+    first: Mapping[str, Any] | None = None  # has the real states
+    observer: list[Any] | None = None  # an encoded array for each state
+    all: dict[str, list[Any]] = field(default_factory=dict)  # the same, by the cell's key
+    entries: list[tuple[str, str]] = field(default_factory=list)  # key and words
+    static: list[tuple[str, Any]] = field(default_factory=list)  # words and trajectory
+    left_out: int = 0  # runs for which there was no room
+
+
+@dataclass
+class Part:
+    """What a report says about one case."""
+
+    case: Case
+    cells: DataFrame
+    deadline: float | None
+    runs: Runs = field(default_factory=Runs)
+
+
+def choose_runs(source: Source, cells: DataFrame, case: Case, most: int) -> Runs:
+    """The runs of one case: the best configurations' first, up to this many bytes."""
+    runs = Runs()
+    seed = cells["seed"].min()
+    first = cells[(cells["seed"] == seed) & (cells["outcome"] == "done")]
+    pareto = {
+        configuration_words(row): bool(row["pareto"]) for _, row in case.summary.iterrows()
+    }
+    order = sorted(
+        (not pareto[configuration_words(row)], float(row["rmse"]), configuration_words(row),
+         str(row["key"]))
+        for _, row in first.iterrows()
+    )
+    named = [configuration_words(row) for row in chosen(case.summary) or () if row is not None]
+    spent = 0
+    for behind, _, words, key in order:
+        if spent >= most and "observer" not in words and words not in named:
+            runs.left_out += 1
+            continue
+        trajectory = source.trajectory(key)
+        if trajectory is None:
+            continue
+        runs.first = runs.first or trajectory
+        encoded = [_encoded(one) for one in np.asarray(trajectory["estimates"]).T[:MOST_STATES]]
+        spent += sum(len(one["bdata"]) for one in encoded)
+        if words == "observer":
+            runs.observer = encoded
+        runs.all[key] = encoded
+        runs.entries.append((key, words if behind else f"{words} (Pareto front)"))
+        if words == "observer" or words in named:
+            runs.static.append((words, trajectory))
+    runs.entries.sort(key=lambda entry: entry[1] == "observer")
+    return runs
+
+
+def _encoded(values: Any) -> dict[str, str]:
+    """An array as plotly reads it, at a quarter of the size of digits."""
+    numbers = np.ascontiguousarray(values, dtype="<f4")
+    return {"dtype": "f4", "bdata": b64encode(numbers.tobytes()).decode()}
+
+
+def _run_figure(first: Mapping[str, Any]) -> dict[str, Any]:
+    """The real states of a run, and empty lines for the page to fill."""
+    labels = [str(one) for one in first["labels"]][:MOST_STATES]
+    times, states = _encoded(first["times"]), np.asarray(first["states"])
+    n = len(labels)
+    drawing = Drawing([
+        Panel(
+            Axis(f"time ({first['time_unit']})" if j == n - 1 else "", "linear"),
+            Axis(labels[j], "linear"),
+            [Mark("curve", [], [], role, meta={"role": role, "state": j}) for role in _ROLES],
+        )
+        for j in range(n)
+    ], 90 + (170 if n <= 4 else 115) * n, gap=0.12)
+    figure = interactive(drawing, _ROLES)
+    for trace in figure["data"]:
+        role, j = trace["meta"]["role"], trace["meta"]["state"]
+        trace |= {"x": times, "name": role, "legendgroup": role, "showlegend": j == 0}
+        if role == "real":
+            trace["y"], trace["line"]["width"] = _encoded(states[:, j]), 4
+    layout = figure["layout"]
+    for j in range(n):
+        axis = layout[f"xaxis{j + 1 if j else ''}"]
+        axis |= {"showticklabels": j == n - 1, **({"matches": "x"} if j else {})}
+    layout |= {
+        "showlegend": True, "margin": {"l": 8, "r": 14, "t": 40, "b": 8},
+        "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom", "xanchor": "left"},
+    }
+    return figure
+
+
+def files(
+    parts: list[Part], drawn: Mapping[str, Style], profile: list[Profile]
+) -> dict[str, Figure]:
+    """The figures that are written beside the page, by the name of the file."""
+    found: dict[str, Any] = {}
+    for part in parts:
+        case, rows = part.case, part.case.summary
+        starts = sorted(rows["start"].unique(), key=usual_first)
+        start = str(starts[0])
+        of_start = f"; start {start}" if len(starts) > 1 else ""
+
+        def columns(words: list[str], **more: str) -> list[tuple[str, dict[str, str]]]:
+            return [(qps_heading(one), {"qps": one, **more}) for one in words]
+
+        one = figures.accuracy(rows, "rmse", "RMSE", rows["pareto"])
+        if one is not None:
+            found[f"{case.key}-accuracy-time"] = static(
+                one, drawn, (8.6, 4.8), f"{case.title}\nlarger: more QPs per sample; hollow: "
+                "capped; pale: runs failed; bars: 95 %",
+            )
+        one = figures.anytime(rows)
+        rest = case.whole[(case.whole["backend"] != "observer") & (case.whole["start"] == start)]
+        if one is not None and len(rest):
+            words = ranked(map(qps_words, rest["qps"]))
+            found[f"{case.key}-anytime"] = static(
+                one, drawn, (1.4 + 2.1 * max(2, len(words)), 5.0),
+                f"{case.title}\ncap on the solver's iterations in each QP; dashed: the observer "
+                f"alone{of_start}", columns(words, start=start),
+            )
+        spreads = [
+            one for one in figures.spreads(part.cells)
+            if one.backend == "observer" or (one.cap == "none" and one.start == start)
+        ]
+        words = ranked(one.qps for one in spreads if one.backend != "observer")
+        one = figures.times(spreads, part.deadline)
+        if one is not None and words:
+            found[f"{case.key}-step-times"] = static(
+                one, drawn,
+                (1.6 + 2.3 * max(2, len(words)), 1.5 + 0.27 * len(one.panels[0].y.values)),
+                f"{case.title}\nno cap on the solver{of_start}", columns(words),
+            )
+        if part.runs.static:
+            found[f"{case.key}-run"] = _run_file(part.runs)
+    one = figures.performance(profile)
+    if one is not None:
+        found["profile"] = static(
+            one, drawn, (7.2, 4.2),
+            f"Solved: J on average within {percent(SOLVED)} of the converged one",
+        )
+    return found
+
+
+def _run_file(runs: Runs) -> Figure:
+    first = runs.static[0][1]
+    labels = [str(one) for one in first["labels"]][:_MOST_STATIC]
+    n = len(labels)
+    figure: Figure = trajectories(
+        np.asarray(first["times"]), np.asarray(first["states"])[:, :n],
+        {words: np.asarray(one["estimates"])[:, :n] for words, one in runs.static[:6]},
+        labels, f"time t ({first['time_unit']})",
+    )[0].figure
+    return figure
+
+
+def _cells(frame: DataFrame, case: Case) -> DataFrame:
+    first = case.summary.iloc[0]
+    same = frame["model"] == first["model"]
+    for name in ("horizon", "steps"):
+        column, value = frame[name], first[name]
+        equal = column.isna() if missing(value) else (column == value).fillna(False)
+        same &= equal.astype(bool)
+    return frame[same]
+
+
+def _page(
+    frame: DataFrame,
+    meta: Mapping[str, Any],
+    parts: list[Part],
+    drawn: Mapping[str, Style],
+    profile: list[Profile],
+) -> str:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from plotly.offline import get_plotlyjs
+
+    jinja = Environment(
+        loader=PackageLoader("qpmhe.studies.report", "."), autoescape=True,
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )
+    here, found = Path(__file__).parent, [part.case for part in parts]
+    overall = figures.performance(profile)
+    data = {
+        "cases": {part.case.key: _figures(part, drawn, overall) for part in parts},
+        "columns": {"backend": 0, "case": 1},
+    }
+    done = int((frame["outcome"] == "done").sum())
+    models = listed([str(model) for model in dict.fromkeys(frame["model"])])
+    return jinja.get_template("page.html.j2").render(
+        title=f"Backends compared: {models}",
+        subtitle=f"{len(frame)} runs ({done} finished, {len(frame) - done} failed) of "
+        f"{sum(len(case.summary) for case in found)} configurations, "
+        f"{frame['seed'].nunique()} seeds, up to {int(frame['steps'].max())} steps each.",
+        css=(here / "page.css").read_text(encoding="utf-8"),
+        script=(here / "page.js").read_text(encoding="utf-8"),
+        plotly=get_plotlyjs(),
+        bundle=bundle(),
+        table=table(found),
+        data=embedded(data),
+        cases=found,
+        styles=[(name, style) for name, style in drawn.items() if name in set(frame["backend"])],
+        metrics=_METRICS,
+        problems=profile[0].problems if profile else 0,
+        solved=percent(SOLVED),
+        profile_words="; ".join(one.words for one in profile),
+        most_states=MOST_STATES,
+        trajectories=any(part.runs.all for part in parts),
+        left_out=sum(part.runs.left_out for part in parts),
+        limitations=limitations(frame, summarise(frame)),
+        failures=failures(frame),
+        settings=_flat(meta.get("study") or {}),
+        environments=[_flat(one) for one in meta.get("environments") or []],
+    )
+
+
+def embedded(value: Any) -> str:
+    """JSON for a script element, which no text in it can end or lengthen."""
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _figures(part: Part, drawn: Mapping[str, Style], overall: Drawing | None) -> dict[str, Any]:
+    summary, runs = part.case.summary, part.runs
+    whole = summary["failures"] == 0
+    measures = {}
+    for metric, label in _METRICS:
+        by = "rmse" if metric == "rmse_excess" else metric
+        front = whole & pareto_front(
+            summary["time_median"].where(whole), summary[by].where(whole), TOLERANCE
+        )
+        rows = _in_percent(summary) if metric == "rmse_excess" else summary
+        measures[metric] = _interactive(figures.accuracy(rows, metric, label, front), drawn)
+    rest = summary[summary["backend"] != "observer"]
+    qps = [(word, word) for word in ranked(map(qps_words, rest["qps"]))]
+    caps = [(word, word) for word in ranked(map(cap_words, rest["solver_iterations"]))]
+    starts = [(str(one), str(one)) for one in sorted(rest["start"].unique(), key=usual_first)]
+    numbers = [word for word, _ in qps if word.isdigit()]
+    return {
+        "accuracy": measures,
+        "anytime": _interactive(figures.anytime(summary), drawn),
+        "times": _interactive(figures.times(figures.spreads(part.cells), part.deadline), drawn),
+        "profile": _interactive(overall, drawn),
+        "trajectories": None if runs.first is None else _run_figure(runs.first),
+        "runs": {"observer": runs.observer, "all": runs.all},
+        "menus": {
+            "anytime": {"qps": qps, "start": starts},
+            "times": {"qps": qps, "cap": caps, "start": starts},
+            "trajectories": {"run": runs.entries},
+        },
+        "defaults": {
+            "qps": "2" if "2" in numbers else numbers[-1] if numbers else "converged",
+            "cap": "none",
+            "start": starts[0][0] if starts else None,
+            "run": runs.entries[0][0] if runs.entries else None,
+        },
+    }
+
+
+def _interactive(drawing: Drawing | None, drawn: Mapping[str, Style]) -> dict[str, Any] | None:
+    return None if drawing is None else interactive(drawing, drawn)
+
+
+def _in_percent(summary: DataFrame) -> DataFrame:
+    """The excess over the best in per cent, no less than the tolerance, for a logarithmic axis."""
+    names = ("rmse_excess", "rmse_excess_low", "rmse_excess_high")
+    least = 100.0 * TOLERANCE
+    return summary.assign(**{name: (100.0 * summary[name]).clip(lower=least) for name in names})
+
+
+def _flat(content: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [
+        (_HEADINGS.get(str(key), str(key).replace("_", " ")), _words(value, _NONE.get(str(key))))
+        for key, value in content.items()
+    ]
+
+
+def _words(value: Any, nothing: str | None = None) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_words(one)}" for key, one in value.items()) or "none"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_words(one, nothing) for one in value) or "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return (nothing or "none") if value is None else str(value)
