@@ -584,7 +584,10 @@ class Case:
     @contextmanager
     def optimised(self):
         """Compile with one of the levels of optimisation that are in use, or below."""
-        levels = getattr(compiler, "_LEVELS", ())
+        levels = getattr(compiler, "_LEVELS", None)
+        if levels is None:
+            yield
+            return
         compiler._LEVELS = tuple(one for one in levels if " ".join(one) == self.level) or levels
         try:
             yield
@@ -756,7 +759,8 @@ class Case:
             ("model", f"{self.source}, {self.writing}"), ("engine", self.options["engine"]),
             ("engine and model", f"{self.options['engine']}, {self.source}"),
             ("optimisation", self.level), ("kind", self.model.kind),
-            ("n", self.model.n), ("p", self.model.p), ("m", self.model.m), ("time", self.model.method or "discrete"),
+            ("n", self.model.n), ("p", self.model.p), ("m", self.model.m),
+            ("time", self.model.method or "discrete"),
             ("observer", self.watcher.kind),
             ("prior of the observer", self.price.prior_of_observer),
             ("cost", "quadratic" if self.price.quadratic else "robust"),
@@ -892,7 +896,7 @@ class Case:
             if policy != "project" or surely:
                 raise WrongStepError(f"projected, and outside of {surely}")
         elif not surely <= set(estimate.dropped) <= perhaps:
-            raise WrongStepError(f"dropped {estimate.dropped}; the candidate is outside of {surely}")
+            raise WrongStepError(f"dropped {estimate.dropped}, and not {surely}")
         left = outside(estimate.trajectory, w, v, FEASIBLE * (1 + 1e-6) + 10.0 * rounding)
         if not left <= set(estimate.dropped):
             raise WrongStepError(f"outside of {left}; dropped {estimate.dropped}")

@@ -20,7 +20,7 @@ FEW = {"numpy": 120, "casadi": 180, "jax": 90}
 WAYS = [(source, writing) for source, writings in WRITINGS.items() for writing in writings]
 
 
-@pytest.mark.parametrize(("source", "writing"), WAYS, ids=", ".join)
+@pytest.mark.parametrize(("source", "writing"), WAYS)
 def test_every_step_is_what_it_says(source, writing):
     if source != "numpy":
         pytest.importorskip(source)
