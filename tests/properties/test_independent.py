@@ -101,5 +101,5 @@ def test_memory_of_the_estimator_that_is_handed_out_is_noticed(monkeypatch):
         return estimate
 
     monkeypatch.setattr(qpmhe.MovingHorizonEstimator, "update", careless)
-    _, failures = fuzz(200, SEED, source="numpy", writing="batched")
+    _, failures = fuzz(400, SEED, source="numpy", writing="batched")
     assert any("handed out" in failure for failure in failures)
