@@ -839,5 +839,5 @@ def test_functions_without_such_indices_are_not_compiled_for_the_check(monkeypat
     from jax.experimental import checkify
 
     monkeypatch.setattr(checkify, "checkify", None)
-    system = jax_system(lambda x: x[::-1] * x[0], lambda x: x[-1], n=2, p=1)
+    system = jax_system(lambda x: 0.5 * x[::-1], lambda x: x[1:], n=2, p=1)
     assert system.n == 2
