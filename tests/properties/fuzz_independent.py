@@ -43,7 +43,7 @@ BACKENDS = (
     "scs", "ecos", "cvxopt",
 )
 COMPILED_BACKENDS = ("auto",)
-LEVELS = getattr(compiler, "_LEVELS", (("as usual",),))
+LEVELS = compiler._LEVELS
 
 
 class WrongStepError(Exception):
