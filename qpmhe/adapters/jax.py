@@ -13,7 +13,7 @@ from .._checks import count, positive
 from ..errors import ModelError
 from ..functions import Trusted
 from ..sets import ConvexSet
-from ..system import System
+from ..system import System, checked_set, probe_points
 from .fused import Fused
 from .jax_programs import Programs
 
@@ -78,7 +78,7 @@ def jax_system(
         If JAX is not installed, or has no CPU device.
     ModelError
         If JAX cannot trace a function, or it returns the wrong shape, or less than double
-        precision.
+        precision, or it indexes out of range at one of a few points in the set X.
     OptionError
         If a size or dt is out of range, or the method unknown.
     SetError
@@ -119,7 +119,8 @@ def jax_system(
     """
     n, p, m = count("n", n, 1), count("p", p, 1), count("m", m, 0)
     length = None if dt is None else positive("dt", dt)
-    programs = Programs(f, h, n, p, m, method, timed=length is not None)
+    probes = probe_points(checked_set("states", states, n), n, m)
+    programs = Programs(f, h, n, p, m, method, length is not None, probes)
     sets = {"states": states, "disturbances": disturbances, "noises": noises}
     system = _assembled(_Model(programs, length), m, sets)
     if length is not None:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ..discretize import discretize
 from ..errors import InvalidInputError, ModelError
-from ..functions import check_inputs, takes_input
+from ..functions import Probes, check_inputs, takes_input
+from .jax_indices import check_indices
 
 __all__ = ["Programs"]
 
@@ -42,15 +43,25 @@ class Programs:
         How the rate is discretised.
     timed : bool
         Whether the length of the step is an argument.
+    probes : list of (x, u)
+        Points at which the functions must not index out of range.
     """
 
     def __init__(
-        self, f: Function, h: Function, n: int, p: int, m: int, method: str, timed: bool
+        self,
+        f: Function,
+        h: Function,
+        n: int,
+        p: int,
+        m: int,
+        method: str,
+        timed: bool,
+        probes: Probes,
     ) -> None:
         self.n, self.p, self.m, self.timed = n, p, m, timed
         self._jax, self._double, self._device = _imported()
         jax, concatenate = self._jax, self._jax.numpy.concatenate
-        rate, output = self._checked("f", f, n), self._checked("h", h, p)
+        rate, output = self._checked("f", f, n, probes), self._checked("h", h, p, probes)
         check_inputs(m, f=takes_input("f", f, m), h=takes_input("h", h, m))
         step = discretize(rate, None, method)[0]
         if method == "rk4":
@@ -120,8 +131,8 @@ class Programs:
             costs = self._jax.jit(function).lower(*arguments).cost_analysis()
         return float(costs["flops"]) if costs and "flops" in costs else math.inf
 
-    def _checked(self, name: str, function: Function, size: int) -> Function:
-        """The user's function as one of (x, u) to (size,), traced once to see that it is."""
+    def _checked(self, name: str, function: Function, size: int, probes: Probes) -> Function:
+        """The user's function as one of (x, u) to (size,), tried to see that it is."""
         if not callable(function):
             raise ModelError(f"{name} is {function!r}; expected a function of the state.")
         jax, with_input = self._jax, takes_input(name, function, self.m)
@@ -151,6 +162,9 @@ class Programs:
                     f"JAX cannot trace {name}: {_told(error)}. Write it for one state with "
                     "jax.numpy, with jnp.where or lax.cond in place of if."
                 ) from error
+            (device,) = self._device.device_set
+            with jax.default_device(device):
+                check_indices(jax, name, evaluate, probes)
         return evaluate
 
     def _compiled(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import OrderedDict
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +17,10 @@ __all__ = ["Cost", "CostConstants"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+# Weights for patterns of missing components are kept up to so many bytes, and a few in any case.
+_KEPT_BYTES = 2**22
+_KEPT_LEAST = 8
 
 
 @dataclass(frozen=True)
@@ -80,7 +86,10 @@ class Cost(ABC):
         self.prior, self.disturbance, self.noise = prior, disturbance, noise
         self.n, self.p = disturbance.shape[0], noise.shape[0]
         self.stage_weight = self.joint_weight(noise)
-        self._partial: dict[bytes, Array] = {}
+        # By pattern, the least recently used first. Estimators in several threads may share it:
+        # each of its methods is atomic, and a matrix that two of them compute is the same.
+        self._partial: OrderedDict[bytes, Array] = OrderedDict()
+        self._kept = max(_KEPT_LEAST, _KEPT_BYTES // self.stage_weight.nbytes)
 
     @property
     @abstractmethod
@@ -177,19 +186,26 @@ class Cost(ABC):
         noise : (p, p) array, optional
             A weight of this sample's noise, instead of the usual one.
         """
+        if noise is not None:
+            return self._reduced(observed, noise)
         key = observed.tobytes()
-        if noise is None and key in self._partial:
-            return self._partial[key]
-        weight = self.noise if noise is None else noise
+        joint = self._partial.pop(key, None)
+        if joint is None:
+            joint = self._reduced(observed, self.noise)
+            joint.flags.writeable = False
+        self._partial[key] = joint
+        if len(self._partial) > self._kept:
+            with suppress(KeyError):  # other threads may have emptied it meanwhile
+                self._partial.popitem(last=False)
+        return joint
+
+    def _reduced(self, observed: Mask, weight: Array) -> Array:
         reduced = np.zeros_like(weight)
         there = np.flatnonzero(observed)
         if there.size:
             block = np.linalg.inv(weight)[np.ix_(there, there)]
             reduced[np.ix_(there, there)] = np.linalg.inv(block)
-        joint = self.joint_weight(reduced)
-        if noise is None:
-            self._partial[key] = joint
-        return joint
+        return self.joint_weight(reduced)
 
 
 def quadratic_form(residuals: Array, weights: Array) -> Array:

@@ -733,3 +733,111 @@ def test_a_system_pickles_where_its_functions_do():
     np.testing.assert_array_equal(loaded.timed.f.batch(x, extended), system.f.batch(x, u))
     with pytest.raises((pickle.PicklingError, AttributeError)):
         pickle.dumps(by_jax("reactor", "euler"))
+
+
+# Indices out of range, where JAX reads another entry
+
+
+TABLE = np.linspace(0.0, 1.0, 8)
+ROWS = np.arange(6.0).reshape(3, 2)
+
+
+@jax.jit
+def compiled_by_the_user(x):
+    return x * x[5]
+
+
+def place(x):
+    return (8.0 * x[0]).astype(int)
+
+
+def loop(x, turns):
+    return jax.lax.fori_loop(0, turns, lambda i, total: total + x[i], 0.0) * x
+
+
+OUT_OF_RANGE = {
+    "positive": (lambda x, u: x * x[5], "index 5 on axis 0, of size 2, of an array (2,)"),
+    "negative": (lambda x, u: x * x[-3], "index -3 on axis 0, of size 2"),
+    "input": (lambda x, u: x * u[1], "index 1 on axis 0, of size 1, of an array (1,)"),
+    "list": (lambda x, u: x[jnp.array([0, 2])], "index 2 on axis 0, of size 2"),
+    "list in NumPy": (lambda x, u: x[np.array([0, -3])], "index -3 on axis 0"),
+    "nested constants": (lambda x, u: x * jnp.asarray(ROWS)[1, 2], "index 2 on axis 1, of size 2"),
+    "row": (lambda x, u: x + jnp.asarray(ROWS)[3], "index 3 on axis 0, of size 3"),
+    "table": (lambda x, u: x * jnp.asarray(TABLE)[place(10.0 * x)], "on axis 0, of size 8"),
+    "write": (lambda x, u: x.at[2].set(1.0), "index 2 on axis 0, of size 2"),
+    "slice": (lambda x, u: jax.lax.dynamic_slice(x, (1,), (2,)), "index 1 on axis 0, of size 2"),
+    "loop": (lambda x, u: loop(x, 3), "index 2 on axis 0, of size 2"),
+    "vmap": (lambda x, u: x * jax.vmap(lambda i: x[i])(jnp.arange(3))[2], "index 2 on axis 0"),
+    "compiled": (lambda x, u: compiled_by_the_user(x), "index 5 on axis 0, of size 2"),
+    "in a branch": (
+        lambda x, u: jax.lax.cond(u[0] > 0.0, lambda: x * x[5], lambda: x), "index 5 on axis 0"
+    ),
+}
+IN_RANGE = {
+    "last": lambda x, u: x * x[-1] + u[-1],
+    "turned": lambda x, u: x[::-1],
+    "slice": lambda x, u: x[0:9],
+    "write": lambda x, u: x.at[-1].set(1.0).at[:1].add(u),
+    "unpacked": lambda x, u: jnp.array([x[1], *u]),
+    "clipped": lambda x, u: x * jnp.asarray(TABLE)[jnp.clip(place(x), 0, 7)],
+    "clip": lambda x, u: x * jnp.take(jnp.asarray(TABLE), place(x), mode="clip"),
+    "clipped rows": lambda x, u: jnp.asarray(ROWS).at[(9.0 * x).astype(int)].get(mode="clip")[0],
+    "clip in a loop": lambda x, u: jax.lax.fori_loop(
+        0, 4, lambda i, z: 0.5 * z + jnp.take(x, i, mode="clip"), x
+    ),
+    "wrap": lambda x, u: x * jnp.take(jnp.asarray(TABLE), place(x), mode="wrap"),
+    "fill": lambda x, u: x * jnp.take(jnp.asarray(TABLE), place(x), mode="fill", fill_value=0.0),
+    "filled": lambda x, u: x * jnp.asarray(TABLE).at[place(x)].get(mode="fill", fill_value=0.5),
+    "clipped write": lambda x, u: x.at[place(x)].set(1.0, mode="clip"),
+    "interpolation": lambda x, u: x * jnp.interp(x[0], jnp.asarray(TABLE), jnp.asarray(TABLE)),
+    "map": lambda x, u: x * jax.scipy.ndimage.map_coordinates(jnp.asarray(TABLE), [10.0 * x], 1),
+    "loop": lambda x, u: loop(x, 2),
+    "sorted": lambda x, u: x[jnp.argsort(x)] + x[jnp.argmax(x)],
+    "solved": lambda x, u: jnp.linalg.solve(jnp.eye(2) + jnp.outer(x, x), x),
+    "guarded by a branch": lambda x, u: jax.lax.cond(
+        u[0] < 0.0, lambda: x * x[5], lambda: x
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OUT_OF_RANGE)
+def test_an_index_out_of_range_is_refused(name):
+    function, told = OUT_OF_RANGE[name]
+    for method in (None, "rk4"):
+        timing = {} if method is None else {"dt": 0.1, "method": method}
+        with pytest.raises(ModelError) as caught:
+            jax_system(function, lambda x: x[0], n=2, p=1, m=1, **timing)
+        assert str(caught.value).startswith("f uses index ")
+        assert told in str(caught.value)
+        assert "jnp.clip" in str(caught.value)
+    with pytest.raises(ModelError, match=r"^h uses index "):
+        jax_system(lambda x: x, lambda x, u: function(x, u), n=2, p=2, m=1)
+
+
+@pytest.mark.parametrize("name", IN_RANGE)
+def test_indices_in_range_or_with_a_meaning_are_taken(name):
+    function = IN_RANGE[name]
+    system = jax_system(function, lambda x: x[0], n=2, p=1, m=1)
+    x, u = np.array([0.4, 0.7]), np.array([0.2])
+    home = jax if hasattr(jax, "enable_x64") else jax.experimental
+    with home.enable_x64(True):
+        np.testing.assert_allclose(system.f(x, u), np.asarray(jax.jit(function)(x, u)), rtol=1e-12)
+
+
+def test_indices_are_checked_within_the_set_of_states():
+    inside = qpmhe.Box([0.0, 0.0], [0.9, 0.9])
+
+    def lookup(x):
+        return x * jnp.asarray(TABLE)[place(x)]
+
+    assert jax_system(lookup, lambda x: x[0], n=2, p=1, states=inside).n == 2
+    with pytest.raises(ModelError, match="f uses index"):
+        jax_system(lookup, lambda x: x[0], n=2, p=1)
+
+
+def test_functions_without_such_indices_are_not_compiled_for_the_check(monkeypatch):
+    from jax.experimental import checkify
+
+    monkeypatch.setattr(checkify, "checkify", None)
+    system = jax_system(lambda x: 0.5 * x[::-1], lambda x: x[1:], n=2, p=1)
+    assert system.n == 2

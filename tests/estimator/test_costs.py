@@ -1,4 +1,8 @@
+import gc
 import itertools
+import pickle
+import threading
+import weakref
 
 import numpy as np
 import pytest
@@ -142,6 +146,62 @@ def test_partial_weights_leave_the_full_one_alone():
     np.testing.assert_array_equal(
         cost.partial_weight(masks(3)[2]), random_cost(2, 3).partial_weight(masks(3)[2])
     )
+
+
+def reduced(noise, mask):
+    weight = np.zeros_like(noise)
+    weight[np.ix_(mask, mask)] = np.linalg.inv(np.linalg.inv(noise)[np.ix_(mask, mask)])
+    return weight
+
+
+def test_few_patterns_of_missing_components_are_kept():
+    n, p, kept = 10, 30, 2**22
+    cost = random_cost(n, p)
+    assert len(pickle.dumps(cost)) < kept
+    observed = np.random.default_rng(8).random((2000, p)) < 0.7
+    matrices, usual = [], cost.partial_weight(observed[0])
+    for mask in observed[1:]:
+        weight = cost.partial_weight(mask)
+        np.testing.assert_allclose(weight[n:, n:], reduced(cost.noise, mask), rtol=1e-9, atol=1e-9)
+        assert cost.partial_weight(observed[0]) is usual  # used all the time
+        matrices.append(weakref.ref(weight))
+    del weight
+    gc.collect()
+    alive = sum(one() is not None for one in matrices)
+    assert 100 < alive <= kept / cost.stage_weight.nbytes
+    assert all(one() is not None for one in matrices[-100:])  # the last ones
+    assert len(pickle.dumps(cost)) < 1.5 * kept
+
+
+def test_a_few_patterns_are_kept_of_large_weights():
+    cost = random_cost(1, 800)
+    first = cost.partial_weight(np.arange(800) != 0)
+    for k in range(1, 4):
+        cost.partial_weight(np.arange(800) != k)
+    assert cost.partial_weight(np.arange(800) != 0) is first
+
+
+def test_threads_may_share_a_cost_whose_patterns_are_dropped():
+    cost, failures = random_cost(1, 12), []
+    cost._kept = 2
+    expected = {mask.tobytes(): random_cost(1, 12).partial_weight(mask) for mask in masks(12)[:64]}
+
+    def work(seed):
+        generator = np.random.default_rng(seed)
+        try:
+            for _ in range(400):
+                mask = masks_of_twelve[generator.integers(64)]
+                np.testing.assert_array_equal(cost.partial_weight(mask), expected[mask.tobytes()])
+        except BaseException as error:
+            failures.append(error)
+
+    masks_of_twelve = masks(12)[:64]
+    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(6)]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    assert failures == []
 
 
 # The prior weight from an observer's covariance

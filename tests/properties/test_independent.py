@@ -1,0 +1,105 @@
+"""Random estimation problems against a second implementation of everything that is promised.
+
+A few hundred steps by default; `QPMHE_FUZZ_STEPS=100000` for as many as one likes.
+"""
+
+import copy
+import os
+from collections import Counter
+
+import pytest
+
+import qpmhe
+
+from .fuzz_independent import WRITINGS, Case, WrongStepError, fuzz, table
+
+STEPS = int(os.environ.get("QPMHE_FUZZ_STEPS", "0"))
+SEED = int(os.environ.get("QPMHE_FUZZ_SEED", "1"))
+# Steps of each by default: whatever is compiled takes its time to be made.
+FEW = {"numpy": 120, "casadi": 180, "jax": 90}
+WAYS = [(source, writing) for source, writings in WRITINGS.items() for writing in writings]
+
+
+@pytest.mark.parametrize(("source", "writing"), WAYS)
+def test_every_step_is_what_it_says(source, writing):
+    if source != "numpy":
+        pytest.importorskip(source)
+    share = {"numpy": 0.6, "casadi": 0.3, "jax": 0.1}[source] / len(WRITINGS[source])
+    steps = max(FEW[source], round(share * STEPS))
+    counts, failures = fuzz(steps, SEED, source=source, writing=writing, estimators=2)
+    print(table(counts))
+    assert failures == []
+    assert counts["steps"] == steps
+
+
+def spoil_model(case):
+    case.model.numbers[0][0][0] += 1e-3
+
+
+def spoil_output(case):
+    case.model.numbers[2][-1][-1] += 1e-3
+
+
+def spoil_weight(case):
+    case.price.weights[1][0, 0] *= 1.0 + 1e-6
+
+
+def spoil_discount(case):
+    case.price.discount *= 1.0 - 1e-6
+
+
+def spoil_gain(case):
+    case.watcher.gain[0, 0] += 1e-3
+    case.watcher.R[0, 0] *= 1.0 + 1e-2
+
+
+def spoil_noise_weight(case):
+    case.price.weights[2][-1, -1] *= 1.0 + 1e-6
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [spoil_model, spoil_output, spoil_weight, spoil_discount, spoil_gain, spoil_noise_weight],
+)
+@pytest.mark.parametrize("seed", [3, 4])
+def test_what_differs_a_little_is_noticed(monkeypatch, seed, spoil):
+    case = Case(seed, "numpy", "batched")
+    case.model = copy.deepcopy(case.model)  # that of the system is as it was
+    configure = case.configure
+
+    def configured():
+        mhe = configure()
+        spoil(case)
+        return mhe
+
+    monkeypatch.setattr(case, "configure", configured)
+    with pytest.raises(WrongStepError):
+        case.run(60, Counter())
+
+
+def test_a_cost_that_is_too_low_is_noticed(monkeypatch):
+    update = qpmhe.MovingHorizonEstimator.update
+
+    def flattering(self, *arguments, **options):
+        estimate = update(self, *arguments, **options)
+        estimate.cost *= 1.0 - 1e-7
+        return estimate
+
+    monkeypatch.setattr(qpmhe.MovingHorizonEstimator, "update", flattering)
+    _, failures = fuzz(30, SEED, source="numpy", writing="batched")
+    assert "cost is" in failures[0]
+
+
+def test_memory_of_the_estimator_that_is_handed_out_is_noticed(monkeypatch):
+    update, memory = qpmhe.MovingHorizonEstimator.update, {}
+
+    def careless(self, *arguments, **options):
+        estimate = update(self, *arguments, **options)
+        own = memory.setdefault((id(self), estimate.candidate.shape), estimate.candidate.copy())
+        own[...] = estimate.candidate
+        estimate.candidate = own
+        return estimate
+
+    monkeypatch.setattr(qpmhe.MovingHorizonEstimator, "update", careless)
+    _, failures = fuzz(400, SEED, source="numpy", writing="batched")
+    assert any("handed out" in failure for failure in failures)
