@@ -438,12 +438,12 @@ class _Rehearsal:
         if not projected and reference.moved(candidate):
             return "the candidate does not follow f + K v of CasADi's interpreter"
         # The candidate's disturbances are L, which is known itself.
-        own = best if (trajectory != candidate).any() or projected else reference
-        if w is not None and v is not None and np.isfinite(own.cost) and own.has_squares:
-            if differs(w, own.w, own.allowed_w) or differs(
-                v[own.observed], own.v[own.observed], own.allowed_v[own.observed]
-            ):
-                return "the residuals differ from those of CasADi's interpreter"
+        own = best if projected or status & Status.IMPROVED.value else reference
+        if w is not None and v is not None and own.has_squares and (
+            differs(w, own.w, own.allowed_w)
+            or differs(v[own.observed], own.v[own.observed], own.allowed_v[own.observed])
+        ):
+            return "the residuals differ from those of CasADi's interpreter"
         if (
             status & Status.MODEL_FAILED.value and not projected and reference.has_squares
             and best.has_squares and self._is_sound(t, candidate, trajectory)
