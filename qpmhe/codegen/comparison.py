@@ -420,9 +420,10 @@ class _Rehearsal:
         prior = self._window(record)["z"][0]
         reference = self._judge(t, candidate, prior, not projected)
         best = self._judge(t, trajectory, prior, False)
-        for name, told, one in (
-            ("the candidate", candidate_cost, reference), ("the estimate", cost, best)
-        ):
+        judged = [("the estimate", cost, best)]
+        if not (projected and w is None):  # whole records do not say where it was projected to
+            judged.append(("the candidate", candidate_cost, reference))
+        for name, told, one in judged:
             # NaN and infinity are the same: not a cost.
             if np.isfinite(one.cost):
                 # C takes for infinite what has no finite square.
@@ -436,13 +437,17 @@ class _Rehearsal:
             return f"J of the estimate, {cost:.6g}, is above the candidate's {candidate_cost:.6g}"
         if not projected and reference.moved(candidate):
             return "the candidate does not follow f + K v of CasADi's interpreter"
-        if w is not None and v is not None and np.isfinite(best.cost):
-            own = best if (trajectory != candidate).any() or projected else reference
-            if differs(w, own.w, own.allowed_w) or differs(
-                v[own.observed], own.v[own.observed], own.allowed_v[own.observed]
-            ):
-                return "the residuals differ from those of CasADi's interpreter"
-        if status & Status.MODEL_FAILED.value and self._is_sound(t, candidate, trajectory):
+        # The candidate's disturbances are L, which is known itself.
+        own = best if projected or status & Status.IMPROVED.value else reference
+        if w is not None and v is not None and own.has_squares and (
+            differs(w, own.w, own.allowed_w)
+            or differs(v[own.observed], own.v[own.observed], own.allowed_v[own.observed])
+        ):
+            return "the residuals differ from those of CasADi's interpreter"
+        if (
+            status & Status.MODEL_FAILED.value and not projected and reference.has_squares
+            and best.has_squares and self._is_sound(t, candidate, trajectory)
+        ):
             return "it says that the model failed where CasADi's interpreter does not"
         return ""
 

@@ -227,3 +227,14 @@ def test_linear_models_at_every_level(n, level, cache, monkeypatch):
                 one, two = mhe.update(y), other.update(y)
                 assert one.cost == pytest.approx(two.cost, rel=1e-6)
             assert mhe.engine == "compiled"
+
+
+@pytest.mark.parametrize(
+    "h", [lambda x: 1e200 * x, lambda x: ca.exp(700.0 * x), lambda x: ca.log(x - 0.99),
+          lambda x: ca.exp(45.0 * x) * 1e140],
+    ids=["no squares", "overflow", "hardly finite", "beyond the largest"],
+)
+def test_what_is_not_finite_is_no_fault(h, cache):
+    system = qpmhe.System.from_casadi(lambda x: 0.9 * x, lambda x: h(x[0]), n=2, compiled=True)
+    assert estimator(system).engine == "compiled"
+    assert not notes(cache)
