@@ -131,7 +131,7 @@ class CompiledEngine:
     @property
     def time(self) -> int:
         """Number of measurements taken so far."""
-        return self._time.item()
+        return int(self._time.item())
 
     @property
     def state(self) -> Array:
@@ -149,7 +149,7 @@ class CompiledEngine:
         self, y: Array, u: Array, dt: float | None, noise_weight: Array | None, began: float
     ) -> Estimate:
         """Take a sample in, and estimate."""
-        time = self.time
+        time = self._time.item()
         try:
             self._y[...] = y
             self._inputs[...] = u
@@ -265,7 +265,7 @@ class CompiledEngine:
 
         Terms are computed where they were not wanted before.
         """
-        (n, _, horizon), system, settings = self._sizes, self._system, self._library.settings
+        horizon, system, settings = self._sizes[2], self._system, self._library.settings
         time, length = int(record["time"]), int(record["length"])
         sets = sum(1 << k for k, name in enumerate(SET_NAMES) if getattr(system, name))
         if not (
@@ -325,7 +325,9 @@ class CompiledEngine:
         if stage["is_irregular"]:
             system, u = system.timed, np.append(u, stage["step"])
         values = [np.full(size, np.nan) for size in (n, p, (n, n), (p, n))]
-        functions = system.f, system.h, system.f_jacobian, system.h_jacobian
+        functions: tuple[Callable[..., Any], ...] = (
+            system.f, system.h, system.f_jacobian, system.h_jacobian
+        )
         for value, function in zip(values, functions, strict=True):
             with suppress(Exception):  # outside of the model's domain: NaN, as in C
                 value[...] = function(x, u)
@@ -333,10 +335,11 @@ class CompiledEngine:
         error = np.where(seen, stage["y"] - output, 0.0)
         correction = self._library.settings["gain"].reshape(n, p).dot(error)
         reached, weights = ahead + correction, (self._cost.disturbance, stage["noise_weight"])
-        cost, size = (
-            turned(correction).dot(turned(weights[0])).dot(turned(correction))
-            + turned(error).dot(turned(weights[1].reshape(p, p))).dot(turned(error))
-            for turned in (np.asarray, np.abs)
+        weights = weights[0], weights[1].reshape(p, p)
+        cost = sum(r.dot(w).dot(r) for r, w in zip((correction, error), weights, strict=True))
+        size = sum(
+            np.abs(r).dot(np.abs(w)).dot(np.abs(r))
+            for r, w in zip((correction, error), weights, strict=True)
         )
         held = not np.isfinite(stage["cost"])
         if held != (not np.isfinite([reached.dot(reached), cost]).all()):
@@ -355,7 +358,7 @@ class CompiledEngine:
         if not near(following, reached, sizes):
             raise other("model (f)")
         w, v = stage["w"], stage["v"]
-        kept = w.dot(weights[0]).dot(w) + v.dot(weights[1].reshape(p, p)).dot(v)
+        kept = w.dot(weights[0]).dot(w) + v.dot(weights[1]).dot(v)
         if not near(stage["cost"], kept, size):
             raise other("cost")
         finite = np.isfinite(a).all() and np.isfinite(c).all()

@@ -83,8 +83,11 @@ class PythonEngine:
         self._before: tuple[Mark, Array | None, tuple[str, ...], tuple[Array, ...]]
         self._trajectory: Array | None = None  # the last estimate's
         self._dropped: tuple[str, ...] = ()
-        # Estimates of x(t-N), ..., x(t), each made at its own time.
-        self._history: deque[Array] = deque([initial_state.copy()], maxlen=settings.horizon + 1)
+        # Estimates of x(t-N), ..., x(t), each made at its own time; or the last where it suffices.
+        again = settings.candidate == "reinitialized"
+        self._history: deque[Array] = deque(
+            [initial_state.copy()], maxlen=settings.horizon + 1 if again else 1
+        )
 
     def reset(self, initial_state: Array) -> None:
         """Forget all measurements and start at this state."""
@@ -136,7 +139,8 @@ class PythonEngine:
     ) -> Estimate:
         """Take a sample in, and estimate."""
         window, again = self._window, self._settings.candidate == "reinitialized"
-        window.make_room()
+        if window.end == window.room:
+            window.make_room()
         self._mark(again)
         try:
             with np.errstate(all="ignore"):
@@ -148,7 +152,10 @@ class PythonEngine:
                     first = self._history[len(self._history) - window.length]
                     missing, held, flat = window.replay(window.length, first)
                 estimate = self._estimate(missing, held, flat, began)
-            self._history.append(estimate.state.copy())  # a view would keep the trajectory
+            assert self._trajectory is not None
+            newest = self._trajectory[-1]
+            # Of many states, views would keep as many trajectories.
+            self._history.append(newest.copy() if again else newest)
             return estimate
         except BaseException:  # an interrupt: the sample is not taken
             self.undo()
@@ -314,8 +321,9 @@ class PythonEngine:
         for one in (window, again):
             one.load_state_dict(state["window"], self._system._timed is not None)
         history = [taken("history", one, (n,)) for one in state["history"]]
-        if len(history) != window.length + 1:
-            raise ValueError(f"history has {len(history)} states; expected {window.length + 1}")
+        count = min(window.length + 1, self._history.maxlen or 1)
+        if len(history) != count:
+            raise ValueError(f"history has {len(history)} states; expected {count}")
         trajectory = state["trajectory"]
         if (trajectory is None) != (window.time == 0):
             raise TypeError("trajectory is there exactly if there was a measurement")

@@ -232,7 +232,9 @@ class MovingHorizonEstimator:
         """Take the measurement y(t) and the input u(t) in, and estimate x(t+1).
 
         Solver failures, a model that cannot be evaluated and missing measurements do not
-        raise: the step falls back to the candidate, and the estimate's status tells why.
+        raise: the step falls back to the candidate, and the estimate's status tells why. An
+        update that is interrupted (Ctrl+C) has not taken the sample; a QP solver that
+        warm-starts then starts afresh.
 
         Parameters
         ----------
@@ -365,7 +367,13 @@ class MovingHorizonEstimator:
         Raises
         ------
         InvalidInputError
-            If it is not such a state; the estimator is left as it was.
+            If it is not such a state: damaged, or of an estimator with another model,
+            observer, cost, sets or candidate. The estimator is left as it was. QP caps,
+            backend, tolerances and policies may differ.
+
+        Notes
+        -----
+        Every stored stage is computed once more, and compared.
         """
         self._engine.load_state_dict(state)
 

@@ -64,7 +64,7 @@ class Stages:
     ) -> None:
         self.horizon, self._step = horizon, step
         room = horizon + max(horizon // 4, 32)
-        self._room = room
+        self.room = room
         self._z = np.zeros((room + 1, n))
         # The input of each stage, and behind it the length of its step.
         self._y, self._u = np.zeros((room, p)), np.zeros((room, m + 1))
@@ -143,7 +143,7 @@ class Stages:
 
     def make_room(self) -> None:
         """Move the stages to the front where there is no place for another one."""
-        if self.end < self._room:
+        if self.end < self.room:
             return
         state, covariance = self._last_good(self.start)
         earlier = state.copy(), None if covariance is None else covariance.copy()

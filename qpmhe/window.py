@@ -114,7 +114,8 @@ class Window(Stages):
             measurement; the observer goes on where the model last worked, and the
             candidate's cost is infinite while the stage stays.
         """
-        self.make_room()
+        if self.end == self.room:
+            self.make_room()
         k, m = self.end, self._m
         place = self._places[k]
         place.y[...] = y

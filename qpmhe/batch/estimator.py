@@ -239,6 +239,11 @@ class BatchEstimator:
         ------
         ShapeError, InvalidInputError
             If an argument does not fit; the estimator is left as it was.
+
+        Notes
+        -----
+        An update that is interrupted (Ctrl+C) has taken the samples of no member; in compiled
+        code, of all or of none: see ``time``.
         """
         y = measurements_of(Y, self.members, self.system.p)
         return self._engine.step(y, inputs_of(U, self.members, self.system.m))

@@ -136,7 +136,7 @@ def test_a_move_to_the_front_is_interrupted_at_every_line():
     for arguments in record[:36]:
         assert_same(numbers(feed(mhe, arguments, False)), numbers(feed(twin, arguments, False)))
     window = mhe._engine._window
-    assert window.end == window._room
+    assert window.end == window.room
     arguments = record[36]
     for after in range(1, 10_000):
         if after % 20 == 0:  # from where it was not moved yet
@@ -146,7 +146,7 @@ def test_a_move_to_the_front_is_interrupted_at_every_line():
         with Interruption(after), pytest.raises(KeyboardInterrupt):
             feed(mhe, arguments, False)
         np.testing.assert_array_equal(mhe.covariances(), twin.covariances())
-        if mhe._engine._window.end < window._room and after > 150:
+        if mhe._engine._window.end < window.room and after > 150:
             break
     for arguments in record[36:]:
         assert_same(numbers(feed(mhe, arguments, False)), numbers(feed(twin, arguments, False)))
@@ -237,7 +237,7 @@ def test_an_interrupted_step_of_a_batch_was_not_taken(name):
                 after += int(generator.integers(1, 60))
 
         if t % 3 == 0:
-            both(lambda one: one.update(Y, U))
+            both(lambda one, Y=Y, U=U: one.update(Y, U))
             twin.update(Y, U)
             np.testing.assert_array_equal(mhe.states, twin.states)
         if t == 11:

@@ -142,7 +142,7 @@ def test_other_observers_losses_and_corrections_are_refused():
     ):
         for arguments in samples(9):
             feed(one, arguments, False)
-        with pytest.raises(InvalidInputError, match="another (observer|cost|weight)"):
+        with pytest.raises(InvalidInputError, match=r"another (observer|cost|weight)"):
             another.load_state_dict(one.state_dict())
         assert another.time == 0
 
@@ -155,7 +155,8 @@ def test_caps_and_policies_may_change(engine):
     for first, second in (
         ({"max_qps": 0}, {"max_qps": 2}), ({"max_qps": 3}, {"max_qps": 0}),
         ({}, {"max_qps": None, "tolerance": 1e-6, "solver_tolerance": 1e-5, "delay": 1}),
-        ({}, {"backend": "banded", "max_solver_iterations": 7}), ({}, {"start": "best", "max_qps": None}),
+        ({}, {"backend": "banded", "max_solver_iterations": 7}),
+        ({}, {"start": "best", "max_qps": None}),
         ({"outside": "keep"}, {"outside": "drop"}),
     ):
         one, other, fresh = made(**first), made(**second), made(**second)
@@ -316,7 +317,8 @@ def test_damaged_states_are_refused_whole_or_harmless(engine, options):
                 path[:2] in (
                     ("window", "earlier"), ("window", "earlier_covariance"),
                     ("window", "last_special"), ("window", "last_irregular"),
-                    ("window", "time"), ("window", "covariance"), ("window", "terms"), ("window", "stages"),
+                    ("window", "time"), ("window", "covariance"), ("window", "terms"),
+                    ("window", "stages"),
                 )
             ), path
             mhe.update(np.zeros(1), np.zeros(1))
