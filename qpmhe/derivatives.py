@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from copy import copy
 from functools import partial
 from typing import Any
 
@@ -157,6 +158,23 @@ class Jacobian:
             self._compare(self._given, [(x, u)])
         elif self.method == "complex step" and not self._complex_step_works([(x, u)]):
             self.use("finite differences")
+
+    def copy(self, function: BatchedFunction) -> Jacobian:
+        """The same Jacobian, with a method of its own, of a copy of its function.
+
+        Parameters
+        ----------
+        function : BatchedFunction
+            The copy.
+        """
+        other = copy(self)
+        other._function = function
+        if self._given is None:
+            other.use(self.method)
+        else:
+            other._given = self._given.copy()
+            other.batch = other._given.batch
+        return other
 
     def use(self, method: str) -> None:
         """Compute by a certain one of the two methods from now on, unless one was given.

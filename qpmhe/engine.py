@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
+from contextlib import suppress
 from time import perf_counter
 from typing import Any
 
@@ -23,6 +25,8 @@ from .observers import Observer
 from .optimizer import Optimizer
 from .problem import Problem
 from .settings import Settings
+from .snapshot import SET_NAMES, check_description, described, reading, taken
+from .stages import Mark
 from .subproblem import Subproblem
 from .system import System
 from .window import Window
@@ -40,7 +44,9 @@ class PythonEngine:
 
     Parameters
     ----------
-    system, observer, cost, settings, initial_state
+    system : System
+        The estimator's own; how its functions are called may change.
+    observer, cost, settings, initial_state
         The estimator's.
     """
 
@@ -73,31 +79,52 @@ class PythonEngine:
             exact = ExactStep(system, cost)
             exact.prepare(settings.horizon)
         self._optimizer = Optimizer(self._subproblem, solver, settings, exact)
+        self._linearized = settings.qp_limit > 0
         self._window = self._fresh_window(initial_state)
+        self._made = system._calling()  # how the model is called, as found at construction
+        self._before: tuple[Mark, Array | None, tuple[str, ...], tuple[Array, ...]]
         self._trajectory: Array | None = None  # the last estimate's
         self._dropped: tuple[str, ...] = ()
-        # Estimates of x(t-N), ..., x(t), each made at its own time.
-        self._history: deque[Array] = deque([initial_state.copy()], maxlen=settings.horizon + 1)
+        # Estimates of x(t-N), ..., x(t), each made at its own time; or the last where it suffices.
+        again = settings.candidate == "reinitialized"
+        self._history: deque[Array] = deque(
+            [initial_state.copy()], maxlen=settings.horizon + 1 if again else 1
+        )
 
     def reset(self, initial_state: Array) -> None:
         """Forget all measurements and start at this state."""
         self._solver.forget()
-        self._window.reset(initial_state, self._observer.initial_covariance())
-        self._trajectory, self._dropped = None, ()
-        self._history.clear()
-        self._history.append(initial_state.copy())
+        self.replace(self._fresh_window(initial_state), None, (), [initial_state.copy()])
+
+    @property
+    def memory(self) -> tuple[Window, Array | None, tuple[str, ...], deque[Array]]:
+        """What `replace` takes."""
+        return self._window, self._trajectory, self._dropped, self._history
+
+    def replace(
+        self, window: Window, trajectory: Array | None, dropped: tuple[str, ...],
+        history: Iterable[Array],
+    ) -> None:
+        """Remember this in place of all that was; whole or, if interrupted, not at all."""
+        before = self.memory
+        try:
+            self._window, self._trajectory, self._dropped = window, trajectory, dropped
+            self._history = deque(history, maxlen=self._history.maxlen)
+        except BaseException:
+            self._window, self._trajectory, self._dropped, self._history = before
+            raise
 
     def _fresh_window(self, initial_state: Array) -> Window:
         settings = self._settings
         return Window(
             self._system, self._observer, self._cost, settings.horizon, initial_state,
-            settings.qp_limit > 0,
+            self._linearized,
         )
 
     @property
     def state(self) -> Array:
         """The current estimate."""
-        return self._history[-1]
+        return self._history[-1].copy()
 
     @property
     def time(self) -> int:
@@ -113,37 +140,70 @@ class PythonEngine:
         self, y: Array, u: Array, dt: float | None, noise_weight: Array | None, began: float
     ) -> Estimate:
         """Take a sample in, and estimate."""
-        window = self._window
-        with np.errstate(all="ignore"):
-            if window.length == self._settings.horizon:
-                self._solver.shift()
-            missing, held, flat = window.push(y, u, dt, noise_weight)
-            if self._settings.candidate == "reinitialized":
-                # The history reaches back to the estimate of the window's first state.
-                first = self._history[len(self._history) - window.length]
-                missing, held, flat = window.replay(window.length, first)
-            estimate = self._estimate(missing, held, flat, began)
-        self._history.append(estimate.state.copy())  # a view would keep the trajectory
-        return estimate
+        window, again = self._window, self._settings.candidate == "reinitialized"
+        if window.end == window.room:
+            window.make_room()
+        self._mark(again)
+        try:
+            with np.errstate(all="ignore"):
+                if window.length == self._settings.horizon:
+                    self._solver.shift()
+                missing, held, flat = window.push(y, u, dt, noise_weight)
+                if again:
+                    # The history reaches back to the estimate of the window's first state.
+                    first = self._history[len(self._history) - window.length]
+                    missing, held, flat = window.replay(window.length, first)
+                estimate = self._estimate(missing, held, flat, began)
+            assert self._trajectory is not None
+            newest = self._trajectory[-1]
+            # Of many states, views would keep as many trajectories.
+            self._history.append(newest.copy() if again else newest)
+            return estimate
+        except BaseException:  # an interrupt: the sample is not taken
+            self.undo()
+            raise
 
     def amend(self, time: int, y: Array) -> Estimate:
         """Put a late measurement in its place, and estimate again."""
         began = perf_counter()
-        with np.errstate(all="ignore"):
-            self._window.amend(time, y)
-            self._trajectory = None  # it does not belong to the window before this one
-            missing = not self._window.observed[-1].all()
-            held = self._window.newest_is_held
-            estimate = self._estimate(missing, held, False, began)
-        self._history[-1] = estimate.state.copy()
-        return estimate
+        self._mark(True)
+        try:
+            with np.errstate(all="ignore"):
+                self._window.amend(time, y)
+                self._trajectory = None  # it does not belong to the window before this one
+                missing = not self._window.observed[-1].all()
+                held = self._window.newest_is_held
+                estimate = self._estimate(missing, held, False, began)
+            self._history[-1] = estimate.state.copy()
+            return estimate
+        except BaseException:
+            self.undo()
+            raise
+
+    def _mark(self, whole: bool) -> None:
+        """Note what `undo` needs; whole where stages of the window are to be rewritten."""
+        window = self._window.mark(whole)
+        self._before = window, self._trajectory, self._dropped, tuple(self._history)
+
+    def undo(self) -> None:
+        """Take the last step back, as far as this is in our hands: solvers start afresh."""
+        window, self._trajectory, self._dropped, history = self._before
+        self._window.roll_back(window)
+        self._history.clear()
+        self._history.extend(history)
+        self._subproblem.forget()
+        with suppress(Exception, SystemExit):
+            self._solver.forget()
 
     def covariances(self) -> Array:
         """Covariances along the last estimate."""
         if self._trajectory is None:
             raise InvalidInputError("there is no estimate yet; update first.")
+        problem = self._problem
         with np.errstate(all="ignore"):
-            return window_covariances(self._problem, self._trajectory)
+            problem.bind(self._window)
+            problem.leave_out(self._dropped)
+            return window_covariances(problem, self._trajectory.copy())
 
     def _estimate(self, missing: bool, held: bool, flat: bool, began: float) -> Estimate:
         """Solve the window's problem as it stands."""
@@ -189,7 +249,8 @@ class PythonEngine:
         )
         if held and outcome.improved:
             window.restart(estimate.state)
-        self._trajectory, self._dropped = trajectory, outcome.dropped
+        # The estimate's arrays are the user's.
+        self._trajectory, self._dropped = trajectory.copy(), outcome.dropped
         estimate.step_time = perf_counter() - began
         return estimate
 
@@ -210,24 +271,22 @@ class PythonEngine:
         """All that was learnt from measurements so far, as plain arrays and numbers."""
         # What a solver keeps is not written down: this estimator goes on without it, too.
         self._solver.forget()
+        modes, methods = self._system._calling()
         return {
             "problem": self._size(),
+            "estimator": self._description(),
+            "linearized": self._linearized,
             "window": self._window.state_dict(),
             "history": [state.copy() for state in self._history],
             "trajectory": None if self._trajectory is None else self._trajectory.copy(),
             "dropped": self._dropped,
             # How the model is called: another way of calling would round differently.
-            "modes": [one.mode for system in self._systems() for one in (system.f, system.h)],
-            "methods": [
-                one.method for system in self._systems()
-                for one in (system.f_jacobian, system.h_jacobian)
-            ],
+            "modes": list(modes),
+            "methods": list(methods),
         }
 
-    def _systems(self) -> list[System]:
-        """The system, and that for steps of other lengths once it is in use."""
-        timed = self._system.__dict__.get("timed")
-        return [self._system] if timed is None else [self._system, timed]
+    def _description(self) -> dict[str, Any]:
+        return described(self._system, self._observer, self._cost, self._settings)
 
     def _size(self) -> tuple[int, ...]:
         system = self._system
@@ -235,46 +294,73 @@ class PythonEngine:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where another estimator stopped."""
-        system = self._system
         check_problem(state, self._size())
-        if state.get("engine", "python") != "python":
+        if str(state.get("engine", "python")) != "python":
             raise InvalidInputError(
                 f"the state is of an estimator with engine={state['engine']!r}, which is not at "
                 "work here; install a C compiler, or snapshot with engine='python'."
             )
+        before = self._system._calling()
         try:
-            if not self._window.fits(state["window"]):
-                raise InvalidInputError(
-                    "the state is of an estimator with another observer or cost."
-                )
-            history = [np.array(x, np.float64).reshape(system.n) for x in state["history"]]
-            window = self._fresh_window(history[-1])
-            window.load_state_dict(state["window"])
-            trajectory, dropped = state["trajectory"], tuple(state["dropped"])
-            if trajectory is not None:
-                trajectory = np.array(trajectory, np.float64).reshape(-1, system.n)
-            modes, methods = tuple(state["modes"]), tuple(state["methods"])
-            if len(modes) not in (2, 4) or len(methods) != len(modes):
-                raise ValueError("modes and methods are of other numbers of functions")
-            if len(modes) == 4 and system._timed is None:
-                raise ValueError("the system has no steps of other lengths")
-        except (KeyError, IndexError, TypeError, ValueError) as error:
-            if isinstance(error, InvalidInputError):
-                raise
-            raise InvalidInputError(
-                f"the state is damaged ({type(error).__name__}: {error}); expected what "
-                "state_dict gave, unchanged."
-            ) from error
-        # All of it could be read: from here on nothing fails, and nothing is half done.
-        self._solver.forget()
-        self._window, self._trajectory, self._dropped = window, trajectory, dropped
-        self._history.clear()
-        self._history.extend(history)
-        systems = [system] if len(modes) == 2 else [system, system.timed]
-        for k, one in enumerate(systems):
-            one.f.mode, one.h.mode = modes[2 * k : 2 * k + 2]
-            one.f_jacobian.use(methods[2 * k])
-            one.h_jacobian.use(methods[2 * k + 1])
+            with reading():
+                check_description(state["estimator"], self._description())
+                self._system._call_as(self._checked_calling(state["modes"], state["methods"]))
+                found = self._read(state)
+                self._solver.forget()
+            self.replace(*found)
+        except BaseException:
+            self._system._call_as(before)
+            raise
+
+    def _read(
+        self, state: dict[str, Any]
+    ) -> tuple[Window, Array | None, tuple[str, ...], list[Array]]:
+        """What a state's estimator remembered, checked."""
+        n, linearized = self._system.n, state["linearized"]
+        if not isinstance(linearized, bool):
+            raise TypeError(f"linearized is {linearized!r}")
+        window, again = (self._fresh_window(np.zeros(n)) for _ in range(2))
+        for one in (window, again):
+            one.load_state_dict(state["window"], self._system._timed is not None)
+        history = [taken("history", one, (n,)) for one in state["history"]]
+        count = min(window.length + 1, self._history.maxlen or 1)
+        if len(history) != count:
+            raise ValueError(f"history has {len(history)} states; expected {count}")
+        trajectory = state["trajectory"]
+        if (trajectory is None) != (window.time == 0):
+            raise TypeError("trajectory is there exactly if there was a measurement")
         if trajectory is not None:
-            self._problem.bind(self._window)
-            self._problem.leave_out(self._dropped)
+            trajectory = taken("trajectory", trajectory, (window.length + 1, n))
+            if not np.array_equal(trajectory[-1], history[-1]):
+                raise ValueError("history does not end where the trajectory does")
+        dropped = state["dropped"]
+        if not isinstance(dropped, tuple) or not all(
+            isinstance(name, str) and getattr(self._system, name, None) is not None
+            and name in SET_NAMES for name in dropped
+        ):
+            raise ValueError(f"dropped is {dropped!r}")
+        alike = linearized == self._linearized
+        again.check_stages(window, alike)
+        return window if alike else again, trajectory, dropped, history
+
+    def _checked_calling(
+        self, modes: Any, methods: Any
+    ) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """How a state's estimator called the model, if that is how it can be called here."""
+        made = self._made
+        if len(modes) == 4:
+            if self._system._timed is None:
+                raise ValueError("the system has no steps of other lengths")
+            timed = self._system._timed()._calling()
+            made = made[0] + timed[0], made[1] + timed[1]
+        for name, found, known, slowest in (
+            ("modes", modes, made[0], "looped"),
+            ("methods", methods, made[1], "finite differences"),
+        ):
+            if not isinstance(found, (list, tuple)) or len(found) != len(known):
+                raise ValueError(f"{name} is {found!r}; expected {len(known)} of them")
+            for one, mine in zip(found, known, strict=True):
+                usual = isinstance(one, str) and one in (mine, slowest)
+                if not usual and not (mine == "unknown" and one in ("batched", "columns")):
+                    raise ValueError(f"{name} is {found!r}; expected {known}")
+        return tuple(modes), tuple(methods)

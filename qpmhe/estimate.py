@@ -104,6 +104,10 @@ class Estimate:
     With N_t = min(t + 1, N) stages in the window, the trajectory holds the estimates of
     x(t+1-N_t), ..., x(t+1), made from the measurements y(t+1-N_t), ..., y(t).
 
+    The arrays are the caller's: no estimator reads them again. ``state``, ``filtered`` and
+    ``delayed`` are rows of ``trajectory``; copy them to change one without the other, or to
+    keep a state without its window.
+
     Attributes
     ----------
     time : int

@@ -153,11 +153,14 @@ class MovingHorizonEstimator:
                 "has no covariance; take a Kalman-type observer, such as qpmhe.ExtendedKalman, "
                 "or give a constant weight."
             )
-        self.initial_state: Array = self._checked_start(initial_state)
+        #: For this estimator alone, which may change how the model is called.
+        self._own = system._private()
+        self._initial_state: Array = self._checked_start(initial_state)
         self._no_input = np.zeros(system.m)
-        self._timed_is_checked = False
         try:
-            self._engine = engine_for(system, observer, cost, self.settings, self.initial_state)
+            self._engine = engine_for(
+                self._own, observer, cost, self.settings, self._initial_state
+            )
         except MemoryError as error:
             raise OptionError(
                 f"horizon is {self.settings.horizon}: the arrays of so many stages of "
@@ -166,8 +169,8 @@ class MovingHorizonEstimator:
 
     def _checked_start(self, initial_state: ArrayLike) -> Array:
         state = vector("initial_state", initial_state, self.system.n)
-        self.system.check(state, np.zeros(self.system.m))
-        self.observer.check(self.system, state)
+        self._own.check(state, np.zeros(self.system.m))
+        self.observer.check(self._own, state)
         states = self.system.states
         if states is not None and states.violation(state) > 0.0:
             raise InvalidInputError(
@@ -189,9 +192,20 @@ class MovingHorizonEstimator:
         InvalidInputError
             If the state does not fit; the estimator is left as it was.
         """
-        if initial_state is not None:
-            self.initial_state = self._checked_start(initial_state)
-        self._engine.reset(self.initial_state)
+        before = self._initial_state, self._own._calling()
+        try:
+            if initial_state is not None:
+                self._initial_state = self._checked_start(initial_state)
+            self._engine.reset(self._initial_state)
+        except BaseException:
+            self._initial_state, calling = before
+            self._own._call_as(calling)
+            raise
+
+    @property
+    def initial_state(self) -> Array:
+        """The initial estimate, a copy."""
+        return self._initial_state.copy()
 
     @property
     def state(self) -> Array:
@@ -224,7 +238,9 @@ class MovingHorizonEstimator:
         """Take the measurement y(t) and the input u(t) in, and estimate x(t+1).
 
         Solver failures, a model that cannot be evaluated and missing measurements do not
-        raise: the step falls back to the candidate, and the estimate's status tells why.
+        raise: the step falls back to the candidate, and the estimate's status tells why. An
+        update that is interrupted (Ctrl+C) has not taken the sample; a QP solver that
+        warm-starts then starts afresh.
 
         Parameters
         ----------
@@ -264,10 +280,10 @@ class MovingHorizonEstimator:
 
     def _check_timed(self, dt: float) -> None:
         """Insist, before the sample is taken, that there is a model with this step."""
-        if not self._timed_is_checked:
-            u = np.append(self._no_input, dt)
-            self.system.timed.check(self.initial_state, u)
-            self._timed_is_checked = True
+        if "timed" not in self._own.__dict__:
+            timed = self.system.timed._private()
+            timed.check(self._initial_state, np.append(self._no_input, dt))
+            self._own.__dict__["timed"] = timed
 
     def _measurement(self, y: ArrayLike | None) -> Array:
         p = self.system.p
@@ -357,7 +373,13 @@ class MovingHorizonEstimator:
         Raises
         ------
         InvalidInputError
-            If it is not such a state; the estimator is left as it was.
+            If it is not such a state: damaged, or of an estimator with another model,
+            observer, cost, sets or candidate. The estimator is left as it was. QP caps,
+            backend, tolerances and policies may differ.
+
+        Notes
+        -----
+        Every stored stage is computed once more, and compared.
         """
         self._engine.load_state_dict(state)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
+from copy import copy
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -235,6 +236,10 @@ class BatchedFunction:
         self._returns_array = self._returns_array and isinstance(raw, np.ndarray)
         self._holds_objects = getattr(raw, "dtype", None) == np.object_
         return value.reshape(self.shape) if np.isfinite(value).all() else None
+
+    def copy(self) -> BatchedFunction:
+        """The same function, with a mode of its own."""
+        return copy(self)
 
     @property
     def direct(self) -> Callable[..., Any]:

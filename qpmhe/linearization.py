@@ -183,11 +183,6 @@ class StageTerms:
         """The arrays, each with one entry a stage."""
         return self.linear, self.panel, self.own, self.following
 
-    def keep_last(self, end: int, keep: int) -> None:
-        """Move the stages end-keep, ..., end-1 to the front."""
-        for array in self.arrays():
-            array[:keep] = array[end - keep : end]
-
 
 def _places(n: int, p: int) -> NDArray[np.intp]:
     """Where the panel of a stage stands in [M^T W M, W M, 0], flat."""

@@ -122,14 +122,17 @@ class Problem:
         self._candidate = None
         self.frame = frame = window.frame
         self.prior, self.measurements = frame.prior, frame.measurements
-        if window.unusual:
+        # Decided by what the window holds: an estimator that goes on from a snapshot must round
+        # as the one that it was taken of.
+        unusual = window.unusual and (window.has_special_weights or window.has_irregular_steps)
+        if unusual:
             self.inputs, self.model = window.inputs, window.model
             self.stage_weights = window.stage_weights
             self.observed = window.observed if window.has_special_weights else None
         else:
             self.inputs, self.model = frame.inputs, self._system
             self.stage_weights, self.observed = self._cost.stage_weight, None
-        self._fused, self._first = None if window.unusual else window.fused, window.start
+        self._fused, self._first = None if unusual else window.fused, window.start
         if self._discounted:
             self.discounts = window.discounts
         if self._prior_rule is not None and window.prior_covariance is not None:

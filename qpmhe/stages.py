@@ -10,12 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ._checks import positive_definite
 from .linearization import StageTerms
+from .snapshot import check_size, other, taken
 from .views import Frame, Place, Views, read_only
 
-__all__ = ["Stages"]
+__all__ = ["Mark", "Stages"]
 
 Array = NDArray[np.float64]
+Mark = tuple[
+    int, int, int, int, int, bool, "dict[int, Array] | None", "list[Array] | None"
+]
 
 # Views of longer windows are not kept: they would outweigh the arrays, and are little of a step.
 _KEPT = 1000
@@ -41,6 +46,8 @@ class Stages:
         Weight of a usual stage.
     quadratic : bool
         Whether the cost's weights majorise it themselves.
+    step : float
+        The usual length of a step, 0 where there is none.
     """
 
     def __init__(
@@ -53,13 +60,15 @@ class Stages:
         covariance: Array | None,
         stage_weight: Array,
         quadratic: bool,
+        step: float,
     ) -> None:
-        self.horizon = horizon
+        self.horizon, self._step = horizon, step
         room = horizon + max(horizon // 4, 32)
-        self._room = room
+        self.room = room
         self._z = np.zeros((room + 1, n))
-        # The input of each stage, and behind it the length of its step where that is unusual.
+        # The input of each stage, and behind it the length of its step.
         self._y, self._u = np.zeros((room, p)), np.zeros((room, m + 1))
+        self._u[:, m] = step
         self._irregular = np.zeros(room, dtype=np.bool_)
         self._observed = np.ones((room, p), dtype=np.bool_)
         # Stages whose weight is not the cost's own, because y is missing or has its own noise.
@@ -86,35 +95,20 @@ class Stages:
         )
         if horizon <= _KEPT:
             self._places, self._frames = list(self._places), list(self._frames)
-        self.reset(initial_state, covariance)
-
-    def reset(self, initial_state: Array, covariance: Array | None) -> None:
-        """Forget all samples.
-
-        Parameters
-        ----------
-        initial_state : (n,) array
-            z(0).
-        covariance : (n, n) array or None
-            The observer's, of z(0).
-        """
         self.time = 0  # samples ever pushed: the window ends at x(time)
         self.start = self.end = 0
         self._last_special = self._last_irregular = -self.horizon - 1
         # The last state at which the model worked, of the stages that are no longer here.
-        self._earlier, self._earlier_covariance = initial_state, covariance
+        self._earlier = initial_state.copy()
+        self._earlier_covariance = None if covariance is None else covariance.copy()
         self._z[0] = initial_state
         if self._covariance is not None:
             self._covariance[0] = covariance
-        self._own_noise.clear()
-        if self.unusual:
-            self._make_usual(0)
-            self.unusual = False
 
     def _make_usual(self, first: int) -> None:
         """Make the places from one on those of usual stages."""
         self._observed[first:], self._special[first:], self._irregular[first:] = True, False, False
-        self._weight[first:] = self._stage_weight
+        self._weight[first:], self._u[first:, -1] = self._stage_weight, self._step
 
     @property
     def length(self) -> int:
@@ -147,21 +141,77 @@ class Stages:
                 return self._z[k], None if self._covariance is None else self._covariance[k]
         return self._earlier, self._earlier_covariance
 
-    def _move_to_front(self) -> None:
-        keep, end = self.end - self.start, self.end
+    def make_room(self) -> None:
+        """Move the stages to the front where there is no place for another one."""
+        if self.end < self.room:
+            return
         state, covariance = self._last_good(self.start)
-        self._earlier = state.copy()
-        self._earlier_covariance = None if covariance is None else covariance.copy()
-        for array in self._per_stage():
-            array[:keep] = array[end - keep : end]
-        self.terms.keep_last(end, keep)
-        for states in (self._z, self._covariance):
-            if states is not None:
-                states[: keep + 1] = states[end - keep : end + 1]
+        earlier = state.copy(), None if covariance is None else covariance.copy()
+        kept = self._kept()
+        try:
+            self._settle(kept, earlier)
+        except BaseException:  # an interrupt: of half a move nothing could be told
+            self._settle(kept, earlier)
+            raise
+
+    def _settle(self, kept: list[Array], earlier: tuple[Array, Array | None]) -> None:
+        self._earlier, self._earlier_covariance = earlier
+        keep = len(kept[0])
+        self._put(kept, 0)
         if self.unusual:
             self._make_usual(keep)
             self.unusual = bool(self._special[:keep].any() or self._irregular[:keep].any())
         self.start, self.end = 0, keep
+
+    def _kept(self) -> list[Array]:
+        """Copies of the window's part of all arrays."""
+        stages, points = slice(self.start, self.end), slice(self.start, self.end + 1)
+        arrays = [array[stages].copy() for array in (*self._per_stage(), *self.terms.arrays())]
+        arrays.append(self._z[points].copy())
+        if self._covariance is not None:
+            arrays.append(self._covariance[points].copy())
+        return arrays
+
+    def _put(self, kept: list[Array], first: int) -> None:
+        """Put what `_kept` gave into the places from one on."""
+        arrays = [*self._per_stage(), *self.terms.arrays(), self._z]
+        if self._covariance is not None:
+            arrays.append(self._covariance)
+        for array, part in zip(arrays, kept, strict=True):
+            array[first : first + len(part)] = part
+
+    def mark(self, whole: bool) -> Mark:
+        """What `roll_back` needs.
+
+        Parameters
+        ----------
+        whole : bool
+            Whether stages of the window are to change, too, and not only one to enter.
+        """
+        return (
+            self.start, self.end, self.time, self._last_special, self._last_irregular,
+            self.unusual, self._own_noise.copy() if self._own_noise else None,
+            self._kept() if whole else None,
+        )
+
+    def roll_back(self, mark: Mark) -> None:
+        """Undo all that was done since a mark, except for a move to the front.
+
+        Parameters
+        ----------
+        mark : tuple
+            What `mark` gave, when there was room for a stage.
+        """
+        (
+            self.start, self.end, self.time, self._last_special, self._last_irregular,
+            unusual, own_noise, kept,
+        ) = mark
+        self._own_noise = own_noise or {}
+        if kept is not None:
+            self._put(kept, self.start)
+        if self.unusual:
+            self._make_usual(self.end)
+        self.unusual = unusual
 
     def state_dict(self) -> dict[str, Any]:
         """All that the window knows, as copies of arrays and numbers."""
@@ -181,33 +231,67 @@ class Stages:
             "last_irregular": self._last_irregular,
         }
 
-    def fits(self, state: dict[str, Any]) -> bool:
-        """Whether a state is of a window like this one."""
-        return (state["covariance"] is None) == (self._covariance is None) and len(
-            state["stages"]
-        ) == len(self._per_stage())
+    def load_state_dict(self, state: dict[str, Any], irregular: bool) -> None:
+        """Take over what `state_dict` of an equal window gave, into a fresh window.
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` of an equal window gave."""
-        length = len(state["z"]) - 1
-        self.start, self.end, self.time = 0, length, int(state["time"])
-        self._z[: length + 1] = state["z"]
+        Raises whatever comes of a state that is damaged; the window is void then.
+
+        Parameters
+        ----------
+        state : dict
+            The state.
+        irregular : bool
+            Whether there may be steps of unusual length.
+        """
+        time = check_size("time", state["time"], lambda found: found >= 0)
+        length = min(time, self.horizon)
+        points = [("z", self._z, state["z"]), ("covariance", self._covariance, state["covariance"])]
+        for name, mine, saved in points:
+            if (mine is None) != (saved is None):
+                raise other("observer")
+            if mine is not None:
+                mine[: length + 1] = taken(name, saved, (length + 1, *mine.shape[1:]))
+        self._earlier = taken("earlier", state["earlier"], self._earlier.shape)
         if self._covariance is not None:
-            self._covariance[: length + 1] = state["covariance"]
-        self._earlier = np.array(state["earlier"], np.float64).reshape(self._z.shape[1])
-        saved_covariance = state["earlier_covariance"]
-        self._earlier_covariance = (
-            None if saved_covariance is None
-            else np.array(saved_covariance, np.float64).reshape(self._z.shape[1], -1)
+            saved, shape = state["earlier_covariance"], self._covariance.shape[1:]
+            self._earlier_covariance = taken("earlier_covariance", saved, shape)
+        if len(state["stages"]) != len(self._per_stage()):
+            raise other("cost")
+        for arrays, part, loose in (
+            # Inputs, costs and terms where the model fails need not be finite.
+            (self._per_stage(), state["stages"], (self._u, self._stage_cost)),
+            (self.terms.arrays(), state["terms"], self.terms.arrays()),
+        ):
+            for array, saved in zip(arrays, part, strict=True):
+                finite = not any(array is one for one in loose)
+                array[:length] = taken(
+                    "a stage", saved, (length, *array.shape[1:]), array.dtype, finite
+                )
+        if not (self._stage_cost[:length] >= 0.0).all():
+            raise ValueError("a stage's cost is not a number >= 0")
+        steps, odd = self._u[:length, -1], self._irregular[:length]
+        if (steps[~odd] != self._step).any() or (odd.any() and not (
+            irregular and np.isfinite(steps).all() and (steps > 0.0).all()
+        )):
+            raise ValueError("a step's length is impossible")
+        p = self._y.shape[1]
+        for when, weight in state["own_noise"].items():
+            when = check_size("a sample's time", when, lambda t: time - length <= t < time)
+            self._own_noise[when] = positive_definite(
+                "noise_weight", taken("noise_weight", weight, (p, p))
+            )
+        latest = [
+            time - length + int(np.flatnonzero(flags[:length])[-1]) if flags[:length].any()
+            else -self.horizon - 1
+            for flags in (self._special, self._irregular)
+        ]
+        self._last_special = check_size(
+            "last_special", state["last_special"], lambda t: latest[0] <= t < time
         )
-        for array, saved in zip(self._per_stage(), state["stages"], strict=True):
-            array[:length] = saved
-        for array, saved in zip(self.terms.arrays(), state["terms"], strict=True):
-            array[:length] = saved
-        self._own_noise = {time: weight.copy() for time, weight in state["own_noise"].items()}
-        self.unusual = True
-        self._last_special = int(state["last_special"])
-        self._last_irregular = int(state["last_irregular"])
+        self._last_irregular = check_size(
+            "last_irregular", state["last_irregular"], lambda t: latest[1] <= t < time
+        )
+        self.start, self.end, self.time, self.unusual = 0, length, time, True
 
     @property
     def candidate(self) -> Array:

@@ -92,6 +92,10 @@ class Subproblem:
         terms.set_all(count, trial.weights)
         return self._assemble(problem, trial, Span(terms, 0, count), False)
 
+    def forget(self) -> None:
+        """Make the QP anew at its next use: an interrupt may have left it half done."""
+        self._qp = None
+
     @property
     def jacobian(self) -> Array:
         """Jacobians (K, n + p, n) of (f, h) along the trajectory of the last QP."""

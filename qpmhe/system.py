@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -385,6 +386,39 @@ class System:
                 "time, as System.from_ode takes it."
             )
         return self._timed()
+
+    def _private(self) -> System:
+        """The same system for one estimator, which may change how its functions are called."""
+        other = copy(self)
+        other.f, other.h = self.f.copy(), self.h.copy()
+        other.f_jacobian = self.f_jacobian.copy(other.f)
+        other.h_jacobian = self.h_jacobian.copy(other.h)
+        other.__dict__.pop("timed", None)
+        if self._timed is not None:
+            other._timed = lambda: self.timed._private()
+        return other
+
+    def _calling(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Modes of the functions and methods of the Jacobians, behind them those of `timed`."""
+        timed = self.__dict__.get("timed")
+        systems = (self,) if timed is None else (self, timed)
+        return (
+            tuple(one.mode for system in systems for one in (system.f, system.h)),
+            tuple(
+                one.method for system in systems for one in (system.f_jacobian, system.h_jacobian)
+            ),
+        )
+
+    def _call_as(self, calling: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
+        """Call the functions as `_calling` said."""
+        modes, methods = calling
+        systems = [self] if len(modes) == 2 else [self, self.timed]
+        if len(modes) == 2:
+            self.__dict__.pop("timed", None)
+        for k, system in enumerate(systems):
+            system.f.mode, system.h.mode = modes[2 * k : 2 * k + 2]
+            system.f_jacobian.use(methods[2 * k])
+            system.h_jacobian.use(methods[2 * k + 1])
 
     @property
     def derivatives(self) -> dict[str, str]:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from .costs import Cost, ObserverPrior
 from .functions import contained
-from .linearization import Stage
+from .linearization import Stage, StageTerms
 from .observers import HighGain, Luenberger, Observer, Sample
+from .snapshot import near, other
 from .stages import Stages
 from .system import Function, System
 from .views import Frame
@@ -63,7 +64,7 @@ class Window(Stages):
         self._jacobians = linearized or observer.needs_jacobians
         super().__init__(
             n, p, m, horizon, initial_state, observer.initial_covariance(), cost.stage_weight,
-            cost.quadratic,
+            cost.quadratic, system.dt or 0.0,
         )
         self._sample = Sample(system, np.zeros(m))
         self._correct = contained(observer.correct)
@@ -113,8 +114,8 @@ class Window(Stages):
             measurement; the observer goes on where the model last worked, and the
             candidate's cost is infinite while the stage stays.
         """
-        if self.end == self._room:
-            self._move_to_front()
+        if self.end == self.room:
+            self.make_room()
         k, m = self.end, self._m
         place = self._places[k]
         place.y[...] = y
@@ -322,6 +323,89 @@ class Window(Stages):
         """Go on from another state after a failed stage, whose correction is void anyway."""
         self._z[self.end] = state
 
+    def check_stages(self, kept: Window, terms: bool) -> None:
+        """Compute the stages of an equal window once more, and insist on what was kept of them.
+
+        Afterwards this window is that one with all of it computed here.
+
+        Parameters
+        ----------
+        kept : Window
+            What a snapshot gave. It was loaded into this window, too.
+        terms : bool
+            Whether it holds Jacobians and Gauss-Newton terms exactly if this one does.
+
+        Raises
+        ------
+        InvalidInputError
+            If another model, observer or cost was at work.
+        """
+        n, count, first = self._n, self.end, self.time - self.end
+        with np.errstate(all="ignore"):
+            for k in range(count):
+                self._set_weight(k, first + k)
+                self._enter(k, first + k)
+                there = math.isfinite(kept._stage_cost[k])
+                if there != math.isfinite(self._stage_cost[k]):
+                    raise other("model")
+                if there:
+                    self._check_stage(k, kept, terms)
+                elif kept.terms.residuals[k, :n].any():  # there is no correction
+                    raise other("model")
+                # A failed stage is followed by a restart; all else has been compared.
+                self._z[k + 1] = kept._z[k + 1]
+                if self._covariance is not None and kept._covariance is not None:
+                    self._covariance[k + 1] = kept._covariance[k + 1]
+        self._last_special, self._last_irregular = kept._last_special, kept._last_irregular
+
+    def _check_stage(self, k: int, kept: Window, terms: bool) -> None:
+        n, mine, saved = self._n, self.terms, kept.terms
+        if not (
+            np.array_equal(self._special[k], kept._special[k])
+            and np.array_equal(self._observed[k], kept._observed[k])
+            and near(kept._weight[k], self._weight[k], np.abs(self._weight[k]).max())
+        ):
+            raise other("weight of the stages' cost")
+        y, fitting = np.abs(self._y[k]), mine.residuals[k, n:]
+        seen = y + np.abs(fitting)
+        if not near(saved.residuals[k, n:], fitting, seen):
+            raise other("model (h)")
+        sizes = np.abs(kept._z[: self.end + 1]).max(axis=0)
+        correction = mine.residuals[k, :n]
+        reached = np.maximum(sizes, np.abs(correction))
+        if not near(saved.residuals[k, :n], correction, reached):
+            raise other("observer")
+        if not near(kept._z[k + 1], self._z[k + 1], reached):
+            raise other("model (f)")
+        if self._covariance is not None and kept._covariance is not None:
+            found, expected = kept._covariance[k + 1], self._covariance[k + 1]
+            spread = np.sqrt(np.abs(expected.diagonal()))
+            if not near(found, expected, np.outer(spread, spread)):
+                raise other("observer")
+        r, weight = saved.residuals[k], kept._weight[k]
+        cost = float(self._stage_costs(r[None], weight)[0])
+        size = np.abs(r).dot(np.abs(weight)).dot(np.abs(r)) if self._quadratic else cost
+        if not near(kept._stage_cost[k], cost, size):
+            raise other("cost")
+        if not (terms and (self._linearized or self._quadratic)):
+            return
+        slopes = mine.linear[k, :, 1:]
+        steepest = np.nan_to_num(np.abs(slopes)).max(axis=1, keepdims=True)
+        if not near(saved.linear[k, :, 1:], slopes, steepest):
+            raise other("model (its Jacobians)")
+        if not near(kept._majorising[k], self._majorising[k], np.abs(self._majorising[k]).max()):
+            raise other("cost")
+        exact, bound = StageTerms(1, n, r.size - n), StageTerms(1, n, r.size - n)
+        exact.linear[0], weight = saved.linear[k], kept._majorising[k]
+        bound.linear[0] = np.abs(exact.linear[0])
+        exact.set_all(1, weight)
+        bound.set_all(1, np.abs(weight))
+        for found, expected, size in zip(
+            saved.arrays(), exact.arrays(), bound.arrays(), strict=True
+        ):
+            if not near(found[k], expected[0], size[0]):
+                raise other("weight of the stages' cost")
+
     @property
     def candidate_cost(self) -> float:
         """J of the candidate; its prior term is 0 exactly."""
@@ -354,11 +438,7 @@ class Window(Stages):
         """The inputs u, with the steps' lengths behind them if some are irregular."""
         if not self.has_irregular_steps:
             return self.usual_inputs
-        u = self._u[self.start : self.end]
-        lengths = self._u[:, self._m]
-        usual = ~self._irregular[self.start : self.end]
-        lengths[self.start : self.end][usual] = self._system.dt
-        return u
+        return self._u[self.start : self.end]
 
     @property
     def model(self) -> System:

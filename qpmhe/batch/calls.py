@@ -37,7 +37,8 @@ class MemberFunction:
     ) -> None:
         self._function, self._shape = function, shape
         self._casting = "same_kind" if strict else "unsafe"
-        self._apart = False
+        #: Whether members are called one by one.
+        self.apart = False
 
     def at(self, x: Array, u: Array) -> Array:
         """Values (K, ...) at one state of each member.
@@ -82,7 +83,7 @@ class MemberFunction:
 
     def _together(self, x: Array, u: Array) -> Array | None:
         """The values of one call on all; None where it cannot be trusted."""
-        if self._apart:
+        if self.apart:
             return None
         try:
             value = np.asarray(self._function.batch(x, u))
@@ -103,7 +104,7 @@ class MemberFunction:
         members : (k,) int array
             Whom to call once more.
         """
-        if self._apart or getattr(self._function, "mode", "") == "looped":
+        if self.apart or getattr(self._function, "mode", "") == "looped":
             return True
         finite = values[np.isfinite(values)]
         rounding = 1e-9 * (1.0 + float(np.abs(finite).max(initial=0.0)))
@@ -116,7 +117,7 @@ class MemberFunction:
             if there != np.isfinite(one).all() or (
                 there and not (np.abs(one - values[k]) <= rounding).all()
             ):
-                self._apart = True
+                self.apart = True
                 return False
         return True
 
@@ -136,3 +137,15 @@ class Calls:
         self.h = MemberFunction(system.h, (p,), strict=True)
         self.f_jacobian = MemberFunction(system.f_jacobian, (n, n))
         self.h_jacobian = MemberFunction(system.h_jacobian, (p, n))
+
+    def apart(self) -> list[bool]:
+        """Whose functions are called member by member."""
+        return [one.apart for one in self._all()]
+
+    def set_apart(self, apart: list[bool]) -> None:
+        """Call them as `apart` said."""
+        for one, value in zip(self._all(), apart, strict=True):
+            one.apart = value
+
+    def _all(self) -> tuple[MemberFunction, ...]:
+        return self.f, self.h, self.f_jacobian, self.h_jacobian

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -62,13 +63,17 @@ class CompiledBatchEngine:
     def reset(self, states: Array) -> None:
         """See `qpmhe.batch.engines.BatchEngine.reset`."""
         self._memory = self._library.estimators(states)
-        self.time = 0
+
+    @property
+    def time(self) -> int:
+        """See `qpmhe.batch.engines.BatchEngine.time`."""
+        return int(self._memory["time"][0])
 
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt from measurements so far."""
         memory = self._memory.view(np.uint8).copy()  # as bytes: padding is copied, too
         memory.view(self._memory.dtype)["settings"] = 0  # an address means nothing elsewhere
-        return {"time": self.time, "memory": memory}
+        return {"memory": memory}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where an engine of the same arguments stopped.
@@ -80,7 +85,6 @@ class CompiledBatchEngine:
         """
         self._memory = state["memory"].copy().view(self._memory.dtype)
         self._memory["settings"] = self._library.settings.ctypes.data
-        self.time = state["time"]
 
     @property
     def states(self) -> Array:
@@ -101,7 +105,6 @@ class CompiledBatchEngine:
             )
 
         self._share(work)
-        self.time += 1
         states = slice(0, int(found["length"][0]) + 1)
         return BatchEstimate(
             self.time - 1, found["trajectory"][:, states], found["cost"],
@@ -129,7 +132,6 @@ class CompiledBatchEngine:
             )
 
         self._share(work)
-        self.time += samples
         return BatchRun(
             states=np.concatenate((start[:, None], log.states), axis=1), filtered=log.filtered,
             delayed=log.delayed, costs=log.costs, candidate_costs=log.candidate_costs,
@@ -137,8 +139,31 @@ class CompiledBatchEngine:
         )
 
     def _share(self, work: Callable[[slice, NDArray[np.uint8]], None]) -> None:
-        """Do the work on all members, a part a thread; C runs without the interpreter's lock."""
-        if self._pool is None:
-            work(self._parts[0], self._workspaces[0])
-        else:
-            list(self._pool.map(work, self._parts, self._workspaces))
+        """Do the work on all members, a part a thread; C runs without the interpreter's lock.
+
+        An interrupt is raised when all members have done their work, or none.
+        """
+        pending = set(range(len(self._parts)))
+        done = [Event() for _ in pending]
+
+        def do(k: int) -> None:
+            try:
+                pending.remove(k)
+            except KeyError:  # somebody else has begun it
+                return
+            try:
+                work(self._parts[k], self._workspaces[k])
+            finally:
+                done[k].set()
+
+        try:
+            if self._pool is None:
+                work(self._parts[0], self._workspaces[0])
+            else:
+                list(self._pool.map(do, range(len(self._parts))))
+        except BaseException:
+            if self._pool is not None:
+                for k, one in enumerate(done):
+                    do(k)
+                    one.wait()
+            raise

@@ -129,10 +129,12 @@ class BatchEstimator:
         if not isinstance(system, System):
             raise InvalidInputError(f"system is {system!r}; expected a qpmhe.System.")
         states = starts_of(initial_states, self.members, system.n)
+        # For this estimator alone, which may change how the model is called.
+        own = system._private()
         if isinstance(observer, Observer):
-            check_starts(system, observer, states)
+            check_starts(own, observer, states)
         self.system, self.observer, self.cost = system, observer, cost
-        self.initial_states = states
+        self._initial_states = states
         self._threads = None if threads is None else count("threads", threads, 1)
         try:
             # The checks of all that members have in common are those of a single estimator.
@@ -145,15 +147,15 @@ class BatchEstimator:
             )
             # Where it could not be compiled, that was told once.
             self.settings = replace(one.settings, engine=one.engine)
-            self._make_engine(one.engine)
+            self._make_engine(one.engine, own)
         except MemoryError as error:
             raise OptionError(
                 f"{self.members} members with a horizon of {horizon} need more memory than there "
                 f"is ({error}); take a shorter horizon, or fewer members at once."
             ) from error
 
-    def _make_engine(self, engine: str) -> None:
-        system, observer, cost, states = self.system, self.observer, self.cost, self.initial_states
+    def _make_engine(self, engine: str, system: System) -> None:
+        observer, cost, states = self.observer, self.cost, self._initial_states
         found = obstacles(system, observer, cost, self.settings)
         self.mode = "looped" if found else "vectorised"
         self.mode_reason = "; ".join(found)
@@ -201,11 +203,21 @@ class BatchEstimator:
         InvalidInputError
             If they do not fit; the estimator is left as it was.
         """
+        before = states = self._initial_states
         if initial_states is not None:
             states = starts_of(initial_states, self.members, self.system.n)
-            check_starts(self.system, self.observer, states)
-            self.initial_states = states
-        self._engine.reset(self.initial_states.copy())
+            check_starts(self.system._private(), self.observer, states)
+        try:
+            self._initial_states = states
+            self._engine.reset(states.copy())
+        except BaseException:
+            self._initial_states = before
+            raise
+
+    @property
+    def initial_states(self) -> Array:
+        """The initial estimates (K, n), a copy."""
+        return self._initial_states.copy()
 
     def update(self, Y: ArrayLike | None, U: ArrayLike | None = None) -> BatchEstimate:
         """Take the measurements y(t) and inputs u(t) of all members in, and estimate x(t+1).
@@ -227,6 +239,11 @@ class BatchEstimator:
         ------
         ShapeError, InvalidInputError
             If an argument does not fit; the estimator is left as it was.
+
+        Notes
+        -----
+        An update that is interrupted (Ctrl+C) has taken the samples of no member; in compiled
+        code, of all or of none: see ``time``.
         """
         y = measurements_of(Y, self.members, self.system.p)
         return self._engine.step(y, inputs_of(U, self.members, self.system.m))
@@ -277,9 +294,10 @@ class BatchEstimator:
         self.__dict__.update(saved)
         state = self.__dict__.pop("state")
         if isinstance(state, bytes):
-            self._engine, self._compiled = _Unpickler(BytesIO(state), self.system).load(), None
+            own = self.system._private()
+            self._engine, self._compiled = _Unpickler(BytesIO(state), own).load(), None
             return
-        self._make_engine(self.settings.engine)
+        self._make_engine(self.settings.engine, self.system._private())
         if self._compiled is not None:
             self._compiled.load_state_dict(state)
         elif isinstance(self._engine, LoopedEngine):

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
-from ..engines import engine_for
+from ..engine import PythonEngine
+from ..estimate import Estimate
 from ..observers import Observer
 from ..settings import Settings
 from ..system import System
@@ -35,7 +36,8 @@ class LoopedEngine:
     ) -> None:
         self._delay = settings.delay
         self._engines = [
-            engine_for(system, observer, cost, settings, state.copy()) for state in states
+            PythonEngine(system._private(), observer, cost, settings, state.copy())
+            for state in states
         ]
 
     @property
@@ -50,15 +52,31 @@ class LoopedEngine:
 
     def reset(self, states: Array) -> None:
         """See `qpmhe.batch.engines.BatchEngine.reset`."""
-        for engine, state in zip(self._engines, states, strict=True):
-            engine.reset(state.copy())
+        before = [engine.memory for engine in self._engines]
+        try:
+            for engine, state in zip(self._engines, states, strict=True):
+                engine.reset(state)
+        except BaseException:  # an interrupt: all members or none
+            for engine, memory in zip(self._engines, before, strict=True):
+                engine.replace(*memory)
+            raise
 
     def step(self, y: Array, u: Array) -> BatchEstimate:
         """See `qpmhe.batch.engines.BatchEngine.step`."""
-        estimates = [
-            engine.step(y[k], u[k], None, None, perf_counter())
-            for k, engine in enumerate(self._engines)
-        ]
+        time = self.time
+        try:
+            estimates = [
+                engine.step(y[k], u[k], None, None, perf_counter())
+                for k, engine in enumerate(self._engines)
+            ]
+            return self._collected(estimates)
+        except BaseException:
+            for engine in self._engines:
+                if engine.time > time:
+                    engine.undo()
+            raise
+
+    def _collected(self, estimates: list[Estimate]) -> BatchEstimate:
         return BatchEstimate(
             estimates[0].time,
             np.array([one.trajectory for one in estimates]),

@@ -59,6 +59,10 @@ class Terms:
         )
         self._weighted = self._work[: self._q * n * members].reshape(self._q, n, members)
 
+    def arrays(self) -> tuple[Array, ...]:
+        """The arrays, each with one entry a slot."""
+        return self.square, self.below, self.own, self.following
+
     def set_stage(
         self, slot: int, weight: Array, special: Special | None, jacobian: Array, weighted: Array
     ) -> None:
@@ -100,10 +104,7 @@ class Terms:
         """
         self.hold(members.size)
         for i, slot in enumerate(slots):
-            for mine, other in (
-                (self.square, terms.square), (self.below, terms.below),
-                (self.own, terms.own), (self.following, terms.following),
-            ):
+            for mine, other in zip(self.arrays(), terms.arrays(), strict=True):
                 np.take(other[slot], members, axis=-1, out=mine[i])
 
 

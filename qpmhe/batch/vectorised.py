@@ -90,13 +90,18 @@ class VectorisedEngine:
         self._sequence = Sequence(
             self._windows, problems, cost, _solver(settings), settings
         )
-        self.reset(states)
+        self._states = states.copy()
+        self._before: Array | None = None  # the last estimates' trajectories
 
     def reset(self, states: Array) -> None:
         """See `qpmhe.batch.engines.BatchEngine.reset`."""
-        self._windows.reset(states)
-        self._states = states.copy()
-        self._before: Array | None = None  # the last estimates' trajectories
+        before = self._states, self._before
+        try:
+            self._states, self._before = states.copy(), None
+            self._windows.reset(states)
+        except BaseException:
+            self._states, self._before = before
+            raise
 
     @property
     def states(self) -> Array:
@@ -110,6 +115,17 @@ class VectorisedEngine:
 
     def step(self, y: Array, u: Array) -> BatchEstimate:
         """See `qpmhe.batch.engines.BatchEngine.step`."""
+        windows = self._windows
+        windows.make_room()
+        mark, before = windows.mark(), (self._states, self._before)
+        try:
+            return self._step(y, u)
+        except BaseException:  # an interrupt: the samples are not taken
+            windows.roll_back(mark)
+            self._states, self._before = before
+            raise
+
+    def _step(self, y: Array, u: Array) -> BatchEstimate:
         windows = self._windows
         with np.errstate(all="ignore"):
             windows.push(y, u)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -81,6 +83,8 @@ class Windows:
         self.missing: Mask | None = None
         self.held: Mask | None = None
         self.flat: Mask | None = None
+        self.time = self._start = self._end = 0
+        self._good[...] = initial_states
         self.reset(initial_states)
 
     def reset(self, initial_states: Array) -> None:
@@ -91,9 +95,42 @@ class Windows:
         initial_states : (K, n) array
             z(0).
         """
-        self._z[0] = self._good[...] = initial_states
-        self.time = self._start = self._end = 0
-        self.missing = self.held = self.flat = None
+        first, good, counters = self._z[0].copy(), self._good.copy(), self._counters()
+        try:
+            self._z[0] = self._good[...] = initial_states
+            self.time = self._start = self._end = 0
+            self.missing = self.held = self.flat = None
+        except BaseException:  # an interrupt: whole or not at all
+            self._z[0], self._good[...] = first, good
+            self.time, self._start, self._end, self.missing, self.held, self.flat = counters
+            raise
+
+    def _counters(self) -> tuple[Any, ...]:
+        return self.time, self._start, self._end, self.missing, self.held, self.flat
+
+    def mark(self) -> tuple[Any, ...]:
+        """What `roll_back` needs, when there is room for a stage."""
+        slot = self.time % self.horizon
+        terms = [array[slot].copy() for array in self.terms.arrays()]
+        return (
+            self._counters(), self.special[slot], terms, self._good.copy(), self.calls.apart()
+        )
+
+    def roll_back(self, mark: tuple[Any, ...]) -> None:
+        """Undo the sample that was pushed since a mark.
+
+        Parameters
+        ----------
+        mark : tuple
+            What `mark` gave.
+        """
+        counters, special, terms, good, apart = mark
+        self.time, self._start, self._end, self.missing, self.held, self.flat = counters
+        slot = self.time % self.horizon
+        self.special[slot], self._good[...] = special, good
+        for array, part in zip(self.terms.arrays(), terms, strict=True):
+            array[slot] = part
+        self.calls.set_apart(apart)
 
     def push(self, y: Array, u: Array) -> None:
         """Take a sample of each member in, and advance the observers.
@@ -105,8 +142,6 @@ class Windows:
         u : (K, m) array
             u(t).
         """
-        if self._end == self._room:
-            self._move_to_front()
         k, slot = self._end, self.time % self.horizon
         self._y[k], self._u[k] = y.T, u
         self.special[slot] = None
@@ -127,11 +162,22 @@ class Windows:
         if self._end - self._start > self.horizon:
             self._start += 1
 
-    def _move_to_front(self) -> None:
-        keep, end = self._end - self._start, self._end
+    def make_room(self) -> None:
+        """Move the stages to the front where there is no place for another one."""
+        if self._end < self._room:
+            return
+        states = self._z[self._start : self._end + 1].copy()
+        try:
+            self._move_to_front(states)
+        except BaseException:  # an interrupt: of half a move nothing could be told
+            self._move_to_front(states)
+            raise
+
+    def _move_to_front(self, states: Array) -> None:
+        keep = len(states) - 1
         for array in (self._y, self._u, self._stage_cost):
-            array[:keep] = array[end - keep : end]
-        self._z[: keep + 1] = self._z[end - keep : end + 1]
+            array[:keep] = array[self._room - keep :]
+        self._z[: keep + 1] = states
         self._start, self._end = 0, keep
 
     def _advance(self, k: int, slot: int) -> tuple[Array, Mask]:

@@ -163,8 +163,8 @@ class EstimatorLibrary:
         Its sizes.
     settings : structured array
         The ``mhe_settings`` in use; must outlive all estimators that point to it.
-    update, update_special, update_members, amend, reset, run : ctypes functions
-        The C functions of these names.
+    update, update_members, amend, reset, run : ctypes functions
+        The C functions of these names; `update` is ``mhe_update_undoable``.
 
     Raises
     ------
@@ -197,16 +197,13 @@ class EstimatorLibrary:
         quick = ctypes.PyDLL(library._name)
         self.workspace_size = self._check_sizes(quick)
         pointer, integer = ctypes.c_void_p, ctypes.c_int64
-        self.update, self.update_special = quick.mhe_update, quick.mhe_update_special
+        self.update = quick.mhe_update_undoable
         self.amend, self.reset, self.run = quick.mhe_amend, quick.mhe_reset, library.mhe_run
         self.update_members = library.mhe_update_members
         for function in (
-            self.update, self.update_special, self.reset, self.run, self.update_members
+            self.update, self.reset, self.run, self.update_members
         ):
             function.restype = None
-        self.update_special.argtypes = [
-            pointer, pointer, pointer, pointer, ctypes.c_double, pointer, pointer
-        ]
         self.amend.argtypes = [pointer, pointer, integer, pointer, pointer]
         self.reset.argtypes = [pointer, pointer, pointer]
         self.update_members.argtypes = [pointer, integer, pointer, pointer, pointer, pointer]

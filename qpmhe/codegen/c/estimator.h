@@ -184,6 +184,11 @@ void mhe_update_special(mhe_estimator *estimator, mhe_workspace *workspace, cons
 void mhe_update(mhe_estimator *estimator, mhe_workspace *workspace, const mhe_real *y,
                 const mhe_real *u, mhe_estimate *estimate);
 
+/* The same, after the estimator was copied to `before`, from where the sample can be undone. */
+void mhe_update_undoable(mhe_estimator *estimator, mhe_estimator *before,
+                         mhe_workspace *workspace, const mhe_real *y, const mhe_real *u,
+                         mhe_real step, const mhe_real *noise_weight, mhe_estimate *estimate);
+
 /* Put a late measurement into a sample that is still in the window; 0, or -1 if it is not. */
 int mhe_amend(mhe_estimator *estimator, mhe_workspace *workspace, int64_t time,
               const mhe_real *y, mhe_estimate *estimate);

@@ -92,6 +92,14 @@ void mhe_update(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u
     mhe_update_special(e, k, y, u, 0, 0, out);
 }
 
+void mhe_update_undoable(mhe_estimator *e, mhe_estimator *before, mhe_workspace *k,
+                         const real *y, const real *u, real step, const real *noise_weight,
+                         mhe_estimate *out)
+{
+    *before = *e;
+    mhe_update_special(e, k, y, u, step, noise_weight, out);
+}
+
 void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspace *k,
                         const real *y, const real *u, mhe_estimate *estimates)
 {

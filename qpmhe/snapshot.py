@@ -1,0 +1,196 @@
+"""Whether a snapshot is sound, and of an estimator like this one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .costs import Cost
+from .errors import InvalidInputError
+from .observers import Observer
+from .settings import Settings
+from .system import System, probe_points
+
+__all__ = [
+    "SET_NAMES", "check_description", "check_size", "described", "near", "other",
+    "reading", "taken",
+]
+
+Array = NDArray[Any]
+
+SET_NAMES = ("states", "disturbances", "noises")
+
+# What another machine computes of the same numbers differs by less, as a share of their size;
+# and for entries that are much smaller than others of their array, as a share of these.
+_ROUNDING, _FLOOR = 1e-7, 1e-10
+
+
+def described(
+    system: System, observer: Observer, cost: Cost, settings: Settings
+) -> dict[str, Any]:
+    """What gives the stored numbers their meaning, as arrays, numbers and names.
+
+    Functions are described by values of f and h at some points; what else a user's function
+    does shows when the stored stages are computed once more. Caps, backend and policies of
+    the QPs are left out: they may change between snapshot and restart.
+
+    Parameters
+    ----------
+    system, observer, cost, settings
+        The estimator's.
+    """
+    found: dict[str, Any] = {"candidate": settings.candidate, "sampling time": system.dt}
+    for name in SET_NAMES:
+        _describe(f"set of {name}", getattr(system, name), found)
+    _describe("observer", observer, found)
+    _describe("cost", cost, found)
+    for name in ("prior", "disturbance", "noise", "discount"):
+        _describe(f"cost.{name}", getattr(cost, name), found)
+    for name, function in (("f", system.f), ("h", system.h)):
+        values = np.full((5, *function.shape), np.nan)
+        for value, (x, u) in zip(values, probe_points(None, system.n, system.m), strict=True):
+            try:
+                with np.errstate(all="ignore"):
+                    value[...] = function(x, u)
+            except Exception:  # outside of the function's domain
+                continue
+        found[f"model ({name})"] = values
+    return found
+
+
+def _describe(name: str, value: Any, found: dict[str, Any]) -> None:
+    if isinstance(value, np.ndarray):
+        found[name] = value.copy()
+    elif value is None or isinstance(value, (bool, int, float, str)):
+        found[name] = value
+    elif isinstance(value, np.generic):
+        found[name] = value.item()
+    elif isinstance(value, (tuple, list)):
+        for k, item in enumerate(value):
+            _describe(f"{name}[{k}]", item, found)
+    elif not (callable(value) or isinstance(value, (Mapping, System))):  # mappings are caches
+        found[name] = type(value).__qualname__
+        if not type(value).__module__.startswith("qpmhe."):
+            return  # what a user's class keeps need not be a parameter
+        parts = dict(vars(value)) if hasattr(value, "__dict__") else {}
+        for kind in type(value).__mro__:
+            slots = getattr(kind, "__slots__", ())
+            parts |= {key: getattr(value, key) for key in slots if hasattr(value, key)}
+        for key in sorted(parts):
+            _describe(f"{name}.{key.lstrip('_')}", parts[key], found)
+
+
+def check_description(found: Any, mine: dict[str, Any]) -> None:
+    """Refuse the state of an estimator that differs, and name what does.
+
+    Parameters
+    ----------
+    found, mine : dict
+        What `described` gave of it, and of this one.
+
+    Raises
+    ------
+    InvalidInputError
+        If they differ.
+    """
+    if not isinstance(found, dict):
+        raise TypeError("it does not describe its estimator")
+    for name in (*mine, *found):
+        if name not in found or name not in mine or not _alike(found[name], mine[name]):
+            raise other(name)
+
+
+def _alike(one: Any, two: Any) -> bool:
+    if not isinstance(one, (float, np.ndarray)) or not isinstance(two, (float, np.ndarray)):
+        return type(one) is type(two) and bool(one == two)
+    one, two = np.asarray(one), np.asarray(two)
+    if one.shape != two.shape or one.dtype != two.dtype:
+        return False
+    if one.dtype != np.float64:
+        return bool((one == two).all())
+    size = np.abs(two)
+    largest = size[np.isfinite(size)].max(initial=0.0)
+    return near(one, two, size + _FLOOR / _ROUNDING * largest)
+
+
+def near(found: Array | float, expected: Array | float, size: Array | float) -> bool:
+    """Whether numbers differ by no more than the rounding of terms of this size.
+
+    Parameters
+    ----------
+    found, expected : array or float
+        The numbers. What is not finite, as some bounds and a failed model's values are, must
+        be the same.
+    size : array or float
+        Sizes of the terms that they are sums of.
+    """
+    found, expected = np.asarray(found), np.asarray(expected)
+    there = np.isfinite(expected)
+    if not np.array_equal(found[~there], expected[~there], equal_nan=True):
+        return False
+    with np.errstate(all="ignore"):
+        close = np.abs(found - expected) <= _ROUNDING * np.asarray(size)
+    return bool((~there | close).all())
+
+
+class _OtherEstimatorError(InvalidInputError):
+    """The state is of another estimator."""
+
+
+def other(what: str) -> InvalidInputError:
+    """The error for the state of an estimator that differs in something."""
+    return _OtherEstimatorError(
+        f"the state is of an estimator with another {what} (or it is damaged); make this one "
+        "with the arguments of the one that it was taken of."
+    )
+
+
+@contextmanager
+def reading() -> Iterator[None]:
+    """Turn whatever reading a snapshot raises into one error of ours."""
+    try:
+        yield
+    except _OtherEstimatorError:
+        raise
+    except Exception as error:
+        raise InvalidInputError(
+            f"the state is damaged ({type(error).__name__}: {error}); expected what "
+            "state_dict gave, unchanged."
+        ) from error
+
+
+def taken(
+    name: str, value: Any, shape: tuple[int, ...], kind: Any = np.float64, finite: bool = True
+) -> Array:
+    """A copy of an array of a snapshot; `reading` turns what it raises into our error.
+
+    Parameters
+    ----------
+    name : str
+        What error texts call it.
+    value : object
+        What the snapshot has in its place.
+    shape : tuple of int
+        The shape that it must have.
+    kind : type
+        Of its entries.
+    finite : bool
+        Whether they must be finite.
+    """
+    if not isinstance(value, np.ndarray) or value.dtype != kind or value.shape != shape:
+        found = (value.shape, value.dtype) if isinstance(value, np.ndarray) else type(value)
+        raise TypeError(f"{name} is {found}; expected an array {shape} of {np.dtype(kind)}")
+    if finite and not np.isfinite(value).all():
+        raise ValueError(f"{name} is not finite")
+    return value.copy()
+
+
+def check_size(name: str, value: Any, fits: Callable[[int], bool]) -> int:
+    """An integer of a snapshot that fits."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not fits(int(value)):
+        raise ValueError(f"{name} is {value!r}")
+    return int(value)

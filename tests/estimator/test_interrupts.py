@@ -1,0 +1,261 @@
+"""A step that is interrupted was not taken, wherever the interrupt comes."""
+
+import pathlib
+import sys
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.codegen.compiler import find_compiler
+
+from .test_own_memory import (
+    BATCHES,
+    BOX,
+    assert_same,
+    batch_of,
+    estimator,
+    feed,
+    numbers,
+    samples,
+    system_of,
+)
+
+WITHIN = str(pathlib.Path(qpmhe.__file__).parent)
+CASES = {
+    "plain": ("numpy", {}),
+    "reinitialized": ("numpy", {"candidate": "reinitialized", "start": "best"}),
+    "kalman": ("numpy", {"kalman": True, "candidate": "reinitialized"}),
+    "robust": ("numpy", {"robust": True, "max_qps": 2}),
+    "projected": ("numpy", {"sets": BOX, "outside": "project", "max_qps": 2}),
+    "discount": ("numpy", {"discount": 0.8, "start": "best"}),
+    "casadi": ("casadi", {}),
+    "compiled": ("compiled", {"candidate": "reinitialized"}),
+}
+
+
+class Interruption:
+    """Raises KeyboardInterrupt at the k-th line of the package."""
+
+    def __init__(self, after):
+        self.left, self.count = after, 0
+
+    def __enter__(self):
+        self.before = sys.gettrace()
+        sys.settrace(self.call)
+        return self
+
+    def __exit__(self, *_):
+        sys.settrace(self.before)
+
+    def call(self, frame, event, argument):
+        return self.line if frame.f_code.co_filename.startswith(WITHIN) else None
+
+    def line(self, frame, event, argument):
+        if event == "line":
+            self.count += 1
+            if self.count == self.left:
+                raise KeyboardInterrupt
+        return self.line
+
+
+def leaves(value):
+    """A state as a flat list that can be compared."""
+    if isinstance(value, dict):
+        return [leaf for key, item in value.items() for leaf in (key, *leaves(item))]
+    if isinstance(value, (list, tuple)):
+        return [leaf for item in value for leaf in leaves(item)]
+    if isinstance(value, np.ndarray):
+        return [value.tobytes()]
+    return [value]
+
+
+def interrupted(mhe, do, generator, stride=60):
+    """Interrupt something again and again, each time at a later line, until it is done."""
+    before, after = leaves(state_of(mhe)), 1
+    while True:
+        with Interruption(after) as interruption:
+            try:
+                found = do(mhe)
+            except KeyboardInterrupt:
+                found = None
+        if interruption.count < after:
+            return found
+        assert found is None, "the interrupt was swallowed"
+        assert leaves(state_of(mhe)) == before, after
+        after += 1 if after < 4 else int(generator.integers(1, stride))
+
+
+def state_of(mhe):
+    state = mhe.state_dict()
+    for name in ("modes", "methods"):  # behind them, how the model is called with an unusual dt
+        if name in state:
+            state[name] = state[name][:2]
+    return [state, mhe.initial_state]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_interrupted_step_was_not_taken(name):
+    engine, options = CASES[name]
+    if engine == "compiled" and find_compiler() is None:
+        pytest.skip("there is no C compiler")
+    mhe, twin = estimator(engine, **options), estimator(engine, **options)
+    generator = np.random.default_rng(1)
+
+    def both(do):
+        state_of(twin)  # in which solvers forget, as they do after an interrupt
+        expected, found = do(twin), interrupted(mhe, do, generator)
+        assert (found is None) == (expected is None)
+        if expected is not None:
+            assert_same(numbers(found), numbers(expected))
+        np.testing.assert_array_equal(mhe.state, twin.state)
+        np.testing.assert_array_equal(mhe.initial_state, twin.initial_state)
+
+    for t, arguments in enumerate(samples(44)):
+        if t in (0, 1, 3, 6, 10, 17, 36, 37):  # the first move of stages to the front is at 36
+            both(lambda one, a=arguments: feed(one, a, False))
+        else:
+            twin.state_dict()
+            expected = numbers(feed(twin, arguments, False))
+            assert_same(numbers(feed(mhe, arguments, False)), expected)
+        if t in (2, 9, 20):
+            both(lambda one, t=t: one.amend(t - 1, [0.3]))
+            np.testing.assert_array_equal(mhe.covariances(), twin.covariances())
+        if t == 24:
+            state = estimator(engine, **options).state_dict()
+            both(lambda one, state=state: one.load_state_dict(state))
+        if t == 26:
+            both(lambda one: one.reset())
+        if t == 28:
+            both(lambda one: one.reset([0.2, 0.1]))
+
+
+def test_a_move_to_the_front_is_interrupted_at_every_line():
+    mhe, twin = (estimator("numpy", candidate="reinitialized") for _ in range(2))
+    record = samples(45, 3)
+    for arguments in record[:36]:
+        assert_same(numbers(feed(mhe, arguments, False)), numbers(feed(twin, arguments, False)))
+    window = mhe._engine._window
+    assert window.end == window.room
+    arguments = record[36]
+    for after in range(1, 10_000):
+        if after % 20 == 0:  # from where it was not moved yet
+            mhe = estimator("numpy", candidate="reinitialized")
+            for one in record[:36]:
+                feed(mhe, one, False)
+        with Interruption(after), pytest.raises(KeyboardInterrupt):
+            feed(mhe, arguments, False)
+        np.testing.assert_array_equal(mhe.covariances(), twin.covariances())
+        if mhe._engine._window.end < window.room and after > 150:
+            break
+    for arguments in record[36:]:
+        assert_same(numbers(feed(mhe, arguments, False)), numbers(feed(twin, arguments, False)))
+
+
+class Bomb:
+    """Counts calls of what a user wrote, and interrupts one of them."""
+
+    left = 0
+
+    def tick(self):
+        self.left -= 1
+        if self.left == 0:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("where", ["f", "h", "observer", "solver"])
+@pytest.mark.parametrize("candidate", ["observer", "reinitialized"])
+def test_an_interrupt_out_of_what_the_user_wrote(where, candidate, monkeypatch):
+    def made():
+        bomb = Bomb()
+
+        def ticking(name, function):
+            def call(*arguments):
+                if name == where:
+                    bomb.tick()
+                return function(*arguments)
+
+            return call
+
+        system = qpmhe.System(
+            ticking("f", lambda x: 0.9 * x), ticking("h", lambda x: x[..., :1] ** 2), n=2, p=1
+        )
+        observer = qpmhe.OutputInjection(
+            ticking("observer", lambda z, v: np.array([0.1, 0.2]) * v[0])
+        )
+        cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(1))
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, observer, cost, horizon=3, initial_state=[0.5, 0.4], candidate=candidate,
+            start="best", max_qps=2,
+        )
+        solver = mhe._engine._optimizer._solver
+        monkeypatch.setattr(solver, "solve", ticking("solver", solver.solve))
+        return mhe, bomb
+
+    (mhe, bomb), (twin, _) = made(), made()
+    generator = np.random.default_rng(2)
+    hit = 0
+    for _ in range(12):
+        y = generator.uniform(0.0, 1.0, 1)
+        for k in range(1, 30):
+            bomb.left = k
+            try:
+                mhe.update(y)
+            except KeyboardInterrupt:
+                hit += 1
+            else:
+                break
+        bomb.left = 0
+        expected = numbers(twin.update(y))
+        np.testing.assert_array_equal(mhe.state, expected[1])
+        np.testing.assert_array_equal(mhe.covariances(), twin.covariances())
+        assert mhe.time == twin.time
+    assert hit > 11
+
+
+@pytest.mark.parametrize("name", BATCHES)
+def test_an_interrupted_step_of_a_batch_was_not_taken(name):
+    mhe, twin, generator = batch_of(name), batch_of(name), np.random.default_rng(0)
+    for t in range(20):
+        Y, U = generator.normal(0.0, 0.5, (3, 1)), generator.normal(0.0, 1.0, (3, 1))
+        Y[generator.random((3, 1)) < 0.2] = np.nan
+        def both(do):
+            after, before = 1, mhe.time
+            while True:
+                with Interruption(after) as interruption:
+                    try:
+                        found = do(mhe)
+                    except KeyboardInterrupt:
+                        found = None
+                if interruption.count < after:
+                    return found
+                if mhe.time != before:  # C is not interrupted: it has taken the sample, whole
+                    assert name == "compiled"
+                    return None
+                np.testing.assert_array_equal(mhe.states, twin.states)
+                np.testing.assert_array_equal(mhe.initial_states, twin.initial_states)
+                after += int(generator.integers(1, 60))
+
+        if t % 3 == 0:
+            both(lambda one, Y=Y, U=U: one.update(Y, U))
+            twin.update(Y, U)
+            np.testing.assert_array_equal(mhe.states, twin.states)
+        if t == 11:
+            both(lambda one: one.reset([0.1, 0.2]))
+            twin.reset([0.1, 0.2])
+        found, expected = mhe.update(Y, U), twin.update(Y, U)
+        names = ("trajectories", "candidates", "costs", "candidate_costs", "flags", "qps")
+        assert_same(*([getattr(one, k) for k in names] for one in (found, expected)))
+
+
+def test_the_modes_of_the_model_are_those_before_the_step():
+    """A batch that turns out not to be one, in a step that is taken back."""
+    system = system_of("numpy")
+    mhe = estimator("numpy", system=system)
+    feed(mhe, samples(1)[0], False)
+    own = mhe._engine._system
+    mhe._engine._mark(False)
+    mhe._engine._calling = own._calling()
+    own.f.mode = "looped"
+    mhe._engine.undo()
+    assert own.f.mode == system.f.mode == "batched"

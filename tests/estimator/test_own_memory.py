@@ -1,0 +1,227 @@
+"""What is handed out or in is never memory of the estimator."""
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.codegen.compiler import find_compiler
+
+BOX = {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9])}
+OPTIONS = {
+    "plain": {},
+    "observer alone": {"max_qps": 0},
+    "best": {"start": "best", "max_qps": 2},
+    "reinitialized": {"candidate": "reinitialized", "start": "best"},
+    "delayed": {"delay": 2},
+    "dropped": {"sets": BOX, "max_qps": 3},
+    "projected": {"sets": BOX, "outside": "project", "start": "best"},
+    "kept": {"sets": BOX, "outside": "keep"},
+    "discount": {"discount": 0.8},
+}
+PYTHON_ONLY = {
+    "robust": {"robust": True},
+    "kalman": {"kalman": True, "candidate": "reinitialized"},
+    "exact": {"robust": True, "subproblem": "exact"},
+}
+HORIZON = 4
+
+
+def system_of(engine, sets=None):
+    if engine == "numpy":
+        def rate(x, u):
+            return np.stack((x[..., 1], u[..., 0] - np.sin(x[..., 0])), axis=-1)
+
+        return qpmhe.System.from_ode(
+            rate, lambda x, u: x[..., :1] + 0.1 * x[..., :1] ** 2, dt=0.1, n=2, p=1, m=1,
+            method="euler", **(sets or {}),
+        )
+    ca = pytest.importorskip("casadi")
+    return qpmhe.System.from_casadi(
+        lambda x, u: [x[1], u[0] - ca.sin(x[0])], lambda x, u: x[0] + 0.1 * x[0] ** 2, dt=0.1,
+        method="euler", n=2, m=1, **(sets or {}),
+    )
+
+
+def estimator(engine, sets=None, discount=1.0, robust=False, kalman=False, system=None, **options):
+    gain, weights = np.array([[0.3], [0.4]]), [np.eye(2), 10.0 * np.eye(2), np.eye(1)]
+    start = np.array([0.5, 0.0])
+    names = ("prior", "disturbance", "noise")
+    if robust:
+        cost = qpmhe.RobustCost(
+            prior=weights[0], disturbance=weights[1], noise=qpmhe.Huber(weights[2]),
+            discount=discount,
+        )
+    else:
+        cost = qpmhe.QuadraticCost(**dict(zip(names, weights, strict=True)), discount=discount)
+    if kalman:
+        observer = qpmhe.ExtendedKalman(**dict(zip(names, weights, strict=True)))
+    else:
+        observer = qpmhe.Luenberger(gain)
+    own = engine if engine == "compiled" else "python"
+    mhe = qpmhe.MovingHorizonEstimator(
+        system or system_of(engine, sets), observer, cost,
+        **{"horizon": HORIZON, "initial_state": start, "engine": own} | options,
+    )
+    for array in (gain, start, *weights):
+        array[...] = np.nan
+    return mhe
+
+
+def samples(count, seed=0):
+    generator, found = np.random.default_rng(seed), []
+    for t in range(count):
+        y, u, own = generator.normal(0.0, 0.6, 1), generator.normal(0.0, 1.0, 1), {}
+        if generator.random() < 0.2:
+            y[0] = np.nan
+        if t % 7 == 3:
+            own = {"dt": 0.07, "noise_weight": np.array([[3.0]])}
+        found.append((y, u, own))
+    return found
+
+
+def arrays_of(value, depth=0):
+    """All arrays that can be reached from a value."""
+    if isinstance(value, np.ndarray):
+        return [value]
+    if isinstance(value, dict):
+        return [array for item in value.values() for array in arrays_of(item, depth)]
+    if isinstance(value, (list, tuple)):
+        return [array for item in value for array in arrays_of(item, depth)]
+    if depth > 3 or not type(value).__module__.startswith("qpmhe"):
+        return []
+    parts = [getattr(value, name, None) for name in dir(value) if not name.startswith("__")]
+    return [array for part in parts if not callable(part) for array in arrays_of(part, depth + 1)]
+
+
+def spoil(value):
+    found = arrays_of(value)
+    for array in found:
+        array[...] = np.nan if array.dtype.kind == "f" else 0
+    return len(found)
+
+
+def feed(mhe, arguments, spoilt):
+    y, u, own = arguments
+    if not spoilt:
+        return mhe.update(y, u, **own)
+    y, u, own = y.copy(), u.copy(), {k: np.array(v) if k != "dt" else v for k, v in own.items()}
+    estimate = mhe.update(y, u, **own)
+    spoil([y, u, list(own.values())])
+    return estimate
+
+
+def numbers(estimate):
+    names = ("trajectory", "state", "filtered", "candidate", "disturbances", "noises", "delayed")
+    return [np.array(getattr(estimate, name), np.float64) for name in names] + [
+        np.array([estimate.cost, estimate.candidate_cost, estimate.status.value])
+    ]
+
+
+def assert_same(one, other):
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def cases():
+    for engine in ("numpy", "casadi", "compiled"):
+        names = OPTIONS if engine == "compiled" else OPTIONS | PYTHON_ONLY
+        for name in names:
+            yield pytest.param(engine, names[name], id=f"{engine}-{name}")
+
+
+@pytest.mark.parametrize(("engine", "options"), list(cases()))
+def test_a_spoilt_estimator_goes_on_as_its_twin(engine, options):
+    if engine == "compiled" and find_compiler() is None:
+        pytest.skip("there is no C compiler")
+    if options.get("subproblem") == "exact":
+        pytest.importorskip("cvxpy")
+    count = 12 if "subproblem" in options else 60
+    twin, spoilt = estimator(engine, **options), estimator(engine, **options)
+    assert spoil(spoilt.initial_state) == 1
+    for t, arguments in enumerate(samples(count)):
+        spoil(spoilt.state)
+        expected = numbers(feed(twin, arguments, False))
+        estimate = feed(spoilt, arguments, True)
+        assert_same(numbers(estimate), expected)
+        assert spoil(estimate) >= 6
+        if t % 9 == 5:
+            late = np.array([0.1 * t])
+            expected = numbers(twin.amend(t - 2, np.array([0.1 * t])))
+            estimate = spoilt.amend(t - 2, late)
+            assert_same(numbers(estimate), expected)
+            spoil([late, estimate])
+        if t % 3 == 0:
+            expected, found = twin.covariances(), spoilt.covariances()
+            np.testing.assert_array_equal(found, expected)
+            spoil(found)
+        if t % 11 == 8:
+            state = spoilt.state_dict()
+            spoil(state)
+            state = twin.state_dict()
+            spoilt.load_state_dict(state)
+            spoil(state)
+    Y, U = np.zeros((20, 1)), np.ones((20, 1))
+    expected, run = twin.run(Y.copy(), U.copy()), spoilt.run(Y, U)
+    assert_same([run.states, run.costs], [expected.states, expected.costs])
+    spoil([run, Y, U])
+    expected, found = (one.run(np.zeros((5, 1)), np.ones((5, 1)), covariances=True)
+                       for one in (twin, spoilt))
+    np.testing.assert_array_equal(found.covariances, expected.covariances)
+    spoil(found)
+    for one in (twin, spoilt):
+        one.reset()
+    for arguments in samples(10, 1):
+        assert_same(numbers(feed(spoilt, arguments, True)), numbers(feed(twin, arguments, False)))
+
+
+BATCHES = {
+    "vectorised": {},
+    "vectorised best": {"start": "best", "max_qps": 2, "delay": 1},
+    "vectorised alone": {"max_qps": 0},
+    "looped": {"candidate": "reinitialized"},
+    "compiled": {"engine": "compiled"},
+}
+
+
+def batch_of(name, members=3):
+    options, starts = BATCHES[name], np.full((members, 2), 0.5)
+    if name == "compiled" and find_compiler() is None:
+        pytest.skip("there is no C compiler")
+    found = qpmhe.BatchEstimator(
+        system_of("casadi" if name == "compiled" else "numpy"), qpmhe.Luenberger([0.3, 0.4]),
+        qpmhe.QuadraticCost(prior=np.eye(2), disturbance=10.0 * np.eye(2), noise=1.0),
+        members=members, horizon=HORIZON, initial_states=starts, **options,
+    )
+    spoil(starts)
+    return found
+
+
+@pytest.mark.parametrize("name", BATCHES)
+def test_a_spoilt_batch_goes_on_as_its_twin(name):
+    twin, spoilt, generator = batch_of(name), batch_of(name), np.random.default_rng(0)
+    assert name.startswith(spoilt.mode)
+    spoil(spoilt.initial_states)
+    for _ in range(25):
+        Y, U = generator.normal(0.0, 0.5, (3, 1)), generator.normal(0.0, 1.0, (3, 1))
+        expected = twin.update(Y.copy(), U.copy())
+        found = spoilt.update(Y, U)
+        names = ("trajectories", "candidates", "costs", "candidate_costs", "flags", "qps", "states")
+        assert_same(*([getattr(one, k) for k in names] for one in (found, expected)))
+        spoil([found, Y, U, spoilt.states])
+    Y, U = generator.normal(0.0, 0.5, (3, 9, 1)), np.zeros((3, 9, 1))
+    expected, found = twin.run(Y.copy(), U.copy()), spoilt.run(Y, U)
+    np.testing.assert_array_equal(found.states, expected.states)
+    spoil([found, Y, U])
+    for one in (twin, spoilt):
+        one.reset()
+    Y, U = np.ones((3, 9, 1)), np.zeros((3, 9, 1))
+    np.testing.assert_array_equal(spoilt.run(Y, U).states, twin.run(Y, U).states)
+
+
+def test_state_and_filtered_are_rows_of_the_trajectory():
+    """As documented: changing one changes the other, of this estimate alone."""
+    estimate = estimator("numpy", delay=1).update([0.1], [0.0])
+    estimate.state[...] = 7.0
+    assert estimate.trajectory[-1].tolist() == [7.0, 7.0]
+    assert np.shares_memory(estimate.filtered, estimate.trajectory)
+    assert not np.shares_memory(estimate.candidate, estimate.trajectory)
