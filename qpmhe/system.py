@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -389,7 +388,8 @@ class System:
 
     def _private(self) -> System:
         """The same system for one estimator, which may change how its functions are called."""
-        other = copy(self)
+        other = object.__new__(type(self))  # `copy` would make the model anew, as pickle does
+        other.__dict__.update(self.__dict__)
         other.f, other.h = self.f.copy(), self.h.copy()
         other.f_jacobian = self.f_jacobian.copy(other.f)
         other.h_jacobian = self.h_jacobian.copy(other.h)

@@ -363,7 +363,7 @@ class _Rehearsal:
         """What is wrong; empty if nothing is."""
         library, n = self._library, self._interpreter.model.n
         memory = library.estimators(self._start[None])
-        before = np.zeros_like(memory)
+        before = np.empty_like(memory)
         workspace, out = library.workspace(), np.zeros(1, library.estimate_type)
         library.reset(memory.ctypes.data, self._settings.ctypes.data, self._start.ctypes.data)
         ys, us = np.ascontiguousarray(self._ys), np.ascontiguousarray(self._us)
@@ -386,17 +386,16 @@ class _Rehearsal:
             if fault:
                 return fault
             y, u = ys[t : t + 1], us[t : t + 1]
-            at = [ctypes.c_void_p(one.ctypes.data) for one in (memory, workspace, y, u, out)]
+            at = [
+                ctypes.c_void_p(one.ctypes.data) for one in (memory, before, workspace, y, u, out)
+            ]
             usual = self._steps[t] == (self._interpreter.model.dt or 0.0)
             if t < _BY_RUN + _BY_MEMBERS:
-                library.update_members(at[0], 1, *at[1:])
+                library.update_members(at[0], 1, *at[2:])
             else:
-                special = t % 6 == 0
-                library.update(
-                    at[0], ctypes.c_void_p(before.ctypes.data), *at[1:4],
-                    ctypes.c_double(self._steps[t] if special and not usual else 0.0),
-                    ctypes.c_void_p(self._own_noise.ctypes.data if special else None), at[4],
-                )
+                weight = None if t % 6 else ctypes.c_void_p(self._own_noise.ctypes.data)
+                step = ctypes.c_double(0.0 if usual else self._steps[t])
+                library.update(*at[:5], step, weight, at[5])
             if t > count + 4 and t % 3:
                 continue
             found = out[0]

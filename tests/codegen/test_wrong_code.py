@@ -238,3 +238,9 @@ def test_what_is_not_finite_is_no_fault(h, cache):
     system = qpmhe.System.from_casadi(lambda x: 0.9 * x, lambda x: h(x[0]), n=2, compiled=True)
     assert estimator(system).engine == "compiled"
     assert not notes(cache)
+
+
+def test_an_estimator_does_not_make_the_model_anew(cache, monkeypatch):
+    system = linear()
+    monkeypatch.setattr("qpmhe.adapters.casadi.casadi_model", None)
+    assert estimator(system, "python").update([1.0, 2.0]).cost >= 0.0
