@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable
-from contextlib import suppress
 from time import perf_counter
 from typing import Any
 
@@ -192,8 +191,7 @@ class PythonEngine:
         self._history.clear()
         self._history.extend(history)
         self._subproblem.forget()
-        with suppress(Exception, SystemExit):
-            self._solver.forget()
+        self._solver.forget()
 
     def covariances(self) -> Array:
         """Covariances along the last estimate."""

@@ -18,7 +18,6 @@ from .test_own_memory import (
     feed,
     numbers,
     samples,
-    system_of,
 )
 
 WITHIN = str(pathlib.Path(qpmhe.__file__).parent)
@@ -246,16 +245,3 @@ def test_an_interrupted_step_of_a_batch_was_not_taken(name):
         found, expected = mhe.update(Y, U), twin.update(Y, U)
         names = ("trajectories", "candidates", "costs", "candidate_costs", "flags", "qps")
         assert_same(*([getattr(one, k) for k in names] for one in (found, expected)))
-
-
-def test_the_modes_of_the_model_are_those_before_the_step():
-    """A batch that turns out not to be one, in a step that is taken back."""
-    system = system_of("numpy")
-    mhe = estimator("numpy", system=system)
-    feed(mhe, samples(1)[0], False)
-    own = mhe._engine._system
-    mhe._engine._mark(False)
-    mhe._engine._calling = own._calling()
-    own.f.mode = "looped"
-    mhe._engine.undo()
-    assert own.f.mode == system.f.mode == "batched"
