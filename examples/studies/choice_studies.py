@@ -61,7 +61,7 @@ def studies(
             "backends": ["auto"], "solver_iterations": [None], "seeds": seeds, "steps": steps,
             "cell_timeout": 120.0,
         }
-        return Study.within(HERE, models=names, **{**common, **options})
+        return Study(folder=HERE, models=names, **{**common, **options})
 
     def of(chosen: tuple[str, ...]) -> list[str]:
         return [model for model in models if model in chosen]

@@ -63,13 +63,13 @@ class Study:
     solver_iterations : sequence of int or None
         Caps on the solver's own iterations in each QP; None leaves the solver's default.
     horizons : sequence of int or None
-        N; None takes that of the model's scenario.
+        N; None takes the scenario's.
     starts : sequence of {"candidate", "best"}
         Where the sequences of QPs start.
     seeds : int or sequence of int
         Seeds of the records; a number k stands for 0, ..., k-1.
     steps : int, optional
-        Samples of a record; those of the model's scenario if left out.
+        Samples of a record; the scenario's if left out.
     measure : {"both", "accuracy", "time"}
         What is recorded. With "time" one cell runs at a time, unless more jobs are asked for.
     deadline : float, optional

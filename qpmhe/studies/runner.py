@@ -237,6 +237,7 @@ def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
     waiting, suspects = deque(tasks), deque[Task]()
     sent: dict[Future[Result], Task] = {}
     began: dict[Future[Result], float] = {}
+    broken = False
     while waiting or sent or suspects:
         # No worker waits for us; but after a death nothing new starts until its cause is found.
         while waiting and not suspects and len(sent) < 2 * workers.jobs:
@@ -244,6 +245,7 @@ def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
                 sent[workers.submit(waiting[0])] = waiting[0]
                 waiting.popleft()
             except BrokenExecutor:
+                broken = True
                 break
         for future in islice(sent, workers.jobs):  # tasks start in the order of their sending
             began.setdefault(future, monotonic())
@@ -264,11 +266,11 @@ def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
                 del began[future]
                 future.cancel()
                 yield failure(sent.pop(future), _HUNG)
-        if not sent:
-            if suspects or waiting:
-                workers.restart()
+        if not sent and (suspects or broken):
             while suspects:
                 yield _again(workers, suspects.popleft())
+            workers.restart()
+            broken = False
 
 
 def _answer(

@@ -101,7 +101,7 @@ class Case:
         observer = rows.iloc[0]
         ratio = observer["rmse"] / other["rmse"]
         text = (
-            f"RMSE {_limited(observer, 'rmse')}, {number(ratio)} times that of "
+            f"RMSE {_limited(observer, 'rmse')}, {number(ratio)} times the RMSE of "
             f"{configuration_words(other)}"
         )
         if np.isfinite(observer["time_median"]):
@@ -209,15 +209,15 @@ def limitations(frame: DataFrame, summary: DataFrame) -> list[str]:
         share = float(timed["shared"].eq(True).mean())
         notes.append(
             f"Times were taken while cores were shared with other work in {percent(share)} of "
-            "the runs: medians are usable for ratios, 99 % quantiles and maxima are those of "
-            "the machine as much as of the solver."
+            "the runs: ratios of medians can be trusted; 99 % quantiles and maxima depend on the "
+            "machine as much as on the solver."
         )
     if timed.empty:
         notes.append("No times were taken; there is no Pareto front.")
     if frame["environment"].nunique() > 1:
         notes.append(
             f"The runs were made in {frame['environment'].nunique()} environments (listed "
-            "below); times of one are not comparable to those of another."
+            "below); compare times within one of them only."
         )
     if seeds == 1:
         notes.append("There is one seed only: no confidence limits, and luck cannot be ruled out.")
@@ -227,7 +227,7 @@ def limitations(frame: DataFrame, summary: DataFrame) -> list[str]:
     if short:
         notes.append(
             f"{short} of {len(summary)} configurations have fewer runs than {seeds}: the study "
-            "is not finished, and their means are over other seeds than those of the rest."
+            "is not finished, and their means are over fewer seeds than the others'."
         )
     failed = int((frame["outcome"] != "done").sum())
     if failed:
