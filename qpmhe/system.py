@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -389,7 +388,9 @@ class System:
 
     def _private(self) -> System:
         """The same system for one estimator, which may change how its functions are called."""
-        other = copy(self)
+        # Not by `copy`, which makes a System anew from the user's functions.
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
         other.f, other.h = self.f.copy(), self.h.copy()
         other.f_jacobian = self.f_jacobian.copy(other.f)
         other.h_jacobian = self.h_jacobian.copy(other.h)

@@ -364,6 +364,7 @@ class _Rehearsal:
         library, n = self._library, self._interpreter.model.n
         memory = library.estimators(self._start[None])
         workspace, out = library.workspace(), np.zeros(1, library.estimate_type)
+        before = np.zeros(1, library.estimator_type)  # what the last step changed
         library.reset(memory.ctypes.data, self._settings.ctypes.data, self._start.ctypes.data)
         ys, us = np.ascontiguousarray(self._ys), np.ascontiguousarray(self._us)
         numbers, flags = np.zeros((3 * n + 2, _BY_RUN)), np.zeros((3, _BY_RUN), np.int32)
@@ -389,12 +390,13 @@ class _Rehearsal:
             usual = self._steps[t] == (self._interpreter.model.dt or 0.0)
             if t < _BY_RUN + _BY_MEMBERS:
                 library.update_members(at[0], 1, *at[1:])
-            elif t % 6 == 0:
-                library.update_special(
-                    *at[:4], 0.0 if usual else self._steps[t], self._own_noise.ctypes.data, at[4]
-                )
             else:
-                library.update(*at)
+                special = t % 6 == 0
+                step = self._steps[t] if special and not usual else 0.0
+                library.update(
+                    at[0], ctypes.c_void_p(before.ctypes.data), *at[1:4], ctypes.c_double(step),
+                    ctypes.c_void_p(self._own_noise.ctypes.data) if special else None, at[4],
+                )
             if t > count + 4 and t % 3:
                 continue
             found = out[0]
