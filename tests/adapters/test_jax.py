@@ -841,3 +841,20 @@ def test_functions_without_such_indices_are_not_compiled_for_the_check(monkeypat
     monkeypatch.setattr(checkify, "checkify", None)
     system = jax_system(lambda x: 0.5 * x[::-1], lambda x: x[1:], n=2, p=1)
     assert system.n == 2
+
+
+def test_estimators_of_one_system_share_its_programs(monkeypatch):
+    system = by_jax("reactor", "euler")
+    arguments = (
+        qpmhe.Luenberger([[0.05], [0.05]]),
+        qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(1)),
+    )
+    options = {"horizon": 4, "initial_state": [3.0, 0.0]}
+    expected = qpmhe.MovingHorizonEstimator(system, *arguments, **options).update([2.5])
+    compiled = []
+    monkeypatch.setattr(
+        "qpmhe.adapters.jax_programs.Programs._compiled", lambda *given: compiled.append(given)
+    )
+    mhe = qpmhe.MovingHorizonEstimator(system, *arguments, **options)
+    assert compiled == []
+    assert mhe.update([2.5]).cost == expected.cost
