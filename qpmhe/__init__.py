@@ -14,8 +14,12 @@ from .costs import (
     RobustCost,
 )
 from .errors import QpmheError
-from .estimate import Estimate, Status
-from .estimator import MovingHorizonEstimator
+from .estimation.estimate import Estimate, Status
+from .estimation.estimator import MovingHorizonEstimator
+from .estimation.run import Run
+from .model.parameters import augment_parameters
+from .model.sets import Box, ConvexSet, Polytope
+from .model.system import System
 from .observers import (
     ExtendedKalman,
     HighGain,
@@ -27,10 +31,6 @@ from .observers import (
     UnscentedKalman,
     design_luenberger,
 )
-from .parameters import augment_parameters
-from .run import Run
-from .sets import Box, ConvexSet, Polytope
-from .system import System
 
 __version__ = "0.1.0"
 

@@ -13,9 +13,9 @@ from qpmhe_solvers import SolveStatus
 
 from .costs import Cost, Huber, Loss, Power, Quadratic, QuadraticCost, RobustCost
 from .errors import OptionError
+from .estimation.problem import Problem, Trial
 from .exact_program import ExactProgram, discounts
-from .problem import Problem, Trial
-from .system import System
+from .model.system import System
 
 __all__ = ["ExactSolution", "ExactStep"]
 

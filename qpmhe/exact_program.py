@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from qpmhe_solvers import SolveStatus
 
 from .costs import Cost, Huber, Loss, Power, Quadratic
-from .problem import Problem, Trial
-from .sets import ConvexSet
-from .system import System
+from .estimation.problem import Problem, Trial
+from .model.sets import ConvexSet
+from .model.system import System
 
 __all__ = ["ExactProgram", "discounts"]
 

@@ -14,8 +14,8 @@ from peers import Array, Peer, UnavailableError, WindowData
 from problems import Problem
 from stopwatch import timed
 
-from qpmhe.problem import Problem as TrueProblem
-from qpmhe.window import Window
+from qpmhe.estimation.problem import Problem as TrueProblem
+from qpmhe.estimation.window import Window
 
 __all__ = ["SAME", "Measurement", "Series", "measure"]
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import qpmhe
-from qpmhe.discretize import discretize
+from qpmhe.model.discretize import discretize
 from qpmhe.models.batch_reactor import batch_reactor
 from qpmhe.models.batch_reactor import casadi_output as reactor_output
 from qpmhe.models.batch_reactor import casadi_rate as reactor_rate

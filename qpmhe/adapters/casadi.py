@@ -18,9 +18,9 @@ from ..codegen.evaluation import fixed_call, may_fail, separate_calls
 from ..codegen.expressions import CasadiModel, casadi_model, import_casadi
 from ..codegen.source import model_files
 from ..errors import CompilationError, EngineWarning, OptionError
-from ..functions import Trusted
-from ..sets import ConvexSet
-from ..system import System
+from ..model.functions import Trusted
+from ..model.sets import ConvexSet
+from ..model.system import System
 from .fused import Fused, fused, fused_fault
 
 __all__ = ["casadi_system"]

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from .._checks import numbers, positive
 from ..errors import InvalidInputError, ModelError, OptionError
-from ..functions import Trusted
-from ..sets import ConvexSet
-from ..system import System, probe_points
+from ..model.functions import Trusted
+from ..model.sets import ConvexSet
+from ..model.system import System, probe_points
 
 __all__ = ["control_system"]
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from .._checks import count, positive
 from ..errors import ModelError
-from ..functions import Trusted
-from ..sets import ConvexSet
-from ..system import System, checked_set, probe_points
+from ..model.functions import Trusted
+from ..model.sets import ConvexSet
+from ..model.system import System, checked_set, probe_points
 from .fused import Fused
 from .jax_programs import Programs
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..errors import ModelError
-from ..functions import Probes
+from ..model.functions import Probes
 
 __all__ = ["check_indices"]
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..discretize import discretize
 from ..errors import InvalidInputError, ModelError
-from ..functions import Probes, check_inputs, takes_input
+from ..model.discretize import discretize
+from ..model.functions import Probes, check_inputs, takes_input
 from .jax_indices import check_indices
 
 __all__ = ["Programs"]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from .._checks import positive
 from ..errors import InvalidInputError, ModelError
-from ..functions import Trusted
-from ..sets import ConvexSet
-from ..system import System
+from ..model.functions import Trusted
+from ..model.sets import ConvexSet
+from ..model.system import System
 
 __all__ = ["sympy_system"]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..derivatives import Jacobian
-from ..functions import BatchedFunction
-from ..system import System
+from ..model.derivatives import Jacobian
+from ..model.functions import BatchedFunction
+from ..model.system import System
 
 __all__ = ["Calls", "MemberFunction"]
 

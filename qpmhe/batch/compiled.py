@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..codegen.engine import RunLog
 from ..codegen.library import EstimatorLibrary
-from ..compiled import RunLog
 from ..costs import Cost
+from ..estimation.settings import Settings
+from ..model.system import System
 from ..observers import Observer
-from ..settings import Settings
-from ..system import System
 from .results import BatchEstimate, BatchRun
 
 __all__ = ["CompiledBatchEngine"]

@@ -15,9 +15,9 @@ from qpmhe_solvers.errors import tell_unknown_options
 from .._checks import count
 from ..costs import Cost, QuadraticCost
 from ..errors import InvalidInputError, OptionError
-from ..estimator import MovingHorizonEstimator
+from ..estimation.estimator import MovingHorizonEstimator
+from ..model.system import System
 from ..observers import Luenberger, Observer
-from ..system import System
 from .calls import Calls
 from .engines import BatchEngine
 from .looped import LoopedEngine

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
-from ..engine import PythonEngine
-from ..estimate import Estimate
+from ..estimation.engine import PythonEngine
+from ..estimation.estimate import Estimate
+from ..estimation.settings import Settings
+from ..model.system import System
 from ..observers import Observer
-from ..settings import Settings
-from ..system import System
 from .results import BatchEstimate
 
 __all__ = ["LoopedEngine"]

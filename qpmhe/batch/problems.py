@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 
 
 class Problems:
-    """P_t of every member, without sets; see `qpmhe.problem.Problem`.
+    """P_t of every member, without sets; see `qpmhe.estimation.problem.Problem`.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimate import Status
+from ..estimation.estimate import Status
 
 __all__ = ["BatchEstimate", "BatchRun"]
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from qpmhe_solvers import Solver, SolveStatus
 
 from ..costs import QuadraticCost
-from ..estimate import Status
-from ..optimizer import LENGTHS, ROUNDING, STALLED
-from ..settings import Settings
+from ..estimation.estimate import Status
+from ..estimation.optimizer import LENGTHS, ROUNDING, STALLED
+from ..estimation.settings import Settings
 from .factor import BlockCholesky
 from .fallback import member_qp
 from .problems import Problems
@@ -113,7 +113,7 @@ class _Group:
 
 
 class Sequence:
-    """Gauss-Newton steps from the candidates; see `qpmhe.optimizer.Optimizer`.
+    """Gauss-Newton steps from the candidates; see `qpmhe.estimation.optimizer.Optimizer`.
 
     Parameters
     ----------

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .._checks import numbers
-from ..derivatives import Jacobian
 from ..errors import InvalidInputError, ModelError, ShapeError
+from ..model.derivatives import Jacobian
+from ..model.system import System
 from ..observers import Observer
-from ..system import System
 from .calls import Calls
 
 __all__ = ["check_starts", "input_record", "inputs_of", "measurements_of", "record_of", "starts_of"]

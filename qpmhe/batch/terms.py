@@ -17,7 +17,7 @@ Special = tuple[Index, Array]
 
 
 class Terms:
-    r"""What each stage adds to the QPs, members last; see `qpmhe.linearization.StageTerms`.
+    r"""What each stage adds to the QPs, members last; see `qpmhe.estimation.linearization.StageTerms`.
 
     With the Jacobian G of (f, h), the joint weight W and the residual r = (w, v):
     ``square`` is :math:`G^\top W G`, ``below`` the coupling block :math:`-Q A`, ``own``

@@ -10,10 +10,10 @@ from qpmhe_solvers.auto import AutoSolver
 from qpmhe_solvers.banded import BandedSolver
 
 from ..costs import Cost, ObserverPrior, QuadraticCost
-from ..estimate import Status
+from ..estimation.estimate import Status
+from ..estimation.settings import Settings
+from ..model.system import System
 from ..observers import Luenberger, Observer
-from ..settings import Settings
-from ..system import System
 from .problems import Problems
 from .results import BatchEstimate
 from .sequence import Outcome, Sequence
@@ -64,7 +64,7 @@ def _solver(settings: Settings) -> Solver:
 
 
 class VectorisedEngine:
-    """The step of `qpmhe.engine.PythonEngine` for all members; see `BatchEngine`.
+    """The step of `qpmhe.estimation.engine.PythonEngine` for all members; see `BatchEngine`.
 
     Parameters
     ----------

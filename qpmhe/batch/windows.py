@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
+from ..model.system import System
 from ..observers import Luenberger
-from ..system import System
 from .calls import Calls, MemberFunction
 from .terms import Special, Terms
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-# A measurement beyond this has no finite square: it is as good as missing (see `qpmhe.window`).
+# A measurement beyond this has no finite square: it is as good as missing (see `qpmhe.estimation.window`).
 _LARGEST = 1e150
 
 # Every so many samples it is made sure that the model may be called on many states at once.
@@ -27,7 +27,7 @@ _CHECK_EVERY = 16
 
 
 class Windows:
-    """The windows of all members, which slide together; see `qpmhe.window.Window`.
+    """The windows of all members, which slide together; see `qpmhe.estimation.window.Window`.
 
     States and inputs are kept as (stages, members, components), as the model takes them;
     all else has the members last. States, samples and costs slide along arrays longer than
@@ -238,7 +238,7 @@ class Windows:
         bad[members] = ~(np.isfinite(cost[members]) & np.isfinite(squares))
 
     def _hold(self, k: int, held: Mask) -> None:
-        """Fill a stage where the model cannot be evaluated; see `qpmhe.window.Window`."""
+        """Fill a stage where the model cannot be evaluated; see `qpmhe.estimation.window.Window`."""
         self._z[k + 1, held] = self._good[held]
         self._residual[:, held] = self._weighted[:, held] = 0.0
 

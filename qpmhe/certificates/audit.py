@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import record, vector
 from ..costs import Cost, CostConstants, ObserverPrior, QuadraticCost
 from ..errors import InvalidInputError, ModelError, ShapeError
+from ..model.sets import Box, ConvexSet
+from ..model.system import System
 from ..models.scenario import Record
 from ..observers import Observer, Sample
-from ..sets import Box, ConvexSet
-from ..system import System
 from .branch_and_bound import output_lipschitz
 from .deadline import PART_SECONDS, Deadline
 from .evaluation import evaluated

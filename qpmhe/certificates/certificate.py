@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import count, numbers, vector
 from ..costs import Cost
 from ..errors import InvalidInputError, OptionError, ShapeError
-from ..estimate import Status
-from ..estimator import MovingHorizonEstimator
+from ..estimation.estimate import Status
+from ..estimation.estimator import MovingHorizonEstimator
+from ..estimation.run import Run
+from ..model.system import System
 from ..observers import Observer
-from ..run import Run
-from ..system import System
 from .audit import Audit
 from .decay import checked_length
 from .evidence import CertificateError, Evidence, MismatchError, weakest

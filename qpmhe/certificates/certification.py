@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import count
 from ..costs import Cost, CostConstants
 from ..errors import OptionError
+from ..model.sets import Box, ConvexSet
+from ..model.system import System
 from ..models.scenario import Record
 from ..observers import Observer
-from ..sets import Box, ConvexSet
-from ..system import System
 from .audit import audit, checked_ingredients
 from .branch_and_bound import constant_output
 from .certificate import Certificate

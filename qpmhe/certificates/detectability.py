@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sets import Box, ConvexSet
-from ..system import System
+from ..model.sets import Box, ConvexSet
+from ..model.system import System
 from .deadline import PART_SECONDS, Deadline
 from .decay import checked_rate
 from .evidence import JumpError, NotCertifiedError, OutOfTimeError

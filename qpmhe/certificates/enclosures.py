@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codegen.expressions import CasadiModel, import_casadi
-from ..system import System
+from ..model.system import System
 from .evaluation import check_values
 from .intervals import Interval, Jet, OutsideDomainError, variables
 from .regions import Region

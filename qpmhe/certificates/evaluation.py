@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ModelError
-from ..functions import BatchedFunction
-from ..system import System
+from ..model.functions import BatchedFunction
+from ..model.system import System
 
 __all__ = ["check_values", "evaluated", "joint_jacobians", "jump_about", "jump_between"]
 

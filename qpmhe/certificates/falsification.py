@@ -13,10 +13,10 @@ from qpmhe_solvers import available
 
 from .._checks import count, numbers
 from ..errors import InvalidInputError, ShapeError
-from ..estimator import MovingHorizonEstimator
-from ..run import Run
-from ..sets import Box, ConvexSet
-from ..system import System
+from ..estimation.estimator import MovingHorizonEstimator
+from ..estimation.run import Run
+from ..model.sets import Box, ConvexSet
+from ..model.system import System
 from .certificate import Certificate
 from .decay import DecayingSums
 from .horizon_bounds import Kind

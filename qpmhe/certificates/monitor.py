@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import count, record
 from ..costs import ObserverPrior
 from ..errors import InvalidInputError, OptionError, ShapeError
-from ..estimate import Estimate, Status
-from ..estimator import MovingHorizonEstimator
-from ..run import Run
-from ..system import System
+from ..estimation.estimate import Estimate, Status
+from ..estimation.estimator import MovingHorizonEstimator
+from ..estimation.run import Run
+from ..model.system import System
 from .certificate import Certificate
 from .evidence import MismatchError
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidInputError, OptionError, ShapeError
+from ..model.sets import Box, ConvexSet
+from ..model.system import System
 from ..observers import Luenberger, Observer, OutputInjection, SteadyStateKalman
-from ..sets import Box, ConvexSet
-from ..system import System
 from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
 from .decay import checked_rate
 from .evidence import CertificateError, JumpError, NotCertifiedError, OutOfTimeError

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import numbers, positive
 from ..errors import OptionError
-from ..sets import ConvexSet
-from ..system import System
+from ..model.sets import ConvexSet
+from ..model.system import System
 from .decay import checked_rate
 from .evaluation import evaluated
 from .evidence import CertificateError, Evidence, MismatchError, weakest

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import numbers
 from ..errors import ModelError, SetError
-from ..sets import Box, ConvexSet
-from ..system import System
+from ..model.sets import Box, ConvexSet
+from ..model.system import System
 
 __all__ = ["Region", "beyond", "bounded_region", "checked_system", "stated_region"]
 

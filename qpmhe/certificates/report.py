@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidInputError, QpmheError, SetError, ShapeError
-from ..estimator import MovingHorizonEstimator
+from ..estimation.estimator import MovingHorizonEstimator
+from ..estimation.run import Run
+from ..model.sets import Box, ConvexSet
 from ..models.example import Example
 from ..models.scenario import Record
 from ..plots.style import LIGHT, STYLES, panels, save
-from ..run import Run
-from ..sets import Box, ConvexSet
 from .audit import Audit, audit
 from .certificate import Certificate
 from .certification import certify

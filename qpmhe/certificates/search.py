@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .._checks import positive
 from ..errors import ModelError, OptionError
-from ..system import System
+from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel

@@ -17,8 +17,8 @@ from ..certificates.properties import Detectability, ObserverStability
 from ..certificates.regions import Region
 from ..certificates.report import LABELS, Report, certify_model
 from ..errors import InvalidInputError, OptionError
+from ..model.sets import Box
 from ..models.loading import find, load
-from ..sets import Box
 
 __all__ = ["certify"]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ..errors import InvalidInputError, OptionError
 
 if TYPE_CHECKING:
-    from ..estimator import MovingHorizonEstimator
+    from ..estimation.estimator import MovingHorizonEstimator
 
 __all__ = ["write"]
 
@@ -72,7 +72,7 @@ def write(
     InvalidInputError
         If this is no estimator, or the directory cannot be written.
     """
-    from ..estimator import MovingHorizonEstimator
+    from ..estimation.estimator import MovingHorizonEstimator
     from .library import generated
 
     if not isinstance(estimator, MovingHorizonEstimator):

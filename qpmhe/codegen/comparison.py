@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimate import Status
-from ..sets import ConvexSet
+from ..estimation.estimate import Status
+from ..model.sets import ConvexSet
 from .evaluation import fixed_call
 from .expressions import CasadiModel
 

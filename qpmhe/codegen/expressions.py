@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from .._checks import count, positive
-from ..discretize import METHODS
 from ..errors import InvalidInputError, ModelError, OptionError
-from ..functions import check_inputs, takes_input
+from ..model.discretize import METHODS
+from ..model.functions import check_inputs, takes_input
 
 __all__ = ["CasadiModel", "casadi_model", "import_casadi"]
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from ..costs import Cost
 from ..errors import OptionError
-from ..estimate import Status
+from ..estimation.estimate import Status
+from ..estimation.settings import Settings
+from ..model.sets import ConvexSet
+from ..model.system import System
 from ..observers import Luenberger, SteadyStateKalman
-from ..sets import ConvexSet
-from ..settings import Settings
-from ..system import System
 
 __all__ = ["SET_NAMES", "Layout", "settings_record"]
 

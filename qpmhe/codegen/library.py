@@ -11,10 +11,10 @@ from scipy.optimize import linprog
 
 from ..costs import Cost, ObserverPrior, QuadraticCost
 from ..errors import CompilationError, OptionError
+from ..estimation.settings import Settings
+from ..model.sets import ConvexSet
+from ..model.system import System
 from ..observers import HighGain, Luenberger, Observer, SteadyStateKalman
-from ..sets import ConvexSet
-from ..settings import Settings
-from ..system import System
 from .comparison import Interpreter, estimator_fault
 from .compiler import compiled_library
 from .layout import SET_NAMES, Layout, settings_record

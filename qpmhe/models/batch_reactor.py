@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import QuadraticCost
+from ..model.system import System
 from ..observers import Luenberger
-from ..system import System
 from .example import Example
 from .scenario import Scenario
 

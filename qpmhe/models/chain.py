@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from .._checks import count
 from ..costs import QuadraticCost
 from ..errors import OptionError
+from ..model.system import System
 from ..observers import design_luenberger
-from ..system import System
 from .example import Example
 from .scenario import Scenario
 

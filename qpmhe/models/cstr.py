@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import QuadraticCost
+from ..model.sets import Box
+from ..model.system import System
 from ..observers import design_luenberger
-from ..sets import Box
-from ..system import System
 from .example import Example
 from .scenario import Scenario
 

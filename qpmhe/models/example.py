@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from ..costs import QuadraticCost
+from ..model.system import System
 from ..observers import Observer
-from ..system import System
 from .scenario import Scenario
 
 __all__ = ["Example"]

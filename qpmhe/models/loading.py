@@ -21,8 +21,8 @@ import qpmhe_solvers
 
 from ..costs import Cost
 from ..errors import ModelError, QpmheError
+from ..model.system import System
 from ..observers import Observer
-from ..system import System
 from .catalogue import catalogue
 from .example import Example
 from .scenario import Scenario

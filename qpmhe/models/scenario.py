@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from .._checks import count, positive, positive_definite, vector
 from ..errors import InvalidInputError, ModelError, OptionError
-from ..sets import ConvexSet
-from ..system import System
+from ..model.sets import ConvexSet
+from ..model.system import System
 
 __all__ = ["Record", "Scenario"]
 

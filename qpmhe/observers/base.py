@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system import System
+from ..model.system import System
 
 __all__ = ["Observer", "Sample"]
 

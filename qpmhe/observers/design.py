@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import positive_definite, vector
 from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
-from ..system import System
+from ..model.system import System
 from .luenberger import Luenberger
 
 __all__ = ["design_luenberger"]

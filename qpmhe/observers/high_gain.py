@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import count, positive, vector
 from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
-from ..system import System
+from ..model.system import System
 from .design import ackermann, linearize, spectral_radius
 from .luenberger import Luenberger
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ModelError
-from ..system import System
+from ..model.system import System
 from .base import Observer, Sample
 
 __all__ = ["OutputInjection"]

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import numbers
 from ..errors import ShapeError
-from ..system import System
+from ..model.system import System
 from .base import Observer, Sample
 
 __all__ = ["Luenberger"]

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import numbers
 from ..errors import InvalidInputError, ShapeError
-from ..estimate import Estimate
-from ..run import Run
+from ..estimation.estimate import Estimate
+from ..estimation.run import Run
 
 __all__ = ["check_estimate", "check_run", "curve", "label_list", "named_curves", "sample_times"]
 

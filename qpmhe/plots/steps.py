@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import positive
-from ..estimate import Status
+from ..estimation.estimate import Status
 from .checks import check_run
 from .style import STYLES, panels
 
 if TYPE_CHECKING:
-    from ..run import Run
+    from ..estimation.run import Run
 
 __all__ = ["costs", "outcomes", "step_times"]
 

@@ -13,8 +13,8 @@ from .checks import check_estimate, check_run, curve, label_list, named_curves, 
 from .style import REAL, STYLES, panels
 
 if TYPE_CHECKING:
-    from ..estimate import Estimate
-    from ..run import Run
+    from ..estimation.estimate import Estimate
+    from ..estimation.run import Run
 
 __all__ = ["states", "trajectories", "window"]
 

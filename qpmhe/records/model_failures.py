@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimate import Estimate, Status
-from ..functions import EvaluationError
+from ..estimation.estimate import Estimate, Status
+from ..model.functions import EvaluationError
+from ..model.system import System
 from ..models.loading import code_place
-from ..system import System
 
 __all__ = ["ModelFailures"]
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from .._checks import need
 from ..errors import InvalidInputError, OptionError
-from ..estimate import Estimate
-from ..estimator import MovingHorizonEstimator
+from ..estimation.estimate import Estimate
+from ..estimation.estimator import MovingHorizonEstimator
 from .checkpoints import CheckpointError, WriteError
 
 __all__ = ["Output", "RowFormat"]

@@ -9,11 +9,11 @@ from typing import Any
 
 from ..costs import Cost
 from ..errors import ModelError, OptionError, QpmheError
-from ..estimator import MovingHorizonEstimator
+from ..estimation.estimator import MovingHorizonEstimator
+from ..model.system import System
 from ..models import Scenario
 from ..models.loading import build, code_place, find
 from ..observers import Observer
-from ..system import System
 
 __all__ = ["RecordModel", "load_record_model"]
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from .._checks import count
 from ..errors import InvalidInputError, OptionError
-from ..estimate import Status
+from ..estimation.estimate import Status
 from .checkpoints import Checkpoint, CheckpointError, WriteError, load, save, versions
 from .columns import ColumnNames
 from .measurements import Measurement, RecordReader

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from .._checks import count, positive
 from ..errors import InvalidInputError, OptionError
-from ..system import System
+from ..model.system import System
 
 __all__ = ["OnlyGapsError", "Step", "Steps"]
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers import Backend, BackendError, backend, register
 
-from ..estimate import Estimate
-from ..estimator import MovingHorizonEstimator
+from ..estimation.estimate import Estimate
+from ..estimation.estimator import MovingHorizonEstimator
+from ..estimation.run import Run
 from ..models import Example, Record
 from ..models.loading import ModelSource, load
-from ..run import Run
 from . import metrics
 from .environment import environment
 

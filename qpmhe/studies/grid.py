@@ -28,8 +28,8 @@ from qpmhe_solvers.errors import tell_unknown_options
 
 from .._checks import count, positive
 from ..errors import BackendError, InvalidInputError
+from ..estimation.settings import Start
 from ..models.loading import ModelSource, find, load
-from ..settings import Start
 from .cell import OBSERVER, Cell
 from .errors import StudyError
 

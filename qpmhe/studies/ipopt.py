@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from ..costs import ObserverPrior, QuadraticCost
 from ..errors import InvalidInputError
-from ..estimate import Estimate, Status
+from ..estimation.estimate import Estimate, Status
+from ..estimation.problem import Problem
+from ..estimation.window import Window
+from ..model.system import System
 from ..observers import Observer
-from ..problem import Problem
-from ..system import System
-from ..window import Window
 
 __all__ = ["IpoptEstimator"]
 

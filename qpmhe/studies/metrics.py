@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimate import Status
-from ..run import Run
+from ..estimation.estimate import Status
+from ..estimation.run import Run
 
 __all__ = ["accuracy", "consistency", "cost_ratio", "outcomes", "timing"]
 

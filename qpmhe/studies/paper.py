@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers import available, backend, create
 
-from ..discretize import discretize
 from ..errors import InvalidInputError
-from ..estimate import Status
-from ..estimator import MovingHorizonEstimator
+from ..estimation.estimate import Status
+from ..estimation.estimator import MovingHorizonEstimator
+from ..estimation.run import Run
+from ..model.discretize import discretize
 from ..models import Example
 from ..models.batch_reactor import batch_reactor, casadi_output, casadi_rate
 from ..models.scenario import Record
 from ..plots import save, trajectories
-from ..run import Run
 from .ipopt import IpoptEstimator
 
 __all__ = ["SETTLED", "PaperStudy", "Reproduction", "Row", "reproduce"]

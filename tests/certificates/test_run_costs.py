@@ -9,7 +9,7 @@ from qpmhe.certificates.evidence import MismatchError
 from qpmhe.certificates.monitor import Monitor, monitor
 from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.errors import InvalidInputError
-from qpmhe.run import Run
+from qpmhe.estimation.run import Run
 
 COST = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
 SYSTEM = qpmhe.System(lambda x: 1.1 * x, lambda x: 1.0 * x, n=1, p=1)

@@ -178,7 +178,7 @@ class OwnGain(qpmhe.Luenberger):
 
 
 def equality():
-    return qpmhe.Box(-1.0, 1.0) & qpmhe.sets.ConvexSet(
+    return qpmhe.Box(-1.0, 1.0) & qpmhe.model.sets.ConvexSet(
         np.array([-INF]), np.array([INF]), np.eye(1), np.zeros(1), np.zeros(1)
     )
 

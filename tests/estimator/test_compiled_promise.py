@@ -85,7 +85,7 @@ numbers = st.one_of(
 
 def box(draw, rows):
     low, high = (np.array([draw(sides), draw(sides)]) for _ in range(2))
-    return qpmhe.Box(-low, high) & qpmhe.sets.ConvexSet(
+    return qpmhe.Box(-low, high) & qpmhe.model.sets.ConvexSet(
         np.full(2, -INF), np.full(2, INF), np.array([rows]),
         np.array([-draw(sides)]), np.array([draw(sides)]),
     )

@@ -108,13 +108,13 @@ def test_a_qp_that_is_ready_too_late_is_not_begun(clock, monkeypatch, subproblem
     mhe = estimator(
         backend="ticking", max_qps=2, time_budget=1.0, subproblem=subproblem
     )
-    made = qpmhe.subproblem.Subproblem.at_candidate
+    made = qpmhe.estimation.subproblem.Subproblem.at_candidate
 
     def slow(self, problem, window):
         clock.now += seconds
         return made(self, problem, window)
 
-    monkeypatch.setattr(qpmhe.subproblem.Subproblem, "at_candidate", slow)
+    monkeypatch.setattr(qpmhe.estimation.subproblem.Subproblem, "at_candidate", slow)
     estimate = mhe.update(MEASUREMENTS[0])
     assert clock.limits == []
     assert (estimate.qps, estimate.solve_time) == (0, 0.0)

@@ -21,10 +21,10 @@ from qpmhe import (
     RobustCost,
     System,
 )
+from qpmhe.estimation.problem import Problem
+from qpmhe.estimation.subproblem import Subproblem
+from qpmhe.estimation.window import Window
 from qpmhe.exact import ExactStep
-from qpmhe.problem import Problem
-from qpmhe.subproblem import Subproblem
-from qpmhe.window import Window
 from qpmhe_solvers import SolverOptions, SolveStatus, create
 
 P0, Q2, R2 = np.diag([2.0, 0.5]), np.array([[30.0, 5.0], [5.0, 20.0]]), np.diag([4.0, 9.0])

@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 
 import qpmhe
 from qpmhe import Box, Luenberger, MovingHorizonEstimator, Polytope, QuadraticCost, Status
-from qpmhe.parameters import augment_parameters
+from qpmhe.model.parameters import augment_parameters
 from qpmhe_solvers import backend
 
 DT = 0.1

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.problem import Problem
-from qpmhe.subproblem import Subproblem
-from qpmhe.window import Window
+from qpmhe.estimation.problem import Problem
+from qpmhe.estimation.subproblem import Subproblem
+from qpmhe.estimation.window import Window
 
 from .plain import Record, differences, spd
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.problem import Problem
-from qpmhe.window import Window
+from qpmhe.estimation.problem import Problem
+from qpmhe.estimation.window import Window
 
 NONE = np.zeros(0)
 

@@ -149,7 +149,7 @@ def test_a_horizon_beyond_the_memory(monkeypatch):
     def exhausted(*_):
         raise MemoryError("Unable to allocate 745. GiB")
 
-    monkeypatch.setattr("qpmhe.estimator.engine_for", exhausted)
+    monkeypatch.setattr("qpmhe.estimation.estimator.engine_for", exhausted)
     check(
         OptionError, ["horizon is 10000000", "745. GiB", "take a shorter one"],
         lambda: estimator(horizon=10_000_000),

@@ -227,7 +227,7 @@ def test_how_models_of_other_steps_are_called_goes_along():
 @pytest.mark.parametrize("name", OPTIONS)
 def test_a_long_window_keeps_no_views_and_is_the_same(name, monkeypatch):
     measurements, kept = record(80), make(**OPTIONS[name])
-    monkeypatch.setattr("qpmhe.stages._KEPT", 5)
+    monkeypatch.setattr("qpmhe.estimation.stages._KEPT", 5)
     fresh = make(**OPTIONS[name])
     assert isinstance(kept._engine._window._places, list)
     assert not isinstance(fresh._engine._window._places, list)

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.problem import Problem
-from qpmhe.subproblem import Subproblem
-from qpmhe.window import Window
+from qpmhe.estimation.problem import Problem
+from qpmhe.estimation.subproblem import Subproblem
+from qpmhe.estimation.window import Window
 
 NONE = np.zeros(0)
 SIZES = [(1, 1, 0), (2, 1, 0), (3, 2, 1), (2, 3, 2)]

@@ -9,8 +9,8 @@ import pytest
 import qpmhe
 from qpmhe.costs import Loss
 from qpmhe.errors import ModelError
-from qpmhe.functions import BatchedFunction
-from qpmhe.tracing import trace
+from qpmhe.model.functions import BatchedFunction
+from qpmhe.model.tracing import trace
 
 NOTHING = np.zeros(0)
 TABLE = np.array([0.0, 1.0, 4.0, 9.0])

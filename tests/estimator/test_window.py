@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.linearization import StageTerms
-from qpmhe.window import Window
+from qpmhe.estimation.linearization import StageTerms
+from qpmhe.estimation.window import Window
 
 NONE = np.zeros(0)
 

@@ -408,7 +408,7 @@ def test_a_projection_and_what_follows_share_the_time(clock, name, budget):
 @pytest.mark.parametrize("outside", ["drop", "project", "keep"])
 @pytest.mark.parametrize("name", TIGHT)
 def test_without_time_for_any_qp_the_candidate_is_the_estimate(clock, monkeypatch, name, outside):
-    monkeypatch.setattr("qpmhe.optimizer.perf_counter", lambda: clock.now + 2.0)
+    monkeypatch.setattr("qpmhe.estimation.optimizer.perf_counter", lambda: clock.now + 2.0)
     _, found = tight(name, backend="ticking", time_budget=1.0, outside=outside)
     assert clock.now == 0.0
     for estimate, free, _, outsider in found:
@@ -423,7 +423,7 @@ def test_without_time_for_any_qp_the_candidate_is_the_estimate(clock, monkeypatc
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_solvers_with_next_to_no_time_do_no_harm(monkeypatch, backend):
     """Their own clocks run; the one between QPs stands still, so that they are called."""
-    monkeypatch.setattr("qpmhe.optimizer.perf_counter", lambda: 0.0)
+    monkeypatch.setattr("qpmhe.estimation.optimizer.perf_counter", lambda: 0.0)
     case = Case("polytopes", True, "missing", "quadratic")
     for estimate, known in case.estimates(backend=backend, time_budget=1e-9):
         case.check(estimate, known)

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from qpmhe_solvers import QP
 from qpmhe_solvers.qp import band_of
 
-from .costs import Cost
+from ..costs import Cost
+from ..model.sets import ConvexSet
+from ..model.system import System
 from .linearization import Span, StageTerms
 from .problem import Problem, Trial
-from .sets import ConvexSet
-from .system import System
 from .window import Window
 
 __all__ = ["Subproblem"]

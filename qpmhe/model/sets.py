@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ._checks import numbers
-from .errors import SetError
+from .._checks import numbers
+from ..errors import SetError
 
 __all__ = ["Box", "ConvexSet", "Polytope"]
 

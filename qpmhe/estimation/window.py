@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .costs import Cost, ObserverPrior
-from .functions import contained
+from ..costs import Cost, ObserverPrior
+from ..model.functions import contained
+from ..model.system import Function, System
+from ..observers import HighGain, Luenberger, Observer, Sample
+from ..snapshot import near, other
 from .linearization import Stage, StageTerms
-from .observers import HighGain, Luenberger, Observer, Sample
-from .snapshot import near, other
 from .stages import Stages
-from .system import Function, System
 from .views import Frame
 
 if TYPE_CHECKING:
-    from .adapters.fused import Fused
+    from ..adapters.fused import Fused
 
 __all__ = ["Window"]
 

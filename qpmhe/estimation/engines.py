@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .costs import Cost
+from ..costs import Cost
+from ..errors import CompilationError, EngineWarning
+from ..model.system import System
+from ..observers import Observer
 from .engine import PythonEngine
-from .errors import CompilationError, EngineWarning
-from .observers import Observer
 from .settings import Settings
-from .system import System
 
 if TYPE_CHECKING:
-    from .compiled import CompiledEngine
+    from ..codegen.engine import CompiledEngine
 
 __all__ = ["engine_for"]
 
@@ -39,7 +39,7 @@ def engine_for(
         If the compiled engine does not cover something.
     """
     if settings.engine == "compiled":
-        from .compiled import CompiledEngine  # late: most programs do without
+        from ..codegen.engine import CompiledEngine  # late: most programs do without
 
         try:
             return CompiledEngine(system, observer, cost, settings, initial_state)

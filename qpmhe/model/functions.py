@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ModelError, QpmheError
+from ..errors import ModelError, QpmheError
 from .tracing import trace
 
 __all__ = ["BatchedFunction", "Trusted", "check_inputs", "contained", "takes_input"]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ._checks import count, numbers
-from .errors import InvalidInputError, ModelError, SetError, ShapeError
+from .._checks import count, numbers
+from ..errors import InvalidInputError, ModelError, SetError, ShapeError
 from .functions import BatchedFunction, Probes, Trusted
 from .sets import Box, ConvexSet
 from .system import System, probe_points
@@ -92,7 +92,7 @@ def augment_parameters(
     An unknown decay, seen through the state:
 
     >>> import numpy as np, qpmhe
-    >>> from qpmhe.parameters import augment_parameters
+    >>> from qpmhe.model.parameters import augment_parameters
     >>> system = augment_parameters(
     ...     lambda x, theta: theta * x + 1.0, lambda x, theta: x, n=1, p=1, nominal=[0.5])
     >>> system.n

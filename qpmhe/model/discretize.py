@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import OptionError
+from ..errors import OptionError
 
 __all__ = ["METHODS", "Method", "discretize"]
 

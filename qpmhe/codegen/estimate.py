@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .codegen.layout import SET_NAMES
-from .estimate import Estimate, Status
+from ..estimation.estimate import Estimate, Status
+from .layout import SET_NAMES
 
 __all__ = ["CompiledEstimate", "dropped_names"]
 

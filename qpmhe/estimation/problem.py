@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.qp import band_of
 
-from .costs import Cost, ObserverPrior
-from .functions import contained
-from .sets import ConvexSet
-from .system import System
+from ..costs import Cost, ObserverPrior
+from ..model.functions import contained
+from ..model.sets import ConvexSet
+from ..model.system import System
 from .views import read_only
 from .window import Window
 
 if TYPE_CHECKING:
-    from .adapters.fused import Fused
+    from ..adapters.fused import Fused
     from .views import Frame
 
 __all__ = ["Problem", "Trial"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from ._checks import count, positive
-from .errors import OptionError
+from .._checks import count, positive
+from ..errors import OptionError
 
 __all__ = ["Candidate", "Convex", "Engine", "Policy", "Settings", "Start"]
 

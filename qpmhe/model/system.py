@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.errors import tell_unknown_options
 
-from ._checks import count
+from .._checks import count
+from ..errors import InvalidInputError, ModelError, SetError
 from .derivatives import Jacobian
-from .errors import InvalidInputError, ModelError, SetError
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .sets import ConvexSet
 
 if TYPE_CHECKING:
-    from .adapters.fused import Fused
-    from .codegen.expressions import CasadiModel
+    from ..adapters.fused import Fused
+    from ..codegen.expressions import CasadiModel
 
 __all__ = ["Joint", "System", "checked_set", "probe_points"]
 
@@ -228,7 +228,7 @@ class System:
         CompilationError
             If ``compiled`` is True, and it fails.
         """
-        from .adapters.casadi import casadi_system
+        from ..adapters.casadi import casadi_system
 
         return casadi_system(
             f, h, dt=dt, method=method, n=n, p=p, m=m, states=states,
@@ -275,7 +275,7 @@ class System:
         InvalidInputError
             If JAX is not installed.
         """
-        from .adapters.jax import jax_system
+        from ..adapters.jax import jax_system
 
         return jax_system(
             f, h, n=n, p=p, m=m, dt=dt, method=method, states=states,
@@ -315,7 +315,7 @@ class System:
         InvalidInputError
             If python-control is not installed.
         """
-        from .adapters.control import control_system
+        from ..adapters.control import control_system
 
         return control_system(
             system, dt=dt, method=method, states=states, disturbances=disturbances,
@@ -359,7 +359,7 @@ class System:
         InvalidInputError
             If SymPy is not installed.
         """
-        from .adapters.sympy import sympy_system
+        from ..adapters.sympy import sympy_system
 
         return sympy_system(
             f, h, x, u, dt=dt, method=method, states=states, disturbances=disturbances,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ._checks import count, positive
+from .._checks import count, positive
 from .derivatives import Jacobian
 from .discretize import discretize
 from .functions import BatchedFunction, Trusted, check_inputs

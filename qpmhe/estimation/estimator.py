@@ -10,16 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers.errors import tell_unknown_options
 
-from ._checks import positive, positive_definite, record, vector
-from .costs import Cost, ObserverPrior
+from .._checks import positive, positive_definite, record, vector
+from ..costs import Cost, ObserverPrior
+from ..errors import InvalidInputError, OptionError, ShapeError
+from ..model.system import System
+from ..observers import Observer
 from .engine import PythonEngine
 from .engines import engine_for
-from .errors import InvalidInputError, OptionError, ShapeError
 from .estimate import Estimate
-from .observers import Observer
 from .run import Run
 from .settings import Settings
-from .system import System
 
 __all__ = ["MovingHorizonEstimator"]
 

@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 from qpmhe_solvers import SolverOptions, create
 from qpmhe_solvers.contained import ContainedSolver
 
-from ._checks import check_problem
-from .costs import Cost
+from .._checks import check_problem
+from ..costs import Cost
+from ..errors import InvalidInputError
+from ..exact import ExactStep
+from ..model.system import System
+from ..observers import Observer
+from ..snapshot import SET_NAMES, check_description, described, reading, taken
 from .covariance import window_covariances
-from .errors import InvalidInputError
 from .estimate import Estimate, Status
-from .exact import ExactStep
-from .observers import Observer
 from .optimizer import Optimizer
 from .problem import Problem
 from .settings import Settings
-from .snapshot import SET_NAMES, check_description, described, reading, taken
 from .stages import Mark
 from .subproblem import Subproblem
-from .system import System
 from .window import Window
 
 __all__ = ["PythonEngine"]

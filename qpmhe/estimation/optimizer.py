@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from qpmhe_solvers import QP, Solution, SolveStatus
 from qpmhe_solvers.contained import ContainedSolver
 
+from ..exact import ExactSolution, ExactStep
 from .estimate import Status
-from .exact import ExactSolution, ExactStep
 from .problem import Problem, Trial
 from .settings import Settings
 from .subproblem import Subproblem

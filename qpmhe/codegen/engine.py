@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ._checks import check_problem, positive_definite
-from .codegen.library import EstimatorLibrary
-from .compiled_estimate import CompiledEstimate, dropped_names
-from .costs import Cost
-from .covariance import window_covariances
-from .errors import InvalidInputError
-from .estimate import Estimate
-from .observers import Observer
-from .problem import Problem
-from .run import Run
-from .settings import Settings
-from .snapshot import SET_NAMES, check_description, described, near, other, reading, taken
-from .system import System
+from .._checks import check_problem, positive_definite
+from ..costs import Cost
+from ..errors import InvalidInputError
+from ..estimation.covariance import window_covariances
+from ..estimation.estimate import Estimate
+from ..estimation.problem import Problem
+from ..estimation.run import Run
+from ..estimation.settings import Settings
+from ..model.system import System
+from ..observers import Observer
+from ..snapshot import SET_NAMES, check_description, described, near, other, reading, taken
+from .estimate import CompiledEstimate, dropped_names
+from .library import EstimatorLibrary
 
 __all__ = ["CompiledEngine", "RunLog"]
 
