@@ -1,0 +1,1 @@
+"""The estimator's step in Python: window, problem, subproblem, optimizer, estimate."""

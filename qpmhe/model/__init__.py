@@ -1,0 +1,1 @@
+"""Models: systems, their functions and derivatives, sets, discretisation, unknown parameters."""
