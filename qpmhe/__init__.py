@@ -1,5 +1,7 @@
 """Suboptimal moving horizon estimation by sequences of convex QPs, with a stability promise."""
 
+from typing import Any
+
 from . import batch, codegen, errors, models, solvers
 from .batch import BatchEstimator
 from .costs import (
@@ -14,6 +16,7 @@ from .costs import (
     RobustCost,
 )
 from .errors import QpmheError
+from .estimation.engines import Engine, register_engine
 from .estimation.estimate import Estimate, Status
 from .estimation.estimator import MovingHorizonEstimator
 from .estimation.run import Run
@@ -33,6 +36,15 @@ from .observers import (
 )
 
 __version__ = "0.1.0"
+
+
+def _compiled_engine(*parts: Any) -> Engine:
+    from .codegen.engine import CompiledEngine  # late: most programs do without
+
+    return CompiledEngine(*parts)
+
+
+register_engine("compiled", _compiled_engine)
 
 __all__ = [
     "BatchEstimator",

@@ -81,6 +81,8 @@ class CompiledEngine:
         If there is no compiler, or it fails.
     """
 
+    name = "compiled"
+
     def __init__(
         self,
         system: System,

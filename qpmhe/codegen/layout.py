@@ -196,7 +196,7 @@ def _filled(
     most = settings.max_solver_iterations
     record["max_iterations"] = 0 if settings.backend == "banded" else min(most or 50, _MOST)
     record["outside"] = _POLICIES.index(settings.outside)
-    record["start_at_best"] = settings.start == "best"
+    record["start_at_best"] = settings.warm_start
     record["reinitialize"] = settings.candidate == "reinitialized"
     record["delay"] = settings.delay
     return record

@@ -67,8 +67,6 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             f"the compiled step solves its QPs itself, not by {settings.backend!r}; take "
             "backend='auto', or 'banded' for QPs without inequalities."
         )
-    if settings.subproblem != "qp":
-        return "subproblem='exact' has no C form; take 'qp'."
     if settings.time_budget is not None:
         return (
             "the compiled step has no clock; bound it by max_qps and max_solver_iterations "

@@ -17,7 +17,6 @@ from qpmhe_solvers.contained import ContainedSolver
 from .._checks import check_problem
 from ..costs import Cost
 from ..errors import InvalidInputError
-from ..exact import ExactStep
 from ..model.system import System
 from ..observers import Observer
 from ..snapshot import SET_NAMES, check_description, described, reading, taken
@@ -49,6 +48,8 @@ class PythonEngine:
         The estimator's.
     """
 
+    name = "python"
+
     def __init__(
         self,
         system: System,
@@ -73,11 +74,7 @@ class PythonEngine:
             system.joint.prepare(settings.horizon)
         self._problem = Problem(system, cost)
         self._subproblem = Subproblem(system, cost, settings.horizon)
-        exact = None
-        if settings.subproblem == "exact":
-            exact = ExactStep(system, cost)
-            exact.prepare(settings.horizon)
-        self._optimizer = Optimizer(self._subproblem, solver, settings, exact)
+        self._optimizer = Optimizer(self._subproblem, solver, settings)
         self._linearized = settings.qp_limit > 0
         self._window = self._fresh_window(initial_state)
         self._made = system._calling()  # how the model is called, as found at construction
@@ -89,6 +86,9 @@ class PythonEngine:
         self._history: deque[Array] = deque(
             [initial_state.copy()], maxlen=settings.horizon + 1 if again else 1
         )
+
+    def run(self, ys: Array, us: Array | None) -> None:
+        """Take only sample by sample."""
 
     def reset(self, initial_state: Array) -> None:
         """Forget all measurements and start at this state."""
@@ -207,7 +207,7 @@ class PythonEngine:
         """Solve the window's problem as it stands."""
         window, problem, settings = self._window, self._problem, self._settings
         problem.bind(window)
-        start = self._shifted() if settings.start == "best" else None
+        start = self._shifted() if settings.warm_start else None
         deadline = math.inf if settings.time_budget is None else began + settings.time_budget
         outcome = self._optimizer.improve(problem, window, start, deadline)
         trial, reference = outcome.trial, outcome.reference

@@ -1,9 +1,10 @@
-"""Which engine carries out the steps."""
+"""The engines that can run the step, and the door through which they register."""
 
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,40 +14,78 @@ from ..errors import CompilationError, EngineWarning
 from ..model.system import System
 from ..observers import Observer
 from .engine import PythonEngine
+from .estimate import Estimate
+from .run import Run
 from .settings import Settings
 
-if TYPE_CHECKING:
-    from ..codegen.engine import CompiledEngine
-
-__all__ = ["engine_for"]
+__all__ = ["Engine", "engine_for", "register_engine"]
 
 Array = NDArray[np.float64]
 
 
+class Engine(Protocol):
+    """The loop body with its memory; `MovingHorizonEstimator` has checked what it is given."""
+
+    name: str
+
+    @property
+    def state(self) -> Array:
+        """The current estimate, a copy."""
+
+    @property
+    def time(self) -> int:
+        """Number of measurements taken so far."""
+
+    @property
+    def length(self) -> int:
+        """Number of samples in the window."""
+
+    def reset(self, initial_state: Array) -> None:
+        """Forget all measurements and start at this state."""
+
+    def step(
+        self, y: Array, u: Array, dt: float | None, noise_weight: Array | None, began: float
+    ) -> Estimate:
+        """Take a sample in, and estimate."""
+
+    def amend(self, time: int, y: Array) -> Estimate:
+        """Put a late measurement in its place, and estimate again."""
+
+    def run(self, ys: Array, us: Array | None) -> Run | None:
+        """Take a whole record in; None where it takes only sample by sample."""
+
+    def covariances(self) -> Array:
+        """Covariances along the last estimate."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that was learnt from measurements so far, as plain arrays and numbers."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where another estimator stopped."""
+
+
+_ENGINES: dict[str, Callable[[System, Observer, Cost, Settings, Array], Engine]] = {
+    "python": PythonEngine
+}
+
+
+def register_engine(
+    name: str, make: Callable[[System, Observer, Cost, Settings, Array], Engine]
+) -> None:
+    """Let ``engine=name`` use this factory, which may raise `CompilationError`."""
+    _ENGINES[name] = make
+
+
 def engine_for(
     system: System, observer: Observer, cost: Cost, settings: Settings, initial_state: Array
-) -> PythonEngine | CompiledEngine:
-    """The engine that the settings ask for, or the Python one where it cannot be compiled.
-
-    Parameters
-    ----------
-    system, observer, cost, settings, initial_state
-        The estimator's.
-
-    Raises
-    ------
-    OptionError
-        If the compiled engine does not cover something.
-    """
-    if settings.engine == "compiled":
-        from ..codegen.engine import CompiledEngine  # late: most programs do without
-
-        try:
-            return CompiledEngine(system, observer, cost, settings, initial_state)
-        except CompilationError as error:
-            warnings.warn(
-                f"engine='compiled' is carried out by the Python step: {error}",
-                EngineWarning,
-                stacklevel=4,
-            )
+) -> Engine:
+    """The engine that the settings ask for, or the Python one where it cannot be compiled."""
+    try:
+        return _ENGINES[settings.engine](system, observer, cost, settings, initial_state)
+    except CompilationError as error:
+        warnings.warn(
+            f"engine={settings.engine!r} falls back to the Python step: {error}",
+            EngineWarning,
+            stacklevel=4,
+        )
     return PythonEngine(system, observer, cost, settings, initial_state)

@@ -12,16 +12,15 @@ from qpmhe_solvers.errors import tell_unknown_options
 
 from .._checks import positive, positive_definite, record, vector
 from ..costs import Cost, ObserverPrior
-from ..errors import InvalidInputError, OptionError, ShapeError
+from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
 from ..model.system import System
 from ..observers import Observer
-from .engine import PythonEngine
 from .engines import engine_for
 from .estimate import Estimate
 from .run import Run
 from .settings import Settings
 
-__all__ = ["MovingHorizonEstimator"]
+__all__ = ["MovingHorizonEstimator", "check_start"]
 
 Array = NDArray[np.float64]
 
@@ -74,17 +73,13 @@ class MovingHorizonEstimator:
         sets out in this step, the paper's remedy after Assumption ass:observer; ``project``
         takes the nearest trajectory inside as candidate, if one QP finds a truly feasible
         one, and drops otherwise; ``keep`` returns the candidate.
-    start : {"candidate", "best"}
-        Where the sequence starts: at the candidate, or at the shifted previous estimate if
-        its true J is lower. Accepted is what beats the candidate, in both cases.
+    warm_start : bool
+        Whether the sequence starts at the shifted previous estimate where its true J is lower
+        than the candidate's. What beats the candidate is accepted in either case.
     candidate : {"observer", "reinitialized"}
         The paper's candidate, or that of an observer which at each sample starts again
         from the estimate of x(t-N) made at that time; the paper's outlook, outside of the
         theorem as proved there.
-    subproblem : {"qp", "exact"}
-        What is solved around a trajectory: a QP in which quadratic forms majorise the
-        cost, by the backend; or the convex problem with the cost as it is, by cvxpy, which
-        needs fewer but much slower steps where the cost is a `RobustCost`.
     time_budget : float or None
         Seconds for one update: no QP is begun later, and backends with a clock stop.
     delay : int
@@ -127,16 +122,15 @@ class MovingHorizonEstimator:
         tolerance: float = 1e-9,
         engine: str = "python",
         outside: str = "drop",
-        start: str = "candidate",
+        warm_start: bool = False,
         candidate: str = "observer",
-        subproblem: str = "qp",
         time_budget: float | None = None,
         delay: int = 0,
         isolated: bool = False,
     ) -> None:
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
-            engine, outside, start, candidate, subproblem, time_budget, delay, isolated,
+            engine, outside, warm_start, candidate, time_budget, delay, isolated,
         )
         self.system, self.observer, self.cost = system, observer, cost
         _is(system, System, "system", "qpmhe.System")
@@ -169,14 +163,7 @@ class MovingHorizonEstimator:
 
     def _checked_start(self, initial_state: ArrayLike) -> Array:
         state = vector("initial_state", initial_state, self.system.n)
-        self._own.check(state, np.zeros(self.system.m))
-        self.observer.check(self._own, state)
-        states = self.system.states
-        if states is not None and states.violation(state) > 0.0:
-            raise InvalidInputError(
-                f"initial_state is {state.tolist()}, which is outside of the state set "
-                f"{states!r}; start within it."
-            )
+        check_start(self._own, self.observer, state)
         return state
 
     def reset(self, initial_state: ArrayLike | None = None) -> None:
@@ -215,7 +202,7 @@ class MovingHorizonEstimator:
     @property
     def engine(self) -> str:
         """How the step is carried out: ``python`` or ``compiled``."""
-        return "python" if isinstance(self._engine, PythonEngine) else "compiled"
+        return self._engine.name
 
     @property
     def time(self) -> int:
@@ -445,16 +432,17 @@ class MovingHorizonEstimator:
                 )
         elif self.system.m:
             self._input(None)
-        if not isinstance(self._engine, PythonEngine) and not covariances:
-            return self._engine.run(ys, us)
+        found = None if covariances else self._engine.run(ys, us)
+        if found is not None:
+            return found
         start, estimates, collected = self.state.copy(), [], []
         for y, u in zip(ys, [None] * len(ys) if us is None else us, strict=True):
             estimates.append(self.update(y, u))
             if covariances:
                 collected.append(self._newest_covariance())
         n = self.system.n
-        found = np.array(collected).reshape(-1, n, n) if covariances else None
-        return Run.of(start, estimates, found)
+        blocks = np.array(collected).reshape(-1, n, n) if covariances else None
+        return Run.of(start, estimates, blocks)
 
     def _newest_covariance(self) -> Array:
         try:
@@ -467,3 +455,22 @@ class MovingHorizonEstimator:
 def _is(value: object, kind: type, name: str, expected: str) -> None:
     if not isinstance(value, kind):
         raise InvalidInputError(f"{name} is {value!r}; expected a {expected}.")
+
+
+def check_start(
+    system: System, observer: Observer, state: Array, name: str = "initial_state"
+) -> None:
+    """Check that model and observer work at an initial state, and that it is in its set."""
+    try:
+        system.check(state, np.zeros(system.m))
+        observer.check(system, state)
+    except ModelError as error:
+        if name == "initial_state":
+            raise
+        raise ModelError(f"{name}: {error}") from error
+    states = system.states
+    if states is not None and states.violation(state) > 0.0:
+        raise InvalidInputError(
+            f"{name} is {state.tolist()}, which is outside of the state set "
+            f"{states!r}; start within it."
+        )

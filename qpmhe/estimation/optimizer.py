@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from qpmhe_solvers import QP, Solution, SolveStatus
 from qpmhe_solvers.contained import ContainedSolver
 
-from ..exact import ExactSolution, ExactStep
 from .estimate import Status
 from .problem import Problem, Trial
 from .settings import Settings
@@ -130,8 +129,6 @@ class Optimizer:
         Where they go.
     settings : Settings
         Cap on the QPs, tolerance, and what to do with a candidate outside of the sets.
-    exact : ExactStep, optional
-        Solves the convex problem with the cost as it is, in place of the QPs.
     """
 
     def __init__(
@@ -139,9 +136,8 @@ class Optimizer:
         subproblem: Subproblem,
         solver: ContainedSolver,
         settings: Settings,
-        exact: ExactStep | None = None,
     ) -> None:
-        self._subproblem, self._solver, self._exact = subproblem, solver, exact
+        self._subproblem, self._solver = subproblem, solver
         self._limit, self._tolerance = settings.qp_limit, settings.tolerance
         self._outside = settings.outside
 
@@ -240,23 +236,9 @@ class Optimizer:
         outcome.count(solution.iterations, perf_counter() - began)
         return solution
 
-    def _solve_exactly(self, problem: Problem, outcome: Outcome) -> ExactSolution | None:
-        began = perf_counter()
-        left = outcome.remaining(began)
-        if left is not None and left <= 0.0:
-            return None
-        assert self._exact is not None
-        solution = self._exact.solve(problem, outcome.trial, self._subproblem.jacobian, left)
-        outcome.count(solution.iterations, perf_counter() - began)
-        return solution
-
     def _step(self, problem: Problem, qp: QP, outcome: Outcome) -> bool:
         """Solve one QP and judge its iterate; whether another QP is worth while."""
-        solution: Solution | ExactSolution | None
-        if self._exact is None:
-            solution = self._solve(qp, outcome)
-        else:
-            solution = self._solve_exactly(problem, outcome)
+        solution = self._solve(qp, outcome)
         if solution is None:
             return False
         outcome.qps += 1
@@ -275,10 +257,7 @@ class Optimizer:
         trial = self._trial(problem, best, step)
         if trial.cost < target:
             return self._accept(outcome, trial, solved, enough)
-        if isinstance(solution, ExactSolution):
-            promised = best.cost - solution.predicted
-        else:
-            promised = abs(float(np.vdot(qp.gradient, step)))
+        promised = abs(float(np.vdot(qp.gradient, step)))
         if 0.0 < trial.violation < math.inf and qp.rows:
             missed = trial
             if trial.violation <= _NEARLY:
@@ -297,7 +276,7 @@ class Optimizer:
                 if trial.cost < target:
                     break
             else:
-                stalled = solved and 0.0 <= promised <= STALLED * enough
+                stalled = solved and promised <= STALLED * enough
                 outcome.events |= Status.CONVERGED if stalled else Status.NO_DECREASE
                 return False
         return self._accept(outcome, trial, solved, enough)

@@ -8,12 +8,10 @@ from typing import Literal, get_args
 from .._checks import count, positive
 from ..errors import OptionError
 
-__all__ = ["Candidate", "Convex", "Engine", "Policy", "Settings", "Start"]
+__all__ = ["Candidate", "Engine", "Policy", "Settings"]
 
 Policy = Literal["drop", "project", "keep"]
-Start = Literal["candidate", "best"]
 Candidate = Literal["observer", "reinitialized"]
-Convex = Literal["qp", "exact"]
 Engine = Literal["python", "compiled"]
 
 # With max_qps=None the sequence ends by convergence; this bounds it where that fails.
@@ -27,7 +25,7 @@ class Settings:
     Parameters
     ----------
     horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance, engine,
-    outside, start, candidate, subproblem, time_budget, delay, isolated
+    outside, warm_start, candidate, time_budget, delay, isolated
         As there.
 
     Raises
@@ -44,9 +42,8 @@ class Settings:
     tolerance: float = 1e-9
     engine: str = "python"
     outside: str = "drop"
-    start: str = "candidate"
+    warm_start: bool = False
     candidate: str = "observer"
-    subproblem: str = "qp"
     time_budget: float | None = None
     delay: int = 0
     isolated: bool = False
@@ -71,12 +68,12 @@ class Settings:
                 f"delay is {self.delay!r}; expected at most the horizon, {self.horizon}: older "
                 "states are not in the window."
             )
+        if not isinstance(self.warm_start, bool):
+            raise OptionError(f"warm_start is {self.warm_start!r}; expected True or False.")
         for name, choices in (
             ("engine", get_args(Engine)),
             ("outside", get_args(Policy)),
-            ("start", get_args(Start)),
             ("candidate", get_args(Candidate)),
-            ("subproblem", get_args(Convex)),
         ):
             value = getattr(self, name)
             if value not in choices:

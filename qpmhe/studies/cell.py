@@ -218,7 +218,8 @@ def _estimator(example: Example, task: Task) -> MovingHorizonEstimator:
         system, observer, cost,
         horizon=cell.horizon, initial_state=scenario.initial_estimate,
         backend="banded" if cell.backend == OBSERVER else cell.backend,
-        max_qps=cell.qps, max_solver_iterations=cell.solver_iterations, start=cell.start,
+        max_qps=cell.qps, max_solver_iterations=cell.solver_iterations,
+        warm_start=cell.start == "best",
         isolated=task.isolated,
     )
 

@@ -357,7 +357,7 @@ def estimator(system, **options):
 
 
 RUNS = {
-    "converged": {"max_qps": None}, "best": {"max_qps": 2, "start": "best"},
+    "converged": {"max_qps": None}, "best": {"max_qps": 2, "warm_start": True},
     "observer": {"max_qps": 0}, "reinitialized": {"candidate": "reinitialized"},
     "Kalman": {"max_qps": 1},
 }

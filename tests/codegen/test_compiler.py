@@ -133,7 +133,7 @@ def test_model_sizes_and_sets_compile_anew_weights_and_options_do_not(wrapped):
     assert len(calls()) == 1
     for same in (
         {"weight": 2.0}, {"max_qps": 5, "outside": "keep", "backend": "banded"},
-        {"start": "best", "delay": 1, "candidate": "reinitialized"},
+        {"warm_start": True, "delay": 1, "candidate": "reinitialized"},
     ):
         assert estimator(**same).engine == "compiled"
     assert len(calls()) == 1

@@ -298,7 +298,7 @@ CASES = {
     "map": ({}, {"max_qps": None}),
     "one of each": ({"n": 1, "p": 1}, {"horizon": 1}),
     "many outputs": ({"n": 1, "p": 3, "m": 1}, {"horizon": 3, "max_qps": 2}),
-    "Euler": ({"method": "euler", "m": 2}, {"start": "best", "max_qps": 2, "discount": 0.9}),
+    "Euler": ({"method": "euler", "m": 2}, {"warm_start": True, "max_qps": 2, "discount": 0.9}),
     "Runge-Kutta": ({"method": "rk4", "n": 4}, {"candidate": "reinitialized"}),
     "matrices": ({"kind": "MX", "method": "rk4", "m": 1}, {"horizon": 1, "max_qps": 2}),
     "observer": ({"m": 1}, {"max_qps": 0}),
@@ -320,7 +320,7 @@ WIDE = {"states": 0.6, "disturbances": 0.05, "noises": 0.15}
 POLICIES = [("drop", "candidate"), ("project", "candidate"), ("keep", "best"), ("project", "best")]
 
 
-def constrained(outside="drop", start="candidate", **options):
+def constrained(outside="drop", warm_start=False, **options):
     sets = {
         name: polytope(2 if name == "noises" else 3, width) for name, width in WIDE.items()
     }
@@ -399,7 +399,7 @@ def broken(horizon, **options):
 def test_held_stages(horizon, tmp_path):
     program = compiled(broken(horizon), tmp_path)
     ys = [0.6, 0.8, 0.9, 1.0, -20.0, 0.9, np.nan, 1.0, -30.0, -30.0, 1.1, 1.0, 0.9, 0.9, 0.8]
-    for options in ({"max_qps": 0}, {"max_qps": 2}, {"max_qps": 2, "start": "best"}):
+    for options in ({"max_qps": 0}, {"max_qps": 2}, {"max_qps": 2, "warm_start": True}):
         mhe = broken(horizon, **options)
         expected = [mhe.update([y]) for y in ys]
         assert any(Status.MODEL_FAILED in one.status for one in expected)
@@ -619,8 +619,6 @@ def without_form(case):
         parts[0] = model(p=1, disturbances=qpmhe.Box([-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]))
     elif case == "backend='auto'":
         options["backend"] = "osqp"
-    elif case == "subproblem":
-        options["subproblem"] = "exact"
     elif case == "time_budget":
         options["time_budget"] = 0.1
     return qpmhe.MovingHorizonEstimator(
@@ -629,8 +627,7 @@ def without_form(case):
 
 
 @pytest.mark.parametrize("remedy", [
-    "from_casadi", "constant gain", "QuadraticCost", "widen", "backend='auto'", "subproblem",
-    "time_budget",
+    "from_casadi", "constant gain", "QuadraticCost", "widen", "backend='auto'", "time_budget",
 ])
 def test_what_has_no_c_form_tells_the_remedy(remedy, tmp_path):
     with pytest.raises(OptionError, match=remedy):

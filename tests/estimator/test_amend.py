@@ -258,7 +258,7 @@ def test_the_late_measurement_is_copied():
             same(first, second)
 
 
-@pytest.mark.parametrize("options", [{"start": "best"}, {"candidate": "reinitialized"}], ids=str)
+@pytest.mark.parametrize("options", [{"warm_start": True}, {"candidate": "reinitialized"}], ids=str)
 def test_amended_estimators_go_on(options):
     mhe = estimator(**options)
     for t, arguments in enumerate(samples(12)):

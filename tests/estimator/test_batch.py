@@ -206,7 +206,7 @@ def test_the_previous_estimate_as_start(name, max_qps, discount):
     )
     one = qpmhe.System(case.f, case.h, n=case.n, p=case.p), qpmhe.Luenberger(case.gain), cost
     Y = spoilt(case_records(case, 5, 20), np.random.default_rng(2))
-    compare(one, Y, starts=case.start, max_qps=max_qps, start="best", delay=3)
+    compare(one, Y, starts=case.start, max_qps=max_qps, warm_start=True, delay=3)
 
 
 @pytest.mark.parametrize("way", PENDULUMS)
@@ -243,7 +243,7 @@ def logarithm(x):
 
 @pytest.mark.parametrize("model", [strict, plain, silent, logarithm])
 @pytest.mark.parametrize(
-    "options", [{"max_qps": 0}, {}, {"max_qps": 3}, {"max_qps": 2, "start": "best"}], ids=str
+    "options", [{"max_qps": 0}, {}, {"max_qps": 3}, {"max_qps": 2, "warm_start": True}], ids=str
 )
 def test_a_model_that_is_not_defined_for_some_members(model, options):
     generator = np.random.default_rng(6)
@@ -668,7 +668,7 @@ def test_records_of_inputs():
 def test_reset(sets):
     Y = np.random.default_rng(4).standard_normal((3, 90, 1))
     Y[0, 3], Y[1, 70] = np.nan, np.nan
-    options = {"members": 3, "horizon": 5, "max_qps": 2, "start": "best"}
+    options = {"members": 3, "horizon": 5, "max_qps": 2, "warm_start": True}
     batch = BatchEstimator(*parts(**sets), initial_states=[0.5, 0.0], **options)
     first = batch.run(Y).states
     batch.reset()

@@ -40,7 +40,7 @@ def starts():
 @pytest.mark.parametrize(
     ("sets", "options"),
     [
-        ({}, {}), ({}, {"max_qps": 0}), ({}, {"max_qps": None, "start": "best", "delay": 3}),
+        ({}, {}), ({}, {"max_qps": 0}), ({}, {"max_qps": None, "warm_start": True, "delay": 3}),
         ({"disturbances": BOX}, {"outside": "project", "max_qps": 2}),
     ],
     ids=["one", "none", "converged", "sets"],
@@ -168,7 +168,7 @@ def test_copies_go_on_where_they_were_made(mode, engine, sets, compiled, copied)
     members, cut = 20, 14
     batch = qpmhe.BatchEstimator(
         system, model.observer, model.cost, members=members, horizon=8, engine=engine,
-        initial_states=starts()[:members], max_qps=2, start="best",
+        initial_states=starts()[:members], max_qps=2, warm_start=True,
     )
     y = records()[:members]
     batch.run(y[:, :cut])
@@ -182,7 +182,7 @@ def test_copies_go_on_where_they_were_made(mode, engine, sets, compiled, copied)
     other.reset()
     again = qpmhe.BatchEstimator(
         system, model.observer, model.cost, members=members, horizon=8, engine=engine,
-        initial_states=starts()[:members], max_qps=2, start="best",
+        initial_states=starts()[:members], max_qps=2, warm_start=True,
     )
     np.testing.assert_array_equal(other.update(y[:, 0]).states, again.update(y[:, 0]).states)
 

@@ -70,7 +70,7 @@ def shifted(kept, before):
 @pytest.mark.parametrize("horizon", [1, 4, 7])
 def test_the_best_start_is_the_shifted_estimate_where_that_costs_less(horizon, missing, discount):
     options = {"horizon": horizon, "discount": discount}
-    mhe, kept = estimator(start="best", **options), plain_record(**options)
+    mhe, kept = estimator(warm_start=True, **options), plain_record(**options)
     before, starts = None, []
     for y in record(20, missing):
         estimate = mhe.update(y)
@@ -91,16 +91,16 @@ def test_the_best_start_is_the_shifted_estimate_where_that_costs_less(horizon, m
 def test_a_better_start_helps_where_one_qp_is_not_enough():
     ys = record(25)
     sums = {
-        start: estimator(start=start, horizon=7).run(ys).costs.sum()
-        for start in ("candidate", "best")
+        start: estimator(warm_start=start, horizon=7).run(ys).costs.sum()
+        for start in (False, True)
     }
     converged = estimator(max_qps=None, horizon=7).run(ys).costs.sum()
-    assert converged * (1 - 1e-9) <= sums["best"] < sums["candidate"]
+    assert converged * (1 - 1e-9) <= sums[True] < sums[False]
 
 
 def test_the_start_changes_no_candidate():
     ys = record(20, 0.2)
-    runs = [estimator(start=start).run(ys) for start in ("candidate", "best")]
+    runs = [estimator(warm_start=start).run(ys) for start in (False, True)]
     np.testing.assert_array_equal(runs[0].candidate_costs, runs[1].candidate_costs)
     for run in runs:
         assert (run.costs <= run.candidate_costs).all()
@@ -108,14 +108,14 @@ def test_the_start_changes_no_candidate():
 
 def test_without_qps_there_is_nothing_to_start():
     ys = record(10)
-    runs = [estimator(start=start, max_qps=0).run(ys) for start in ("candidate", "best")]
+    runs = [estimator(warm_start=start, max_qps=0).run(ys) for start in (False, True)]
     np.testing.assert_array_equal(runs[0].states, runs[1].states)
     np.testing.assert_array_equal(runs[0].costs, runs[1].costs)
 
 
 def test_the_first_sample_has_no_better_start():
     ys = record(3)
-    mhes = [estimator(start=start) for start in ("candidate", "best")]
+    mhes = [estimator(warm_start=start) for start in (False, True)]
     np.testing.assert_array_equal(*(mhe.update(ys[0]).trajectory for mhe in mhes))
     mhes[1].update(ys[1])
     # Nor is there one after a reset: what came before is forgotten.
@@ -127,7 +127,7 @@ def test_the_first_sample_has_no_better_start():
 @pytest.mark.parametrize("backend", qpmhe.solvers.available())
 def test_the_best_start_with_a_backend_that_may_fail(backend):
     # Stopped after one iteration, most solvers bring little: the start is the estimate then.
-    mhe = estimator(start="best", backend=backend, max_solver_iterations=1)
+    mhe = estimator(warm_start=True, backend=backend, max_solver_iterations=1)
     kept, before = plain_record(), None
     for y in record(8):
         estimate = mhe.update(y)
@@ -144,7 +144,7 @@ def test_a_start_outside_of_the_sets_is_clipped_and_judged():
     system = qpmhe.System(swing, seen, n=2, p=1, states=box)
     cost = qpmhe.QuadraticCost(prior=P, disturbance=Q, noise=R)
     mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(GAIN), cost, horizon=4, initial_state=[2.0, -0.5], start="best"
+        system, qpmhe.Luenberger(GAIN), cost, horizon=4, initial_state=[2.0, -0.5], warm_start=True
     )
     for y in record(20):
         estimate = mhe.update(y)
@@ -164,9 +164,9 @@ def test_a_start_that_the_model_does_not_reach(root):
     cost = qpmhe.QuadraticCost(prior=1.0, disturbance=0.01, noise=10.0)
     runs = [
         qpmhe.MovingHorizonEstimator(
-            system, qpmhe.Luenberger([0.9]), cost, horizon=3, initial_state=[1.0], start=start
+            system, qpmhe.Luenberger([0.9]), cost, horizon=3, initial_state=[1.0], warm_start=start
         ).run([0.9, 0.5, -0.3, 0.5, 0.9, 0.9, 1.0, 1.0, 1.0])
-        for start in ("candidate", "best")
+        for start in (False, True)
     ]
     for run in runs:
         assert (run.costs <= run.candidate_costs).all()
@@ -240,7 +240,7 @@ def test_a_reinitialised_poor_observer_comes_closer():
 
 
 def test_both_options_together():
-    mhe = estimator(candidate="reinitialized", start="best")
+    mhe = estimator(candidate="reinitialized", warm_start=True)
     kept, made, before = plain_record(), [START], None
     for y in record(15):
         estimate = mhe.update(y)
@@ -265,7 +265,7 @@ def test_a_reset_forgets_the_estimates():
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3, 5])
-@pytest.mark.parametrize("options", [{}, {"max_qps": 0}, {"start": "best"}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"max_qps": 0}, {"warm_start": True}], ids=str)
 def test_the_delayed_estimate_is_that_many_states_back(delay, options):
     mhe = estimator(horizon=5, delay=delay, **options)
     for t, y in enumerate(record(12)):

@@ -191,10 +191,10 @@ OPTIONS = {
     "1 qp": {"max_qps": 1},
     "3 qps": {"max_qps": 3, "delay": 1},
     "converged": {"max_qps": None, "delay": 2},
-    "best": {"max_qps": 1, "start": "best"},
-    "best converged": {"max_qps": None, "start": "best"},
+    "best": {"max_qps": 1, "warm_start": True},
+    "best converged": {"max_qps": None, "warm_start": True},
     "reinitialized": {"candidate": "reinitialized"},
-    "reinitialized best": {"candidate": "reinitialized", "start": "best"},
+    "reinitialized best": {"candidate": "reinitialized", "warm_start": True},
     "loose": {"max_qps": None, "tolerance": 1e-3},
     "banded": {"backend": "banded"},
 }
@@ -215,7 +215,7 @@ def test_discounts(name, discount):
     model = made(name)
     weights = {name: getattr(model.cost, name) for name in ("prior", "disturbance", "noise")}
     cost = qpmhe.QuadraticCost(**weights, discount=discount)
-    for options in ({"max_qps": 0}, {"max_qps": 3}, {"start": "best", "max_qps": None}):
+    for options in ({"max_qps": 0}, {"max_qps": 3}, {"warm_start": True, "max_qps": None}):
         follow(model, both(model, cost=cost, **options))
 
 
@@ -245,7 +245,7 @@ def test_a_discount_that_underflows_within_the_window():
 def test_horizons(name, horizon):
     model = made(name)
     for options in (
-        {"delay": 1}, {"delay": horizon, "start": "best"}, {"candidate": "reinitialized"},
+        {"delay": 1}, {"delay": horizon, "warm_start": True}, {"candidate": "reinitialized"},
     ):
         estimates = follow(model, both(model, horizon=horizon, **options))
         assert len(estimates[-1].trajectory) == horizon + 1
@@ -277,7 +277,7 @@ def test_jacobians_without_entries():
     """Components that do not depend on the state, and an output that depends on none."""
     system = system_of(lambda x, u: [u[0], 0.5], lambda x, u: 2.0 * u[0], n=2, m=1)
     model = model_of(system, [[0.1], [0.1]], [0.5, 0.5], 3)
-    for options in ({"max_qps": 0}, {"max_qps": None}, {"start": "best"}):
+    for options in ({"max_qps": 0}, {"max_qps": None}, {"warm_start": True}):
         follow(model, both(model, **options))
 
 
@@ -294,7 +294,7 @@ assert not system.symbolic.f.is_a("SXFunction")
 cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=10 * np.eye(2), noise=np.eye(1))
 Y = np.random.default_rng(0).standard_normal((12, 1))
 for options in (
-    {{"max_qps": 0}}, {{"max_qps": 2}}, {{"start": "best"}}, {{"candidate": "reinitialized"}},
+    {{"max_qps": 0}}, {{"max_qps": 2}}, {{"warm_start": True}}, {{"candidate": "reinitialized"}},
 ):
     one, other = (
         qpmhe.MovingHorizonEstimator(

@@ -19,8 +19,8 @@ Status = qpmhe.Status
 WAYS = {
     "observer": {"max_qps": 0},
     "2 qps": {"max_qps": 2, "delay": 2},
-    "best": {"max_qps": 1, "start": "best"},
-    "reinitialized": {"candidate": "reinitialized", "start": "best"},
+    "best": {"max_qps": 1, "warm_start": True},
+    "reinitialized": {"candidate": "reinitialized", "warm_start": True},
 }
 ways = pytest.mark.parametrize("way", WAYS)
 
@@ -112,7 +112,7 @@ def test_late_measurements_of_samples_with_weights_of_their_own():
 def test_a_full_record_in_any_order():
     """Late measurements that complete a record give the estimate of the complete record."""
     model = made("inputs")
-    pair, late = [estimator(model, start="best") for _ in range(2)], []
+    pair, late = [estimator(model, warm_start=True) for _ in range(2)], []
     for t in range(STEPS):
         one = pair[0].update(model.Y[t], *input_at(model, t))
         other = pair[1].update(None if t % 3 else model.Y[t], *input_at(model, t))
@@ -246,7 +246,7 @@ def test_an_outage_longer_than_the_window(engine):
 def test_late_measurements_around_stages_where_the_model_fails():
     for name in ("logarithm", "roots"):
         model = fragile(name)
-        for options in ({}, {"start": "best"}):
+        for options in ({}, {"warm_start": True}):
             pair, Y = both(model, **options), outliers(model, 1)
             for t in range(STEPS):
                 close(*(one.update(Y[t]) for one in pair), 1e-7)

@@ -145,7 +145,7 @@ def test_weights_and_options_need_no_compiler(monkeypatch, tmp_path):
     cost = qpmhe.QuadraticCost(prior=2.0, disturbance=3.0, noise=4.0 * np.eye(2), discount=0.9)
     estimator(
         made("n=1"), cost=cost, observer=qpmhe.Luenberger([[0.1, 0.1]]), max_qps=None,
-        start="best", delay=1, backend="banded", tolerance=1e-4, initial_state=[0.1],
+        warm_start=True, delay=1, backend="banded", tolerance=1e-4, initial_state=[0.1],
     )
     assert list(tmp_path.glob("*.so")) == [library]
     assert (library.stat().st_ino, library.stat().st_mtime_ns) == (stamp.st_ino, stamp.st_mtime_ns)
@@ -207,7 +207,6 @@ def equality():
         ("noises has a direction of zero width.*less than 5e-09", {"system": lambda: symbolic(
             noises=qpmhe.Polytope([[1.0], [-1.0]], [1e-9, 1e-9]))}),
         ("not by 'osqp'; take backend='auto'", {"backend": "osqp"}),
-        ("take 'qp'", {"subproblem": "exact"}),
         ("max_qps and max_solver_iterations", {"time_budget": 1.0}),
     ],
 )

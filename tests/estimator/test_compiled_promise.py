@@ -118,7 +118,7 @@ def test_whatever_the_system_and_the_options(data):
         max_solver_iterations=draw(st.sampled_from([None, 1, 3])),
         backend=draw(st.sampled_from(["auto", "auto", "banded"])),
         outside=draw(st.sampled_from(["drop", "project", "keep"])),
-        start=draw(st.sampled_from(["candidate", "best"])),
+        warm_start=draw(st.booleans()),
         candidate=draw(st.sampled_from(["observer", "reinitialized"])), delay=1,
     )
     usual = [draw(st.floats(-1.1, 1.1)) for _ in range(4)] + [2.0]

@@ -38,7 +38,7 @@ def saved(mhe):
 @pytest.mark.parametrize("name", ["wide", "inputs", "reactor rk4", "n=3"])
 def test_a_snapshot_goes_on_bit_for_bit(name, cut):
     model = made(name)
-    options = {"start": "best", "candidate": "reinitialized", "delay": 1}
+    options = {"warm_start": True, "candidate": "reinitialized", "delay": 1}
     mhe, Y = estimator(model, **options), spoilt(model, 3)
     for t in range(cut):
         dt = 0.07 if model.system.dt and t % 3 == 0 else None
@@ -133,7 +133,7 @@ def test_damaged_snapshots_are_refused_whole():
 def test_damaged_numbers_do_no_harm():
     """Damage is refused, or too small to matter: the last digits, or what is never read."""
     model, generator = made("inputs"), np.random.default_rng(0)
-    mhe, twin = estimator(model, start="best"), estimator(model, start="best")
+    mhe, twin = estimator(model, warm_start=True), estimator(model, warm_start=True)
     for t in range(8):
         mhe.update(model.Y[t], *input_at(model, t))
     good, taken = mhe.state_dict(), 0
@@ -169,7 +169,7 @@ def test_a_record_is_its_samples(name):
     count = 600
     Y = np.resize(spoilt(model, 4, share=0.1), (count, model.system.p))
     U = generator.uniform(-1.0, 1.0, (count, model.system.m)) if model.system.m else None
-    options = {"start": "best", "delay": 2}
+    options = {"warm_start": True, "delay": 2}
     one, other = estimator(model, **options), estimator(model, **options)
     start, run = one.state.copy(), other.run(Y, U)
     estimates = [one.update(Y[t], *(() if U is None else (U[t],))) for t in range(count)]
@@ -275,7 +275,7 @@ def test_covariances_with_sets_discount_and_failures():
 
 def test_reset_starts_anew():
     model = made("wide")
-    mhe, Y = estimator(model, start="best"), spoilt(model, 9)
+    mhe, Y = estimator(model, warm_start=True), spoilt(model, 9)
     first = [mhe.update(y) for y in Y]
     mhe.reset()
     assert mhe.time == 0
@@ -285,7 +285,7 @@ def test_reset_starts_anew():
     mhe.reset([0.3, -0.2])
     twin = qpmhe.MovingHorizonEstimator(
         model.system, model.observer, model.cost, horizon=model.horizon,
-        initial_state=[0.3, -0.2], engine="compiled", max_qps=2, start="best",
+        initial_state=[0.3, -0.2], engine="compiled", max_qps=2, warm_start=True,
     )
     for y in Y:
         equal(mhe.update(y), twin.update(y))

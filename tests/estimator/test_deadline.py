@@ -41,8 +41,8 @@ class Clock:
     def __init__(self, monkeypatch):
         self.now = 0.0
         self.limits = []
-        for module in ("estimator", "engine", "optimizer", "exact_program"):
-            monkeypatch.setattr(f"qpmhe.{module}.perf_counter", lambda: self.now)
+        for module in ("estimator", "engine", "optimizer"):
+            monkeypatch.setattr(f"qpmhe.estimation.{module}.perf_counter", lambda: self.now)
 
     def solver(self, options):
         clock, inner = self, create("banded")
@@ -101,13 +101,8 @@ def test_time_that_the_model_takes_is_not_left_to_the_solver(clock):
 
 
 @pytest.mark.parametrize("seconds", [1.0, 2.0])
-@pytest.mark.parametrize("subproblem", ["qp", "exact"])
-def test_a_qp_that_is_ready_too_late_is_not_begun(clock, monkeypatch, subproblem, seconds):
-    if subproblem == "exact":
-        pytest.importorskip("cvxpy")
-    mhe = estimator(
-        backend="ticking", max_qps=2, time_budget=1.0, subproblem=subproblem
-    )
+def test_a_qp_that_is_ready_too_late_is_not_begun(clock, monkeypatch, seconds):
+    mhe = estimator(backend="ticking", max_qps=2, time_budget=1.0)
     made = qpmhe.estimation.subproblem.Subproblem.at_candidate
 
     def slow(self, problem, window):
@@ -119,25 +114,6 @@ def test_a_qp_that_is_ready_too_late_is_not_begun(clock, monkeypatch, subproblem
     assert clock.limits == []
     assert (estimate.qps, estimate.solve_time) == (0, 0.0)
     assert estimate.status == Status.CANDIDATE | Status.TIME_UP
-
-
-def test_the_exact_subproblem_gets_what_remains_in_each_attempt(clock, monkeypatch):
-    pytest.importorskip("cvxpy")
-    mhe = estimator(subproblem="exact", max_qps=2, time_budget=1.0)
-    (program,) = mhe._engine._optimizer._exact._programs.values()
-    mhe._engine._optimizer._exact._programs[1] = program  # never solved in this test
-    given = []
-
-    def fail(**words):
-        given.append(words["time_limit"])
-        clock.now += 0.75
-        raise mhe._engine._optimizer._exact._cp.SolverError("nothing")
-
-    monkeypatch.setattr(program.problem, "solve", fail)
-    monkeypatch.setattr(program, "set", lambda *arguments: None)
-    estimate = mhe.update(MEASUREMENTS[0])
-    assert given == [1.0, 0.25]
-    assert Status.SOLVER_FAILED in estimate.status
 
 
 # Every backend in a process of its own, all of which begin with no more than the package.
@@ -156,15 +132,15 @@ SETS = {
     },
 }
 
-def growth(backend, subproblem):
-    return [of_one(backend, sets, subproblem) for sets in SETS]
+def growth(backend):
+    return [of_one(backend, sets) for sets in SETS]
 
-def of_one(backend, sets, subproblem):
+def of_one(backend, sets):
     system = qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1, **SETS[sets])
     cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=9.0 * np.eye(2), noise=[[4.0]])
     mhe = qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger([[0.3], [0.1]]), cost, horizon=4, initial_state=[0.5, 0.0],
-        backend=backend, max_qps=2, subproblem=subproblem,
+        backend=backend, max_qps=2,
     )
     before = set(sys.modules)
     mhe.update([1.0])
@@ -175,25 +151,22 @@ def of_one(backend, sets, subproblem):
 def dispatched(name):
     return getattr(qpmhe.solvers.backend(name).factory, "func", None) is DispatchSolver
 
-cases = [("auto", "exact")] if sys.argv[1] == "exact" else []
-cases += sorted(
-    ((name, "qp") for name in qpmhe.solvers.available()), key=lambda case: dispatched(case[0])
-)
+cases = sorted(qpmhe.solvers.available(), key=dispatched)
 found = {}
 for case in cases:
-    if dispatched(case[0]) and "qpsolvers" not in sys.modules:
+    if dispatched(case) and "qpsolvers" not in sys.modules:
         import qpsolvers  # as whoever makes one of these does; once for all children
     reader, writer = os.pipe()
     if os.fork() == 0:
         try:
-            answer = growth(*case)
+            answer = growth(case)
         except BaseException:
             answer = traceback.format_exc()
         os.write(writer, json.dumps(answer).encode()[:60000])
         os._exit(0)
     os.close(writer)
     with os.fdopen(reader, "rb") as pipe:
-        found[" ".join(case)] = json.loads(pipe.read() or b'"died"')
+        found[case] = json.loads(pipe.read() or b'"died"')
     os.wait()
 print(json.dumps(found))
 """
@@ -201,14 +174,8 @@ print(json.dumps(found))
 
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
 def test_no_update_imports_anything():
-    try:
-        import cvxpy  # noqa: F401
-    except ImportError:
-        exact = "no"
-    else:
-        exact = "exact"
     done = subprocess.run(
-        [sys.executable, "-c", GROWTH, exact], capture_output=True, text=True, check=True,
+        [sys.executable, "-c", GROWTH], capture_output=True, text=True, check=True,
         timeout=300,
     )
     found = json.loads(done.stdout.splitlines()[-1])

@@ -23,11 +23,11 @@ from .test_own_memory import (
 WITHIN = str(pathlib.Path(qpmhe.__file__).parent)
 CASES = {
     "plain": ("numpy", {}),
-    "reinitialized": ("numpy", {"candidate": "reinitialized", "start": "best"}),
+    "reinitialized": ("numpy", {"candidate": "reinitialized", "warm_start": True}),
     "kalman": ("numpy", {"kalman": True, "candidate": "reinitialized"}),
     "robust": ("numpy", {"robust": True, "max_qps": 2}),
     "projected": ("numpy", {"sets": BOX, "outside": "project", "max_qps": 2}),
-    "discount": ("numpy", {"discount": 0.8, "start": "best"}),
+    "discount": ("numpy", {"discount": 0.8, "warm_start": True}),
     "casadi": ("casadi", {}),
     "compiled": ("compiled", {"candidate": "reinitialized"}),
 }
@@ -185,7 +185,7 @@ def test_an_interrupt_out_of_what_the_user_wrote(where, candidate, monkeypatch):
         cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(1))
         mhe = qpmhe.MovingHorizonEstimator(
             system, observer, cost, horizon=3, initial_state=[0.5, 0.4], candidate=candidate,
-            start="best", max_qps=2,
+            warm_start=True, max_qps=2,
         )
         solver = mhe._engine._optimizer._solver
         monkeypatch.setattr(solver, "solve", ticking("solver", solver.solve))

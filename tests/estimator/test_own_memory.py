@@ -10,18 +10,17 @@ BOX = {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9])}
 OPTIONS = {
     "plain": {},
     "observer alone": {"max_qps": 0},
-    "best": {"start": "best", "max_qps": 2},
-    "reinitialized": {"candidate": "reinitialized", "start": "best"},
+    "best": {"warm_start": True, "max_qps": 2},
+    "reinitialized": {"candidate": "reinitialized", "warm_start": True},
     "delayed": {"delay": 2},
     "dropped": {"sets": BOX, "max_qps": 3},
-    "projected": {"sets": BOX, "outside": "project", "start": "best"},
+    "projected": {"sets": BOX, "outside": "project", "warm_start": True},
     "kept": {"sets": BOX, "outside": "keep"},
     "discount": {"discount": 0.8},
 }
 PYTHON_ONLY = {
     "robust": {"robust": True},
     "kalman": {"kalman": True, "candidate": "reinitialized"},
-    "exact": {"robust": True, "subproblem": "exact"},
 }
 HORIZON = 4
 
@@ -133,9 +132,7 @@ def cases():
 def test_a_spoilt_estimator_goes_on_as_its_twin(engine, options):
     if engine == "compiled" and find_compiler() is None:
         pytest.skip("there is no C compiler")
-    if options.get("subproblem") == "exact":
-        pytest.importorskip("cvxpy")
-    count = 12 if "subproblem" in options else 60
+    count = 60
     twin, spoilt = estimator(engine, **options), estimator(engine, **options)
     assert spoil(spoilt.initial_state) == 1
     for t, arguments in enumerate(samples(count)):
@@ -176,7 +173,7 @@ def test_a_spoilt_estimator_goes_on_as_its_twin(engine, options):
 
 BATCHES = {
     "vectorised": {},
-    "vectorised best": {"start": "best", "max_qps": 2, "delay": 1},
+    "vectorised best": {"warm_start": True, "max_qps": 2, "delay": 1},
     "vectorised alone": {"max_qps": 0},
     "looped": {"candidate": "reinitialized"},
     "compiled": {"engine": "compiled"},

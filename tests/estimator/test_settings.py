@@ -85,7 +85,7 @@ def test_available_backends_are_accepted(backend):
             ("outside", value, ["drop", "project", "keep"])
             for value in ("dropped", "", "Keep", None, True, ["drop"])
         ),
-        *(("start", value, ["candidate", "best"]) for value in ("observer", "BEST", None, 1)),
+        *(("warm_start", value, ["True or False"]) for value in ("best", None, 1)),
         *(
             ("candidate", value, ["observer", "reinitialized"])
             for value in ("reinitialised", "best", None, 0)
@@ -128,14 +128,14 @@ def test_settings_are_kept_and_frozen():
     given = {
         "horizon": 4, "backend": "banded", "max_qps": 2, "max_solver_iterations": 7,
         "solver_tolerance": 1e-5, "tolerance": 1e-6, "engine": "python", "outside": "keep",
-        "start": "best", "candidate": "reinitialized", "time_budget": 3.5, "delay": 1,
+        "warm_start": True, "candidate": "reinitialized", "time_budget": 3.5, "delay": 1,
     }
     settings = estimator(**given).settings
     assert given.items() <= dataclasses.asdict(settings).items()
     with pytest.raises(dataclasses.FrozenInstanceError):
         settings.horizon = 5
     defaults = dataclasses.asdict(estimator().settings)
-    assert (defaults["outside"], defaults["start"]) == ("drop", "candidate")
+    assert (defaults["outside"], defaults["warm_start"]) == ("drop", False)
     assert (defaults["candidate"], defaults["time_budget"]) == ("observer", None)
     assert (defaults["max_qps"], defaults["delay"]) == (1, 0)
 

@@ -10,7 +10,7 @@ import qpmhe
 OPTIONS = {
     "plain": {},
     "converged": {"max_qps": None},
-    "best": {"start": "best", "max_qps": 2},
+    "best": {"warm_start": True, "max_qps": 2},
     "reinitialized": {"candidate": "reinitialized"},
     "observer alone": {"max_qps": 0},
     "delayed": {"delay": 3},
@@ -118,7 +118,7 @@ def test_a_state_is_a_copy():
 
 
 def test_another_process_continues_bit_for_bit(tmp_path):
-    measurements, mhe = record(), make(start="best", max_qps=2)
+    measurements, mhe = record(), make(warm_start=True, max_qps=2)
     feed(mhe, measurements[:13])
     np.save(tmp_path / "rest.npy", measurements[13:])
     (tmp_path / "mhe.pickle").write_bytes(pickle.dumps(mhe))

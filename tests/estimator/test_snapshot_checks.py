@@ -156,7 +156,7 @@ def test_caps_and_policies_may_change(engine):
         ({"max_qps": 0}, {"max_qps": 2}), ({"max_qps": 3}, {"max_qps": 0}),
         ({}, {"max_qps": None, "tolerance": 1e-6, "solver_tolerance": 1e-5, "delay": 1}),
         ({}, {"backend": "banded", "max_solver_iterations": 7}),
-        ({}, {"start": "best", "max_qps": None}),
+        ({}, {"warm_start": True, "max_qps": None}),
         ({"outside": "keep"}, {"outside": "drop"}),
     ):
         one, other, fresh = made(**first), made(**second), made(**second)

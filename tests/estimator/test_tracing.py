@@ -272,7 +272,7 @@ def estimator(f, **options):
 MEASURED = [0.3, -0.6, 0.1, 14.0, 12.5, -0.4, 13.0, 0.2, 0.0, -1.0]
 
 
-@pytest.mark.parametrize("options", [{}, {"start": "best"}, {"candidate": "reinitialized"}])
+@pytest.mark.parametrize("options", [{}, {"warm_start": True}, {"candidate": "reinitialized"}])
 @pytest.mark.parametrize("way", WRITING)
 def test_a_model_that_writes_into_its_argument_changes_nothing(way, options):
     f = WRITING[way]
@@ -409,7 +409,7 @@ RETURNS = {
 
 
 @pytest.mark.parametrize("where", ["f", "h"])
-@pytest.mark.parametrize("options", [{}, {"start": "best"}, {"candidate": "reinitialized"}])
+@pytest.mark.parametrize("options", [{}, {"warm_start": True}, {"candidate": "reinitialized"}])
 @pytest.mark.parametrize("what", RETURNS)
 def test_what_a_model_returns_far_out_never_leaves_update(what, options, where):
     far = RETURNS[what]

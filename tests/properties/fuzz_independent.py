@@ -126,7 +126,7 @@ class Case:
             "max_qps": one_of(rng, (0, 0, 1, 1, 1, 2, 2, 2, 5, None)),
             "max_solver_iterations": one_of(rng, (None, None, 1, 3)),
             "outside": one_of(rng, ("drop", "drop", "project", "keep")),
-            "start": one_of(rng, ("candidate", "candidate", "best")),
+            "warm_start": one_of(rng, (False, False, True)),
             "candidate": candidate,
             "engine": engine,
         }
@@ -271,7 +271,7 @@ class Case:
             ("discounted", self.price.discount < 1.0), ("horizon", self.options["horizon"]),
             ("backend", self.options["backend"]), ("max_qps", self.options["max_qps"]),
             ("cap", self.options["max_solver_iterations"]),
-            ("candidate", self.options["candidate"]), ("start", self.options["start"]),
+            ("candidate", self.options["candidate"]), ("warm_start", self.options["warm_start"]),
             ("sets", " ".join(sorted(self.regions)) or "none"),
             ("noise-free", bool(self.fixed)), ("outside", self.options["outside"]),
             ("sample", "complete" if observed.all() else "partial" if observed.any() else "none"),

@@ -1,4 +1,4 @@
-"""A batch in compiled code, spread over threads."""
+"""Many estimators in compiled code, spread over threads."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codegen.engine import RunLog
-from ..codegen.library import EstimatorLibrary
 from ..costs import Cost
 from ..estimation.settings import Settings
 from ..model.system import System
 from ..observers import Observer
-from .results import BatchEstimate, BatchRun
+from .engine import RunLog
+from .library import EstimatorLibrary
 
-__all__ = ["CompiledBatchEngine"]
+__all__ = ["CompiledMembers"]
 
 Array = NDArray[np.float64]
 
@@ -28,8 +27,8 @@ Array = NDArray[np.float64]
 _LEAST = 16
 
 
-class CompiledBatchEngine:
-    """The generated C step for each member; see `qpmhe.batch.engines.BatchEngine`.
+class CompiledMembers:
+    """The generated C step for each member of a batch.
 
     Parameters
     ----------
@@ -51,7 +50,7 @@ class CompiledBatchEngine:
         threads: int | None,
     ) -> None:
         self._library = library = EstimatorLibrary(system, observer, cost, settings)
-        self._m, self._n, self._delay = system.m, system.n, settings.delay
+        self._m, self._n = system.m, system.n
         count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         wanted = min(threads or count or 1, max(1, len(states) // _LEAST))
         ends = np.linspace(0, len(states), wanted + 1).astype(int).tolist()
@@ -61,12 +60,12 @@ class CompiledBatchEngine:
         self.reset(states)
 
     def reset(self, states: Array) -> None:
-        """See `qpmhe.batch.engines.BatchEngine.reset`."""
+        """Forget all samples and start at these states."""
         self._memory = self._library.estimators(states)
 
     @property
     def time(self) -> int:
-        """See `qpmhe.batch.engines.BatchEngine.time`."""
+        """Number of samples taken so far."""
         return int(self._memory["time"][0])
 
     def state_dict(self) -> dict[str, Any]:
@@ -88,13 +87,13 @@ class CompiledBatchEngine:
 
     @property
     def states(self) -> Array:
-        """See `qpmhe.batch.engines.BatchEngine.states`."""
+        """The current estimates (K, n)."""
         newest = self._memory["newest"]
         states: Array = self._memory["history"][np.arange(len(newest)), newest]
         return states
 
-    def step(self, y: Array, u: Array) -> BatchEstimate:
-        """See `qpmhe.batch.engines.BatchEngine.step`."""
+    def step(self, y: Array, u: Array) -> tuple[Any, ...]:
+        """Take a sample of each in; the time, trajectories, costs, candidates, ... of all."""
         ys, us = np.ascontiguousarray(y), np.ascontiguousarray(u)
         found = np.empty(len(ys), self._library.estimate_type)
 
@@ -106,13 +105,13 @@ class CompiledBatchEngine:
 
         self._share(work)
         states = slice(0, int(found["length"][0]) + 1)
-        return BatchEstimate(
+        return (
             self.time - 1, found["trajectory"][:, states], found["cost"],
             found["candidate"][:, states], found["candidate_cost"],
-            found["status"].astype(np.int64), found["qps"].astype(np.intp), self._delay,
+            found["status"].astype(np.int64), found["qps"].astype(np.intp),
         )
 
-    def run(self, y: Array, u: Array) -> BatchRun:
+    def run(self, y: Array, u: Array) -> dict[str, Any]:
         """Take records (K, T, p) and (K, T, m) in without leaving C.
 
         Parameters
@@ -132,11 +131,12 @@ class CompiledBatchEngine:
             )
 
         self._share(work)
-        return BatchRun(
-            states=np.concatenate((start[:, None], log.states), axis=1), filtered=log.filtered,
-            delayed=log.delayed, costs=log.costs, candidate_costs=log.candidate_costs,
-            statuses=log.flags.astype(np.int64), qps=log.qps.astype(np.intp),
-        )
+        return {
+            "states": np.concatenate((start[:, None], log.states), axis=1),
+            "filtered": log.filtered, "delayed": log.delayed,
+            "costs": log.costs, "candidate_costs": log.candidate_costs,
+            "statuses": log.flags.astype(np.int64), "qps": log.qps.astype(np.intp),
+        }
 
     def _share(self, work: Callable[[slice, NDArray[np.uint8]], None]) -> None:
         """Do the work on all members, a part a thread; C runs without the interpreter's lock.
