@@ -206,8 +206,10 @@ class BatchEstimator:
         code, of all or of none: see ``time``.
         """
         y = _measurements(Y, self.members, self.system.p)
-        u = _inputs(U, self.members, self.system.m)
-        return BatchEstimate(*self._engine.step(y, u), self.settings.delay)
+        return self._step(y, _inputs(U, self.members, self.system.m))
+
+    def _step(self, y: Array, u: Array) -> BatchEstimate:
+        return BatchEstimate(*self._engine.step(y, u), delay=self.settings.delay)
 
     def run(self, Y: ArrayLike, U: ArrayLike | None = None) -> BatchRun:
         """Take whole records, sample by sample, going on from the present states.
@@ -232,12 +234,9 @@ class BatchEstimator:
         """
         ys = _record(Y, self.members, self.system.p)
         us = _input_record(U, self.members, self.system.m, ys.shape[1])
-        if self.settings.engine == "compiled":
+        if not isinstance(self._engine, _Looped):
             return BatchRun(**self._engine.run(ys, us))
-        found = (
-            BatchEstimate(*self._engine.step(ys[:, t], us[:, t]), self.settings.delay)
-            for t in range(ys.shape[1])
-        )
+        found = (self._step(ys[:, t], us[:, t]) for t in range(ys.shape[1]))
         return BatchRun.of(self.states, found, ys.shape[1])
 
     def __getstate__(self) -> dict[str, Any]:

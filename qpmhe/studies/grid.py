@@ -28,7 +28,6 @@ from qpmhe_solvers.errors import tell_unknown_options
 
 from .._checks import count, positive
 from ..errors import BackendError, InvalidInputError
-from ..estimation.settings import Start
 from ..models.loading import ModelSource, find, load
 from .cell import OBSERVER, Cell
 from .errors import StudyError
@@ -36,6 +35,8 @@ from .errors import StudyError
 __all__ = ["WORDS", "Measure", "Study"]
 
 Measure = Literal["both", "accuracy", "time"]
+#: Where the sequence of QPs begins: at the candidate, or warm-started where that is better.
+Start = Literal["candidate", "best"]
 #: What stands for None in files and on the command line.
 WORDS = {"qps": "converged", "solver_iterations": "none", "horizons": "default"}
 
