@@ -280,7 +280,7 @@ def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
             if monotonic() - start > sent[future].hard_limit + _GRACE:
                 del began[future]
                 future.cancel()
-                yield failure(sent.pop(future), _HUNG)
+                suspects.append(sent.pop(future))  # a cluster may have kept it waiting
         if not sent and (suspects or broken):
             while suspects:
                 yield _again(workers, suspects.popleft())
@@ -301,8 +301,9 @@ def _answer(
     except Exception as error:
         if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
             return failure(task, f"{type(error).__name__}: {error}")
-        hung = start is not None and monotonic() - start >= task.hard_limit
-        return failure(task, _HUNG) if hung else error
+        if isinstance(error, BrokenExecutor) and start is not None:
+            return failure(task, _HUNG) if monotonic() - start >= task.hard_limit else error
+        return error
 
 
 def _again(workers: Workers, task: Task) -> Result:
@@ -312,7 +313,8 @@ def _again(workers: Workers, task: Task) -> Result:
         workers.restart()
         start = monotonic()
         future = workers.submit(replace(task, isolated=isolated))
-        if not wait([future], task.hard_limit + _GRACE).done:
+        # A worker of a cluster may still hang in a cell that was given up.
+        if not wait([future], 2 * task.hard_limit + _GRACE).done:
             future.cancel()
             return failure(task, _HUNG)
         answer = _answer(workers, task, future, start)
