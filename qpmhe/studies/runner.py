@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from threading import Thread
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -169,22 +176,27 @@ class _Cluster:
         distributed = need("distributed", "a study on a cluster", "dask")
         self._address = address
         try:
-            if not isinstance(address, str) or not address:
-                raise TypeError("expected a text")
-            self._client = _within(2 * _CONNECT, partial(
-                distributed.Client, address, timeout=_CONNECT, set_as_default=False
-            ))
-            self._client.wait_for_workers(1, timeout=_CONNECT)
+            if "workers" not in _identity(distributed, address, _CONNECT):
+                raise ValueError("what answers is no scheduler")
+            self._client = distributed.Client(address, timeout=_CONNECT, set_as_default=False)
         except Exception as error:  # anything may answer at an address
-            raise StudyError(
-                f"the scheduler is {address!r}, which gives no Dask workers "
-                f"({str(error) or type(error).__name__}); start one "
-                "with 'dask scheduler' and workers with 'dask worker ADDRESS --nthreads 1', and "
-                "give the address that it shows, such as tcp://10.0.0.1:8786."
-            ) from error
+            raise self._refused(error) from error
+        try:
+            self._client.wait_for_workers(1, timeout=_CONNECT)
+        except Exception as error:
+            self.close()
+            raise self._refused(error) from error
         self.jobs = sum(self._client.ncores().values())
         self._executor = self._client.get_executor(pure=False)
         self._seen = monotonic()
+
+    def _refused(self, error: Exception) -> StudyError:
+        return StudyError(
+            f"the scheduler is {self._address!r}, which gives no Dask workers "
+            f"({str(error) or type(error).__name__}); start one with 'dask scheduler' and workers "
+            "with 'dask worker ADDRESS --nthreads 1', and give the address that it shows, such as "
+            "tcp://10.0.0.1:8786."
+        )
 
     def submit(self, task: Task) -> Future[Result]:
         future: Future[Result] = self._executor.submit(compute, task)
@@ -212,18 +224,21 @@ class _Cluster:
             self._client.close(timeout=5)
 
 
-def _within(seconds: float, call: Callable[[], Any]) -> Any:
-    """A call's result; Dask waits for ever for a program that answers and is no scheduler."""
-    future: Future[Any] = Future()
+def _identity(distributed: Any, address: str, seconds: float) -> dict[str, Any]:
+    """What answers at an address; a client that fails to connect can block later ones."""
+    async def ask() -> Any:
+        arguments = distributed.Security().get_connection_args("client")
+        async with distributed.rpc(
+            address, timeout=0.8 * seconds, connection_args=arguments
+        ) as server:
+            return await server.identity()
 
-    def answer() -> None:
-        try:
-            future.set_result(call())
-        except Exception as error:
-            future.set_exception(error)
+    async def limited() -> Any:
+        return await asyncio.wait_for(ask(), seconds)
 
-    Thread(target=answer, daemon=True).start()
-    return future.result(seconds)
+    with ThreadPoolExecutor(1) as thread:  # there may be an event loop in this one
+        answer = thread.submit(lambda: asyncio.run(limited())).result()
+    return answer if isinstance(answer, dict) else {}
 
 
 def _workers(study: Study, jobs: int | None, scheduler: str | None) -> Workers:
@@ -265,7 +280,7 @@ def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
             if monotonic() - start > sent[future].hard_limit + _GRACE:
                 del began[future]
                 future.cancel()
-                yield failure(sent.pop(future), _HUNG)
+                suspects.append(sent.pop(future))  # a cluster may have kept it waiting
         if not sent and (suspects or broken):
             while suspects:
                 yield _again(workers, suspects.popleft())
@@ -286,8 +301,9 @@ def _answer(
     except Exception as error:
         if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
             return failure(task, f"{type(error).__name__}: {error}")
-        hung = start is not None and monotonic() - start >= task.hard_limit
-        return failure(task, _HUNG) if hung else error
+        if isinstance(error, BrokenExecutor) and start is not None:
+            return failure(task, _HUNG) if monotonic() - start >= task.hard_limit else error
+        return error
 
 
 def _again(workers: Workers, task: Task) -> Result:
@@ -297,7 +313,8 @@ def _again(workers: Workers, task: Task) -> Result:
         workers.restart()
         start = monotonic()
         future = workers.submit(replace(task, isolated=isolated))
-        if not wait([future], task.hard_limit + _GRACE).done:
+        # A worker of a cluster may still hang in a cell that was given up.
+        if not wait([future], 2 * task.hard_limit + _GRACE).done:
             future.cancel()
             return failure(task, _HUNG)
         answer = _answer(workers, task, future, start)

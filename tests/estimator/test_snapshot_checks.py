@@ -252,7 +252,7 @@ def at(value, path):
 
 JUNK = [
     None, 3, -1, 2**70, 0.5, np.nan, True, "text", "", b"bytes", [], (), {}, [1, 2], [[1, 2], [3]],
-    {"a": 1}, object(), np.zeros(0), np.zeros((3, 3)), np.array(1.0), np.array(["a"]),
+    {"a": 1}, object(), np.zeros(0), np.zeros((3, 3)), np.array(1.25), np.array(["a"]),
     np.full(2, np.nan), np.array([None, 1]),
 ]
 
