@@ -209,7 +209,7 @@ class BatchEstimator:
         return self._step(y, _inputs(U, self.members, self.system.m))
 
     def _step(self, y: Array, u: Array) -> BatchEstimate:
-        return BatchEstimate(*self._engine.step(y, u), delay=self.settings.delay)
+        return BatchEstimate(**self._engine.step(y, u), delay=self.settings.delay)
 
     def run(self, Y: ArrayLike, U: ArrayLike | None = None) -> BatchRun:
         """Take whole records, sample by sample, going on from the present states.
@@ -293,7 +293,7 @@ class _Looped:
                 engine.replace(*memory)
             raise
 
-    def step(self, y: Array, u: Array) -> tuple[Any, ...]:
+    def step(self, y: Array, u: Array) -> dict[str, Any]:
         time = self.time
         try:
             return _collected([
@@ -307,17 +307,17 @@ class _Looped:
             raise
 
 
-def _collected(found: list[Estimate]) -> tuple[Any, ...]:
+def _collected(found: list[Estimate]) -> dict[str, Any]:
     """What makes a `BatchEstimate`."""
-    return (
-        found[0].time,
-        np.array([one.trajectory for one in found]),
-        np.array([one.cost for one in found]),
-        np.array([one.candidate for one in found]),
-        np.array([one.candidate_cost for one in found]),
-        np.array([one.status.value for one in found], np.int64),
-        np.array([one.qps for one in found], np.intp),
-    )
+    return {
+        "time": found[0].time,
+        "trajectories": np.array([one.trajectory for one in found]),
+        "costs": np.array([one.cost for one in found]),
+        "candidates": np.array([one.candidate for one in found]),
+        "candidate_costs": np.array([one.candidate_cost for one in found]),
+        "flags": np.array([one.status.value for one in found], np.int64),
+        "qps": np.array([one.qps for one in found], np.intp),
+    }
 
 
 class BatchEstimate:

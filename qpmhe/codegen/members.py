@@ -92,8 +92,8 @@ class CompiledMembers:
         states: Array = self._memory["history"][np.arange(len(newest)), newest]
         return states
 
-    def step(self, y: Array, u: Array) -> tuple[Any, ...]:
-        """Take a sample of each in; the time, trajectories, costs, candidates, ... of all."""
+    def step(self, y: Array, u: Array) -> dict[str, Any]:
+        """Take a sample of each member in, and estimate."""
         ys, us = np.ascontiguousarray(y), np.ascontiguousarray(u)
         found = np.empty(len(ys), self._library.estimate_type)
 
@@ -105,11 +105,13 @@ class CompiledMembers:
 
         self._share(work)
         states = slice(0, int(found["length"][0]) + 1)
-        return (
-            self.time - 1, found["trajectory"][:, states], found["cost"],
-            found["candidate"][:, states], found["candidate_cost"],
-            found["status"].astype(np.int64), found["qps"].astype(np.intp),
-        )
+        return {
+            "time": self.time - 1,
+            "trajectories": found["trajectory"][:, states], "costs": found["cost"],
+            "candidates": found["candidate"][:, states],
+            "candidate_costs": found["candidate_cost"],
+            "flags": found["status"].astype(np.int64), "qps": found["qps"].astype(np.intp),
+        }
 
     def run(self, y: Array, u: Array) -> dict[str, Any]:
         """Take records (K, T, p) and (K, T, m) in without leaving C.

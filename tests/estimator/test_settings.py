@@ -85,7 +85,6 @@ def test_available_backends_are_accepted(backend):
             ("outside", value, ["drop", "project", "keep"])
             for value in ("dropped", "", "Keep", None, True, ["drop"])
         ),
-        *(("warm_start", value, ["True or False"]) for value in ("best", None, 1)),
         *(
             ("candidate", value, ["observer", "reinitialized"])
             for value in ("reinitialised", "best", None, 0)
@@ -96,6 +95,14 @@ def test_unknown_choices_list_the_known_ones(name, value, known):
     check(
         OptionError, [f"{name} is {value!r}", "expected one of", *map(repr, known)],
         lambda: estimator(**{name: value}),
+    )
+
+
+@pytest.mark.parametrize("value", ["best", None, 1])
+def test_a_warm_start_is_wanted_or_not(value):
+    check(
+        OptionError, [f"warm_start is {value!r}", "True or False"],
+        lambda: estimator(warm_start=value),
     )
 
 
