@@ -21,7 +21,6 @@ from ..errors import CompilationError, EngineWarning, OptionError
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System
-from .fused import Fused, fused, fused_fault
 
 __all__ = ["casadi_system"]
 
@@ -67,15 +66,13 @@ def casadi_system(
             else partial(_compiled, model, library, timed)
         )
         evaluator = _Evaluator(maker)
-        if library is not None and not timed:
-            evaluator.fused = partial(fused, library, model.dt or 0.0)
         one = {name: Trusted(partial(evaluator.one, name)) for name in _NAMES}
         system = System(
             one["f"], one["h"], n=model.n, p=model.p, m=model.m + timed,
             f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"], **sets,
         )
         system.f_jacobian.method = system.h_jacobian.method = "casadi"
-        system.joint = evaluator
+        system.kernel = evaluator
         return system
 
     system = made(False)
@@ -107,7 +104,6 @@ class _Evaluator:
 
     def __init__(self, maker: Maker) -> None:
         self._maker = maker
-        self.fused: Callable[..., Fused | None] | None = None
         self._local = threading.local()  # two threads must not share buffers
 
     def one(self, name: str, x: Array, u: Array | None = None) -> Array:
@@ -207,10 +203,7 @@ def _library(
             interpreter = Interpreter(model)
             made.append((interpreter, list(points(interpreter, states, 0))))
         quick, (interpreter, batches) = ctypes.PyDLL(library._name), made[0]
-        return (
-            model_fault(interpreter, partial(_compiled, model, quick), batches)
-            or fused_fault(interpreter, quick, batches)
-        )
+        return model_fault(interpreter, partial(_compiled, model, quick), batches)
 
     try:
         library = compiled_library(model_files(model), "model.c", check=fault)

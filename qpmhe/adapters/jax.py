@@ -14,7 +14,6 @@ from ..errors import ModelError
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System, checked_set, probe_points
-from .fused import Fused
 from .jax_programs import Programs
 
 __all__ = ["jax_system"]
@@ -148,7 +147,7 @@ def _assembled(model: _Model, m: int, sets: dict[str, Any]) -> System:
             f"derivative of its own within {name}."
         ) from error
     system.f_jacobian.method = system.h_jacobian.method = "jax"
-    system.joint = model
+    system.kernel = model
     return system
 
 
@@ -165,7 +164,6 @@ class _Model:
 
     def __init__(self, programs: Programs, length: float | None) -> None:
         self.n, self.p = programs.n, programs.p
-        self.fused: Callable[..., Fused | None] | None = None
         self._programs = programs
         self._length = b"" if length is None else np.float64(length).tobytes()
         self._splits = programs.timed and length is None

@@ -70,8 +70,8 @@ class PythonEngine:
         )
         if settings.qp_limit:
             solver.prepare((settings.horizon + 1) * system.n)
-        if system.joint is not None:
-            system.joint.prepare(settings.horizon)
+        if system.kernel is not None:
+            system.kernel.prepare(settings.horizon)
         self._problem = Problem(system, cost)
         self._subproblem = Subproblem(system, cost, settings.horizon)
         self._optimizer = Optimizer(self._subproblem, solver, settings)

@@ -18,20 +18,16 @@ from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .sets import ConvexSet
 
 if TYPE_CHECKING:
-    from ..adapters.fused import Fused
     from ..codegen.expressions import CasadiModel
 
-__all__ = ["Joint", "System", "checked_set", "probe_points"]
+__all__ = ["ModelKernel", "System", "checked_set", "probe_points"]
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
 
 
-class Joint(Protocol):
+class ModelKernel(Protocol):
     """Several of a model's functions by one call."""
-
-    #: What makes the calls of `qpmhe.adapters.fused.Fused`, where the model is machine code.
-    fused: Callable[..., Fused | None] | None
 
     def stage(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Values f (n,), h (p,) and their Jacobian (n + p, n) at one state, until the next call."""
@@ -118,7 +114,7 @@ class System:
         #: The sampling time of a system made by `from_ode`, None otherwise.
         self.dt: float | None = None
         #: f, h and Jacobians by one call, where the model offers that.
-        self.joint: Joint | None = None
+        self.kernel: ModelKernel | None = None
         #: The same model as CasADi functions, of a system made by `from_casadi`.
         self.symbolic: CasadiModel | None = None
         self._timed: Callable[[], System] | None = None
