@@ -22,7 +22,7 @@ from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System
 
-__all__ = ["casadi_system"]
+__all__ = ["from_casadi"]
 
 Array = NDArray[np.float64]
 # Makes buffers for a number of states and the wanted results.
@@ -31,7 +31,7 @@ Maker = Callable[[int, tuple[str, ...]], Buffers]
 _MOST_KEPT = 64
 
 
-def casadi_system(
+def from_casadi(
     f: Any,
     h: Any,
     *,
@@ -45,12 +45,44 @@ def casadi_system(
     noises: ConvexSet | None = None,
     compiled: bool | None = None,
 ) -> System:
-    """Make a system from CasADi functions; see `qpmhe.System.from_casadi`.
+    """Make a system from CasADi functions, with exact Jacobians.
+
+    The functions are compiled once, cached on disk, and called on a whole window at once;
+    without a C compiler CasADi's virtual machine evaluates them. ``engine="compiled"`` and
+    `qpmhe.codegen` need such a system.
 
     Parameters
     ----------
-    f, h, dt, method, n, p, m, states, disturbances, noises, compiled
-        As there.
+    f, h : casadi.Function or callable
+        (x) or (x, u) to a column: functions of CasADi, or Python functions that take
+        symbolic columns and return one column or a list of entries.
+    dt : float, optional
+        Sampling time. If given, f is the right-hand side of an ODE, in units of x per unit
+        of time, which is discretised with u held over the step.
+    method : {"rk4", "euler"}
+        Runge-Kutta of order 4, or one explicit Euler step.
+    n, p, m : int, optional
+        Numbers of states, outputs and inputs; n (and m, if there are inputs) are needed
+        where f is not a casadi.Function.
+    states, disturbances, noises : Box or Polytope, optional
+        The sets X, W and V; the whole space if left out.
+    compiled : bool, optional
+        Whether to compile the functions. The default compiles them where there is a C
+        compiler.
+
+    Returns
+    -------
+    System
+        It pickles, whatever f and h were. With dt, it takes steps of other lengths.
+
+    Raises
+    ------
+    ModelError, SetError, OptionError
+        If a function, size, set or option does not fit; the message names it.
+    InvalidInputError
+        If CasADi is not installed.
+    CompilationError
+        If ``compiled`` is True and compilation fails.
     """
     if not (compiled is None or isinstance(compiled, bool)):
         raise OptionError(f"compiled is {compiled!r}; expected True, False or None.")
@@ -78,9 +110,9 @@ def casadi_system(
     system = made(False)
     system.symbolic, system.dt = model, model.dt
     if model.dt is not None:
-        system._timed = lambda: made(True)
-    system._recipe = (
-        casadi_system,
+        system.make_timed = lambda: made(True)
+    system.recipe = (
+        from_casadi,
         {
             "f": model.f, "h": model.h, "dt": dt, "method": method, "compiled": compiled, **sets,
         },

@@ -61,7 +61,7 @@ def test_the_model_is_evaluated_once_at_each_new_observer_state(max_qps, trials)
     assert counted.many.get("A", 0) == max(0, max_qps - 1) * steps
 
 
-@pytest.mark.parametrize("options", [{}, {"max_qps": 2, "start": "best"}], ids=["one", "two"])
+@pytest.mark.parametrize("options", [{}, {"max_qps": 2, "warm_start": True}], ids=["one", "two"])
 def test_memory_does_not_grow(options):
     reactor = qpmhe.models.batch_reactor()
     measurements = reactor.scenario.simulate(0, 500).measurements
