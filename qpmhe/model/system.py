@@ -28,7 +28,7 @@ class ModelKernel(Protocol):
     """Evaluates several of a model's functions in one call."""
 
     def stage(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """f (n,), h (p,) and their Jacobian (n + p, n) at one state; valid until the next call."""
+        """Values f (n,), h (p,) and Jacobian (n + p, n) at one state; valid until the next call."""
 
     def residuals(self, trajectory: Array, y: Array, u: Array) -> Array:
         """Residuals (w, v) along a trajectory (K + 1, n), in a new array (K, n + p)."""
