@@ -3,6 +3,10 @@
 from typing import Any
 
 from . import batch, codegen, errors, models, solvers
+from .adapters.casadi import from_casadi
+from .adapters.control import from_control
+from .adapters.jax import from_jax
+from .adapters.sympy import from_sympy
 from .batch import BatchEstimator
 from .costs import (
     Cost,
@@ -80,6 +84,10 @@ __all__ = [
     "codegen",
     "design_luenberger",
     "errors",
+    "from_casadi",
+    "from_control",
+    "from_jax",
+    "from_sympy",
     "models",
     "solvers",
 ]

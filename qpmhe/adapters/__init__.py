@@ -1,1 +1,1 @@
-"""Models of other packages as systems."""
+"""Systems from models that are written for other packages, one function for each package."""

@@ -21,9 +21,8 @@ from ..errors import CompilationError, EngineWarning, OptionError
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System
-from .fused import Fused, fused, fused_fault
 
-__all__ = ["casadi_system"]
+__all__ = ["from_casadi"]
 
 Array = NDArray[np.float64]
 # Makes buffers for a number of states and the wanted results.
@@ -32,7 +31,7 @@ Maker = Callable[[int, tuple[str, ...]], Buffers]
 _MOST_KEPT = 64
 
 
-def casadi_system(
+def from_casadi(
     f: Any,
     h: Any,
     *,
@@ -46,12 +45,44 @@ def casadi_system(
     noises: ConvexSet | None = None,
     compiled: bool | None = None,
 ) -> System:
-    """Make a system from CasADi functions; see `qpmhe.System.from_casadi`.
+    """Make a system from CasADi functions, with exact Jacobians.
+
+    The functions are compiled once, cached on disk, and called on a whole window at once;
+    without a C compiler CasADi's virtual machine evaluates them. ``engine="compiled"`` and
+    `qpmhe.codegen` need such a system.
 
     Parameters
     ----------
-    f, h, dt, method, n, p, m, states, disturbances, noises, compiled
-        As there.
+    f, h : casadi.Function or callable
+        (x) or (x, u) to a column: functions of CasADi, or Python functions that take
+        symbolic columns and return one column or a list of entries.
+    dt : float, optional
+        Sampling time. If given, f is the right-hand side of an ODE, in units of x per unit
+        of time, which is discretised with u held over the step.
+    method : {"rk4", "euler"}
+        Runge-Kutta of order 4, or one explicit Euler step.
+    n, p, m : int, optional
+        Numbers of states, outputs and inputs; n (and m, if there are inputs) are needed
+        where f is not a casadi.Function.
+    states, disturbances, noises : Box or Polytope, optional
+        The sets X, W and V; the whole space if left out.
+    compiled : bool, optional
+        Whether to compile the functions. The default compiles them where there is a C
+        compiler.
+
+    Returns
+    -------
+    System
+        It pickles, whatever f and h were. With dt, it takes steps of other lengths.
+
+    Raises
+    ------
+    ModelError, SetError, OptionError
+        If a function, size, set or option does not fit; the message names it.
+    InvalidInputError
+        If CasADi is not installed.
+    CompilationError
+        If ``compiled`` is True and compilation fails.
     """
     if not (compiled is None or isinstance(compiled, bool)):
         raise OptionError(f"compiled is {compiled!r}; expected True, False or None.")
@@ -67,23 +98,21 @@ def casadi_system(
             else partial(_compiled, model, library, timed)
         )
         evaluator = _Evaluator(maker)
-        if library is not None and not timed:
-            evaluator.fused = partial(fused, library, model.dt or 0.0)
         one = {name: Trusted(partial(evaluator.one, name)) for name in _NAMES}
         system = System(
             one["f"], one["h"], n=model.n, p=model.p, m=model.m + timed,
             f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"], **sets,
         )
         system.f_jacobian.method = system.h_jacobian.method = "casadi"
-        system.joint = evaluator
+        system.kernel = evaluator
         return system
 
     system = made(False)
     system.symbolic, system.dt = model, model.dt
     if model.dt is not None:
-        system._timed = lambda: made(True)
-    system._recipe = (
-        casadi_system,
+        system.make_timed = lambda: made(True)
+    system.recipe = (
+        from_casadi,
         {
             "f": model.f, "h": model.h, "dt": dt, "method": method, "compiled": compiled, **sets,
         },
@@ -107,7 +136,6 @@ class _Evaluator:
 
     def __init__(self, maker: Maker) -> None:
         self._maker = maker
-        self.fused: Callable[..., Fused | None] | None = None
         self._local = threading.local()  # two threads must not share buffers
 
     def one(self, name: str, x: Array, u: Array | None = None) -> Array:
@@ -207,10 +235,7 @@ def _library(
             interpreter = Interpreter(model)
             made.append((interpreter, list(points(interpreter, states, 0))))
         quick, (interpreter, batches) = ctypes.PyDLL(library._name), made[0]
-        return (
-            model_fault(interpreter, partial(_compiled, model, quick), batches)
-            or fused_fault(interpreter, quick, batches)
-        )
+        return model_fault(interpreter, partial(_compiled, model, quick), batches)
 
     try:
         library = compiled_library(model_files(model), "model.c", check=fault)

@@ -14,7 +14,7 @@ from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System, probe_points
 
-__all__ = ["control_system"]
+__all__ = ["from_control"]
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
@@ -22,7 +22,7 @@ Function = Callable[..., Any]
 _FRACTIONS = np.array([0.1, 1.0 / 3.0, 0.5, np.sqrt(0.5), np.pi, 10.0 * np.sqrt(2.0)])
 
 
-def control_system(
+def from_control(
     system: Any,
     *,
     dt: float | None = None,
@@ -31,12 +31,32 @@ def control_system(
     disturbances: ConvexSet | None = None,
     noises: ConvexSet | None = None,
 ) -> System:
-    """Make a system from one of python-control; see `qpmhe.System.from_control`.
+    """Make a system from one of python-control, with the same inputs.
 
     Parameters
     ----------
-    system, dt, method, states, disturbances, noises
-        As there.
+    system : control.StateSpace or control.NonlinearIOSystem
+        Taken as it is in discrete time, and discretised in continuous time. It must not
+        depend on time.
+    dt : float, optional
+        Sampling time of a system in continuous time, which needs it.
+    method : {"zoh", "rk4", "euler"}, optional
+        Discretisation of a system in continuous time. The default is ``zoh``, exact for a
+        held input, for linear systems and ``rk4`` for nonlinear ones.
+    states, disturbances, noises : Box or Polytope, optional
+        The sets X, W and V; the whole space if left out.
+
+    Returns
+    -------
+    System
+        It pickles where its functions do; a linear one always does.
+
+    Raises
+    ------
+    ModelError, SetError, OptionError
+        If the system, a set or an option does not fit; the message names it.
+    InvalidInputError
+        If python-control is not installed.
     """
     control = _import_control()
     linear = isinstance(system, control.StateSpace)
@@ -66,8 +86,8 @@ def control_system(
         return _linear(**matrices, dt=length, method=method, sets=sets)
     made = _nonlinear(system, length, method, sets)
     _refuse_time(system, made, dt)
-    made._recipe = (
-        control_system, {"system": system, "dt": dt, "method": method, **sets}
+    made.recipe = (
+        from_control, {"system": system, "dt": dt, "method": method, **sets}
     )
     return made
 
@@ -133,7 +153,7 @@ def _linear(
 def _remembered(system: System, *arguments: Any) -> System:
     names = ("A", "B", "C", "D", "dt", "method", "sets")
     # A control.StateSpace does not pickle, its matrices do.
-    system._recipe = (_linear, dict(zip(names, arguments, strict=True)))
+    system.recipe = (_linear, dict(zip(names, arguments, strict=True)))
     return system
 
 

@@ -14,10 +14,9 @@ from ..errors import ModelError
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System, checked_set, probe_points
-from .fused import Fused
 from .jax_programs import Programs
 
-__all__ = ["jax_system"]
+__all__ = ["from_jax"]
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
@@ -28,7 +27,7 @@ _DOUBLE = 8  # bytes
 _NOTHING: Array = np.empty(0)
 
 
-def jax_system(
+def from_jax(
     f: Function,
     h: Function,
     *,
@@ -41,7 +40,7 @@ def jax_system(
     disturbances: ConvexSet | None = None,
     noises: ConvexSet | None = None,
 ) -> System:
-    r"""Make a `System` of functions that are written for one state with ``jax.numpy``.
+    r"""Make a system from functions of one state in ``jax.numpy``, with exact Jacobians.
 
     .. math::
         x(t+1) = f(x(t), u(t)) + w(t), \qquad y(t) = h(x(t), u(t)) + v(t),
@@ -110,10 +109,10 @@ def jax_system(
     Examples
     --------
     >>> import jax.numpy as jnp
-    >>> from qpmhe.adapters.jax import jax_system
+    >>> import qpmhe
     >>> def rate(x, u):
     ...     return jnp.array([x[1], u[0] - jnp.sin(x[0])])
-    >>> system = jax_system(rate, lambda x: x[0], n=2, p=1, m=1, dt=0.1)
+    >>> system = qpmhe.from_jax(rate, lambda x: x[0], n=2, p=1, m=1, dt=0.1)
     >>> system.derivatives
     {'f': 'jax', 'h': 'jax'}
     """
@@ -125,9 +124,9 @@ def jax_system(
     system = _assembled(_Model(programs, length), m, sets)
     if length is not None:
         system.dt = length
-        system._timed = partial(_assembled, _Model(programs, None), m + 1, sets)
-    system._recipe = (
-        jax_system,
+        system.make_timed = partial(_assembled, _Model(programs, None), m + 1, sets)
+    system.recipe = (
+        from_jax,
         {"f": f, "h": h, "n": n, "p": p, "m": m, "dt": dt, "method": method, **sets},
     )
     return system
@@ -148,7 +147,7 @@ def _assembled(model: _Model, m: int, sets: dict[str, Any]) -> System:
             f"derivative of its own within {name}."
         ) from error
     system.f_jacobian.method = system.h_jacobian.method = "jax"
-    system.joint = model
+    system.kernel = model
     return system
 
 
@@ -165,7 +164,6 @@ class _Model:
 
     def __init__(self, programs: Programs, length: float | None) -> None:
         self.n, self.p = programs.n, programs.p
-        self.fused: Callable[..., Fused | None] | None = None
         self._programs = programs
         self._length = b"" if length is None else np.float64(length).tobytes()
         self._splits = programs.timed and length is None

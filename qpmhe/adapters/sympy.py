@@ -17,12 +17,12 @@ from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System
 
-__all__ = ["sympy_system"]
+__all__ = ["from_sympy"]
 
 Array = NDArray[np.float64]
 
 
-def sympy_system(
+def from_sympy(
     f: Any,
     h: Any,
     x: Sequence[Any],
@@ -34,12 +34,34 @@ def sympy_system(
     disturbances: ConvexSet | None = None,
     noises: ConvexSet | None = None,
 ) -> System:
-    """Make a system from SymPy expressions; see `qpmhe.System.from_sympy`.
+    """Make a system from SymPy expressions, with exact Jacobians, as NumPy functions.
 
     Parameters
     ----------
-    f, h, x, u, dt, method, states, disturbances, noises
-        As there.
+    f, h : sequence of expressions, or a matrix
+        Entries of the next state (or of its rate, with dt) and of the output.
+    x, u : symbol, or sequence of symbols or functions of time
+        The states and the inputs; taken as real.
+    dt : float, optional
+        Sampling time. If given, f is the right-hand side of an ODE, in units of x per unit
+        of time, which is discretised with u held over the step.
+    method : {"rk4", "euler"}
+        Runge-Kutta of order 4, or one explicit Euler step.
+    states, disturbances, noises : Box or Polytope, optional
+        The sets X, W and V; the whole space if left out.
+
+    Returns
+    -------
+    System
+        With n states for the n symbols in x, and an input for each symbol in u.
+
+    Raises
+    ------
+    ModelError, SetError, OptionError
+        If an expression, symbol, set or option does not fit, for example a symbol that is
+        neither state nor input.
+    InvalidInputError
+        If SymPy is not installed.
     """
     try:
         import sympy
@@ -83,7 +105,7 @@ def sympy_system(
             step, output, dt=positive("dt", dt), method=method, rate_jacobian=step_jacobian,
             **options,
         )
-    system._recipe = (sympy_system, {
+    system.recipe = (from_sympy, {
         "f": rates, "h": outputs, "x": state, "u": given, "dt": dt, "method": method,
         "states": states, "disturbances": disturbances, "noises": noises,
     })

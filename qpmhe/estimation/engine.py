@@ -70,14 +70,14 @@ class PythonEngine:
         )
         if settings.qp_limit:
             solver.prepare((settings.horizon + 1) * system.n)
-        if system.joint is not None:
-            system.joint.prepare(settings.horizon)
+        if system.kernel is not None:
+            system.kernel.prepare(settings.horizon)
         self._problem = Problem(system, cost)
         self._subproblem = Subproblem(system, cost, settings.horizon)
         self._optimizer = Optimizer(self._subproblem, solver, settings)
         self._linearized = settings.qp_limit > 0
         self._window = self._fresh_window(initial_state)
-        self._made = system._calling()  # how the model is called, as found at construction
+        self._made = system.call_modes()  # how the model is called, as found at construction
         self._before: tuple[Mark, Array | None, tuple[str, ...], tuple[Array, ...]]
         self._trajectory: Array | None = None  # the last estimate's
         self._dropped: tuple[str, ...] = ()
@@ -269,7 +269,7 @@ class PythonEngine:
         """All that was learnt from measurements so far, as plain arrays and numbers."""
         # What a solver keeps is not written down: this estimator goes on without it, too.
         self._solver.forget()
-        modes, methods = self._system._calling()
+        modes, methods = self._system.call_modes()
         return {
             "problem": self._size(),
             "estimator": self._description(),
@@ -298,16 +298,17 @@ class PythonEngine:
                 f"the state is of an estimator with engine={state['engine']!r}, which is not at "
                 "work here; install a C compiler, or snapshot with engine='python'."
             )
-        before = self._system._calling()
+        before = self._system.call_modes()
         try:
             with reading():
                 check_description(state["estimator"], self._description())
-                self._system._call_as(self._checked_calling(state["modes"], state["methods"]))
+                found = self._checked_calling(state["modes"], state["methods"])
+                self._system.use_call_modes(found)
                 found = self._read(state)
                 self._solver.forget()
             self.replace(*found)
         except BaseException:
-            self._system._call_as(before)
+            self._system.use_call_modes(before)
             raise
 
     def _read(
@@ -319,7 +320,7 @@ class PythonEngine:
             raise TypeError(f"linearized is {linearized!r}")
         window, again = (self._fresh_window(np.zeros(n)) for _ in range(2))
         for one in (window, again):
-            one.load_state_dict(state["window"], self._system._timed is not None)
+            one.load_state_dict(state["window"], self._system.make_timed is not None)
         history = [taken("history", one, (n,)) for one in state["history"]]
         count = min(window.length + 1, self._history.maxlen or 1)
         if len(history) != count:
@@ -347,9 +348,9 @@ class PythonEngine:
         """How a state's estimator called the model, if that is how it can be called here."""
         made = self._made
         if len(modes) == 4:
-            if self._system._timed is None:
+            if self._system.make_timed is None:
                 raise ValueError("the system has no steps of other lengths")
-            timed = self._system._timed()._calling()
+            timed = self._system.make_timed().call_modes()
             made = made[0] + timed[0], made[1] + timed[1]
         for name, found, known, slowest in (
             ("modes", modes, made[0], "looped"),

@@ -148,7 +148,7 @@ class MovingHorizonEstimator:
                 "or give a constant weight."
             )
         #: For this estimator alone, which may change how the model is called.
-        self._own = system._private()
+        self._own = system.copy()
         self._initial_state: Array = self._checked_start(initial_state)
         self._no_input = np.zeros(system.m)
         try:
@@ -179,14 +179,14 @@ class MovingHorizonEstimator:
         InvalidInputError
             If the state does not fit; the estimator is left as it was.
         """
-        before = self._initial_state, self._own._calling()
+        before = self._initial_state, self._own.call_modes()
         try:
             if initial_state is not None:
                 self._initial_state = self._checked_start(initial_state)
             self._engine.reset(self._initial_state)
         except BaseException:
             self._initial_state, calling = before
-            self._own._call_as(calling)
+            self._own.use_call_modes(calling)
             raise
 
     @property
@@ -268,7 +268,7 @@ class MovingHorizonEstimator:
     def _check_timed(self, dt: float) -> None:
         """Insist, before the sample is taken, that there is a model with this step."""
         if "timed" not in self._own.__dict__:
-            timed = self.system.timed._private()
+            timed = self.system.timed.copy()
             timed.check(self._initial_state, np.append(self._no_input, dt))
             self._own.__dict__["timed"] = timed
 

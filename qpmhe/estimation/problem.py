@@ -19,7 +19,6 @@ from .views import read_only
 from .window import Window
 
 if TYPE_CHECKING:
-    from ..adapters.fused import Fused
     from .views import Frame
 
 __all__ = ["Problem", "Trial"]
@@ -89,8 +88,6 @@ class Problem:
         self._prior_band = band_of(self.prior_weight)
         self._discounted = cost.discount < 1.0
         self._candidate: Trial | None = None
-        self._fused: Fused | None = None
-        self._first = 0
         #: Views of the bound window.
         self.frame: Frame
         self.model = system
@@ -132,7 +129,6 @@ class Problem:
         else:
             self.inputs, self.model = frame.inputs, self._system
             self.stage_weights, self.observed = self._cost.stage_weight, None
-        self._fused, self._first = None if unusual else window.fused, window.start
         if self._discounted:
             self.discounts = window.discounts
         if self._prior_rule is not None and window.prior_covariance is not None:
@@ -199,8 +195,6 @@ class Problem:
         try:
             if self._rolls_out:
                 trajectory = self.restored(trajectory)
-            if self._fused is not None:
-                return self._judged(trajectory, *self._call(self._fused, trajectory))
             residuals = self._residuals(trajectory)
             weights, cost = self._cost_of(residuals)
             offset = trajectory[0] - self.prior
@@ -213,14 +207,6 @@ class Problem:
         except Exception:
             nothing = np.full((trajectory.shape[0] - 1, self._q), np.nan)
             return Trial(trajectory, nothing, self.stage_weights, math.inf, math.inf)
-        return self._judged(trajectory, residuals, cost, weights)
-
-    def _judged(
-        self, trajectory: Array, residuals: Array, cost: float, weights: Array | None = None
-    ) -> Trial:
-        """The verdict on a trajectory whose residuals and cost are known."""
-        if weights is None:
-            weights = self.stage_weights
         if not math.isfinite(cost):
             return Trial(trajectory, residuals, weights, math.inf, math.inf)
         if not self.constrained:
@@ -230,18 +216,11 @@ class Problem:
             cost = math.inf
         return Trial(trajectory, residuals, weights, cost, violation)
 
-    def _call(self, fused: Fused, trajectory: Array) -> tuple[Array, float]:
-        """Residuals and cost by one call."""
-        count = trajectory.shape[0] - 1
-        fused.states[: count + 1] = trajectory
-        cost = fused.judge(self._first, count)
-        return fused.residuals[:count].copy(), cost
-
     def _residuals(self, trajectory: Array) -> Array:
         """Residuals w and v of each stage; raises what the model raises."""
         model = self.model
-        if model.joint is not None:
-            return model.joint.residuals(trajectory, self.measurements, self.inputs)
+        if model.kernel is not None:
+            return model.kernel.residuals(trajectory, self.measurements, self.inputs)
         states = trajectory[:-1]
         # Contiguous differences put together are faster than writing into columns.
         disturbances = trajectory[1:] - model.f.batch(states, self.inputs)

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..costs import Cost, ObserverPrior
+from ..costs import Cost
 from ..model.functions import contained
 from ..model.system import Function, System
-from ..observers import HighGain, Luenberger, Observer, Sample
+from ..observers import Observer, Sample
 from ..snapshot import near, other
 from .linearization import Stage, StageTerms
 from .stages import Stages
 from .views import Frame
-
-if TYPE_CHECKING:
-    from ..adapters.fused import Fused
 
 __all__ = ["Window"]
 
@@ -73,23 +69,9 @@ class Window(Stages):
         self._slopes = system.f_jacobian.direct, system.h_jacobian.direct
         self._linear = True  # whether the stage that enters has Jacobians
         self._no_jacobian = -np.eye(n + p, n)  # what stands in for them, with the minus of `linear`
-        #: Whole stages and trajectories by one call each, where the model offers that.
-        self.fused: Fused | None = self._bound()
         self._ones = np.ones(horizon)
         # gamma^0, gamma^1, ... from the newest stage backwards, and the prior's behind.
         self._ages = cost.discount ** np.arange(horizon, -1, -1.0) if cost.discount < 1 else None
-
-    def _bound(self) -> Fused | None:
-        joint, observer, cost = self._system.joint, self._observer, self._cost
-        if joint is None or joint.fused is None or type(observer) not in (Luenberger, HighGain):
-            return None
-        if not cost.quadratic or cost.discount < 1.0 or isinstance(cost.prior, ObserverPrior):
-            return None
-        assert isinstance(observer, Luenberger)
-        return joint.fused(
-            self.horizon, self._z, self._u, self._y, *self.terms.arrays(), observer.gain,
-            self._stage_weight, cost.prior,
-        )
 
     @property
     def has_special_weights(self) -> bool:
@@ -183,13 +165,6 @@ class Window(Stages):
             self._set_weight(k, time)
         elif self.unusual and not self._observed[k].all():
             observed = self._observed[k]
-        elif self.fused is not None and not (
-            self.unusual and (self._special[k] or self._irregular[k])
-        ):
-            cost = self.fused.enter(k)
-            if math.isfinite(cost):
-                self._stage_cost[k] = cost
-                return False, False, False
         cost = self._advance(k, time, observed)
         if not math.isfinite(cost) and observed is None:
             there = np.abs(y) < _LARGEST
@@ -228,8 +203,8 @@ class Window(Stages):
         try:
             if self.unusual and self._irregular[k]:
                 model, u = self._system.timed, self._u[k]
-            joint = model.joint if self._jacobians else None
-            if joint is None:
+            kernel = model.kernel if self._jacobians else None
+            if kernel is None:
                 usual = model is self._system
                 arguments = place.arguments if usual else (place.arguments[0], u)
                 f, h = self._read if usual else (model.f, model.h)
@@ -239,7 +214,7 @@ class Window(Stages):
                     slopes = self._slopes if usual else (model.f_jacobian, model.h_jacobian)
                     self._differentiate(terms, slopes, arguments)
             else:
-                ahead, output, slope = joint.stage(z, u)
+                ahead, output, slope = kernel.stage(z, u)
                 np.subtract(place.y, output, error)
                 np.negative(slope, terms.linear[:, 1:])
             if observed is not None:
@@ -253,7 +228,7 @@ class Window(Stages):
                 sample.covariance = self._covariance_seen[k]
             correction, posterior = self._correct(place.arguments[0], place.error, sample)
             terms.disturbance[...] = correction
-            np.add(f(*arguments) if joint is None else ahead, correction, following)
+            np.add(f(*arguments) if kernel is None else ahead, correction, following)
         except Exception:  # a model function outside its domain: bad luck, not bad input
             return math.inf
         if self._covariance is not None:

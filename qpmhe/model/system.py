@@ -3,44 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from functools import cached_property, partial
+from typing import Any, NoReturn, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers.errors import tell_unknown_options
 
-from .._checks import count
+from .._checks import count, positive
 from ..errors import InvalidInputError, ModelError, SetError
 from .derivatives import Jacobian
+from .discretize import discretize
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .sets import ConvexSet
 
-if TYPE_CHECKING:
-    from ..adapters.fused import Fused
-    from ..codegen.expressions import CasadiModel
-
-__all__ = ["Joint", "System", "checked_set", "probe_points"]
+__all__ = ["ModelKernel", "System", "checked_set", "probe_points"]
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
 
 
-class Joint(Protocol):
-    """Several of a model's functions by one call."""
-
-    #: What makes the calls of `qpmhe.adapters.fused.Fused`, where the model is machine code.
-    fused: Callable[..., Fused | None] | None
+class ModelKernel(Protocol):
+    """Evaluates several of a model's functions in one call."""
 
     def stage(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Values f (n,), h (p,) and their Jacobian (n + p, n) at one state, until the next call."""
+        """Values f (n,), h (p,) and Jacobian (n + p, n) at one state; valid until the next call."""
 
     def residuals(self, trajectory: Array, y: Array, u: Array) -> Array:
-        """Residuals (w, v) along a trajectory (K + 1, n), in a (K, n + p) array of their own."""
+        """Residuals (w, v) along a trajectory (K + 1, n), in a new array (K, n + p)."""
 
     def prepare(self, horizon: int) -> None:
-        """Make what the first updates with a window of this length would otherwise wait for."""
+        """Compile or allocate now what the first updates with this horizon would wait for."""
+
+
+class _Moved:
+    """A former method of `System`, which is a function of the package now."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, system: object, owner: type) -> NoReturn:
+        raise AttributeError(
+            f"System.{self._name} is now qpmhe.{self._name}, with the same arguments."
+        )
 
 
 @tell_unknown_options
@@ -115,14 +121,17 @@ class System:
         check_inputs(self.m, f=self.f.takes_input, h=self.h.takes_input)
         self.f_jacobian = Jacobian(self.f, f_jacobian, self.m, probes)
         self.h_jacobian = Jacobian(self.h, h_jacobian, self.m, probes)
-        #: The sampling time of a system made by `from_ode`, None otherwise.
+        # What follows is set by the functions that make systems: `from_ode` and the adapters.
+        #: Sampling time of a discretised ODE; None for a discrete-time model.
         self.dt: float | None = None
-        #: f, h and Jacobians by one call, where the model offers that.
-        self.joint: Joint | None = None
-        #: The same model as CasADi functions, of a system made by `from_casadi`.
-        self.symbolic: CasadiModel | None = None
-        self._timed: Callable[[], System] | None = None
-        self._recipe: tuple[Function, dict[str, Any]] = (
+        #: Evaluates f, h and their Jacobians in one call, where the model can.
+        self.kernel: ModelKernel | None = None
+        #: The model as CasADi functions, from which C code is generated.
+        self.symbolic: Any = None
+        #: Makes the system `timed`; None where there is no model in continuous time.
+        self.make_timed: Callable[[], System] | None = None
+        #: Function and keyword arguments that make this system again, when it is unpickled.
+        self.recipe: tuple[Function, dict[str, Any]] = (
             type(self),
             {
                 "f": f, "h": h, "n": n, "p": p, "m": m,
@@ -172,234 +181,85 @@ class System:
         ModelError, SetError
             As for `System`.
         """
-        from .ode import ode_system
-
-        return ode_system(
-            cls, rate, h, dt=dt, n=n, p=p, m=m, method=method, rate_jacobian=rate_jacobian,
-            h_jacobian=h_jacobian, states=states, disturbances=disturbances, noises=noises,
+        n, m = count("n", n, 1), count("m", m, 0)
+        probes = probe_points(checked_set("states", states, n), n, m)
+        batched = BatchedFunction("rate", rate, (n,), m, probes)
+        given = None
+        if rate_jacobian is not None:
+            Jacobian(batched, rate_jacobian, m, probes)  # compares it with differences
+            given = BatchedFunction("rate_jacobian", rate_jacobian, (n, n), m, probes)
+        step, step_jacobian = discretize(
+            _over_leading(batched), given and _over_leading(given), method
+        )
+        length = positive("dt", dt)
+        sets: dict[str, Any] = {
+            "states": states, "disturbances": disturbances, "noises": noises
+        }
+        system = cls(
+            Trusted(partial(step, length)), h, n=n, p=p, m=m,
+            f_jacobian=step_jacobian and Trusted(partial(step_jacobian, length)),
+            h_jacobian=h_jacobian, **sets,
+        )
+        check_inputs(m, rate=batched.takes_input, h=system.h.takes_input)
+        system.dt = length
+        system.recipe = (
+            cls.from_ode,
+            {
+                "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": method,
+                "rate_jacobian": rate_jacobian, "h_jacobian": h_jacobian, **sets,
+            },
         )
 
-    @classmethod
-    def from_casadi(
-        cls,
-        f: Any,
-        h: Any,
-        *,
-        dt: float | None = None,
-        method: str = "rk4",
-        n: int | None = None,
-        p: int | None = None,
-        m: int | None = None,
-        states: ConvexSet | None = None,
-        disturbances: ConvexSet | None = None,
-        noises: ConvexSet | None = None,
-        compiled: bool | None = None,
-    ) -> System:
-        r"""A model written for CasADi, with exact Jacobians, evaluated without Python.
+        def timed() -> System:
+            return cls(
+                Trusted(_timed_by_input(step, m)), Trusted(_without_last(system.h.batch, m)),
+                n=n, p=p, m=m + 1,
+                f_jacobian=step_jacobian and Trusted(_timed_by_input(step_jacobian, m)),
+                h_jacobian=Trusted(_without_last(system.h_jacobian.batch, m)), **sets,
+            )
 
-        Its functions are compiled once, kept in a cache on disk, and called on a whole
-        window at once; without a C compiler CasADi's own virtual machine evaluates them.
-        Such a system is also what ``engine="compiled"`` and `qpmhe.codegen` need.
+        system.make_timed = timed
+        return system
 
-        Parameters
-        ----------
-        f, h : casadi.Function or callable
-            (x) or (x, u) to a column: functions of CasADi, or Python functions that take
-            symbolic columns and return one column or a list of entries.
-        dt : float, optional
-            If given, f is the right-hand side of an ODE, which is discretised with this
-            sampling time; u is held over the step.
-        method : {"rk4", "euler"}
-            Its discretisation.
-        n, p, m : int, optional
-            Numbers of states, outputs and inputs; n (and m, if there are inputs) are needed
-            where f is no casadi.Function.
-        states, disturbances, noises : Box or Polytope, optional
-            The sets X, W and V.
-        compiled : bool, optional
-            Whether to compile the functions; left out, wherever there is a compiler.
-
-        Raises
-        ------
-        ModelError, SetError, OptionError
-            If something does not fit.
-        InvalidInputError
-            If CasADi is not installed.
-        CompilationError
-            If ``compiled`` is True, and it fails.
-        """
-        from ..adapters.casadi import casadi_system
-
-        return casadi_system(
-            f, h, dt=dt, method=method, n=n, p=p, m=m, states=states,
-            disturbances=disturbances, noises=noises, compiled=compiled,
-        )
-
-    @classmethod
-    def from_jax(
-        cls,
-        f: Function,
-        h: Function,
-        *,
-        n: int,
-        p: int,
-        m: int = 0,
-        dt: float | None = None,
-        method: str = "rk4",
-        states: ConvexSet | None = None,
-        disturbances: ConvexSet | None = None,
-        noises: ConvexSet | None = None,
-    ) -> System:
-        """A model written for JAX, compiled and vectorised by it, with exact Jacobians.
-
-        Everything is in double precision, whatever the process's own setting is.
-
-        Parameters
-        ----------
-        f, h : callable
-            f(x) or f(x, u) and h(x) or h(x, u) of one state, written with ``jax.numpy``.
-        n, p, m : int
-            Numbers of states, outputs and inputs.
-        dt : float, optional
-            If given, f is the right-hand side of an ODE, which is discretised with this
-            sampling time; u is held over the step.
-        method : {"rk4", "euler"}
-            Its discretisation.
-        states, disturbances, noises : Box or Polytope, optional
-            The sets X, W and V.
-
-        Raises
-        ------
-        ModelError, SetError, OptionError
-            If something does not fit.
-        InvalidInputError
-            If JAX is not installed.
-        """
-        from ..adapters.jax import jax_system
-
-        return jax_system(
-            f, h, n=n, p=p, m=m, dt=dt, method=method, states=states,
-            disturbances=disturbances, noises=noises,
-        )
-
-    @classmethod
-    def from_control(
-        cls,
-        system: Any,
-        *,
-        dt: float | None = None,
-        method: str | None = None,
-        states: ConvexSet | None = None,
-        disturbances: ConvexSet | None = None,
-        noises: ConvexSet | None = None,
-    ) -> System:
-        """A system of python-control, with the inputs that it has there.
-
-        Parameters
-        ----------
-        system : control.StateSpace or control.NonlinearIOSystem
-            In discrete time as it is; in continuous time it is discretised. A system that
-            depends on time is refused.
-        dt : float, optional
-            Sampling time of a system in continuous time.
-        method : {"zoh", "rk4", "euler"}, optional
-            How that is discretised. The default is exact for a held input (``zoh``) where
-            the system is linear, ``rk4`` where it is not.
-        states, disturbances, noises : Box or Polytope, optional
-            The sets X, W and V.
-
-        Raises
-        ------
-        ModelError, SetError, OptionError
-            If something does not fit.
-        InvalidInputError
-            If python-control is not installed.
-        """
-        from ..adapters.control import control_system
-
-        return control_system(
-            system, dt=dt, method=method, states=states, disturbances=disturbances,
-            noises=noises,
-        )
-
-    @classmethod
-    def from_sympy(
-        cls,
-        f: Any,
-        h: Any,
-        x: Any,
-        u: Any = (),
-        *,
-        dt: float | None = None,
-        method: str = "rk4",
-        states: ConvexSet | None = None,
-        disturbances: ConvexSet | None = None,
-        noises: ConvexSet | None = None,
-    ) -> System:
-        """A model in SymPy's symbols, turned into NumPy functions with exact Jacobians.
-
-        Parameters
-        ----------
-        f, h : sequence of expressions, or a matrix
-            Entries of the next state (or of its rate, with dt) and of the output.
-        x, u : symbol, or sequence of symbols or functions of time
-            The states and the inputs; taken as real.
-        dt : float, optional
-            If given, f is the right-hand side of an ODE, which is discretised with this
-            sampling time; u is held over the step.
-        method : {"rk4", "euler"}
-            Its discretisation.
-        states, disturbances, noises : Box or Polytope, optional
-            The sets X, W and V.
-
-        Raises
-        ------
-        ModelError, SetError, OptionError
-            If something does not fit, such as a symbol that is neither state nor input.
-        InvalidInputError
-            If SymPy is not installed.
-        """
-        from ..adapters.sympy import sympy_system
-
-        return sympy_system(
-            f, h, x, u, dt=dt, method=method, states=states, disturbances=disturbances,
-            noises=noises,
-        )
+    from_casadi = _Moved()
+    from_jax = _Moved()
+    from_control = _Moved()
+    from_sympy = _Moved()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Made anew from the user's functions: the closures inside cannot be pickled.
-        return _made, self._recipe
+        # Made again from the user's functions: the closures inside cannot be pickled.
+        return _made, self.recipe
 
     @cached_property
     def timed(self) -> System:
-        """The same system with the step's length as one more input, behind the others.
+        """The same system with the length of the step as one more input, behind the others.
 
         Raises
         ------
         InvalidInputError
             If the system has no model in continuous time.
         """
-        if self._timed is None:
+        if self.make_timed is None:
             raise InvalidInputError(
                 "the system is discrete: steps of another length need a model in continuous "
                 "time, as System.from_ode takes it."
             )
-        return self._timed()
+        return self.make_timed()
 
-    def _private(self) -> System:
+    def copy(self) -> System:
         """The same system for one estimator, which may change how its functions are called."""
-        other = object.__new__(type(self))  # `copy` would make the model anew, as pickle does
+        other = object.__new__(type(self))  # `copy.copy` would make the model again, as pickle does
         other.__dict__.update(self.__dict__)
         other.f, other.h = self.f.copy(), self.h.copy()
         other.f_jacobian = self.f_jacobian.copy(other.f)
         other.h_jacobian = self.h_jacobian.copy(other.h)
         other.__dict__.pop("timed", None)
-        if self._timed is not None:
-            other._timed = lambda: self.timed._private()
+        if self.make_timed is not None:
+            other.make_timed = lambda: self.timed.copy()
         return other
 
-    def _calling(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Modes of the functions and methods of the Jacobians, behind them those of `timed`."""
+    def call_modes(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Modes of f and h and methods of their Jacobians; then those of `timed`, if it exists."""
         timed = self.__dict__.get("timed")
         systems = (self,) if timed is None else (self, timed)
         return (
@@ -409,9 +269,9 @@ class System:
             ),
         )
 
-    def _call_as(self, calling: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
-        """Call the functions as `_calling` said."""
-        modes, methods = calling
+    def use_call_modes(self, found: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
+        """Call the functions as `call_modes` has found them called."""
+        modes, methods = found
         systems = [self] if len(modes) == 2 else [self, self.timed]
         if len(modes) == 2:
             self.__dict__.pop("timed", None)
@@ -422,11 +282,11 @@ class System:
 
     @property
     def derivatives(self) -> dict[str, str]:
-        """How the Jacobians of f and h are found."""
+        """How the Jacobians of f and h are computed."""
         return {"f": self.f_jacobian.method, "h": self.h_jacobian.method}
 
     def check(self, x: Array, u: Array) -> None:
-        """Insist that f and h are finite, of the right shapes, at a state.
+        """Check that f, h and their Jacobians are finite and of the right shapes at a state.
 
         Parameters
         ----------
@@ -438,7 +298,7 @@ class System:
         Raises
         ------
         ModelError
-            If they are not.
+            If one is not.
         """
         for function in (self.f, self.h, self.f_jacobian, self.h_jacobian):
             try:
@@ -458,7 +318,7 @@ def _made(maker: Function, arguments: dict[str, Any]) -> Any:
 
 
 def checked_set(name: str, value: ConvexSet | None, dimension: int) -> ConvexSet | None:
-    """Insist on a set of this dimension, or none."""
+    """The set, or None, after a check of its type and dimension."""
     if value is None:
         return None
     if not isinstance(value, ConvexSet):
@@ -469,7 +329,7 @@ def checked_set(name: str, value: ConvexSet | None, dimension: int) -> ConvexSet
 
 
 def probe_points(states: ConvexSet | None, n: int, m: int) -> Probes:
-    """A few irregular points inside the state bounds, to try functions on."""
+    """A few irregular points (x, u) within the state bounds, at which functions are tried."""
     generator = np.random.default_rng(20210829)
     probes: Probes = []
     # Positive ones first, where most models are defined; then all signs, where branches part.
@@ -483,3 +343,29 @@ def probe_points(states: ConvexSet | None, n: int, m: int) -> Probes:
                 x = np.where(both, low + share * (high - low), np.clip(x, low, high))
         probes.append((x, generator.uniform(0.2, 1.0, m)))
     return probes
+
+
+def _over_leading(function: BatchedFunction) -> Function:
+    """A function of (..., n), however the user wrote it."""
+    if function.plain:
+        return function.function
+
+    def evaluate(x: Array, *inputs: Array) -> Any:
+        u = inputs[0] if inputs else np.empty((*x.shape[:-1], 0))
+        return function.batch(x, u) if x.ndim > 1 else np.asarray(function(x, u))
+
+    return evaluate
+
+
+def _timed_by_input(step: Function, m: int) -> Function:
+    def evaluate(x: Array, u: Array) -> Any:
+        return step(u[..., m:], x, u[..., :m]) if m else step(u, x)
+
+    return evaluate
+
+
+def _without_last(function: Function, m: int) -> Function:
+    def evaluate(x: Array, u: Array) -> Any:
+        return function(x, u[..., :m]) if x.ndim > 1 else function(x[None], u[None, :m])[0]
+
+    return evaluate

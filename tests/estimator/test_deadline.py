@@ -195,7 +195,7 @@ def test_programs_of_jax_are_compiled_when_the_estimator_is_made(horizon):
         system, qpmhe.Luenberger([[0.3], [0.1]]), cost, horizon=horizon,
         initial_state=[0.5, 0.0], max_qps=3,
     )
-    programs = system.joint._programs._batches
+    programs = system.kernel._programs._batches
     before = set(programs)
     for k in range(horizon + 3):
         mhe.update([np.cos(0.1 * k)])
@@ -215,7 +215,7 @@ def test_programs_of_casadi_for_full_windows_are_made_with_the_estimator(compile
         system, qpmhe.Luenberger([[0.3], [0.1]]), cost, horizon=4,
         initial_state=[0.5, 0.0], max_qps=3,
     )
-    kept = system.joint._local.kept
+    kept = system.kernel._local.kept
     before = set(kept)
     for k in range(7):
         mhe.update([np.cos(0.1 * k)])

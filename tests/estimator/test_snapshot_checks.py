@@ -190,7 +190,7 @@ def test_estimators_of_one_system_do_not_change_each_other():
         )
 
     system = qpmhe.System(f, branching, n=2, p=1)
-    calling = system._calling()
+    calling = system.call_modes()
     one, other, alone = made(system), made(system), made(qpmhe.System(f, branching, n=2, p=1))
     generator = np.random.default_rng(0)
     state = made(system).state_dict()
@@ -203,7 +203,7 @@ def test_estimators_of_one_system_do_not_change_each_other():
         if t % 10 == 5:
             one.load_state_dict(state)
             one.reset([1.4, 1.0])
-        assert system._calling() == calling
+        assert system.call_modes() == calling
 
 
 def test_a_system_is_as_it_was_made():
