@@ -195,27 +195,8 @@ def test_inputs(shared, start):
     assert (Status.MODEL_FAILED in flags_seen(estimates)) != shared
 
 
-@pytest.mark.parametrize("name", ["reactor", "tanks", "stirred_tank", "pendulum"])
-@pytest.mark.parametrize("max_qps", [0, 1, None])
-@pytest.mark.parametrize("discount", [1.0, 0.7])
-def test_the_previous_estimate_as_start(name, max_qps, discount):
-    case = SYSTEMS[name]()
-    cost = qpmhe.QuadraticCost(
-        prior=case.cost.prior, disturbance=case.cost.disturbance, noise=case.cost.noise,
-        discount=discount,
-    )
-    one = qpmhe.System(case.f, case.h, n=case.n, p=case.p), qpmhe.Luenberger(case.gain), cost
-    Y = spoilt(case_records(case, 5, 20), np.random.default_rng(2))
-    compare(one, Y, starts=case.start, max_qps=max_qps, warm_start=True, delay=3)
 
 
-@pytest.mark.parametrize("way", PENDULUMS)
-def test_ways_of_writing_a_model(way):
-    written, mode = PENDULUMS[way]
-    one = parts(written)
-    assert one[0].f.mode == mode
-    Y = 0.5 * np.random.default_rng(4).standard_normal((3, 15, 1))
-    compare(one, Y, starts=[0.5, 0.0], max_qps=2)
 
 
 def strict(x):
@@ -241,94 +222,14 @@ def logarithm(x):
     return np.stack([x[..., 0], 0.9 * x[..., 1] + 0.1 * np.log(x[..., 0])], axis=-1)
 
 
-@pytest.mark.parametrize("model", [strict, plain, silent, logarithm])
-@pytest.mark.parametrize(
-    "options", [{"max_qps": 0}, {}, {"max_qps": 3}, {"max_qps": 2, "warm_start": True}], ids=str
-)
-def test_a_model_that_is_not_defined_for_some_members(model, options):
-    generator = np.random.default_rng(6)
-    Y = generator.uniform(0.0, 1.0, (6, 80, 1))
-    # Outliers throw observers and trials out of the domain, of each member at another time.
-    for k in range(5):
-        Y[k, 5 + 3 * k] = -40.0
-        Y[k, 40 + 3 * k : 48 + 3 * k] = -6.0
-    Y[0, 6:30] = np.nan
-    Y[2, 10] = Y[3, 14] = np.nan
-    one = parts(model, lambda x: x[..., 1:], gain=[[0.4], [0.3]])
-    # From trial to trial through the edge of the domain, rounding grows.
-    seen = flags_seen(compare(one, Y, starts=[1.0, 0.5], tolerance=1e-9, **options))
-    assert Status.MODEL_FAILED in seen
-    assert Status.FAILED_STAGE in seen
-    assert Status.MISSING in seen
 
 
-@pytest.mark.parametrize("how", ["nan", "raises"])
-def test_trials_outside_of_the_domain_are_shortened_or_dropped(how):
-    def narrow(x):
-        inside = np.abs(x).max() < 1.5
-        if how == "raises" and not inside:
-            raise ValueError("outside of the domain")
-        return x @ A.T if inside else (x @ A.T) * np.nan
-
-    Y = np.full((4, 12, 1), 30.0)
-    Y[1], Y[2, ::2], Y[3] = 1e4, 0.3, 0.2
-    one = parts(narrow, gain=[[0.0], [0.0]])
-    seen = flags_seen(compare(one, Y, starts=[0.5, 0.0], max_qps=3))
-    assert Status.NO_DECREASE in seen
 
 
-def test_a_step_that_just_leaves_the_domain_is_taken_almost_in_full():
-    def narrow(x):
-        return np.where(np.abs(x) < 1.5, x @ A.T, np.nan)
-
-    # In a window of one sample, the first state moves by 10 / 14 of the misfit.
-    reached = np.array([1.4, 1.50003, 1.6, 40.0])
-    Y = (0.5 + 1.4 * (reached - 0.5))[:, None, None]
-    one = parts(narrow, gain=[[0.0], [0.0]])
-    estimate = compare(one, Y, starts=[0.5, 0.0], horizon=1)[0]
-    first = estimate.trajectories[:, 0, 0]
-    np.testing.assert_allclose(first[:2], [1.4, 0.5 + 0.9999 * 1.00003], rtol=1e-9)
-    np.testing.assert_allclose(first[2], 0.5 + 0.5 * 1.1, rtol=1e-9)
 
 
-def test_sequences_that_stop_where_no_length_helps():
-    # Slopes that are wrong by a factor lead to where steps promise much and bring nothing.
-    def bent(x):
-        return np.sin(x @ A.T) + 0.2 * x
-
-    wrong = [1.0]
-
-    def slope(x):
-        return (np.cos(x @ A.T)[..., None] * A + 0.2 * np.eye(2)) * wrong[0]
-
-    def before(t):
-        wrong[0] = 2.0
-
-    Y = np.random.default_rng(9).uniform(-1.0, 1.8, (6, 20, 1))
-    estimates = compare(
-        parts(bent, f_jacobian=slope), Y, starts=[0.5, 0.0], before=before, max_qps=None,
-        tolerance=1e-4,
-    )
-    counts = [
-        sum(flag in status for one in estimates for status in one.statuses)
-        for flag in (Status.NO_DECREASE, Status.CONVERGED)
-    ]
-    assert min(counts) > 10
 
 
-def test_a_model_that_breaks_longer_than_the_window_for_all():
-    broken = [False]
-
-    def fragile(x):
-        return x @ A.T * (np.nan if broken[0] else 1.0)
-
-    def before(t):
-        broken[0] = 60 <= t < 90 or 3 <= t < 6
-
-    Y = np.random.default_rng(8).standard_normal((3, 120, 1))
-    estimates = compare(parts(fragile), Y, starts=[0.5, 0.0], max_qps=2, before=before)
-    assert not np.isfinite(estimates[89].costs).any()
-    assert np.isfinite(estimates[-1].costs).all()
 
 
 class Slope:
@@ -347,97 +248,14 @@ class Slope:
         return value
 
 
-@pytest.mark.parametrize("how", ["nan", "raises", 1e200, 3e153])
-@pytest.mark.parametrize("options", [{}, {"max_qps": 3, "backend": "banded"}], ids=str)
-@pytest.mark.parametrize("discount", [1.0, 0.9])
-def test_jacobians_that_fail_where_the_model_does_not(how, options, discount):
-    # Squares of 3e153 have a double, those times the weights have not: the backend is asked.
-    slope = Slope(how)
-    one = parts(f_jacobian=slope, discount=discount)
-
-    def before(t):
-        slope.spoilt = t > 1
-
-    Y = np.random.default_rng(9).uniform(0.0, 1.8, (5, 40, 1))
-    estimates = compare(one, Y, starts=[0.5, 0.0], before=before, **options)
-    flag = Status.SOLVER_FAILED if how == 3e153 else Status.MODEL_FAILED
-    assert flag in flags_seen(estimates)
-    assert sum(estimate.improved.sum() for estimate in estimates) > 20
 
 
-@pytest.mark.parametrize("n", [1, 2, 8])
-@pytest.mark.parametrize("members", [1, 5])
-@pytest.mark.parametrize("discounts", [None, 0.8 ** np.arange(4.0, -1.0, -1.0)])
-def test_the_common_factorisation_solves_the_qps_that_a_backend_is_given(n, members, discounts):
-    generator = np.random.default_rng(n)
-    q, slots = n + 2, [2, 3, 0, 1]
-    prior, weight = spd(generator, n), spd(generator, q)
-    terms = Terms(4, n, q, 5)
-    terms.hold(members)
-    for slot in slots:
-        jacobian = generator.standard_normal((q, n, members))
-        terms.set_stage(slot, weight, None, jacobian, generator.standard_normal((q, members)))
-    gradient = generator.standard_normal((n, members))
-    factor = BlockCholesky(prior, weight[:n, :n], 6, 5)
-    steps, promised, sound = factor.solve(terms, slots, discounts, gradient)
-    assert sound.all()
-    for k in range(members):
-        qp = member_qp(terms, slots, k, (prior, weight[:n, :n]), discounts, gradient)
-        expected = np.linalg.solve(qp.dense(), qp.gradient.ravel())
-        np.testing.assert_allclose(steps[..., k].ravel(), expected, rtol=1e-9, atol=1e-12)
-        assert promised[k] == pytest.approx(qp.gradient.ravel() @ expected, rel=1e-9)
-    kept = steps.copy()
-    # A member without a solution is told, and spoils no other.
-    for spoilt in (np.nan, np.inf, -1e6):
-        terms.square[slots[1], n - 1, n - 1, -1] = spoilt
-        with np.errstate(all="ignore"):
-            again, _, sound = factor.solve(terms, slots, discounts, gradient)
-        assert sound.tolist() == [True] * (members - 1) + [False]
-        np.testing.assert_array_equal(again[..., :-1], kept[..., :-1])
 
 
-def test_a_nearly_singular_qp_is_the_backends_to_solve():
-    # Cholesky breaks down on rounding; what another solver finds then is judged.
-    slope = Slope(1e20)
-    one = parts(f_jacobian=slope)
-    batch = BatchEstimator(*one, members=3, horizon=5, initial_states=[0.5, 0.0], max_qps=2)
-    Y = np.random.default_rng(9).uniform(0.0, 1.8, (3, 30, 1))
-    estimates = []
-    for t in range(30):
-        slope.spoilt = t > 1
-        estimates.append(batch.update(Y[:, t]))
-        assert (estimates[-1].costs <= estimates[-1].candidate_costs).all()
-    assert Status.SOLVER_STOPPED in flags_seen(estimates)
-    assert sum(estimate.improved.sum() for estimate in estimates) > 45
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 7, 12])
-@pytest.mark.parametrize("discount", [1.0, 0.9])
-def test_sizes(n, discount):
-    generator = np.random.default_rng(n)
-    p = 1 + n // 3
-    a, c = generator.standard_normal((n, n)), generator.standard_normal((p, n))
-    a *= 0.7 / np.abs(np.linalg.eigvals(a)).max()
-    cost = qpmhe.QuadraticCost(
-        prior=spd(generator, n), disturbance=spd(generator, n), noise=spd(generator, p),
-        discount=discount,
-    )
-    one = (
-        qpmhe.System(
-            lambda x: np.sin(x @ a.T) + 0.1 * x, lambda x: x @ c.T + 0.1 * np.cos(x[..., :1]),
-            n=n, p=p,
-        ),
-        qpmhe.Luenberger(0.02 * generator.standard_normal((n, p))), cost,
-    )
-    Y = spoilt(generator.standard_normal((6, 20, p)), generator)
-    compare(one, Y, starts=generator.standard_normal((6, n)), max_qps=2, horizon=6)
 
 
-def test_more_members_than_are_factorised_at_a_time(monkeypatch):
-    monkeypatch.setattr("qpmhe.batch.factor._CACHE", 1)
-    monkeypatch.setattr("qpmhe.batch.factor._LEAST", 3)
-    Y = np.random.default_rng(3).standard_normal((8, 15, 1))
-    compare(parts(), Y, starts=[0.5, 0.0], max_qps=2)
 
 
 class Reused:
@@ -459,43 +277,8 @@ def constant_slope(x):
     return np.broadcast_to(A, (*x.shape[:-1], 2, 2))
 
 
-def test_functions_that_return_one_array_every_time():
-    functions = [Reused(function) for function in (f, h, constant_slope)]
-    one, fresh = parts(*functions[:2], f_jacobian=functions[2]), parts(f_jacobian=constant_slope)
-    Y = np.random.default_rng(4).standard_normal((3, 25, 1))
-    options = {"members": 3, "horizon": 5, "initial_states": [0.5, 0.0], "max_qps": 2}
-    found, expected = BatchEstimator(*one, **options), BatchEstimator(*fresh, **options)
-    for function in functions:
-        function.begun = True
-    np.testing.assert_array_equal(found.run(Y).states, expected.run(Y).states)
 
 
-@pytest.mark.parametrize("late", [False, True])
-@pytest.mark.parametrize("part", ["f", "h", "f_jacobian"])
-def test_functions_that_mix_members_unseen_are_called_one_by_one(part, late):
-    # `tolist` leaves NumPy behind, so that only values tell that all depend on one.
-    def mixing(function):
-        def wrapped(x):
-            one_beyond = x.ndim > 1 and max(np.asarray(x).real.ravel().tolist()) > 100.0
-            return function(x) * (1.5 if one_beyond else 1.0)
-
-        return wrapped
-
-    functions = {"f": f, "h": h} | ({"f_jacobian": constant_slope} if part != "f" else {})
-    functions[part] = mixing(functions[part])
-    starts, Y = np.array([[0.5, 0.0], [1.0, 0.0], [0.2, 0.3]]), np.ones((3, 250, 1))
-    # From the first step, or from the 31st on, which the check of every 16th is to notice.
-    if late:
-        Y[1, 30:] = 5e3
-    else:
-        starts[1, 0] = 200.0
-    # Each has a system of its own: what one notices, the other must notice, too.
-    batch, single = parts(**functions), parts(**functions)
-    assert getattr(batch[0], part[0]).mode == "looped"
-    found = BatchEstimator(*batch, members=3, horizon=5, initial_states=starts).run(Y)
-    expected = qpmhe.MovingHorizonEstimator(*single, horizon=5, initial_state=starts[0])
-    first = 200 if late else 0  # by when the observer has forgotten what it was told wrongly
-    same(found.states[0, first:], expected.run(Y[0]).states[first:], part)
 
 
 SETS = {"states": qpmhe.Box([-9.0, -9.0], [9.0, 9.0])}
@@ -508,17 +291,6 @@ LOOPED = {
 }
 
 
-@pytest.mark.parametrize("why", LOOPED)
-def test_what_is_not_vectorised_is_looped_and_told(why):
-    sets, options, words = LOOPED[why]
-    Y = np.random.default_rng(4).standard_normal((3, 8, 1))
-    batch = BatchEstimator(
-        *parts(**sets), members=3, horizon=5, initial_states=[0.5, 0.0], **options
-    )
-    assert batch.mode == "looped"
-    assert words in batch.mode_reason
-    compare(parts(**sets), spoilt(Y, np.random.default_rng(1)), starts=[0.5, 0.0],
-            mode="looped", delay=2, **options)
 
 
 @pytest.mark.parametrize("engine", ["python", "compiled"])
@@ -542,79 +314,10 @@ class Own(qpmhe.Luenberger):
         return 0.5 * self.gain @ v, None
 
 
-@pytest.mark.parametrize(
-    ("observer", "cost", "words"),
-    [
-        (Own(GAIN), None, "Own"),
-        (qpmhe.OutputInjection(lambda z, v: GAIN @ np.tanh(v)), None, "OutputInjection"),
-        (None, qpmhe.RobustCost(
-            prior=qpmhe.Quadratic(np.eye(2)), disturbance=qpmhe.Quadratic(np.eye(2)),
-            noise=qpmhe.Huber([[25.0]]),
-        ), "RobustCost"),
-        (
-            qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(1)),
-            qpmhe.QuadraticCost(
-                prior=qpmhe.ObserverPrior(), disturbance=np.eye(2), noise=np.eye(1)
-            ), "prior",
-        ),
-    ],
-    ids=["subclass", "injection", "robust", "kalman"],
-)
-def test_observers_and_costs_that_are_looped(observer, cost, words):
-    system, usual, quadratic = parts()
-    one = system, observer or usual, cost or quadratic
-    Y = np.random.default_rng(4).standard_normal((3, 10, 1))
-    batch = BatchEstimator(*one, members=3, horizon=5, initial_states=[0.5, 0.0])
-    assert words in batch.mode_reason
-    compare(one, Y, starts=[0.5, 0.0], mode="looped", max_qps=2)
 
 
-def test_every_sample_takes_two_calls_of_the_model_for_all_members_together():
-    calls = []
-
-    def counting(name, function):
-        def counted(x):
-            calls.append((name, x.shape[:-1]))
-            return function(x)
-
-        return counted
-
-    one = parts(counting("f", f), counting("h", h), f_jacobian=counting("A", constant_slope))
-    members, horizon, steps = 40, 5, 64
-    batch = BatchEstimator(
-        *one, members=members, horizon=horizon, initial_states=[0.5, 0.0], backend="banded"
-    )
-    Y = np.random.default_rng(0).standard_normal((members, 16 + steps, 1))
-    batch.run(Y[:, :16])
-    calls.clear()
-    batch.run(Y[:, 16:])
-    for name in ("f", "h"):
-        assert calls.count((name, (members,))) >= steps
-        assert calls.count((name, (members * horizon,))) == steps
-    assert calls.count(("A", (members,))) == steps
-    # Now and then a few states by themselves, to make sure that batches may be trusted.
-    alone = [name for name, lead in calls if lead == ()]
-    assert len(alone) <= steps // 16 * 3 * 4
-    f_calls = [lead for name, lead in calls if name == "f" and lead != ()]
-    assert len(f_calls) == 2 * steps
 
 
-def test_only_members_that_go_on_are_evaluated_again():
-    sizes = []
-
-    def counted(x):
-        if x.ndim > 1:
-            sizes.append(x.shape[0])
-        return np.sin(x @ A.T)
-
-    one = parts(counted, f_jacobian=lambda x: np.cos(x @ A.T)[..., None] * A)
-    Y = np.zeros((10, 1, 1))
-    Y[4] = 3.0  # the others start where everything fits
-    batch = BatchEstimator(*one, members=10, horizon=3, initial_states=[0.0, 0.0], max_qps=None)
-    sizes.clear()
-    estimate = batch.update(Y[:, 0])
-    assert estimate.qps[4] > 1
-    assert sizes == [10, 10, *[1] * (estimate.qps[4] - 1)]
 
 
 def test_a_run_is_its_updates():
@@ -801,19 +504,6 @@ def test_initial_states_that_a_single_estimator_would_not_take(system, starts, f
     np.testing.assert_array_equal(good.states, states)
 
 
-def test_a_state_at_which_the_complex_step_fails_is_found():
-    # `abs` is no analytic function: the complex step is right on one side only.
-    def bent(x):
-        return np.where(x.real < 50.0, x, np.abs(x))
-
-    one, other = parts(bent), parts(bent)
-    assert one[0].derivatives["f"] == "complex step"
-    starts = [[0.5, 0.0], [1.0, 0.0], [80.0, 90.0]]
-    batch = BatchEstimator(*one, members=3, horizon=3, initial_states=starts)
-    single = qpmhe.MovingHorizonEstimator(*other, horizon=3, initial_state=starts[2])
-    jacobian = batch._engine._windows.calls.f_jacobian._function
-    assert jacobian.method == single._own.derivatives["f"] == "finite differences"
-    assert one[0].derivatives["f"] == "complex step"  # a System is never changed
 
 
 BAD_SAMPLES = [
