@@ -18,7 +18,7 @@ BOX = qpmhe.Box([-0.1, -0.1], [0.1, 0.1])
 
 def reactor(**sets):
     model = qpmhe.models.batch_reactor()
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         casadi_rate, casadi_output, dt=0.1, method="euler", n=2, **sets
     )
     return system, model.observer, model.cost
@@ -51,7 +51,7 @@ def test_each_member_is_a_single_estimator(sets, options, threads):
     batch = qpmhe.BatchEstimator(
         *parts, members=MEMBERS, initial_states=x0, threads=threads, **shared
     )
-    assert (batch.mode, batch.mode_reason) == ("compiled", "")
+    assert batch.mode == "compiled"
     estimates = [batch.update(y[:, t]) for t in range(10)]
     run = batch.run(y[:, 10:])
     assert batch.time == STEPS
@@ -82,7 +82,7 @@ def test_inputs_of_each_member_and_shared_ones():
     def f(x, u):
         return [0.9 * x[0] + u[0], 0.8 * x[1] + 0.1 * x[0] * u[1]]
 
-    system = qpmhe.System.from_casadi(f, lambda x: x[0] + x[1], n=2, m=2)
+    system = qpmhe.from_casadi(f, lambda x: x[0] + x[1], n=2, m=2)
     cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[4.0]])
     generator = np.random.default_rng(2)
     y, u = generator.normal(size=(20, 12, 1)), generator.normal(size=(20, 12, 2))
@@ -118,14 +118,14 @@ def test_kept_estimates_do_not_change_and_a_reset_starts_again():
     np.testing.assert_array_equal(batch.update(y[:, 0]).trajectories, kept)
 
 
-def test_without_a_compiler_it_is_vectorised_and_says_so(monkeypatch):
+def test_without_a_compiler_it_is_a_loop_and_says_so(monkeypatch):
     parts = reactor()
     monkeypatch.setenv("CC", "/nowhere/cc")
     with pytest.warns(qpmhe.errors.EngineWarning, match="no C compiler"):
         batch = qpmhe.BatchEstimator(
             *parts, members=3, horizon=4, initial_states=[3.0, 0.1], engine="compiled"
         )
-    assert batch.mode == "vectorised"
+    assert batch.mode == "looped"
 
 
 def test_without_a_compiler_a_looped_batch_says_so_once(monkeypatch):
@@ -137,7 +137,7 @@ def test_without_a_compiler_a_looped_batch_says_so_once(monkeypatch):
         )
     assert len(caught) == 1
     batch.update(np.full((5, 1), 3.0))
-    assert (batch.mode, batch.mode_reason) == ("looped", "the system has sets")
+    assert batch.mode == "looped"
 
 
 def test_bad_input():
@@ -157,12 +157,12 @@ def test_bad_input():
                          ids=["pickle", "deepcopy"])
 @pytest.mark.parametrize(
     ("mode", "engine", "sets", "compiled"),
-    [("compiled", "compiled", {"disturbances": BOX}, None), ("vectorised", "python", {}, None),
-     ("vectorised", "python", {}, False), ("looped", "python", {"disturbances": BOX}, None)],
+    [("compiled", "compiled", {"disturbances": BOX}, None), ("looped", "python", {}, None),
+     ("looped", "python", {}, False), ("looped", "python", {"disturbances": BOX}, None)],
 )
 def test_copies_go_on_where_they_were_made(mode, engine, sets, compiled, copied):
     model = qpmhe.models.batch_reactor()
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         casadi_rate, casadi_output, dt=0.1, method="euler", n=2, compiled=compiled, **sets
     )
     members, cut = 20, 14
@@ -192,7 +192,7 @@ def test_more_memory_than_there_is(monkeypatch):
         raise MemoryError("Unable to allocate 1.49 TiB")
 
     system, observer, cost = reactor()
-    monkeypatch.setattr("qpmhe.batch.estimator.VectorisedEngine", refuse)
+    monkeypatch.setattr("qpmhe.batch._Looped", refuse)
     with pytest.raises(
         qpmhe.errors.OptionError, match=r"1000 members with a horizon of 9 .*1.49 TiB.*fewer"
     ):

@@ -172,9 +172,9 @@ def test_a_spoilt_estimator_goes_on_as_its_twin(engine, options):
 
 
 BATCHES = {
-    "vectorised": {},
-    "vectorised best": {"warm_start": True, "max_qps": 2, "delay": 1},
-    "vectorised alone": {"max_qps": 0},
+    "looped": {},
+    "looped best": {"warm_start": True, "max_qps": 2, "delay": 1},
+    "looped alone": {"max_qps": 0},
     "looped": {"candidate": "reinitialized"},
     "compiled": {"engine": "compiled"},
 }
