@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.estimate import Status
+from ..estimation.limits import LARGEST
 from ..model.sets import ConvexSet
 from .evaluation import fixed_call
 from .expressions import CasadiModel
@@ -43,8 +44,6 @@ _ALL = ("f", "h", "f_jacobian", "h_jacobian")
 # Samples that a compiled estimator is tried on, and how many of them by which function.
 _SAMPLES, _BY_RUN, _BY_MEMBERS = 22, 7, 2
 _MANY_STATES, _FEW_SAMPLES = 40, 12
-# A measurement beyond is missing (LARGEST in window.c).
-_LARGEST = 1e150
 
 
 class Interpreter:
@@ -344,7 +343,7 @@ class _Rehearsal:
                 generator.uniform(-2.0, 2.0, p) if is_wild
                 else 1 + 0.1 * generator.standard_normal(p)
             )
-            self._ys[t, ~(abs(self._ys[t]) < _LARGEST)] = np.nan
+            self._ys[t, ~(abs(self._ys[t]) < LARGEST)] = np.nan
             if t % 5 == 3:
                 self._ys[t, t % p] = np.nan
             if t % 11 == 7:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..costs import Cost
 from ..errors import OptionError
 from ..estimation.estimate import Status
+from ..estimation.limits import c_definitions
 from ..estimation.settings import Settings
 from ..model.sets import ConvexSet
 from ..model.system import System
@@ -74,7 +75,8 @@ class Layout:
         bits = (f"    {name.upper()}_{flag.name} = {flag.value}" for flag in Status)
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
-            "continuous": self.continuous, "real": self.real, "status": ",\n".join(bits),
+            "continuous": self.continuous, "real": self.real,
+            "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("xwv", self.sets, strict=True):
             values[f"{letter}_set"] = int(there)

@@ -11,6 +11,7 @@ from scipy.optimize import linprog
 
 from ..costs import Cost, ObserverPrior, QuadraticCost
 from ..errors import CompilationError, OptionError
+from ..estimation.limits import FEASIBLE
 from ..estimation.settings import Settings
 from ..model.sets import ConvexSet
 from ..model.system import System
@@ -24,8 +25,6 @@ __all__ = ["EstimatorLibrary", "generated", "uncovered"]
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
 _MOST_BYTES = 2**31 - 1
-# Of a polytope: sets are kept to so much (FEASIBLE in window.c).
-_LEAST_WIDTH = 5e-9
 _CONSTANT_GAIN = (Luenberger, HighGain, SteadyStateKalman)
 
 
@@ -53,7 +52,7 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         if one is not None and _is_flat(one):
             return (
                 f"the set of {name} has a direction of zero width (equal bounds, or a polytope "
-                f"less than {_LEAST_WIDTH:g} wide), which the interior-point method in C cannot "
+                f"less than {FEASIBLE:g} wide), which the interior-point method in C cannot "
                 "take; widen it."
             )
     size = _window_size(system, settings.horizon)
@@ -97,7 +96,7 @@ def _is_flat(one: ConvexSet) -> bool:
         np.append(np.zeros(one.dimension), -1.0), np.column_stack((rows, np.ones(limits.size))),
         limits, bounds=[(None, None)] * one.dimension + [(0.0, 1.0)],
     )
-    return found.x is not None and bool(2.0 * found.x[-1] <= _LEAST_WIDTH)
+    return found.x is not None and bool(2.0 * found.x[-1] <= FEASIBLE)
 
 
 def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:

@@ -13,32 +13,15 @@ from qpmhe_solvers import QP, Solution, SolveStatus
 from qpmhe_solvers.contained import ContainedSolver
 
 from .estimate import Status
+from .limits import CORRECTIONS, LENGTHS, NEARLY, ROUNDING, STALLED
 from .problem import Problem, Trial
 from .settings import Settings
 from .subproblem import Subproblem
 from .window import Window
 
-__all__ = ["LENGTHS", "ROUNDING", "STALLED", "Optimizer", "Outcome"]
+__all__ = ["Optimizer", "Outcome"]
 
 Array = NDArray[np.float64]
-
-# Tried in turn where the full step fails: the first where it misses a set by the solver's
-# accuracy; the last is short enough for any descent direction
-# that is worth taking.
-LENGTHS = (0.9999, 0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)
-
-# A decrease of J by less than this share is rounding, and no improvement.
-ROUNDING = 1e-12
-
-# A set missed by less than this is for the first of these lengths, not for a correction.
-_NEARLY = 1e-6
-
-# On curved sets J can only be lowered as far as feasibility can be told: where no length
-# helps and no more than this many times the tolerance was promised, that is convergence.
-STALLED = 1e3
-
-# Second-order corrections of a trial that misses a curved set.
-_CORRECTIONS = 2
 
 _NONE = Status(0)
 
@@ -211,7 +194,7 @@ class Optimizer:
         candidate = outcome.trial
         qp = self._subproblem.nearest(problem, window)
         trial = candidate
-        for attempt in range(1 + _CORRECTIONS):
+        for attempt in range(1 + CORRECTIONS):
             if outcome.late():
                 return replace(candidate, cost=math.inf, violation=math.inf)
             solution = self._solve(qp, outcome)
@@ -221,7 +204,7 @@ class Optimizer:
             trial = self._trial(problem, candidate, step)
             if trial.cost < math.inf or not math.isfinite(trial.violation):
                 return trial
-            if attempt < _CORRECTIONS:
+            if attempt < CORRECTIONS:
                 self._subproblem.corrected(qp, problem, candidate, trial)
                 outcome.corrections += 1
         return trial
@@ -260,7 +243,7 @@ class Optimizer:
         promised = abs(float(np.vdot(qp.gradient, step)))
         if 0.0 < trial.violation < math.inf and qp.rows:
             missed = trial
-            if trial.violation <= _NEARLY:
+            if trial.violation <= NEARLY:
                 trial = self._trial(problem, best, LENGTHS[0] * step)
             # A set missed by its curvature is missed by the first length as well.
             if not trial.cost < target and not (solved and promised <= enough):
@@ -294,7 +277,7 @@ class Optimizer:
     def _corrected(self, problem: Problem, qp: QP, outcome: Outcome, trial: Trial) -> Trial:
         """Second-order corrections of a trial that misses a set by its curvature."""
         best = outcome.trial
-        for _ in range(_CORRECTIONS):
+        for _ in range(CORRECTIONS):
             if outcome.late():
                 break
             self._subproblem.corrected(qp, problem, best, trial)

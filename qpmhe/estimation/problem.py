@@ -15,6 +15,7 @@ from ..costs import Cost, ObserverPrior
 from ..model.functions import contained
 from ..model.sets import ConvexSet
 from ..model.system import System
+from .limits import FEASIBLE
 from .views import read_only
 from .window import Window
 
@@ -25,9 +26,7 @@ __all__ = ["Problem", "Trial"]
 
 Array = NDArray[np.float64]
 
-# A trial lies on the boundary of its sets up to what QP solvers leave. The disturbance is a
-# difference of states, whose rounding comes on top.
-_FEASIBLE = 5e-9
+# The disturbance is a difference of states, whose rounding comes on top of FEASIBLE.
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
 
@@ -148,7 +147,7 @@ class Problem:
             "noises": self.noises
             and self.noises.violation(trial.residuals[:, n:], self.observed),
         }
-        return tuple(name for name, amount in amounts.items() if amount and amount > _FEASIBLE)
+        return tuple(name for name, amount in amounts.items() if amount and amount > FEASIBLE)
 
     def leave_out(self, names: tuple[str, ...]) -> None:
         """Judge without the sets of these names."""
@@ -212,7 +211,7 @@ class Problem:
         if not self.constrained:
             return Trial(trajectory, residuals, weights, cost)
         violation = self.violation(trajectory, residuals)
-        if violation > _FEASIBLE:
+        if violation > FEASIBLE:
             cost = math.inf
         return Trial(trajectory, residuals, weights, cost, violation)
 

@@ -13,6 +13,7 @@ from qpmhe_solvers.qp import band_of
 from ..costs import Cost
 from ..model.sets import ConvexSet
 from ..model.system import System
+from .limits import BEYOND
 from .linearization import Span, StageTerms
 from .problem import Problem, Trial
 from .window import Window
@@ -20,9 +21,6 @@ from .window import Window
 __all__ = ["Subproblem"]
 
 Array = NDArray[np.float64]
-
-# A second-order correction goes this share of itself further, to land inside.
-_BEYOND = 0.1
 
 _NO_BAND: Array = np.zeros(0)
 
@@ -130,8 +128,8 @@ class Subproblem:
         linear[:, :n] += step[1:]
         bent = trial.residuals - linear
         margin = np.full_like(qp.row_lower, 2.0 * qp.violation(step))
-        margin[:-1, self._w] += _BEYOND * np.abs(bent[:, :n] @ self._w_rows.T)
-        margin[:-1, self._v] += _BEYOND * np.abs(bent[:, n:] @ self._v_rows.T)
+        margin[:-1, self._w] += BEYOND * np.abs(bent[:, :n] @ self._w_rows.T)
+        margin[:-1, self._v] += BEYOND * np.abs(bent[:, n:] @ self._v_rows.T)
         self._set_rows(qp, problem, around.residuals + bent, around.trajectory)
         inwards = np.where(qp.row_upper - qp.row_lower > 4.0 * margin, margin, 0.0)
         qp.row_lower += inwards

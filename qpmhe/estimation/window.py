@@ -12,6 +12,7 @@ from ..model.functions import contained
 from ..model.system import Function, System
 from ..observers import Observer, Sample
 from ..snapshot import near, other
+from .limits import LARGEST
 from .linearization import Stage, StageTerms
 from .stages import Stages
 from .views import Frame
@@ -19,10 +20,6 @@ from .views import Frame
 __all__ = ["Window"]
 
 Array = NDArray[np.float64]
-
-
-# A measurement beyond this has no finite square: it is as good as missing.
-_LARGEST = 1e150
 
 
 class Window(Stages):
@@ -130,7 +127,7 @@ class Window(Stages):
             The late measurement.
         """
         k = self.end - (self.time - time)
-        new = np.abs(y) < _LARGEST
+        new = np.abs(y) < LARGEST
         self._y[k, new] = y[new]
         self._observed[k] |= new
         self._set_weight(k, time)
@@ -161,13 +158,13 @@ class Window(Stages):
         y = self._places[k].y
         observed: NDArray[np.bool_] | None = None
         if not math.isfinite(y.dot(y)):
-            self._observed[k] = observed = np.abs(y) < _LARGEST  # false for NaN, too
+            self._observed[k] = observed = np.abs(y) < LARGEST  # false for NaN, too
             self._set_weight(k, time)
         elif self.unusual and not self._observed[k].all():
             observed = self._observed[k]
         cost = self._advance(k, time, observed)
         if not math.isfinite(cost) and observed is None:
-            there = np.abs(y) < _LARGEST
+            there = np.abs(y) < LARGEST
             if not there.all():
                 self._observed[k] = observed = there
                 self._set_weight(k, time)

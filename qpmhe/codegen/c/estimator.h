@@ -41,6 +41,9 @@ typedef $real mhe_real;
 #define MHE_V_ROWS $v_rows
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
+/* Step lengths, tolerances and thresholds. */
+$limits
+
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
     (MHE_X_SET * (MHE_NX + MHE_X_ROWS) + MHE_W_SET * (MHE_NX + MHE_W_ROWS) + \

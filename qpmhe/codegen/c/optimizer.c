@@ -1,17 +1,8 @@
 /* The sequence of QPs; only what the true cost approves is accepted. */
 
-/* A decrease of the cost by less than this share is rounding, and no improvement. */
-#define ROUNDING (sizeof(real) == 8 ? (real)1e-12 : (real)1e-6)
-#define NEARLY (sizeof(real) == 8 ? (real)1e-6 : (real)1e-3)
-#define STALLED 1000
-#define CORRECTIONS 2
-#define BEYOND ((real)0.1)
 #define HAS_ROWS (MHE_W_SET || MHE_V_SET || MHE_X_ROWS)
 
-/* Tried in turn where the full step fails: the first where it misses a set by the solver's
- * accuracy, the last short enough for any descent direction that is worth taking. */
-static const real mhe_lengths[] = {(real)0.9999, (real)0.5, (real)0.25, (real)0.125,
-                                   (real)0.0625, (real)0.015625, (real)0.00390625};
+static const real mhe_lengths[] = MHE_LENGTHS;
 
 typedef struct {
     mhe_trial *reference, *best, *spare; /* best may be the reference */
@@ -20,7 +11,7 @@ typedef struct {
 
 static real mhe_target(const mhe_trial *best)
 {
-    return isfinite(best->cost) ? best->cost - ROUNDING * best->cost : INFINITY;
+    return isfinite(best->cost) ? best->cost - MHE_ROUNDING * best->cost : INFINITY;
 }
 
 static void mhe_clip(const mhe_estimator *e, int sets, real *x)
@@ -137,7 +128,7 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
             for (int j = 0; j < NX; j++) bent[j] = w[i * NX + j] - o->best->w[i * NX + j];
             mhe_values_of(NX, MHE_W_ROWS, bent, e->settings->disturbances.rows, rows + X_COUNT);
             for (int r = 0; r < W_COUNT; r++)
-                rows[X_COUNT + r].load += BEYOND * fabs(rows[X_COUNT + r].value);
+                rows[X_COUNT + r].load += MHE_BEYOND * fabs(rows[X_COUNT + r].value);
         }
 #endif
 #if MHE_V_SET
@@ -146,7 +137,7 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
             real bent[NY];
             for (int j = 0; j < NY; j++) bent[j] = v[i * NY + j] - o->best->v[i * NY + j];
             mhe_values_of(NY, MHE_V_ROWS, bent, e->settings->noises.rows, own);
-            for (int r = 0; r < V_COUNT; r++) own[r].load += BEYOND * fabs(own[r].value);
+            for (int r = 0; r < V_COUNT; r++) own[r].load += MHE_BEYOND * fabs(own[r].value);
         }
 #endif
         /* Bounds on single states are not bent: they hold for every trial. */
@@ -169,7 +160,7 @@ static int mhe_project(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, const
         if (mhe_solve_qp(e, k, o, offset, 1) == FAILED) return 0;
         mhe_try(e, k, o, 1);
         if (isfinite(o->spare->cost)) return 1;
-        if (!isfinite(o->spare->violation) || attempt == CORRECTIONS) return 0;
+        if (!isfinite(o->spare->violation) || attempt == MHE_CORRECTIONS) return 0;
 #if HAS_ROWS
         mhe_bend(e, k, o);
 #endif
@@ -209,14 +200,14 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, 
     if (!(o->spare->cost < target) && o->spare->violation > 0 &&
         isfinite(o->spare->violation)) {
         int bend = 1;
-        if (o->spare->violation <= NEARLY) {
+        if (o->spare->violation <= MHE_NEARLY) {
             mhe_try(e, k, o, mhe_lengths[0]);
             bend = !(o->spare->cost < target);
             if (bend) mhe_try(e, k, o, 1);
         }
         if (bend && !(solved && promised <= enough)) {
             memcpy(k->bent.x, k->step, sizeof k->step);
-            for (int i = 0; i < CORRECTIONS; i++) {
+            for (int i = 0; i < MHE_CORRECTIONS; i++) {
                 mhe_bend(e, k, o);
                 const int failed = mhe_solve_qp(e, k, o, offset, 0) == FAILED;
                 o->corrections++;
@@ -241,7 +232,7 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, 
             if (o->spare->cost < target) break;
         }
         if (i == count) {
-            const int stalled = solved && promised <= STALLED * enough;
+            const int stalled = solved && promised <= MHE_STALLED * enough;
             o->events |= stalled ? MHE_CONVERGED : MHE_NO_DECREASE;
             return 0;
         }

@@ -116,7 +116,7 @@ int mhe_amend(mhe_estimator *e, mhe_workspace *k, int64_t time, const real *y,
     const int i = e->length - (int)age;
     mhe_stage *stage = mhe_stage_at(e, i);
     for (int j = 0; j < NY; j++)
-        if (y[j] < LARGEST && y[j] > -LARGEST) {
+        if (y[j] < MHE_LARGEST && y[j] > -MHE_LARGEST) {
             stage->y[j] = y[j];
             stage->is_observed[j] = 1;
         }

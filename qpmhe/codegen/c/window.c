@@ -1,9 +1,5 @@
 /* The window: samples, the observer along them, and what is computed once on each. */
 
-/* A trial may leave its sets by what a QP solver leaves; a measurement beyond LARGEST has no
- * finite square and is as good as missing. */
-#define FEASIBLE (sizeof(real) == 8 ? (real)5e-9 : (real)1e-5)
-#define LARGEST (sizeof(real) == 8 ? (real)1e150 : (real)1e15)
 #define EPSILON (sizeof(real) == 8 ? (real)2.220446049250313e-16 : (real)1.1920929e-7)
 
 static real mhe_dot(int n, const real *a, const real *b)
@@ -188,7 +184,7 @@ static int mhe_push(mhe_estimator *e, const real *y, const real *u, real step,
     if (noise_weight) memcpy(stage->own_noise_weight, noise_weight, sizeof stage->noise_weight);
     for (int j = 0; j < NY; j++) {
         stage->y[j] = y[j];
-        stage->is_observed[j] = y[j] < LARGEST && y[j] > -LARGEST; /* false for NaN */
+        stage->is_observed[j] = y[j] < MHE_LARGEST && y[j] > -MHE_LARGEST; /* false for NaN */
     }
     mhe_set_noise_weight(s, stage);
     const int outcome = mhe_enter(e, e->length - 1);
@@ -271,7 +267,7 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, int sets, in
     if (violated) {
         *violated = 0;
         for (int i = 0; i < 3; i++)
-            if (worst[i] > FEASIBLE) *violated |= 1 << i;
+            if (worst[i] > MHE_FEASIBLE) *violated |= 1 << i;
     }
     return fmax(worst[0], fmax(worst[1], worst[2]));
 }
@@ -306,7 +302,7 @@ static void mhe_evaluate(mhe_estimator *e, const real *factors, int sets, mhe_tr
     }
 #if CONSTRAINED
     trial->violation = mhe_violation(e, trial, sets, 0);
-    if (trial->violation > FEASIBLE) trial->cost = INFINITY;
+    if (trial->violation > MHE_FEASIBLE) trial->cost = INFINITY;
 #else
     (void)sets;
 #endif
