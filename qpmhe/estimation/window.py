@@ -12,8 +12,8 @@ from ..costs import Cost, ObserverPrior
 from ..model.functions import contained
 from ..model.system import Function, System
 from ..observers import HighGain, Luenberger, Observer, Sample
-from ..snapshot import near, other
 from .linearization import Stage, StageTerms
+from .snapshot import near, other
 from .stages import Stages
 from .views import Frame
 
