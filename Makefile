@@ -6,7 +6,7 @@ ARGS ?=
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: reproduce test lint types examples benchmarks comparison choice docs release-check minimal-versions clean
+.PHONY: reproduce test test-all lint types examples benchmarks comparison choice docs release-check minimal-versions clean
 
 # One stamp for each set of extras, renewed when the project's requirements change.
 $(VENV)/.%: pyproject.toml
@@ -17,11 +17,17 @@ $(VENV)/.%: pyproject.toml
 reproduce: $(VENV)/.solvers
 	$(BIN)/qpmhe reproduce $(ARGS)
 
+# A sample of three minutes on two cores: every test, but not all of its cases.
 test: $(VENV)/.test
 	$(BIN)/python -m pytest --numprocesses auto $(ARGS)
 
+test-all: $(VENV)/.test
+	$(BIN)/python -m pytest --numprocesses auto --all $(ARGS)
+
+# Style, and which room may import which.
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
+	$(BIN)/lint-imports --no-cache
 
 types: $(VENV)/.dev
 	$(BIN)/mypy

@@ -3,6 +3,7 @@
 from typing import Any
 
 from . import batch, codegen, errors, models, solvers
+from ._version import __version__
 from .adapters.casadi import from_casadi
 from .adapters.control import from_control
 from .adapters.jax import from_jax
@@ -39,8 +40,6 @@ from .observers import (
     design_luenberger,
 )
 
-__version__ = "0.1.0"
-
 
 def _compiled_engine(*parts: Any) -> Engine:
     from .codegen.engine import CompiledEngine  # late: most programs do without
@@ -49,6 +48,7 @@ def _compiled_engine(*parts: Any) -> Engine:
 
 
 register_engine("compiled", _compiled_engine)
+
 
 __all__ = [
     "BatchEstimator",

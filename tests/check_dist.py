@@ -71,7 +71,7 @@ def complaints_of_sdist(path: Path, version: str) -> list[str]:
 
 def version() -> str:
     """The one in the source, which all others are made of."""
-    source = (ROOT / "qpmhe" / "__init__.py").read_text(encoding="utf-8")
+    source = (ROOT / "qpmhe" / "_version.py").read_text(encoding="utf-8")
     (found,) = re.findall(r'^__version__ = "(.+)"$', source, flags=re.MULTILINE)
     return str(found)
 

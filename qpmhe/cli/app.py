@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from .. import __version__
+from .._version import __version__
 from ..errors import QpmheError
 from .compare import compare, study
 from .estimate import estimate

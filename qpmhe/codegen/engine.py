@@ -19,9 +19,17 @@ from ..estimation.estimate import Estimate
 from ..estimation.problem import Problem
 from ..estimation.run import Run
 from ..estimation.settings import Settings
+from ..estimation.snapshot import (
+    SET_NAMES,
+    check_description,
+    described,
+    near,
+    other,
+    reading,
+    taken,
+)
 from ..model.system import System
 from ..observers import Observer
-from ..snapshot import SET_NAMES, check_description, described, near, other, reading, taken
 from .estimate import CompiledEstimate, dropped_names
 from .library import EstimatorLibrary
 

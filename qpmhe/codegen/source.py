@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._version import __version__
 from ..errors import CompilationError
 from .expressions import CasadiModel, import_casadi
 from .layout import Layout
@@ -213,7 +214,7 @@ def estimator_files(
     structure : str
         The text without the default settings: equal texts make equal machine code.
     """
-    head = header(name, {**layout.header_values(name), "version": version()})
+    head = header(name, {**layout.header_values(name), "version": __version__})
     parts = ("window.c", "factor.c", "interior_point.c", "optimizer.c", "step.c")
     body = prologue() + model_source(model) + "\n".join(template(part) for part in parts)
     data = (
@@ -222,13 +223,6 @@ def estimator_files(
     )
     text = renamed(f'#include "mhe.h"\n{body}{data}', name).replace('"mhe.h"', f'"{name}.h"')
     return {f"{name}.h": head, f"{name}.c": text}, head + body
-
-
-def version() -> str:
-    """The package's."""
-    from .. import __version__
-
-    return __version__
 
 
 def _initializer(record: NDArray[Any]) -> str:

@@ -19,12 +19,12 @@ from ..costs import Cost
 from ..errors import InvalidInputError
 from ..model.system import System
 from ..observers import Observer
-from ..snapshot import SET_NAMES, check_description, described, reading, taken
 from .covariance import window_covariances
 from .estimate import Estimate, Status
 from .optimizer import Optimizer
 from .problem import Problem
 from .settings import Settings
+from .snapshot import SET_NAMES, check_description, described, reading, taken
 from .stages import Mark
 from .subproblem import Subproblem
 from .window import Window

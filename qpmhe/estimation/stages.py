@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import positive_definite
-from ..snapshot import check_size, other, taken
 from .linearization import StageTerms
+from .snapshot import check_size, other, taken
 from .views import Frame, Place, Views, read_only
 
 __all__ = ["Mark", "Stages"]

@@ -11,9 +11,9 @@ from ..costs import Cost
 from ..model.functions import contained
 from ..model.system import Function, System
 from ..observers import Observer, Sample
-from ..snapshot import near, other
 from .limits import LARGEST
 from .linearization import Stage, StageTerms
+from .snapshot import near, other
 from .stages import Stages
 from .views import Frame
 

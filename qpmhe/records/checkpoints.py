@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
+from .._version import __version__
 from ..errors import InvalidInputError, QpmheError
 
 __all__ = ["Checkpoint", "CheckpointError", "WriteError", "load", "save", "versions"]

@@ -12,9 +12,11 @@ from typing import Any
 
 from qpmhe_solvers import backends
 
+from .._version import __version__
+
 __all__ = ["environment", "revision"]
 
-_PACKAGES = ("qpmhe", "numpy", "scipy", "qpsolvers", "cvxpy", "casadi", "jax", "joblib")
+_PACKAGES = ("numpy", "scipy", "qpsolvers", "cvxpy", "casadi", "jax", "joblib")
 
 
 @lru_cache(maxsize=1)
@@ -31,7 +33,8 @@ def environment() -> dict[str, Any]:
         [*_PACKAGES, *(entry.distribution for entry in backends() if entry.distribution)]
     )
     return {
-        "versions": {name: _version(name) for name in sorted(packages) if _version(name)},
+        "versions": {"qpmhe": __version__}
+        | {name: _version(name) for name in sorted(packages) if _version(name)},
         "cpu": _processor(),
         "cores": _cores(),
         "python": platform.python_version(),

@@ -1,10 +1,9 @@
 """Random estimation problems against a second implementation of everything that is promised.
 
-A few hundred steps by default; `QPMHE_FUZZ_STEPS=100000` for as many as one likes.
+A few hundred steps by default, ``--fuzz-steps 100000`` for as many as one likes.
 """
 
 import copy
-import os
 from collections import Counter
 
 import pytest
@@ -13,20 +12,20 @@ import qpmhe
 
 from .fuzz_independent import WRITINGS, Case, WrongStepError, fuzz, table
 
-STEPS = int(os.environ.get("QPMHE_FUZZ_STEPS", "0"))
-SEED = int(os.environ.get("QPMHE_FUZZ_SEED", "1"))
+SEED = 1
 # Steps of each by default: whatever is compiled takes its time to be made.
 FEW = {"numpy": 120, "casadi": 180, "jax": 90}
 WAYS = [(source, writing) for source, writings in WRITINGS.items() for writing in writings]
 
 
 @pytest.mark.parametrize(("source", "writing"), WAYS)
-def test_every_step_is_what_it_says(source, writing):
+def test_every_step_is_what_it_says(pytestconfig, source, writing):
     if source != "numpy":
         pytest.importorskip(source)
     share = {"numpy": 0.6, "casadi": 0.3, "jax": 0.1}[source] / len(WRITINGS[source])
-    steps = max(FEW[source], round(share * STEPS))
-    counts, failures = fuzz(steps, SEED, source=source, writing=writing, estimators=2)
+    steps = max(FEW[source], round(share * pytestconfig.option.fuzz_steps))
+    seed = pytestconfig.option.fuzz_seed
+    counts, failures = fuzz(steps, seed, source=source, writing=writing, estimators=2)
     print(table(counts))
     assert failures == []
     assert counts["steps"] == steps

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .costs import Cost
-from .errors import InvalidInputError
-from .estimation.settings import Settings
-from .model.system import System, probe_points
-from .observers import Observer
+from ..costs import Cost
+from ..errors import InvalidInputError
+from ..model.system import System, probe_points
+from ..observers import Observer
+from .settings import Settings
 
 __all__ = [
     "SET_NAMES", "check_description", "check_size", "described", "near", "other",

@@ -1,0 +1,86 @@
+"""Which tests run: a sample of about three minutes, or everything with ``--all``.
+
+The sample holds every test. Of the cases of a parametrised test it holds at least a handful, and
+every value of every parameter, so that products of options are thinned and nothing else. Tests
+marked ``slow`` are left out. The choice depends on the names of the cases only, so that the
+processes of pytest-xdist agree on it.
+"""
+
+import hashlib
+from collections import defaultdict
+
+import pytest
+
+SEED = 1
+# Cases that every test keeps, and the share of its further cases that is aimed at.
+HANDFUL, SHARE = 4, 0.1
+LEFT_OUT = pytest.StashKey[int]()
+COLLECTED = pytest.StashKey[int]()
+
+
+def pytest_addoption(parser):
+    group = parser.getgroup("qpmhe")
+    group.addoption("--all", action="store_true", help="run all cases of all tests, slow ones too")
+    group.addoption(
+        "--fuzz-steps", type=int, default=0, metavar="N",
+        help="random steps to compare with the second implementation (default: some hundreds)",
+    )
+    group.addoption("--fuzz-seed", type=int, default=1, metavar="N", help="seed of these steps")
+
+
+def named(config, item):
+    """Whether the command line names this very case."""
+    return any("::" in one and one.rpartition("::")[2] == item.name for one in config.args)
+
+
+def sample(cases):
+    """A handful of the cases and a share of the others, with every value of every parameter."""
+    cases = sorted(cases, key=lambda item: hashlib.sha256(f"{SEED}{item.nodeid}".encode()).digest())
+    seen, kept, others = set(), [], []
+    for item in cases:
+        values = {(name, id(value)) for name, value in item.callspec.params.items()}
+        (others if values <= seen else kept).append(item)
+        seen |= values
+    wanted = HANDFUL + round(SHARE * (len(cases) - HANDFUL))
+    return kept + others[: max(0, wanted - len(kept))]
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config, items):
+    config.stash[COLLECTED] = config.stash[LEFT_OUT] = len(items)
+    tests, kept = defaultdict(list), set()
+    for item in items:
+        if config.option.all or named(config, item):
+            kept.add(item)
+        elif item.get_closest_marker("slow") is None:
+            tests[item.nodeid.partition("[")[0]].append(item)
+    for cases in tests.values():
+        kept.update(sample(cases) if len(cases) > HANDFUL else cases)
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    items[:] = [item for item in items if item in kept]
+    config.stash[LEFT_OUT] -= len(items)
+
+
+def pytest_sessionfinish(session):
+    if hasattr(session.config, "workeroutput"):  # a process of pytest-xdist
+        stash = session.config.stash
+        session.config.workeroutput["left_out"] = stash.get(LEFT_OUT, 0), stash.get(COLLECTED, 0)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node, error):
+    left_out, collected = getattr(node, "workeroutput", {}).get("left_out", (0, 0))
+    node.config.stash[LEFT_OUT], node.config.stash[COLLECTED] = left_out, collected
+
+
+def pytest_report_header(config):
+    chosen = "all" if config.option.all else f"a sample (seed {SEED}); --all runs all of them"
+    return f"cases: {chosen}"
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    left_out, collected = config.stash.get(LEFT_OUT, 0), config.stash.get(COLLECTED, 0)
+    if left_out:
+        terminalreporter.write_line(
+            f"{left_out} of {collected} cases left out; --all (make test-all) runs them too"
+        )
