@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qpmhe_solvers.errors import tell_unknown_options
+from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import count
 from ..costs import Cost, QuadraticCost
@@ -40,7 +40,7 @@ __all__ = ["BatchEstimator"]
 Array = NDArray[np.float64]
 
 
-@tell_unknown_options
+@report_unknown_options
 class BatchEstimator:
     r"""K independent estimators of one system, for Monte Carlo studies and fleets.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from qpmhe_solvers.errors import tell_unknown_options
+from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import count
 from ..errors import InvalidInputError, ModelError, SetError
@@ -43,7 +43,7 @@ class Joint(Protocol):
         """Make what the first updates with a window of this length would otherwise wait for."""
 
 
-@tell_unknown_options
+@report_unknown_options
 class System:
     r"""A nonlinear discrete-time system with additive disturbance and noise.
 
