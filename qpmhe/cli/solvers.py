@@ -17,7 +17,7 @@ _FLAGS = {
     "\nx0": "warm_start",
     "\ny0": "keeps_duals",
     "\ntime": "time_limit",
-    "\ninf": "tells_infeasible",
+    "\ninf": "reports_infeasibility",
     "\nws": "keeps_workspace",
 }
 _SHORT = {

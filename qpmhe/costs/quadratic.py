@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qpmhe_solvers.errors import tell_unknown_options
+from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import positive_definite
 from .base import Cost, CostConstants, quadratic_form
@@ -16,7 +16,7 @@ __all__ = ["QuadraticCost"]
 Array = NDArray[np.float64]
 
 
-@tell_unknown_options
+@report_unknown_options
 class QuadraticCost(Cost):
     r"""Quadratic prior weighting and stage cost.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qpmhe_solvers.errors import tell_unknown_options
+from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import positive_definite
 from ..errors import InvalidInputError
@@ -18,7 +18,7 @@ __all__ = ["RobustCost"]
 Array = NDArray[np.float64]
 
 
-@tell_unknown_options
+@report_unknown_options
 class RobustCost(Cost):
     r"""A cost with a loss for each of prior, disturbance and noise.
 

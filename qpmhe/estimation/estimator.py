@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qpmhe_solvers.errors import tell_unknown_options
+from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import positive, positive_definite, record, vector
 from ..costs import Cost, ObserverPrior
@@ -24,7 +24,7 @@ __all__ = ["MovingHorizonEstimator", "check_start"]
 
 Array = NDArray[np.float64]
 
-@tell_unknown_options
+@report_unknown_options
 class MovingHorizonEstimator:
     r"""Suboptimal moving horizon estimation with an observer-based candidate.
 

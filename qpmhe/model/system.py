@@ -9,7 +9,7 @@ from typing import Any, NoReturn, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from qpmhe_solvers.errors import tell_unknown_options
+from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import count, positive
 from ..errors import InvalidInputError, ModelError, SetError
@@ -49,7 +49,7 @@ class _Moved:
         )
 
 
-@tell_unknown_options
+@report_unknown_options
 class System:
     r"""A nonlinear discrete-time system with additive disturbance and noise.
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from qpmhe_solvers import available, backend
-from qpmhe_solvers.errors import tell_unknown_options
+from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import count, positive
 from ..errors import BackendError, InvalidInputError
@@ -41,7 +41,7 @@ Start = Literal["candidate", "best"]
 WORDS = {"qps": "converged", "solver_iterations": "none", "horizons": "default"}
 
 
-@tell_unknown_options
+@report_unknown_options
 @dataclass(frozen=True)
 class Study:
     """A grid of estimators, each run on records of many seeds.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import numpy as np
 
 from qpmhe_solvers.files import StoredQP, load, qp_files
-from qpmhe_solvers.forms import Form
+from qpmhe_solvers.matrices import QpsolversMatrices
 from qpmhe_solvers.qp import QP
 
 from ..errors import InvalidInputError, OptionError
@@ -168,7 +168,7 @@ def _problem(qp: QP) -> qpsolvers.Problem:
 
     sides = [np.isfinite(side) for side in (qp.lower, qp.upper)]
     box = all(side.all() or not side.any() for side in sides)
-    form = Form(qp, dense=True, box=box, needs_row=False, keep_empty=False)
+    form = QpsolversMatrices(qp, dense=True, box=box, needs_row=False, keep_empty=False)
     form.fill(qp)
     P, q, G, h, A, b, lower, upper = form.arguments
     return qpsolvers.Problem(

@@ -7,11 +7,13 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from .backend import make_solver
 from .banded import BandedSolver
 from .contained import ContainedSolver
+from .native import NATIVE
 from .options import SolverOptions
 from .qp import QP
-from .solution import RawSolution, Solution, SolveStatus
+from .solution import Solution, SolveStatus
 from .solver import Solver
 
 __all__ = ["AutoSolver"]
@@ -40,6 +42,8 @@ class AutoSolver(Solver):
     iterate of the banded solver lives in its workspace until the next solve.
     """
 
+    _judges = True
+
     def __init__(self, options: SolverOptions) -> None:
         super().__init__(options)
         self._banded = BandedSolver(options)
@@ -49,15 +53,10 @@ class AutoSolver(Solver):
     def __reduce__(self) -> tuple[type[AutoSolver], tuple[SolverOptions]]:
         return type(self), (self.options,)
 
-    def _solve(self, qp: QP, start: Array | None) -> RawSolution:
-        solution = self.solve(qp, start)
-        return RawSolution(solution.d, solution.status is SolveStatus.SOLVED)
-
-    def solve(self, qp: QP, start: Array | None = None) -> Solution:
-        """Solve the QP with the cheapest exact method; see `Solver.solve`."""
+    def _solve(self, qp: QP, start: Array | None) -> Solution:
         limit = remaining = self.time_limit
         began = 0.0 if limit is None else perf_counter()
-        solution = self._banded.solve(qp, start)
+        solution = self._banded._solve(qp, start)
         if solution.status is SolveStatus.SOLVED:
             return solution
         small = qp.size <= _SMALL
@@ -103,18 +102,17 @@ class AutoSolver(Solver):
 
     def _choose(self, small: bool) -> list[ContainedSolver]:
         """The two best solvers that can be made: the second where the first brings nothing."""
-        from .registry import available, backend, create
-
-        capped, chosen = self.options.max_iterations is not None, []
-        usable = set(available())
-        names = [name for name in (_SMALL_ORDER if small else _LARGE_ORDER) if name in usable]
-        if self.options.time_limit is not None:
-            names.sort(key=lambda name: not backend(name).time_limit)
-        for name in names:
-            if capped and not backend(name).iterate_at_cap:
+        options, chosen = self.options, []
+        known = [NATIVE[name] for name in (_SMALL_ORDER if small else _LARGE_ORDER)]
+        if options.time_limit is not None:
+            known.sort(key=lambda backend: not backend.time_limit)
+        for backend in known:
+            if options.max_iterations is not None and not backend.iterate_at_cap:
+                continue
+            if not backend.available:
                 continue
             try:
-                chosen.append(ContainedSolver(create(name, self.options)))
+                chosen.append(ContainedSolver(make_solver(backend, options)))
             except Exception:  # an installed package that does not work: the next will do
                 continue
             if len(chosen) == 2:

@@ -8,12 +8,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from .flat import FlatQP
 from .options import SolverOptions
 from .qp import QP
-from .scaling import Scaling
-from .solution import RawSolution, Residuals, Solution, SolveStatus
-from .solver import Solver, expect_qp
+from .solution import Residuals, Solution, SolveStatus
+from .solver import Solver
 
 __all__ = ["BandedSolver"]
 
@@ -38,6 +36,8 @@ class BandedSolver(Solver):
         Kept for the common contract; a direct solve has nothing to cap.
     """
 
+    _judges, _keeps = True, False
+
     def __init__(self, options: SolverOptions) -> None:
         from scipy.linalg.lapack import dgbsv, dpbsv  # late: twice the cost of importing NumPy
 
@@ -47,13 +47,7 @@ class BandedSolver(Solver):
         self._size = (0, 0)
         self._work: tuple[Array, Array, Array] | None = None
 
-    def _solve(self, qp: QP, start: Array | None) -> RawSolution:
-        solution = self.solve(qp, start)
-        return RawSolution(solution.d, solution.status is SolveStatus.SOLVED)
-
-    def solve(self, qp: QP, start: Array | None = None) -> Solution:
-        """Solve the QP without its inequalities, then look whether they hold."""
-        expect_qp(qp)
+    def _solve(self, qp: QP, start: Array | None) -> Solution:
         if qp.rows and (qp.row_lower == qp.row_upper).any():
             return self._solve_scaled(qp)
         step = self._cholesky(qp)
@@ -66,14 +60,7 @@ class BandedSolver(Solver):
 
     def _solve_scaled(self, qp: QP) -> Solution:
         """Solve with equality rows; pivots, unlike a Cholesky factor, depend on units."""
-        flat = self._flat
-        if flat is None or flat.sizes != (qp.stages, qp.n, qp.rows):
-            flat = self._flat = FlatQP(qp.stages, qp.n, qp.rows)
-        flat.gather(qp)
-        if self._scaling is None:
-            self._scaling = Scaling(held=False)
-        scale = self._scaling.scale(flat, qp)
-        scaled = self._scaling.flat.qp
+        scale, scaled = self._scale(self._gather(qp))
         step, multipliers = self._with_equalities(scaled)
         if step is None:
             message = "the factorisation failed: H is not positive definite, or not finite"

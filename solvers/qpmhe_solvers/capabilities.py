@@ -10,7 +10,7 @@ import numpy as np
 from .options import SolverOptions
 from .qp import QP
 from .registry import Backend, create
-from .samples import contradiction, sample
+from .sample_qps import contradiction, sample
 from .solution import Solution, SolveStatus
 
 __all__ = ["CAPS", "PATIENCE", "Capabilities", "all_kinds", "measure", "tight"]
@@ -44,7 +44,7 @@ class Capabilities:
         A time that has passed at once stops it.
     keeps_duals : bool
         What was solved before makes a difference to a capped solve.
-    tells_infeasible : bool
+    reports_infeasibility : bool
         It calls a QP without feasible point infeasible.
     """
 
@@ -54,18 +54,18 @@ class Capabilities:
     warm_start: bool
     time_limit: bool
     keeps_duals: bool
-    tells_infeasible: bool
+    reports_infeasibility: bool
 
     @staticmethod
-    def declared(entry: Backend) -> Capabilities:
+    def declared(backend: Backend) -> Capabilities:
         """What a backend says of itself.
 
         Parameters
         ----------
-        entry : Backend
-            Its entry in the registry.
+        backend : Backend
+            Its description.
         """
-        return Capabilities(**{one.name: getattr(entry, one.name) for one in fields(Capabilities)})
+        return Capabilities(**{one.name: getattr(backend, one.name) for one in fields(Capabilities)})
 
 
 def measure(name: str) -> Capabilities:
@@ -95,7 +95,7 @@ def measure(name: str) -> Capabilities:
         warm_start=_uses_a_start(name, qp),
         time_limit=_minds_the_time(name),
         keeps_duals=_keeps_duals(name),
-        tells_infeasible="infeasible" in infeasible.message.lower(),
+        reports_infeasibility="infeasible" in infeasible.message.lower(),
     )
 
 

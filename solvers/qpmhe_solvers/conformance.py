@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from .battery import run_battery
 from .capabilities import Capabilities, measure
+from .conformance_cases import run_cases
 from .registry import backend, create
 
 __all__ = ["Conformance", "Finding", "check"]
@@ -85,6 +85,6 @@ def check(name: str) -> Conformance:
     create(name)
     measured = measure(name)
     findings = tuple(
-        Finding(part, not detail, detail) for part, detail in run_battery(name, measured)
+        Finding(part, not detail, detail) for part, detail in run_cases(name, measured)
     )
     return Conformance(name, Capabilities.declared(backend(name)), measured, findings)

@@ -1,9 +1,10 @@
-"""The one place where solvers of any origin are called: nothing that they do gets out."""
+"""Containment of solvers of any origin: nothing that they do gets out."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,17 @@ __all__ = ["ContainedSolver"]
 
 Array = NDArray[np.float64]
 
+_NUMBERS = count(1)
+
 
 class ContainedSolver:
     """A solver whose methods raise nothing but KeyboardInterrupt, whatever class it is of.
 
     `Solver.solve` contains what `Solver._solve` does. This contains the rest: a user's class may
     override `solve` itself, and its `shift`, `forget` and `prepare` may raise.
+
+    Several of these may share one solver. Whenever it passes from one to another, it starts
+    afresh: nothing that it keeps from one trajectory warm-starts the other.
 
     Parameters
     ----------
@@ -32,7 +38,8 @@ class ContainedSolver:
 
     def __init__(self, solver: Solver) -> None:
         self.solver = solver
-        is_contained = solver._own or type(solver).solve is Solver.solve
+        self._number = next(_NUMBERS)
+        is_contained = solver._builtin or type(solver).solve is Solver.solve
         self._is_trusted = is_contained and "solve" not in vars(solver)
 
     def solve(
@@ -56,6 +63,8 @@ class ContainedSolver:
         """
         solver = self.solver
         try:
+            if solver._user != self._number:
+                self._take_over(solver)
             if time_limit is not None:
                 solver.time_limit = time_limit
             if self._is_trusted:
@@ -69,13 +78,21 @@ class ContainedSolver:
         except BaseException as error:  # a panic of compiled code is no Exception
             return failure(error)
 
+    def _take_over(self, solver: Solver) -> None:
+        if solver._user:
+            _quietly(solver.forget)
+            solver.time_limit = solver.options.time_limit
+        solver._user = self._number
+
     def shift(self) -> None:
         """Say that the trajectory moved on by one stage; see `Solver.shift`."""
-        _quietly(self.solver.shift)
+        if self.solver._user == self._number:  # otherwise it keeps nothing of this trajectory
+            _quietly(self.solver.shift)
 
     def forget(self) -> None:
         """Drop what is kept from solve to solve; see `Solver.forget`."""
-        _quietly(self.solver.forget)
+        if self.solver._user == self._number:
+            _quietly(self.solver.forget)
 
     def prepare(self, size: int) -> None:
         """Do beforehand what the first QPs would wait for; see `Solver.prepare`.

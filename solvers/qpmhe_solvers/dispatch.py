@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .forms import Form, pattern_of_limits
+from .matrices import QpsolversMatrices, pattern_of_limits
 from .options import SolverOptions
 from .qp import QP
 from .solution import RawSolution
@@ -29,6 +29,8 @@ class Translation:
 
     Parameters
     ----------
+    method, package : str
+        Kind of algorithm, and the module and distribution of the solver.
     matrices : {"csc", "dense"}
         The form in which the solver takes its matrices here.
     bounds : {"box", "rows"}
@@ -45,7 +47,7 @@ class Translation:
         What is added to a cap, where the solver ends before the iteration of that number.
     needs_row : bool
         Whether a QP without any inequality row goes wrong, so that a void row is added.
-    tells_infeasible : bool
+    reports_infeasibility : bool
         Whether its words say so where a QP has no feasible point.
     others : tuple
         Keywords with values that suit numbers of order one.
@@ -53,6 +55,8 @@ class Translation:
         Whether to give matrices without rows, which qpsolvers would make at each solve.
     """
 
+    method: str
+    package: str
     matrices: Literal["csc", "dense"]
     bounds: Literal["box", "rows"]
     cap: str | None
@@ -62,7 +66,7 @@ class Translation:
     start: bool = False
     needs_row: bool = False
     keep_empty: bool = False
-    tells_infeasible: bool = False
+    reports_infeasibility: bool = False
     default_cap: int | None = None
     beyond_cap: int = 0
     others: tuple[tuple[str, float], ...] = ()
@@ -75,42 +79,42 @@ class Translation:
 # 1e-7 to the Hessian's diagonal, which is much where weights spread over decades.
 TRANSLATIONS: Mapping[str, Translation] = {
     "clarabel": Translation(
-        "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"), ("tol_gap_rel",), "time_limit",
+        "interior point", "clarabel", "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"), ("tol_gap_rel",), "time_limit",
         needs_row=True,
-        tells_infeasible=True,
+        reports_infeasibility=True,
     ),
-    "cvxopt": Translation("csc", "rows", "maxiters", ("abstol", "feastol"), ("reltol",)),
+    "cvxopt": Translation("interior point", "cvxopt", "csc", "rows", "maxiters", ("abstol", "feastol"), ("reltol",)),
     "daqp": Translation(
-        "dense", "box", "iter_limit", ("primal_tol", "dual_tol"), time_limit="time_limit",
+        "dual active set", "daqp", "dense", "box", "iter_limit", ("primal_tol", "dual_tol"), time_limit="time_limit",
         start=True, beyond_cap=1,
     ),
     "ecos": Translation(
-        "dense", "rows", "max_iters", ("abstol", "feastol", "reltol"), needs_row=True
+        "interior point", "ecos", "dense", "rows", "max_iters", ("abstol", "feastol", "reltol"), needs_row=True
     ),
     "highs": Translation(
-        "csc", "box", "qp_iteration_limit",
+        "active set", "highspy", "csc", "box", "qp_iteration_limit",
         ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), time_limit="time_limit",
         needs_row=True, others=(("qp_regularization_value", 1e-12),),
     ),
     "osqp": Translation(
-        "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", start=True,
-        tells_infeasible=True,
+        "ADMM", "osqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", start=True,
+        reports_infeasibility=True,
     ),
     "piqp": Translation(
-        "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), keep_empty=True,
-        tells_infeasible=True,
+        "interior point", "piqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), keep_empty=True,
+        reports_infeasibility=True,
     ),
     "proxqp": Translation(
-        "dense", "box", "max_iter", ("eps_abs",), ("eps_rel",), default_cap=200,
-        tells_infeasible=True,
+        "augmented Lagrangian", "proxsuite", "dense", "box", "max_iter", ("eps_abs",), ("eps_rel",), default_cap=200,
+        reports_infeasibility=True,
     ),
     "qpalm": Translation(
-        "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit",
-        tells_infeasible=True,
+        "augmented Lagrangian", "qpalm", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit",
+        reports_infeasibility=True,
     ),
-    "quadprog": Translation("dense", "rows", None, ()),
+    "quadprog": Translation("dual active set", "quadprog", "dense", "rows", None, ()),
     "scs": Translation(
-        "csc", "rows", "max_iters", ("eps_abs",), ("eps_rel",), "time_limit_secs", start=True,
+        "ADMM", "scs", "csc", "rows", "max_iters", ("eps_abs",), ("eps_rel",), "time_limit_secs", start=True,
         needs_row=True,
     ),
 }
@@ -144,7 +148,7 @@ class DispatchSolver(Solver):
         self._keywords = _keywords(self._translation, options)
         self._problem: Callable[..., Any] = qpsolvers.Problem
         self._solve_problem: Callable[..., Any] = qpsolvers.solve_problem
-        self._forms: dict[Hashable, tuple[Form, Any]] = {}
+        self._forms: dict[Hashable, tuple[QpsolversMatrices, Any]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_forms": {}}  # copies of arrays no longer share their numbers
@@ -173,18 +177,18 @@ class DispatchSolver(Solver):
             problem, self.name, initvals=initial, verbose=False, **words
         )
         bound_duals, row_duals = form.multipliers(answer)
-        iterations, message = _told(answer.extras)
+        iterations, message = _report(answer.extras)
         return RawSolution(
             answer.x, bool(answer.found), iterations, bound_duals, row_duals, message
         )
 
-    def _form(self, qp: QP) -> tuple[Form, Any]:
+    def _form(self, qp: QP) -> tuple[QpsolversMatrices, Any]:
         """The layout for this QP's pattern of limits, and the problem made of its arrays."""
         key = pattern_of_limits(qp)
         made = self._forms.pop(key, None)
         if made is None:
             how = self._translation
-            form = Form(
+            form = QpsolversMatrices(
                 qp, dense=how.matrices == "dense", box=how.bounds == "box",
                 needs_row=how.needs_row, keep_empty=how.keep_empty,
             )
@@ -205,7 +209,7 @@ def _keywords(how: Translation, options: SolverOptions) -> dict[str, Any]:
     return words
 
 
-def _told(extras: Mapping[str, Any]) -> tuple[int | None, str]:
+def _report(extras: Mapping[str, Any]) -> tuple[int | None, str]:
     """The solver's own count and words, wherever this solver keeps them."""
     info = extras.get("info")
     # proxqp's cap is on its outer iterations.
@@ -213,6 +217,6 @@ def _told(extras: Mapping[str, Any]) -> tuple[int | None, str]:
     for key in ("iter", "iterations"):
         count = extras.get(key, count)
     if count is not None:
-        count = int(np.ravel(count)[0])  # quadprog tells two numbers: added, then dropped
+        count = int(np.ravel(count)[0])  # quadprog counts two: added, then dropped
     status = getattr(info, "status", extras.get("status", extras.get("exitFlag", "")))
     return count, str(status)

@@ -14,7 +14,7 @@ __all__ = [
     "QpmheError",
     "ShapeError",
     "UnknownOptionError",
-    "tell_unknown_options",
+    "report_unknown_options",
 ]
 
 T = TypeVar("T")
@@ -45,7 +45,7 @@ class BackendError(InvalidInputError):
     """A QP backend that is unknown, not installed, described wrongly, or makes no solver."""
 
 
-def tell_unknown_options(cls: type[T]) -> type[T]:
+def report_unknown_options(cls: type[T]) -> type[T]:
     """Make a class answer an unknown keyword with the ones that it knows."""
     plain = cls.__init__
     known = [name for name in inspect.signature(plain).parameters if name != "self"]

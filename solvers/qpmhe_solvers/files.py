@@ -1,10 +1,13 @@
-"""QPs on disk: one self-describing file each, with what is known of where it came from."""
+"""QPs on disk: one self-describing file each, with its origin."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import platform
+import warnings
+import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -16,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .archive import damaged, foreign, read, write
 from .errors import InvalidInputError
 from .options import SolverOptions
 from .qp import QP
@@ -126,8 +128,9 @@ def dump(
             "message": str(solution.message),
         }
         if solution.residuals is not None:
-            told = solution.residuals
-            arrays["residuals"] = np.array([told.primal, told.dual, told.gap])
+            arrays["residuals"] = np.array(
+                [getattr(solution.residuals, name) for name in ("primal", "dual", "gap")]
+            )
         for name in ("d", "bound_duals", "row_duals"):
             arrays[name] = getattr(solution, name)
     header = {
@@ -138,7 +141,7 @@ def dump(
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     target = Path(path)
-    write(target, header, _in_shape(qp, arrays))
+    _write(target, header, _in_shape(qp, arrays))
     return target
 
 
@@ -161,9 +164,9 @@ def load(path: str | os.PathLike[str]) -> StoredQP:
         If there is no such file, or it is damaged, of another kind, or of a newer version.
     """
     source = Path(path)
-    header, arrays = read(source)
+    header, arrays = _read(source)
     if header.get("format") != _FORMAT:
-        raise foreign(source)
+        raise _foreign(source)
     version = header.get("version")
     if isinstance(version, int) and version > _VERSION:
         raise InvalidInputError(
@@ -175,7 +178,7 @@ def load(path: str | os.PathLike[str]) -> StoredQP:
             raise ValueError(f"version is {version!r}")
         return _stored(source, header, arrays)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise damaged(source, error) from error
+        raise _damaged(source, error) from error
 
 
 def qp_files(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
@@ -240,7 +243,7 @@ def _plain(options: SolverOptions) -> dict[str, Any]:
 @lru_cache(maxsize=1)
 def _versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
-    solvers = {entry.distribution for entry in backends() if entry.distribution}
+    solvers = {one.distribution for one in backends() if one.distribution}
     for name in ("qpmhe", "numpy", "scipy", "qpsolvers", *sorted(solvers)):
         with contextlib.suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
@@ -274,10 +277,10 @@ def _stored(source: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]
     )
 
 
-def _answer(told: dict[str, Any] | None, arrays: dict[str, NDArray[Any]]) -> Solution | None:
-    if told is None:
+def _answer(stored: dict[str, Any] | None, arrays: dict[str, NDArray[Any]]) -> Solution | None:
+    if stored is None:
         return None
-    status, iterations = SolveStatus[told["status"]], told["iterations"]
+    status, iterations = SolveStatus[stored["status"]], stored["iterations"]
     d = arrays.get("d")
     if status.usable != (d is not None):
         raise ValueError(f"status {status.name} does not go with the iterate")
@@ -287,5 +290,69 @@ def _answer(told: dict[str, Any] | None, arrays: dict[str, NDArray[Any]]) -> Sol
     return Solution(
         d, status, iterations,
         None if residuals is None else Residuals(*residuals.tolist()),
-        arrays.get("bound_duals"), arrays.get("row_duals"), str(told["message"]),
+        arrays.get("bound_duals"), arrays.get("row_duals"), str(stored["message"]),
+    )
+
+
+def _write(target: Path, header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write header and arrays beside the target, then rename: it is there whole or not at all."""
+    members = {"header": np.array(json.dumps(header)), **arrays}
+    unfinished = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        try:
+            with unfinished.open("wb") as file:
+                np.savez(file, **members)  # type: ignore[arg-type]  # none is named as its options
+            unfinished.replace(target)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                unfinished.unlink()
+            raise
+    except OSError as error:
+        raise InvalidInputError(
+            f"cannot write {target}: {error.strerror or error}; give a path in an existing "
+            "folder that can be written to and has space left."
+        ) from error
+
+
+def _read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Header and arrays of a file; nothing in it is executed."""
+    try:
+        with source.open("rb") as file:
+            magic = file.read(4)
+    except OSError as error:
+        raise InvalidInputError(
+            f"cannot read {source}: {error.strerror or error}; expected a file of "
+            "qpmhe.solvers.dump."
+        ) from error
+    if not magic.startswith(b"PK"):
+        raise _foreign(source)
+    try:
+        with warnings.catch_warnings(), zipfile.ZipFile(source) as archive:
+            warnings.simplefilter("ignore")
+            if "header.npy" not in archive.namelist():
+                raise _foreign(source)
+        with warnings.catch_warnings(), np.load(source, allow_pickle=False) as opened:
+            warnings.simplefilter("ignore")
+            arrays = {name: opened[name] for name in opened.files}
+        header = json.loads(str(arrays.pop("header")))
+    except InvalidInputError:
+        raise
+    except Exception as error:  # NumPy's and zip's readers raise nearly anything on nonsense
+        raise _damaged(source, error) from error
+    if not isinstance(header, dict):
+        raise _foreign(source)
+    return header, arrays
+
+
+def _foreign(source: Path) -> InvalidInputError:
+    """The error for a file of another kind."""
+    return InvalidInputError(
+        f"{source} is no QP file of qpmhe; expected one of qpmhe.solvers.dump or Recording."
+    )
+
+
+def _damaged(source: Path, error: Exception) -> InvalidInputError:
+    """The error for a file whose contents do not fit together."""
+    return InvalidInputError(
+        f"{source} is damaged ({type(error).__name__}: {error}); copy or dump it again."
     )

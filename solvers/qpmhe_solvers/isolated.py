@@ -18,13 +18,13 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from .backend import Backend, make_solver
 from .contained import ContainedSolver
-from .entry import Backend, make_solver
 from .errors import BackendError
 from .options import SolverOptions
 from .qp import QP
-from .solution import RawSolution, Solution, SolveStatus
-from .solver import Solver, expect_qp
+from .solution import Solution, SolveStatus
+from .solver import Solver
 
 __all__ = ["IsolatedSolver"]
 
@@ -49,7 +49,7 @@ class IsolatedSolver(Solver):
 
     Parameters
     ----------
-    entry : Backend
+    backend : Backend
         The backend. A factory that belongs to the main script can be sent if cloudpickle or
         joblib is installed; otherwise it is to be in a module.
     options : SolverOptions
@@ -67,45 +67,22 @@ class IsolatedSolver(Solver):
     thread.
     """
 
-    def __init__(self, entry: Backend, options: SolverOptions) -> None:
+    _judges = True
+
+    def __init__(self, backend: Backend, options: SolverOptions) -> None:
         super().__init__(options)
-        self._entry, self._size = entry, 0
-        self._sent = _packed(entry)
+        self._backend, self._size = backend, 0
+        self._sent = _packed(backend)
         self._child: _Child | None = _Child(self._sent, options, 0)
         fault = self._child.wait(_START)
         if fault:
             self._child.end()
-            raise BackendError(f"backend {entry.name!r} cannot be isolated: {fault}")
+            raise BackendError(f"backend {backend.name!r} cannot be isolated: {fault}")
 
     def __reduce__(self) -> tuple[type[IsolatedSolver], tuple[Backend, SolverOptions]]:
-        return type(self), (self._entry, self.options)
+        return type(self), (self._backend, self.options)
 
-    def _solve(self, qp: QP, start: Array | None) -> RawSolution:
-        solution = self.solve(qp, start)
-        return RawSolution(solution.d, solution.status is SolveStatus.SOLVED)
-
-    def solve(self, qp: QP, start: Array | None = None) -> Solution:
-        """Have the QP solved by the process; see `Solver.solve`.
-
-        Parameters
-        ----------
-        qp : QP
-            The problem.
-        start : (K, n) array, optional
-            Handed to the backend.
-
-        Returns
-        -------
-        Solution
-            The backend's; FAILED where its process died, with the name of the signal, or took
-            too long.
-
-        Raises
-        ------
-        InvalidInputError
-            If ``qp`` is no `QP`.
-        """
-        expect_qp(qp)
+    def _solve(self, qp: QP, start: Array | None) -> Solution:
         began, limit = time.monotonic(), self.time_limit
         child = self._living()
         # Where a process is starting, the solve has half of the time at least.
@@ -115,13 +92,13 @@ class IsolatedSolver(Solver):
                 self._replace()
             return Solution(None, SolveStatus.FAILED, message=fault)
         if limit is not None:
-            limit *= 1.0 + (_GRACE if self._entry.time_limit else 0.0)
+            limit *= 1.0 + (_GRACE if self._backend.time_limit else 0.0)
             limit -= time.monotonic() - began
         try:
             answer = child.ask(("solve", qp, start, self.time_limit), limit)
         except _DeadError as error:
             self._replace()
-            return Solution(None, SolveStatus.FAILED, message=f"{self._entry.name}: {error}")
+            return Solution(None, SolveStatus.FAILED, message=f"{self._backend.name}: {error}")
         except BaseException:  # an interrupted dialogue cannot go on
             child.end()
             self._child = None
@@ -133,11 +110,11 @@ class IsolatedSolver(Solver):
 
     def forget(self) -> None:
         """Forwarded; see `Solver.forget`."""
-        self._tell("forget")
+        self._send("forget")
 
     def shift(self) -> None:
         """Forwarded; see `Solver.shift`."""
-        self._tell("shift")
+        self._send("shift")
 
     def prepare(self, size: int) -> None:
         """Forwarded, and waited for; see `Solver.prepare`.
@@ -155,7 +132,7 @@ class IsolatedSolver(Solver):
             except _DeadError:
                 self._replace()
 
-    def _tell(self, what: str) -> None:
+    def _send(self, what: str) -> None:
         child = self._child
         # A process that is starting has nothing to forget or to shift.
         if child is not None and child.mine and child.ready:
@@ -293,25 +270,25 @@ def _end(process: subprocess.Popen[bytes], owner: int) -> None:
             cast("IO[bytes]", pipe).close()
 
 
-def _packed(entry: Backend) -> bytes:
-    """The entry as bytes, by value where it belongs to the main script."""
+def _packed(backend: Backend) -> bytes:
+    """The backend as bytes, by value where it belongs to the main script."""
     try:
         for name in ("cloudpickle", "joblib.externals.cloudpickle"):
             try:
                 pickler: Any = importlib.import_module(name)
             except ImportError:
                 continue
-            return cast("bytes", pickler.dumps(entry))
-        sent = pickle.dumps(entry)
+            return cast("bytes", pickler.dumps(backend))
+        sent = pickle.dumps(backend)
     except Exception as error:
         raise BackendError(
-            f"backend {entry.name!r} cannot be isolated: its factory cannot be sent to another "
+            f"backend {backend.name!r} cannot be isolated: its factory cannot be sent to another "
             f"process ({type(error).__name__}: {error}); let it be a class or a function of a "
             "module that can be imported."
         ) from error
     if b"__main__" in sent:
         raise BackendError(
-            f"backend {entry.name!r} cannot be isolated: its factory is in the main script, "
+            f"backend {backend.name!r} cannot be isolated: its factory is in the main script, "
             "which another process cannot import; move it into a module, or install cloudpickle."
         )
     return sent

@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 from numbers import Integral
 
-from .errors import OptionError, tell_unknown_options
+from .errors import OptionError, report_unknown_options
 
 __all__ = ["SolverOptions"]
 
 
-@tell_unknown_options
+@report_unknown_options
 @dataclass(frozen=True)
 class SolverOptions:
     """Limits and accuracy of one QP solve.

@@ -132,23 +132,6 @@ class QP:
         self.row_upper: Array = np.full((stages, rows), np.inf)
         self.bounded = True
 
-    @classmethod
-    def of_numbers(cls, stages: int, n: int, rows: int, numbers: Array) -> QP:
-        """A QP whose arrays are views of one array, as `FlatQP` lays it out."""
-        qp = object.__new__(cls)
-        qp.stages, qp.n, qp.rows, qp.size, qp.bounded = stages, n, rows, stages * n, True
-        at = 0
-        for name, shape in (
-            ("band", (stages, n, 2 * n)), ("gradient", (stages, n)), ("row_own", (stages, rows, n)),
-            ("row_next", (stages, rows, n)), (None, (1,)), ("lower", (stages, n)),
-            ("row_lower", (stages, rows)), ("upper", (stages, n)), ("row_upper", (stages, rows)),
-        ):
-            end = at + math.prod(shape)
-            if name is not None:
-                setattr(qp, name, numbers[at:end].reshape(shape))
-            at = end
-        return qp
-
     def copy(self) -> QP:
         """The same problem in arrays of its own."""
         twin = object.__new__(QP)

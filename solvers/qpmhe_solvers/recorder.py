@@ -14,15 +14,16 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from .entry import make_solver
+from .backend import make_solver
+from .contained import ContainedSolver
 from .errors import InvalidInputError, OptionError
 from .files import dump
 from .options import SolverOptions
 from .qp import QP
 from .registry import backend as registered_backend
 from .registry import backends, register, unregister
-from .solution import RawSolution, Solution, SolveStatus
-from .solver import Solver, expect_qp
+from .solution import Solution, SolveStatus
+from .solver import Solver
 
 __all__ = ["Recording", "RecordingWarning"]
 
@@ -46,7 +47,7 @@ class Recording:
 
     Every QP goes to the solver as it is, and what comes back is handed on as it is: results
     are those of the backend itself. No failure to record reaches the caller; it ends the
-    recording, and a warning tells it when the block ends. Files are written at once, so that
+    recording, and a warning reports it when the block ends. Files are written at once, so that
     those before a crash are safe; only where the solver has a time limit, they wait for the
     end of the block, so that no step runs late on their account.
 
@@ -91,7 +92,7 @@ class Recording:
         only: Which = "suspicious",
         limit: int = 100,
     ) -> None:
-        self._entry = registered_backend(backend)
+        self._backend = registered_backend(backend)
         if only not in get_args(Which):
             known = ", ".join(repr(choice) for choice in get_args(Which))
             raise OptionError(f"only is {only!r}; expected one of {known}.")
@@ -118,7 +119,7 @@ class Recording:
         """
         if not self._name:
             raise InvalidInputError(
-                "the recording is not under way; use its backend within "
+                "the recording has not begun; use its backend within "
                 "`with Recording(...) as recording:`."
             )
         return self._name
@@ -126,12 +127,12 @@ class Recording:
     def __enter__(self) -> Recording:
         with self._lock:
             if self._name:
-                raise InvalidInputError("the recording is under way already; make another one.")
-            taken, name, count = {entry.name for entry in backends()}, "", 1
+                raise InvalidInputError("the recording has begun already; make another one.")
+            taken, name, count = {one.name for one in backends()}, "", 1
             while not name or name in taken:
-                name = f"recorded:{self._entry.name}" + (f":{count}" if count > 1 else "")
+                name = f"recorded:{self._backend.name}" + (f":{count}" if count > 1 else "")
                 count += 1
-            register(replace(self._entry, name=name, factory=self._make))
+            register(replace(self._backend, name=name, factory=self._make))
             self._name = name
         return self
 
@@ -161,7 +162,7 @@ class Recording:
         )
 
     def _make(self, options: SolverOptions) -> Solver:
-        return _Recorder(make_solver(self._entry, options), options, self)
+        return _Recorder(make_solver(self._backend, options), self)
 
     def _take(
         self, qp: QP, start: Array | None, solution: Solution, options: SolverOptions
@@ -194,7 +195,7 @@ class Recording:
         if status is SolveStatus.STOPPED:
             return options.max_iterations is None and options.time_limit is None
         if status is SolveStatus.UNCONSTRAINED:
-            return self._entry.inequalities
+            return self._backend.inequalities
         return status is SolveStatus.INACCURATE
 
     def _write(self, one: _Held) -> None:
@@ -203,7 +204,7 @@ class Recording:
         path = self._folder / f"qp-{one.number:06d}-{one.solution.status.name.lower()}.npz"
         try:
             dump(
-                one.qp, path, solution=one.solution, backend=self._entry.name,
+                one.qp, path, solution=one.solution, backend=self._backend.name,
                 options=one.options, start=one.start,
             )
             self.files.append(path)
@@ -222,48 +223,37 @@ class _Held(NamedTuple):
 
     def copied(self) -> _Held:
         """The same in arrays of its own: those of problem and iterate are used again."""
-        told = self.solution
-        d, start = (None if x is None else np.array(x) for x in (told.d, self.start))
+        found = self.solution
+        d, start = (None if x is None else np.array(x) for x in (found.d, self.start))
         solution = Solution(
-            d, told.status, told.iterations, told.residuals, told.bound_duals, told.row_duals,
-            told.message,
+            d, found.status, found.iterations, found.residuals, found.bound_duals,
+            found.row_duals, found.message,
         )
         return self._replace(qp=self.qp.copy(), start=start, solution=solution)
 
 
 class _Recorder(Solver):
-    """Hands everything on to another solver, and shows its QPs to a recording."""
+    """Hands QPs on to another solver, and shows them to a recording."""
 
-    def __init__(self, solver: Solver, options: SolverOptions, recording: Recording) -> None:
-        super().__init__(options)
-        self._solver, self._recording = solver, recording
-        self._own = solver._own  # as far to be trusted as what it hands on
+    _judges = True
 
-    def _solve(self, qp: QP, start: Array | None) -> RawSolution:
-        return self._solver._solve(qp, start)
+    def __init__(self, solver: Solver, recording: Recording) -> None:
+        super().__init__(solver.options)
+        self._inner, self._recording = ContainedSolver(solver), recording
 
-    def prepare(self, size: int) -> None:
-        self._solver.prepare(size)
-
-    def forget(self) -> None:
-        self._solver.forget()
-
-    def shift(self) -> None:
-        self._solver.shift()
-
-    def solve(self, qp: QP, start: Array | None = None) -> Solution:
-        expect_qp(qp)
-        self._solver.time_limit = self.time_limit
-        try:
-            solution = self._solver.solve(qp, start)
-        except Exception as error:  # a user's solver that overrides the contained `solve`
-            failed = Solution(
-                None, SolveStatus.FAILED, message=f"{type(error).__name__}: {error}"
-            )
-            self._recording._take(qp, start, failed, self.options)
-            raise
+    def _solve(self, qp: QP, start: Array | None) -> Solution:
+        solution = self._inner.solve(qp, start, self.time_limit)
         self._recording._take(qp, start, solution, self.options)
         return solution
+
+    def prepare(self, size: int) -> None:
+        self._inner.prepare(size)
+
+    def forget(self) -> None:
+        self._inner.forget()
+
+    def shift(self) -> None:
+        self._inner.shift()
 
 
 def _writable(folder: Path) -> Path:

@@ -1,11 +1,12 @@
-"""The backends that there are, and the door through which users add theirs."""
+"""The registered backends, and how users add theirs."""
 
 from __future__ import annotations
 
 import warnings
 from importlib import metadata
 
-from .entry import Backend, make_solver
+from .backend import Backend, make_solver
+from .builtin import builtin_backends
 from .errors import BackendError, OptionError
 from .options import SolverOptions
 from .solver import Solver
@@ -17,7 +18,7 @@ _GROUP = "qpmhe.backends"
 _looked = False
 
 
-def register(entry: Backend) -> None:
+def register(backend: Backend) -> None:
     """Add a backend, so that its name can be used wherever a backend is named.
 
     An installed package adds its own without being imported by anyone: by an entry point of
@@ -26,25 +27,25 @@ def register(entry: Backend) -> None:
 
     Parameters
     ----------
-    entry : Backend
+    backend : Backend
         Its name must be new.
 
     Raises
     ------
     BackendError
-        If the name is taken, or ``entry`` is no `Backend`.
+        If the name is taken, or ``backend`` is no `Backend`.
     """
-    if not isinstance(entry, Backend):
+    if not isinstance(backend, Backend):
         raise BackendError(
-            f"cannot register {entry!r}; expected a qpmhe.solvers.Backend, such as "
+            f"cannot register {backend!r}; expected a qpmhe.solvers.Backend, such as "
             "Backend('my_solver', MySolver, 'my method') for a class MySolver(Solver)."
         )
-    if entry.name in _REGISTRY:
+    if backend.name in _REGISTRY:
         raise BackendError(
-            f"backend {entry.name!r} is registered already; choose another name or "
+            f"backend {backend.name!r} is registered already; choose another name or "
             "unregister it first."
         )
-    _REGISTRY[entry.name] = entry
+    _REGISTRY[backend.name] = backend
 
 
 def unregister(name: str) -> None:
@@ -73,7 +74,7 @@ def backends() -> tuple[Backend, ...]:
 def available() -> tuple[str, ...]:
     """Names of the backends that can be used here."""
     _look_for_plugins()
-    return tuple(name for name, entry in _REGISTRY.items() if entry.available)
+    return tuple(name for name, known in _REGISTRY.items() if known.available)
 
 
 def backend(name: str) -> Backend:
@@ -90,12 +91,12 @@ def backend(name: str) -> Backend:
         If there is none of that name; the text lists the names there are.
     """
     _look_for_plugins()
-    entry = _REGISTRY.get(name) if isinstance(name, str) else None
-    if entry is None:
+    found = _REGISTRY.get(name) if isinstance(name, str) else None
+    if found is None:
         raise BackendError(
             f"backend {name!r} is not known; expected one of {', '.join(_REGISTRY)}."
         )
-    return entry
+    return found
 
 
 def create(
@@ -123,14 +124,14 @@ def create(
     """
     if not isinstance(isolated, bool):
         raise OptionError(f"isolated is {isolated!r}; expected True or False.")
-    entry = backend(name)
+    found = backend(name)
     if options is not None and not isinstance(options, SolverOptions):
         raise OptionError(
             f"options is {options!r}; expected qpmhe.solvers.SolverOptions, such as "
             "SolverOptions(max_iterations=5), or None."
         )
-    if not entry.available:
-        package = entry.distribution or entry.module
+    if not found.available:
+        package = found.distribution or found.module
         raise BackendError(
             f"backend {name!r} needs the package {package}, which is not installed; "
             f"pip install {package}, or use one of {', '.join(available())}."
@@ -139,8 +140,8 @@ def create(
     if isolated:
         from .isolated import IsolatedSolver  # late: rarely used
 
-        return IsolatedSolver(entry, options)
-    return make_solver(entry, options)
+        return IsolatedSolver(found, options)
+    return make_solver(found, options)
 
 
 def _look_for_plugins() -> None:
@@ -153,21 +154,15 @@ def _look_for_plugins() -> None:
         try:
             given = point.load()
             given = given if isinstance(given, Backend) else given()
-            for entry in (given,) if isinstance(given, Backend) else tuple(given):
-                register(entry)
+            for one in (given,) if isinstance(given, Backend) else tuple(given):
+                register(one)
         except (Exception, SystemExit) as error:  # a broken package must not break ours
             warnings.warn(
                 f"the entry point {point.name!r} ({point.value}) of the group {_GROUP!r} brings "
-                f"no backend: {type(error).__name__}: {error}. Mend or uninstall its package.",
+                f"no backend: {type(error).__name__}: {error}. Correct or uninstall its package.",
                 stacklevel=3,
             )
 
 
-def _register_own() -> None:
-    from .own import own_backends
-
-    for entry in own_backends():
-        register(entry)
-
-
-_register_own()
+for _one in builtin_backends():
+    register(_one)

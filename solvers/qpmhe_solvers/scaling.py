@@ -1,4 +1,4 @@
-"""QPs in numbers without units: what every solver is handed, and the way back."""
+"""Scaling of QPs to numbers without units, and back."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from .flat import FlatQP
-from .qp import QP
+from .gathered import GatheredQP
 
 __all__ = ["Scale", "Scaling"]
 
@@ -38,7 +37,7 @@ class Scale:
     with a diagonal S, the same at all stages, that brings the diagonal of H' to about 1 or less,
     for each component, or to more where a stage would be lost beside the others; a diagonal R
     that does so for the largest entry of each row; and one number t, for the unit of the cost,
-    that does so for the gradient or the step, as `FlatQP.peaks` puts them together.
+    that does so for the gradient or the step, as `GatheredQP.peaks` puts them together.
 
     Parameters
     ----------
@@ -46,17 +45,15 @@ class Scale:
         Of the factors in S, R and t.
     places : (2, ...) array of int
         See `_places`.
-    flat : FlatQP
-        Any of the size.
+    sizes : tuple of int
+        stages, n and rows of its QPs.
     key : int
         What no other scale is called.
 
     Attributes
     ----------
-    key : int
+    sizes, key
         As given.
-    sizes : tuple of int
-        Of its QPs.
     step : (K, n) array
         t S: the unit of d.
     units : (K n + K rows,) array
@@ -71,22 +68,25 @@ class Scale:
         "_factor", "_unknown", "cost", "duals", "key", "sizes", "step", "units",
     )
 
-    def __init__(self, exponents: Index, places: Index, flat: FlatQP, key: int) -> None:
-        stages, n, rows = self.sizes = flat.sizes
+    def __init__(
+        self, exponents: Index, places: Index, sizes: tuple[int, int, int], key: int
+    ) -> None:
+        stages, n, rows = self.sizes = sizes
         self.key = key
         self._unknown: list[int] = []
         signed = np.concatenate((exponents, -exponents, _NOTHING))
         factors = np.ldexp(1.0, signed[places[0]] + signed[places[1]])
-        self._factor: Array = factors[: flat.numbers.size]
-        units = factors[flat.numbers.size :].reshape(2, stages * (n + rows))
+        count = stages * (n + rows)
+        self._factor: Array = factors[: -2 * count]
+        units = factors[-2 * count :].reshape(2, count)
         self.units: Array = units[0]
         self.duals: Array = units[1]
         self.step: Array = self.units[: stages * n].reshape(stages, n)
         self.cost = math.ldexp(1.0, 2 * int(exponents[-1]))
 
-    def apply(self, flat: FlatQP, scaled: FlatQP) -> None:
+    def apply(self, qp: GatheredQP, scaled: GatheredQP) -> None:
         """Write the scaled numbers of a QP."""
-        np.multiply(flat.numbers, self._factor, out=scaled.numbers)
+        np.multiply(qp.numbers, self._factor, out=scaled.numbers)
         scaled.key = self.key
 
     def leave_out(self, peaks: list[float]) -> None:
@@ -109,7 +109,7 @@ class Scale:
 def _places(sizes: tuple[int, int, int]) -> Index:
     """Which two of the exponents of S, R, t, 1/S, 1/R, 1/t and 1 make up each factor.
 
-    First those of the numbers in a `FlatQP`, then the units of constraints and multipliers.
+    First the numbers of a `GatheredQP`, then the units of constraints and multipliers.
     """
     stages, n, rows = sizes
     s, r, t = np.arange(n), n + np.arange(rows), np.array(n + rows)
@@ -141,15 +141,15 @@ class Scaling:
 
     Attributes
     ----------
-    flat : FlatQP
-        Numbers of the last scaled QP.
+    qp : GatheredQP
+        The last scaled QP.
     """
 
     def __init__(self, held: bool) -> None:
         self._held = held
         self._scales: list[Scale] = []  # the last used is the last one
         self._keys = count(1)
-        self.flat = FlatQP(1, 1, 0)
+        self.qp = GatheredQP(1, 1, 0)
 
     def __reduce__(self) -> tuple[type[Scaling], tuple[bool]]:
         return Scaling, (self._held,)
@@ -158,43 +158,35 @@ class Scaling:
         """Drop the scales: the next one is that of the next QP alone."""
         self._scales.clear()
 
-    def scale(self, flat: FlatQP, qp: QP) -> Scale:
-        """Scale a QP; its scaled numbers are in ``flat``, and it in ``flat.qp``.
-
-        Parameters
-        ----------
-        flat : FlatQP
-            Its numbers, all finite but for limits.
-        qp : QP
-            The QP itself.
-        """
-        scaled, scales = self.flat, self._scales
-        if scaled.sizes != flat.sizes:
-            scaled = self.flat = FlatQP(*flat.sizes)
-        scaled.qp.bounded = qp.bounded
+    def scale(self, qp: GatheredQP) -> Scale:
+        """Scale a QP, whose numbers are finite but for limits, into `Scaling.qp`."""
+        scaled, scales = self.qp, self._scales
+        if scaled.sizes != qp.sizes:
+            scaled = self.qp = GatheredQP(*qp.sizes)
+        scaled.bounded = qp.bounded
         if not self._held:
             scales.clear()
         for at in range(len(scales) - 1, -1, -1):
             scale = scales[at]
-            if scale.sizes == flat.sizes:
-                scale.apply(flat, scaled)
+            if scale.sizes == qp.sizes:
+                scale.apply(qp, scaled)
                 if scale.fits(scaled.peaks()):
                     if at < len(scales) - 1:
                         scales.append(scales.pop(at))
                     return scale
-        scale = self._ideal(flat, scaled)
-        scale.apply(flat, scaled)
+        scale = self._ideal(qp, scaled)
+        scale.apply(qp, scaled)
         if len(scales) == _KEPT:
             del scales[0]
         scales.append(scale)
         return scale
 
-    def _ideal(self, flat: FlatQP, scaled: FlatQP) -> Scale:
+    def _ideal(self, qp: GatheredQP, scaled: GatheredQP) -> Scale:
         """The best scale for one QP."""
-        _, n, rows = flat.sizes
-        places, key = _places(flat.sizes), next(self._keys)
+        _, n, rows = qp.sizes
+        places, key = _places(qp.sizes), next(self._keys)
         exponents = np.zeros(n + rows + 1, np.int64)
-        peaks = flat.peaks()
+        peaks = qp.peaks()
         # The peaks of rows depend on S, and that of the step on both.
         for part in (slice(n), slice(n, n + rows), slice(n + rows, None)):
             found = np.frexp(peaks[part])[1]
@@ -203,9 +195,9 @@ class Scaling:
             else:
                 exponents[part] = found if part.stop is None else -found
             np.clip(exponents, -_MOST, _MOST, out=exponents)
-            scale = Scale(exponents, places, flat, key)
+            scale = Scale(exponents, places, qp.sizes, key)
             if part.stop is not None:
-                scale.apply(flat, scaled)
+                scale.apply(qp, scaled)
                 peaks = scaled.peaks()
         scale.leave_out(peaks)
         return scale

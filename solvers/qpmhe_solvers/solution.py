@@ -24,7 +24,7 @@ _largest = np.maximum.reduce  # the method of an array comes to this, by detours
 
 
 class SolveStatus(enum.Enum):
-    """How a QP solve ended. The value tells what to do about it."""
+    """How a QP solve ended. The value says what to do about it."""
 
     SOLVED = "solved: the recomputed residuals confirm it"
     STOPPED = (
@@ -57,7 +57,7 @@ class RawSolution:
     claimed : bool
         Whether the solver says that it solved the QP.
     iterations : int or None
-        The solver's own count, None where it does not tell.
+        The solver's own count, None where it gives none.
     bound_duals, row_duals : array or None
         Multipliers of the bounds (K n) and rows (K rows), positive on the upper side; None
         where the solver gives none.

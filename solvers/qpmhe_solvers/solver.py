@@ -1,4 +1,4 @@
-"""The contract of a QP solver, and the wall that nothing it does can get through."""
+"""The contract of a QP solver, and the wall that contains whatever it does."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InvalidInputError
-from .flat import FlatQP
+from .gathered import GatheredQP
 from .options import SolverOptions
 from .qp import ARRAYS, QP
+from .sample_qps import sample
 from .scaling import Scale, Scaling
 from .solution import Errors, RawSolution, Solution, SolveStatus
 
@@ -46,21 +47,28 @@ class Solver(ABC):
     """
 
     time_limit: float | None = None
-    _flat: FlatQP | None = None  # kept while the sizes of the QPs stay
+    _gathered: GatheredQP | None = None  # kept while the sizes of the QPs stay
     _scaling: Scaling | None = None
     # Whether Python code may warn during a solve: to keep that inside takes as long as a small QP.
     _warns: ClassVar[bool] = True
     # Whether it is one of this package's, which are tested to read only: all others are lent a
     # copy, since who scales the caller's QP in place would be judged by what is left of it.
-    _own: bool = False
+    _builtin: bool = False
     # Whether it may keep anything of a QP beyond its solve.
     _keeps: ClassVar[bool] = True
+    # Whether `_solve` takes QPs in the caller's units and returns a judged Solution: for solvers
+    # of this package that hand QPs on, or solve them exactly.
+    _judges: ClassVar[bool] = False
     # What the last solve wrote into of what it was lent.
     _wrote: tuple[str, ...] = ()
+    # The `ContainedSolver` that used it last.
+    _user: int = 0
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        cls._own = cls.__module__.startswith(f"{__package__}.")
+        cls._builtin = cls.__module__.startswith(f"{__package__}.")
+        if "_solve" in cls.__dict__:
+            cls._judges = cls._judges and cls._builtin
         if "forget" in cls.__dict__:  # which need not call this class's
             cls.forget = _forgetting(cls.forget)  # type: ignore[assignment,method-assign]
 
@@ -68,16 +76,19 @@ class Solver(ABC):
         self.options = options
         self.time_limit = options.time_limit
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({getattr(self, 'options', '')})"
+
     @abstractmethod
-    def _solve(self, qp: QP, start: Array | None) -> RawSolution:
-        """Solve qp. May raise, hang on to nothing, and lie: `solve` contains all of it.
+    def _solve(self, qp: QP, start: Array | None) -> RawSolution | Solution:
+        """Solve qp. It may raise, and it may lie: `solve` contains all of it.
 
         Parameters
         ----------
         qp : QP
             The problem, scaled by powers of two so that its numbers are of order one, with
-            arrays of its own for this solve. It is to be read: what is written into it is
-            lost, and `check` objects.
+            arrays of its own for this solve. Read it only: what is written into it is lost, and
+            `check` reports it.
         start : (K, n) array or None
             As given to `solve`, scaled likewise, if it is finite and of the right shape.
 
@@ -86,10 +97,6 @@ class Solver(ABC):
         RawSolution
             In the scaled numbers; `solve` takes iterate and multipliers back.
         """
-
-    def _solve_flat(self, qp: QP, flat: FlatQP, start: Array | None) -> RawSolution:
-        """Solve qp, whose numbers are gathered already; for those who want them so."""
-        return self._solve(qp, start)
 
     def shift(self) -> None:  # noqa: B027 - most keep nothing
         """Say that the trajectory moved on by one stage since the last solve.
@@ -118,8 +125,6 @@ class Solver(ABC):
 
     def _rehearse(self) -> None:
         """Solve two small QPs, so that whatever is imported or made at first is there."""
-        from .samples import sample  # late: it is used once
-
         self.solve(sample(3, 2))
         self.solve(sample(3, 2, 2, bounds="part", sides="mixed"))
         self.forget()
@@ -150,6 +155,8 @@ class Solver(ABC):
         """
         expect_qp(qp)
         try:
+            if self._judges:
+                return cast("Solution", self._solve(qp, start))
             if not self._warns:
                 with np.errstate(all="ignore"):
                     return self._checked(qp, start)
@@ -163,28 +170,35 @@ class Solver(ABC):
 
     def _checked(self, qp: QP, start: Array | None) -> Solution:
         """Look at the data, solve, and judge."""
-        flat = self._flat
-        if flat is None or flat.sizes != (qp.stages, qp.n, qp.rows):
-            flat = self._flat = FlatQP(qp.stages, qp.n, qp.rows)
-        flat.gather(qp)
-        fault = flat.fault()
+        gathered = self._gather(qp)
+        fault = gathered.fault()
         if fault:
             return Solution(None, SolveStatus.FAILED, message=fault)
+        scale, scaled = self._scale(gathered)
+        usable = self._usable(start, qp, scale)
+        if self._builtin:
+            return self._judged(scaled, scale, self._solve(scaled, usable))
+        solution = self._judged(scaled, scale, self._solve_lent(scaled, usable))
+        if self._wrote and solution.status is not SolveStatus.SOLVED:
+            note = f"it wrote into {', '.join(self._wrote)} of the QP, which is to be read only"
+            solution.message = f"{solution.message}; {note}" if solution.message else note
+        return solution
+
+    def _gather(self, qp: QP) -> GatheredQP:
+        gathered = self._gathered
+        if gathered is None or gathered.sizes != (qp.stages, qp.n, qp.rows):
+            gathered = self._gathered = GatheredQP(qp.stages, qp.n, qp.rows)
+        gathered.gather(qp)
+        return gathered
+
+    def _scale(self, gathered: GatheredQP) -> tuple[Scale, GatheredQP]:
+        """The scale of a QP, and the scaled QP, which holds until the next one."""
         scaling = self._scaling
         if scaling is None:
             scaling = self._scaling = Scaling(self._keeps)
-        scale = scaling.scale(flat, qp)
-        scaled, flat = scaling.flat.qp, scaling.flat
-        usable = self._usable(start, qp, scale)
-        if self._own:
-            return self._judged(scaled, flat, scale, self._solve_flat(scaled, flat, usable))
-        solution = self._judged(scaled, flat, scale, self._solve_lent(scaled, usable))
-        if self._wrote and solution.status is not SolveStatus.SOLVED:
-            told = f"it wrote into {', '.join(self._wrote)} of the QP, which is to be read only"
-            solution.message = f"{solution.message}; {told}" if solution.message else told
-        return solution
+        return scaling.scale(gathered), scaling.qp
 
-    def _solve_lent(self, qp: QP, start: Array | None) -> RawSolution:
+    def _solve_lent(self, qp: QP, start: Array | None) -> object:
         """Solve with copies, and see what was written into them."""
         self._wrote = ()
         lent = qp.copy()
@@ -202,8 +216,13 @@ class Solver(ABC):
         scaled: Array = start / scale.step
         return scaled if np.isfinite(scaled).all() else None
 
-    def _judged(self, qp: QP, flat: FlatQP, scale: Scale, raw: object) -> Solution:
+    def _judged(self, qp: GatheredQP, scale: Scale, raw: object) -> Solution:
         """Judge the answer to a scaled QP, and give it in the user's units."""
+        if isinstance(raw, Solution):  # of a class that is derived from one of this package
+            raw = RawSolution(
+                raw.d, raw.status is SolveStatus.SOLVED, raw.iterations, raw.bound_duals,
+                raw.row_duals, raw.message,
+            )
         if not isinstance(raw, RawSolution):
             message = f"the backend returned {type(raw).__name__}, not a RawSolution"
             return Solution(None, SolveStatus.FAILED, message=message)
@@ -211,7 +230,7 @@ class Solver(ABC):
         d, message = as_iterate(raw.d, raw.message, qp)
         if d is None:
             return Solution(None, SolveStatus.FAILED, count, message=message)
-        lower, upper, duals = flat.lower, flat.upper, None
+        lower, upper, duals = qp.all_lower, qp.all_upper, None
         if qp.bounded or qp.rows:
             bound_duals = as_multipliers(raw.bound_duals, qp.size)
             row_duals = as_multipliers(raw.row_duals, qp.stages * qp.rows)
@@ -301,15 +320,15 @@ def failure(error: BaseException) -> Solution:
     return Solution(None, SolveStatus.FAILED, message=message)
 
 
-def as_iterate(given: object, told: object, qp: QP) -> tuple[Array | None, str]:
+def as_iterate(given: object, words: object, qp: QP) -> tuple[Array | None, str]:
     """An iterate (K, n) as a copy, and the message that goes with it; None if it is none.
 
     Parameters
     ----------
     given : object
         What the solver brought.
-    told : object
-        The solver's own words.
+    words : object
+        The solver's own.
     qp : QP
         What was to be solved.
 
@@ -318,7 +337,7 @@ def as_iterate(given: object, told: object, qp: QP) -> tuple[Array | None, str]:
     TypeError, ValueError
         If ``given`` cannot be read as numbers.
     """
-    message = told if isinstance(told, str) else f"its message is a {type(told).__name__}"
+    message = words if isinstance(words, str) else f"its message is a {type(words).__name__}"
     if given is None:
         return None, message or "the solver returned no iterate"
     array = np.asarray(given)

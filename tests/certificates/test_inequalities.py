@@ -104,7 +104,7 @@ def test_eigenvalue_and_norm_bounds_are_outward_and_tight():
         eigenvalue_bounds(np.diag([1.0, -1.0]))
 
 
-def test_forms_are_what_they_say():
+def test_matrices_are_what_they_say():
     """Definite exactly where the inequality on (dx, dh) holds: P = 1, scalar numbers."""
     a, c, eta, r = 1.2, 0.5, 0.8, 4.0
     J = Matrices.exact(np.array([[[a], [c]]]))

@@ -42,7 +42,7 @@ def make(here):
         " horizon=4, steps=9, labels=('a',))",
     ],
 )
-def test_forms(make, given):
+def test_matrices(make, given):
     found = load_model(make(given))
     assert (found.estimator.horizon, found.estimator.initial_state.tolist()) == (4, [2.0])
     has_names = "'a'" in given

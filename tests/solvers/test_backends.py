@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -6,7 +8,6 @@ from hypothesis import strategies as st
 import qpmhe_solvers.auto
 import qpmhe_solvers.dispatch
 import qpmhe_solvers.native.workspace
-import qpmhe_solvers.registry
 from qpmhe_solvers import SolverOptions, SolveStatus, backend, create
 
 from .problems import (
@@ -241,7 +242,7 @@ def no_solver_call(monkeypatch):
         pytest.fail("data that are not finite reached a solver")  # not an Exception: no wall
 
     monkeypatch.setattr(qpmhe_solvers.dispatch.DispatchSolver, "_solve", called)
-    monkeypatch.setattr(qpmhe_solvers.native.workspace.NativeSolver, "_solve_flat", called)
+    monkeypatch.setattr(qpmhe_solvers.native.workspace.NativeSolver, "_solve", called)
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -328,10 +329,10 @@ def test_auto_is_banded_where_no_inequality_binds(no_solver_call):
 @pytest.mark.parametrize(("stages", "n"), [(6, 2), (30, 2), (31, 2)])
 def test_auto_chooses_by_size_and_cap(stages, n, cap, monkeypatch):
     chosen = []
-    make_solver = qpmhe_solvers.registry.create
+    make_solver = qpmhe_solvers.auto.make_solver
     monkeypatch.setattr(
-        qpmhe_solvers.registry, "create",
-        lambda name, options: chosen.append(name) or make_solver(name, options),
+        qpmhe_solvers.auto, "make_solver",
+        lambda backend, options: chosen.append(backend.name) or make_solver(backend, options),
     )
     qp, dense = make(stages, n, bounds="all")
     options = SolverOptions(max_iterations=cap, absolute_tolerance=1e-9)
@@ -349,7 +350,9 @@ def test_auto_chooses_by_size_and_cap(stages, n, cap, monkeypatch):
 
 
 def test_auto_without_any_solver_is_banded(monkeypatch):
-    monkeypatch.setattr(qpmhe_solvers.registry, "available", lambda: ("auto", "banded"))
+    for name, native in qpmhe_solvers.native.NATIVE.items():
+        missing = dataclasses.replace(native, module="not_installed_here")
+        monkeypatch.setitem(qpmhe_solvers.native.NATIVE, name, missing)
     qp, _ = make(6, 2, bounds="all")
     solution = create("auto").solve(qp)
     assert solution.status is SolveStatus.UNCONSTRAINED

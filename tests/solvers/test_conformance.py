@@ -16,9 +16,9 @@ from qpmhe_solvers import (
     create,
     measure,
 )
-from qpmhe_solvers.samples import contradiction, sample
+from qpmhe_solvers.sample_qps import contradiction, sample
 
-from .own_backend import Quadprog, entry
+from .example_backend import Quadprog, entry
 from .problems import EVERY, registered
 
 # ecos solves the QP as a second-order cone program; its multipliers satisfy the QP's own
@@ -165,7 +165,7 @@ def test_faults_are_found(fault, part, words):
 @pytest.mark.parametrize(
     "flag",
     ["iteration_cap", "iterate_at_cap", "warm_start", "time_limit", "keeps_duals",
-     "tells_infeasible"],
+     "reports_infeasibility"],
 )
 def test_false_words_are_found(flag):
     pytest.importorskip("quadprog")

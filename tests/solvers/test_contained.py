@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-import qpmhe_solvers.registry
+import qpmhe_solvers.native
 from qpmhe_solvers import (
     Backend,
     RawSolution,
@@ -219,7 +219,7 @@ def test_the_time_limit_is_set_and_may_be_refused():
 def test_auto_contains_solvers_that_override_solve(monkeypatch, behaviour):
     for name in ("clarabel", "daqp", "osqp", "piqp", "proxqp"):
         entry = Backend(name, lambda options: Hostile(behaviour), "-", iterate_at_cap=True)
-        monkeypatch.setitem(qpmhe_solvers.registry._REGISTRY, name, entry)
+        monkeypatch.setitem(qpmhe_solvers.native.NATIVE, name, entry)
     solver = create("auto")
     solver.prepare(12)
     solver.shift()
@@ -239,7 +239,7 @@ def test_auto_passes_on_how_far_the_trajectory_moved(monkeypatch):
 
     for name in ("clarabel", "daqp", "osqp", "piqp", "proxqp"):
         entry = Backend(name, lambda options: Counting(lambda qp: None), "-", iterate_at_cap=True)
-        monkeypatch.setitem(qpmhe_solvers.registry._REGISTRY, name, entry)
+        monkeypatch.setitem(qpmhe_solvers.native.NATIVE, name, entry)
     solver, qp = create("auto"), make(6, 2, bounds="all")[0]
     solver.solve(qp)
     for shifts, told in ((0, 0), (2, 2), (0, 0), (100, 6)):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import qpmhe_solvers.registry
+import qpmhe_solvers.native
 from qpmhe_solvers import (
     Backend,
     InvalidInputError,
@@ -452,7 +452,7 @@ def test_auto_contains_a_broken_package(monkeypatch, when):
 
     for name in ("clarabel", "daqp", "osqp", "piqp", "proxqp"):
         broken = Backend(name, factory, "broken", iterate_at_cap=True)
-        monkeypatch.setitem(qpmhe_solvers.registry._REGISTRY, name, broken)
+        monkeypatch.setitem(qpmhe_solvers.native.NATIVE, name, broken)
     solution = create("auto").solve(make(6, 2, bounds="all")[0])
     # Either word is true: nothing solved it, and the unconstrained minimiser is at hand.
     assert solution.status in (FAILED, SolveStatus.UNCONSTRAINED)

@@ -11,7 +11,7 @@ from qpmhe_solvers import SolverOptions, backends, create
 from qpmhe_solvers.dispatch import TRANSLATIONS, DispatchSolver
 
 from .problems import ARRAYS, CASES, make
-from .test_forms import LETTERS, parts
+from .test_matrices import LETTERS, parts
 
 NAMES = [
     entry.name for entry in backends()

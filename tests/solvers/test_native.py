@@ -6,10 +6,10 @@ import pytest
 import scipy.sparse
 
 from qpmhe_solvers import QP, SolverOptions, SolveStatus, backends, create
-from qpmhe_solvers.flat import FlatQP
+from qpmhe_solvers.gathered import GatheredQP
 from qpmhe_solvers.native.layout import Layout, Structure, Style
 from qpmhe_solvers.native.workspace import NativeSolver
-from qpmhe_solvers.samples import contradiction, sample
+from qpmhe_solvers.sample_qps import contradiction, sample
 
 from .problems import CASES, make, of_order_one
 from .test_dispatch import SparseCount, growth, patterns
@@ -30,16 +30,10 @@ STYLES = {
 }
 
 
-def flat_of(qp):
-    flat = FlatQP(qp.stages, qp.n, qp.rows)
-    flat.gather(qp)
-    return flat
-
-
 def laid_out(style, qp):
-    flat = flat_of(qp)
-    layout = Layout(style, Structure.of(flat), *flat.sizes)
-    layout.fill(flat, layout.voids(flat))
+    gathered = GatheredQP.of(qp)
+    layout = Layout(style, Structure.of(gathered), *gathered.sizes)
+    layout.fill(gathered, layout.voids(gathered))
     return layout
 
 
@@ -110,9 +104,9 @@ def test_a_layout_has_room_for_missing_measurements(style):
         other, dense = make(7, 3, 2, bounds="part", sides="two")
         other.row_lower[stage, 1], other.row_upper[stage, 1] = -np.inf, np.inf
         dense.row_lower, dense.row_upper = other.row_lower.ravel(), other.row_upper.ravel()
-        flat = flat_of(other)
-        assert Structure.of(flat).key == Structure.of(flat_of(qp)).key
-        for source in (flat, flat_of(qp), flat):  # nothing is left of the one before
+        gathered = GatheredQP.of(other)
+        assert Structure.of(gathered).key == Structure.of(GatheredQP.of(qp)).key
+        for source in (gathered, GatheredQP.of(qp), gathered):  # nothing is left of the one before
             layout.fill(source, layout.voids(source))
         low, high = limits(layout, dense)
         np.testing.assert_array_equal(low[21:], dense.row_lower)
@@ -487,15 +481,15 @@ def test_void_rows_do_not_make_a_solver_talk(name, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_flat_numbers_are_those_of_the_qp():
+def test_gathered_numbers_are_those_of_the_qp():
     qp, _ = make(**CASES["all kinds"])
-    flat = flat_of(qp)
-    copied = pickle.loads(pickle.dumps(flat))
+    gathered = GatheredQP.of(qp)
+    copied = pickle.loads(pickle.dumps(gathered))
     copied.gather(qp)
-    for one in (flat, copied):
-        np.testing.assert_array_equal(one.lower, np.append(qp.lower, qp.row_lower))
-        np.testing.assert_array_equal(one.upper, np.append(qp.upper, qp.row_upper))
-        np.testing.assert_array_equal(one.limits, np.append(one.lower, one.upper))
+    for one in (gathered, copied):
+        np.testing.assert_array_equal(one.all_lower, np.append(qp.lower, qp.row_lower))
+        np.testing.assert_array_equal(one.all_upper, np.append(qp.upper, qp.row_upper))
+        np.testing.assert_array_equal(one.limits, np.append(one.all_lower, one.all_upper))
         assert one.numbers[one.one_at] == 1.0
         for start, array in (
             (0, qp.band), (one.gradient_at, qp.gradient), (one.own_at, qp.row_own),
@@ -508,13 +502,13 @@ def test_faults_of_huge_numbers_are_not_made_up():
     qp = QP(2, 2, 1)
     qp.gradient[...] = 1e200  # whose squares overflow
     with np.errstate(all="ignore"):
-        assert flat_of(qp).fault() == ""
+        assert GatheredQP.of(qp).fault() == ""
     qp.gradient[...] = 0.0
     qp.gradient[0, 0] = np.inf
-    assert "not finite" in flat_of(qp).fault()
+    assert "not finite" in GatheredQP.of(qp).fault()
     qp.gradient[0, 0], qp.row_upper[0] = 0.0, np.nan
-    assert "not finite" in flat_of(qp).fault()
+    assert "not finite" in GatheredQP.of(qp).fault()
     qp.gradient[...], qp.row_upper[0] = 0.0, -np.inf
-    assert flat_of(qp).fault() == ""
+    assert GatheredQP.of(qp).fault() == ""
     qp.row_lower[0] = 0.0
-    assert "a lower bound is above its upper bound" in flat_of(qp).fault()
+    assert "a lower bound is above its upper bound" in GatheredQP.of(qp).fault()

@@ -134,10 +134,10 @@ class Without(Nothing):
 @pytest.mark.parametrize(
     ("factory", "words"),
     [
-        (dict, "TypeError: .*; mend the factory"),
-        (Abstract, "TypeError: .*abstract.*; mend the factory"),
-        (lambda: None, "TypeError: .*; mend the factory"),
-        (lambda options: sys.exit(3), "SystemExit: 3; mend the factory"),
+        (dict, "TypeError: .*; correct the factory"),
+        (Abstract, "TypeError: .*abstract.*; correct the factory"),
+        (lambda: None, "TypeError: .*; correct the factory"),
+        (lambda options: sys.exit(3), "SystemExit: 3; correct the factory"),
         (lambda options: None, "made None; expected an instance of a subclass"),
         (lambda options: Nothing, "made <class .*; expected an instance of a subclass"),
         (Without, r"has no options; call super\(\).__init__\(options\)"),

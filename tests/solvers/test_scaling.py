@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from qpmhe_solvers import QP, RawSolution, Solver, SolverOptions, SolveStatus, backends, create
-from qpmhe_solvers.flat import FlatQP
+from qpmhe_solvers.gathered import GatheredQP
 from qpmhe_solvers.scaling import Scaling
 
 from .problems import CASES, EVERY, WITH_INEQUALITIES, make, of_order_one
@@ -176,9 +176,7 @@ def test_what_was_scaled_is_scaled_already():
 
 
 def scaled(scaling, qp):
-    flat = FlatQP(qp.stages, qp.n, qp.rows)
-    flat.gather(qp)
-    return scaling.scale(flat, qp)
+    return scaling.scale(GatheredQP.of(qp))
 
 
 def test_a_scale_is_held_while_it_fits():
@@ -202,7 +200,7 @@ def test_a_scale_is_held_while_it_fits():
     assert scaled(scaling, qp) is first
     scaling.forget()
     assert scaled(scaling, qp) is not first
-    assert pickle.loads(pickle.dumps(scaling)).flat.sizes == (1, 1, 0)
+    assert pickle.loads(pickle.dumps(scaling)).qp.sizes == (1, 1, 0)
 
 
 def test_a_unit_that_nothing_but_zeros_told_is_not_held():

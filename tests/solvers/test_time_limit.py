@@ -2,7 +2,7 @@
 
 import pytest
 
-import qpmhe_solvers.registry
+import qpmhe_solvers.native
 from qpmhe_solvers import (
     Backend,
     RawSolution,
@@ -14,7 +14,7 @@ from qpmhe_solvers import (
     create,
 )
 from qpmhe_solvers.dispatch import TRANSLATIONS, DispatchSolver
-from qpmhe_solvers.samples import sample
+from qpmhe_solvers.sample_qps import sample
 
 from .problems import EVERY
 
@@ -83,7 +83,7 @@ def slow_solvers(monkeypatch):
 
     for name in ("clarabel", "daqp", "osqp", "piqp", "proxqp"):
         entry = Backend(name, Slow, "slow", iterate_at_cap=True)
-        monkeypatch.setitem(qpmhe_solvers.registry._REGISTRY, name, entry)
+        monkeypatch.setitem(qpmhe_solvers.native.NATIVE, name, entry)
     return given
 
 

@@ -85,7 +85,7 @@ class DaqpSolver(NativeSolver):
 
     def _from(self, handle: Any, layout: Layout, sense: Index) -> Answer:
         """Solve from an active set."""
-        # Without rows it may not be told of any: it would look at the first one.
+        # Without rows it must be given none: it would look at the first one.
         rows = {"A": layout.matrix} if layout.matrix.size else {}
         if sense.size:
             rows |= {"bupper": layout.all_upper, "blower": layout.all_lower, "sense": sense}
@@ -112,8 +112,8 @@ class DaqpSolver(NativeSolver):
             near = _AT * (1.0 + np.abs(value))
             above, below = value >= layout.all_upper - near, value <= layout.all_lower + near
         elif duals is not None:
-            told = np.concatenate((duals[:bounds], duals[layout.constraints]))
-            above, below = told > 0.0, told < 0.0
+            known = np.concatenate((duals[:bounds], duals[layout.constraints]))
+            above, below = known > 0.0, known < 0.0
         else:
             return sense
         sense |= (above | below) * np.intc(_ACTIVE)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..flat import FlatQP
+from ..gathered import GatheredQP
 from ..patterns import Pattern, chosen_rows, hessian_pattern
 
 if TYPE_CHECKING:
@@ -62,14 +62,14 @@ class Structure(NamedTuple):
     equal: Flags
 
     @staticmethod
-    def of(flat: FlatQP) -> Structure:
+    def of(qp: GatheredQP) -> Structure:
         """The structure that a QP needs."""
-        stages, n, rows = flat.sizes
+        stages, n, rows = qp.sizes
         size = stages * n
-        equal = (flat.lower == flat.upper) & np.isfinite(flat.lower)
+        equal = (qp.all_lower == qp.all_upper) & np.isfinite(qp.all_lower)
         equal[:size] = False
         sides = []
-        for limits in (flat.lower, flat.upper):
+        for limits in (qp.all_lower, qp.all_upper):
             finite = np.isfinite(limits) & ~equal
             for part in (finite[:size].reshape(stages, n), finite[size:].reshape(stages, rows)):
                 if stages > 1:
@@ -129,7 +129,7 @@ class Layout:
     def __init__(
         self, style: Style, structure: Structure, stages: int, n: int, rows: int
     ) -> None:
-        flat = FlatQP(stages, n, rows)  # for the places in it only
+        places = GatheredQP(stages, n, rows)  # its numbers are not read
         self.style, self.structure = style, structure
         self.size, self.count = size, count = stages * n, stages * (n + rows)
         self.equalities, self.constraints, self.signs = _rows(style, structure, size)
@@ -142,13 +142,13 @@ class Layout:
         patterns = [hessian] + [
             chosen_rows(stages, n, rows, chosen) for chosen in (self.constraints, self.equalities)
         ]
-        lower, upper = flat.lower_at + np.arange(count), flat.upper_at + np.arange(count)
+        lower, upper = places.lower_at + np.arange(count), places.upper_at + np.arange(count)
         box = slice(size if self.boxed else 0)
         above = np.where(self.signs > 0, upper[self.constraints], lower[self.constraints])
         below = lower[self.constraints] if style.sides == 2 else lower[:0]
         sources = [
-            hessian.source, *(flat.own_at + pattern.source for pattern in patterns[1:]),
-            flat.gradient_at + np.arange(size), upper[self.equalities],
+            hessian.source, *(places.own_at + pattern.source for pattern in patterns[1:]),
+            places.gradient_at + np.arange(size), upper[self.equalities],
             lower[box], below, upper[box], above,
         ]
         self._source = np.concatenate(sources)
@@ -180,18 +180,18 @@ class Layout:
             return full
         return _csc(pattern, values, height, self.size)
 
-    def voids(self, flat: FlatQP) -> Voids | None:
+    def voids(self, qp: GatheredQP) -> Voids | None:
         """The rows of C without a limit in this QP, as far as the solver cannot have such.
 
         Parameters
         ----------
-        flat : FlatQP
+        qp : GatheredQP
             A QP that the structure has room for.
         """
         if self.style.infinite:
             return None
-        lower = np.isfinite(flat.lower)[self.constraints]
-        upper = np.isfinite(flat.upper)[self.constraints]
+        lower = np.isfinite(qp.all_lower)[self.constraints]
+        upper = np.isfinite(qp.all_upper)[self.constraints]
         void = ~np.where(self.signs > 0, upper, lower) if self._negated is not None else (
             ~(lower | upper)
         )
@@ -201,18 +201,18 @@ class Layout:
         below = rows if self.style.sides == 2 else rows[:0]
         return Voids(np.flatnonzero(void[self._entry_rows]), below, rows)
 
-    def fill(self, flat: FlatQP, voids: Voids | None) -> None:
+    def fill(self, qp: GatheredQP, voids: Voids | None) -> None:
         """Write the numbers of a QP into the arrays.
 
         Parameters
         ----------
-        flat : FlatQP
+        qp : GatheredQP
             A QP that the structure has room for.
         voids : Voids or None
-            What `voids` tells of it.
+            What `voids` returned for it.
         """
         # Any mode but the default one writes into ``out`` without a buffer between.
-        flat.numbers.take(self._source, out=self._values, mode="clip")
+        qp.numbers.take(self._source, out=self._values, mode="clip")
         if self._negated is not None:
             self._c_entries *= self._negated
             self.upper *= self.signs

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .layout import Layout, Style
 from .workspace import Answer, NativeSolver
 
-__all__ = ["PiqpSolver"]
+__all__ = ["PiqpDenseSolver", "PiqpSolver"]
 
 Array = NDArray[np.float64]
 
@@ -67,3 +67,18 @@ class PiqpSolver(NativeSolver):
             status in (kinds.PIQP_SOLVED, kinds.PIQP_MAX_ITER_REACHED),
             int(result.info.iter), status.name,
         )
+
+
+class PiqpDenseSolver(PiqpSolver):
+    """Solve by PIQP with dense matrices.
+
+    Parameters
+    ----------
+    options : SolverOptions
+        Cap and tolerances; there is no time limit.
+    """
+
+    style = Style("dense", infinite=False)
+
+    def _made(self) -> Any:
+        return self._package.DenseSolver()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .layout import Layout, Style
 from .workspace import Answer, NativeSolver
 
-__all__ = ["ProxqpSolver"]
+__all__ = ["ProxqpSolver", "ProxqpSparseSolver"]
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ class ProxqpSolver(NativeSolver):
     Parameters
     ----------
     options : SolverOptions
-        Tolerances, and a cap on the outer iterations, which are those that are told; there is
+        Tolerances, and a cap on the outer iterations, which are the ones reported; there is
         no time limit.
     """
 
@@ -73,4 +73,23 @@ class ProxqpSolver(NativeSolver):
             layout.duals(z[:count], results.y, z[count:] if layout.boxed else None),
             solved, solved or status == "PROXQP_MAX_ITER_REACHED",
             int(results.info.iter_ext), status,
+        )
+
+
+class ProxqpSparseSolver(ProxqpSolver):
+    """Solve by ProxQP with sparse matrices.
+
+    It begins at the minimiser under the equality rows each time, like the dense one.
+
+    Parameters
+    ----------
+    options : SolverOptions
+        Tolerances, and a cap on the outer iterations; there is no time limit.
+    """
+
+    style = Style("csc", bounds="rows")
+
+    def _made(self, layout: Layout) -> Any:
+        return self._package.proxqp.sparse.QP(
+            layout.size, layout.equalities.size, layout.constraints.size
         )

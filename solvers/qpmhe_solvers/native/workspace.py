@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..flat import FlatQP
+from ..gathered import GatheredQP
 from ..options import SolverOptions
 from ..qp import QP
 from ..solution import RawSolution
@@ -127,14 +127,10 @@ class NativeSolver(Solver):
         """Solve, from an increment (K n,) and multipliers (K n + K rows,); None for zero."""
 
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
-        flat = FlatQP(qp.stages, qp.n, qp.rows)
-        flat.gather(qp)
-        return self._solve_flat(qp, flat, start)
-
-    def _solve_flat(self, qp: QP, flat: FlatQP, start: Array | None) -> RawSolution:
-        key, workspace, voids = self._taken(flat)
+        gathered = GatheredQP.of(qp)
+        key, workspace, voids = self._taken(gathered)
         layout = workspace.layout
-        layout.fill(flat, voids)
+        layout.fill(gathered, voids)
         # Whatever raises from here on leaves the workspace out.
         if workspace.handle is None:
             with warnings.catch_warnings():
@@ -145,7 +141,7 @@ class NativeSolver(Solver):
         if self.time_limit is not None:
             self._limit(workspace.handle, self.time_limit)
         point = None if start is None else np.ravel(start)
-        answer = self._run(workspace.handle, layout, point, self._kept_duals(workspace, flat))
+        answer = self._run(workspace.handle, layout, point, self._kept_duals(workspace, gathered))
         if answer.sound and _finite(answer.x) and _finite(answer.duals):
             workspace.duals, workspace.shifts = answer.duals, self._shifts
             if len(self._workspaces) == _KEPT:
@@ -158,27 +154,27 @@ class NativeSolver(Solver):
             answer.x, answer.solved, answer.iterations, bounds, rows, answer.message
         )
 
-    def _taken(self, flat: FlatQP) -> tuple[Hashable, _Workspace, Voids | None]:
+    def _taken(self, qp: GatheredQP) -> tuple[Hashable, _Workspace, Voids | None]:
         """The workspace for a QP, taken off the shelf, its key, and the QP's void rows."""
         pattern = (
-            flat.sizes, np.isfinite(flat.limits).tobytes(), (flat.lower == flat.upper).tobytes()
+            qp.sizes, np.isfinite(qp.limits).tobytes(), (qp.all_lower == qp.all_upper).tobytes()
         )
         known = self._known.get(pattern)
-        kind = Structure.of(flat).key if known is None else known[0]
+        kind = Structure.of(qp).key if known is None else known[0]
         # QPs of another scale, such as projections into the sets between those of the
         # estimation, have a workspace of their own: a solver's step sizes, and multipliers,
         # are of no use from one to the other, and do harm.
-        key = flat.sizes, kind, flat.key
+        key = qp.sizes, kind, qp.key
         workspace = self._workspaces.pop(key, None)
         if workspace is None:
-            workspace = _Workspace(Layout(self.style, Structure.of(flat), *flat.sizes))
+            workspace = _Workspace(Layout(self.style, Structure.of(qp), *qp.sizes))
         if known is None:
             if len(self._known) == _KNOWN:
                 del self._known[next(iter(self._known))]
-            known = self._known[pattern] = kind, workspace.layout.voids(flat)
+            known = self._known[pattern] = kind, workspace.layout.voids(qp)
         return key, workspace, known[1]
 
-    def _kept_duals(self, workspace: _Workspace, flat: FlatQP) -> Array | None:
+    def _kept_duals(self, workspace: _Workspace, qp: GatheredQP) -> Array | None:
         """Multipliers of the workspace's last solve, moved with the trajectory."""
         duals = workspace.duals
         if duals is None or not self.options.warm_start:
@@ -186,7 +182,7 @@ class NativeSolver(Solver):
         moved = self._shifts - workspace.shifts
         if moved == 0:
             return duals
-        stages, n, rows = flat.sizes
+        stages, n, rows = qp.sizes
         if moved >= stages:
             return None
         shifted = np.zeros_like(duals)  # nothing is known of new stages

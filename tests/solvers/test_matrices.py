@@ -5,7 +5,7 @@ import pytest
 import scipy.sparse
 
 from qpmhe_solvers import QP
-from qpmhe_solvers.forms import Form, pattern_of_limits
+from qpmhe_solvers.matrices import QpsolversMatrices, pattern_of_limits
 
 from .problems import ARRAYS, CASES, make
 
@@ -77,7 +77,7 @@ def parts(arguments):
 def test_the_form_is_that_of_plain_loops(case, how):
     for seed in range(2):
         qp, dense = make(**CASES[case], seed=seed)
-        form = Form(qp, **how)
+        form = QpsolversMatrices(qp, **how)
         form.fill(qp)
         check_arguments(form, expected(dense, how["box"], how["needs_row"], how["keep_empty"])[0])
 
@@ -90,7 +90,7 @@ def test_filling_again_is_making_anew(case, how):
     for name in ("lower", "upper", "row_lower", "row_upper"):  # the same pattern, other numbers
         getattr(other, name)[...] = 3.0 * getattr(qp, name)
     assert pattern_of_limits(other) == pattern_of_limits(qp)
-    form, anew = Form(qp, **how), Form(other, **how)
+    form, anew = QpsolversMatrices(qp, **how), QpsolversMatrices(other, **how)
     form.fill(qp)
     before = list(parts(form.arguments))
     form.fill(other)
@@ -107,7 +107,8 @@ def test_filling_again_is_making_anew(case, how):
 def test_matrices_are_what_the_solvers_can_take(case, box):
     qp, _ = make(**CASES[case])
     form, twin = (
-        Form(qp, dense=False, box=box, needs_row=True, keep_empty=True) for _ in range(2)
+        QpsolversMatrices(qp, dense=False, box=box, needs_row=True, keep_empty=True)
+        for _ in range(2)
     )
     for matrix in form.arguments[0:6:2]:
         assert type(matrix) is scipy.sparse.csc_matrix
@@ -129,7 +130,7 @@ def test_matrices_are_what_the_solvers_can_take(case, box):
 def test_multipliers_go_back_to_their_constraints(case, box):
     rng = np.random.default_rng(0)
     qp, dense = make(**CASES[case])
-    form = Form(qp, dense=True, box=box, needs_row=True, keep_empty=False)
+    form = QpsolversMatrices(qp, dense=True, box=box, needs_row=True, keep_empty=False)
     arguments, origins, level = expected(dense, box, True, False)
     z, y = (rng.standard_normal(0 if one is None else len(one)) for one in arguments[3:6:2])
     z_box = rng.standard_normal(0 if arguments[6] is None else qp.size)
@@ -148,7 +149,7 @@ def test_multipliers_go_back_to_their_constraints(case, box):
 @pytest.mark.parametrize("value", [None, np.zeros(1)], ids=["none", "too few"])
 def test_missing_multipliers_are_not_made_up(missing, value):
     qp, _ = make(**CASES["all kinds"])
-    form = Form(qp, dense=True, box=True, needs_row=False, keep_empty=False)
+    form = QpsolversMatrices(qp, dense=True, box=True, needs_row=False, keep_empty=False)
     told = {
         "z": np.ones(len(form.arguments[3])), "y": np.ones(len(form.arguments[5])),
         "z_box": np.ones(qp.size),

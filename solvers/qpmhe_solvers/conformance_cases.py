@@ -12,11 +12,11 @@ from .capabilities import CAPS, PATIENCE, Capabilities, all_kinds, tight
 from .options import SolverOptions
 from .qp import ARRAYS, QP
 from .registry import create
-from .samples import Bounds, Sides, contradiction, sample
+from .sample_qps import Bounds, Sides, contradiction, sample
 from .solution import SolveStatus
 from .solver import Solver
 
-__all__ = ["run_battery"]
+__all__ = ["run_cases"]
 
 Array = NDArray[np.float64]
 
@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 _SAME = 1e-4
 
 
-def run_battery(name: str, can: Capabilities) -> Iterator[tuple[str, str]]:
+def run_cases(name: str, can: Capabilities) -> Iterator[tuple[str, str]]:
     """Put a backend through all parts of the battery that it can take."""
-    for part, look in _BATTERY.items():
+    for part, look in _CASES.items():
         if can.inequalities or part in _WITHOUT_INEQUALITIES:
             yield part, "; ".join(look(name, can))
 
@@ -82,7 +82,7 @@ def _caps(name: str, can: Capabilities) -> Iterator[str]:
     for cap in CAPS:
         solution = create(name, tight(cap)).solve(qp)
         if can.iteration_cap and (solution.iterations or 0) > cap:
-            yield f"it tells {solution.iterations} iterations at the cap {cap}"
+            yield f"it reports {solution.iterations} iterations at the cap {cap}"
         if solution.d is None and can.iterate_at_cap:
             yield f"no iterate at the cap {cap}: {solution.message}"
     yield from _wrong(create(name, tight(5000)), qp, "at a cap of 5000")
@@ -203,7 +203,7 @@ def _shifted(name: str, _: Capabilities) -> Iterator[str]:
     yield from _wrong(solver, qps[1], "shifted beyond its end")
 
 
-_BATTERY: dict[str, Callable[[str, Capabilities], Iterator[str]]] = {
+_CASES: dict[str, Callable[[str, Capabilities], Iterator[str]]] = {
     "no inequality": _no_inequality,
     "equalities": _equalities,
     "unbounded unknowns": _unbounded,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .qp import QP
 
-__all__ = ["FlatQP"]
+__all__ = ["GatheredQP"]
 
 Array = NDArray[np.float64]
 
@@ -19,15 +19,10 @@ _ONE = np.ones(1)
 _SPREAD, _LEAST = 2.0**10, 2.0**-34
 
 
-class FlatQP:
-    """A kept copy of a QP's numbers, for QPs of one size.
+class GatheredQP(QP):
+    """A QP whose arrays are views of one array, which is filled anew for each QP of its sizes.
 
     Constraints are numbered: the K n bounds first, then the K rows general rows.
-
-    Parameters
-    ----------
-    stages, n, rows : int
-        Sizes of the QP.
 
     Attributes
     ----------
@@ -38,25 +33,24 @@ class FlatQP:
         all lower, then all upper.
     gradient_at, own_at, one_at, lower_at, upper_at : int
         Where these start in ``numbers``; the band at 0, the next rows right behind the own.
-    lower, upper : (K n + K rows,) array
+    all_lower, all_upper : (K n + K rows,) array
         Views of the limits of all constraints.
     limits : array
         View of both, one behind the other.
-    qp : QP
-        The numbers as a QP, whose arrays are views of them.
     key : int
         Name of the scale that the numbers are in.
     """
 
     __slots__ = (
         "_columns", "_data", "_diagonal", "_entries", "_looked_at", "_magnitudes", "_starts",
-        "_steps", "_uppers", "gradient_at", "key", "limits", "lower", "lower_at", "numbers",
-        "one_at", "own_at", "qp", "sizes", "upper", "upper_at",
+        "_steps", "_uppers", "all_lower", "all_upper", "gradient_at", "key", "limits", "lower_at",
+        "numbers", "one_at", "own_at", "sizes", "upper_at",
     )
 
     def __init__(self, stages: int, n: int, rows: int) -> None:
+        self.stages, self.n, self.rows, self.size = stages, n, rows, stages * n
+        self.sizes, self.bounded, self.key = (stages, n, rows), True, 0
         size, general = stages * n, stages * rows
-        self.sizes = (stages, n, rows)
         self.gradient_at = 2 * size * n
         self.own_at = self.gradient_at + size
         self.one_at = self.own_at + 2 * general * n
@@ -65,11 +59,30 @@ class FlatQP:
         self.numbers: Array = np.empty(self.upper_at + size + general)
         self._data = self.numbers[: self.one_at]
         self.limits = self.numbers[self.lower_at :]
-        self.lower = self.numbers[self.lower_at : self.upper_at]
-        self.upper = self.numbers[self.upper_at :]
-        self.key = 0
-        self.qp = QP.of_numbers(stages, n, rows, self.numbers)
+        self.all_lower = self.numbers[self.lower_at : self.upper_at]
+        self.all_upper = self.numbers[self.upper_at :]
+        self.band = self._data[: self.gradient_at].reshape(stages, n, 2 * n)
+        self.gradient = self._data[self.gradient_at : self.own_at].reshape(stages, n)
+        self.row_own, self.row_next = self._data[self.own_at :].reshape(2, stages, rows, n)
+        self.lower, self.upper = (
+            limits[:size].reshape(stages, n) for limits in (self.all_lower, self.all_upper)
+        )
+        self.row_lower, self.row_upper = (
+            limits[size:].reshape(stages, rows) for limits in (self.all_lower, self.all_upper)
+        )
         self._prepare_peaks()
+
+    @classmethod
+    def of(cls, qp: QP) -> GatheredQP:
+        """The QP itself, or its numbers in one array."""
+        if isinstance(qp, GatheredQP):
+            return qp
+        gathered = cls(qp.stages, qp.n, qp.rows)
+        gathered.gather(qp)
+        return gathered
+
+    def __reduce__(self) -> tuple[object, tuple[QP]]:
+        return GatheredQP.of, (self.copy(),)  # views of a copied array would be arrays of their own
 
     def _prepare_peaks(self) -> None:
         """Find the entries that `peaks` looks at, in groups."""
@@ -89,12 +102,9 @@ class FlatQP:
         self._magnitudes = seen[: seen.size - limits]
         self._diagonal = seen[: stages * n]
         self._steps = self._magnitudes[self._magnitudes.size - stages * n :]
-        self._uppers = seen[seen.size - self.upper.size :]
+        self._uppers = seen[seen.size - self.all_upper.size :]
         self._starts = np.cumsum([0] + [group.size for group in groups[:-1]])
         self._columns = self._starts[:n]
-
-    def __reduce__(self) -> tuple[type[FlatQP], tuple[int, int, int]]:
-        return FlatQP, self.sizes  # views of a copied array would be arrays of their own
 
     def gather(self, qp: QP) -> None:
         """Copy the numbers of a QP."""
@@ -105,6 +115,7 @@ class FlatQP:
             ),
             axis=None, out=self.numbers,
         )
+        self.bounded = qp.bounded
 
     def peaks(self) -> list[float]:
         """What says how well the numbers are scaled, the signs left out.
@@ -134,9 +145,9 @@ class FlatQP:
         """What no solver must be given: NaN hangs some and comes back as success from others."""
         # Squares may overflow where the numbers do not: then each one is looked at.
         finite = math.isfinite(self._data.dot(self._data)) or np.isfinite(self._data).all()
-        ordered = (self.lower <= self.upper).all()
+        ordered = (self.all_lower <= self.all_upper).all()
         if finite and ordered:
             return ""
-        if not finite or np.isnan(self.lower).any() or np.isnan(self.upper).any():
+        if not finite or np.isnan(self.all_lower).any() or np.isnan(self.all_upper).any():
             return "the QP's data are not finite"
         return "the QP is infeasible: a lower bound is above its upper bound"

@@ -1,4 +1,4 @@
-"""What is told of a backend, and the solver that comes of it."""
+"""Description of a backend: its capabilities, and how its solver is made."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from importlib import metadata
 from importlib.util import find_spec
 
-from .errors import BackendError, QpmheError, tell_unknown_options
+from .errors import BackendError, QpmheError, report_unknown_options
 from .options import SolverOptions
 from .solver import Solver
 
@@ -18,7 +18,7 @@ _NAME = re.compile(r"\w[\w.:+-]*")
 _MATRICES = ("banded", "csc", "dense")
 
 
-@tell_unknown_options
+@report_unknown_options
 @dataclass(frozen=True)
 class Backend:
     """One QP backend and its capabilities.
@@ -50,7 +50,7 @@ class Backend:
         Whether ``SolverOptions.time_limit`` is honoured.
     keeps_duals : bool
         Whether multipliers of the last solve start the next one, moved by ``Solver.shift``.
-    tells_infeasible : bool
+    reports_infeasibility : bool
         Whether its message says "infeasible" where a QP has no feasible point.
     keeps_workspace : bool
         Whether the solver is set up once and updated from then on, not anew for each QP.
@@ -59,7 +59,7 @@ class Backend:
     ------
     BackendError
         If the name cannot be written as above, the factory cannot be called, or anything else
-        is of another kind than told here.
+        has a wrong type.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Backend:
     warm_start: bool = False
     time_limit: bool = False
     keeps_duals: bool = False
-    tells_infeasible: bool = False
+    reports_infeasibility: bool = False
     keeps_workspace: bool = False
 
     def __post_init__(self) -> None:
@@ -127,29 +127,29 @@ class Backend:
             return ""
 
 
-def make_solver(entry: Backend, options: SolverOptions) -> Solver:
-    """Make a solver of an entry, registered or not, whose package is there."""
+def make_solver(backend: Backend, options: SolverOptions) -> Solver:
+    """Make the solver of a backend, registered or not, whose package is there."""
     try:
-        solver: object = entry.factory(options)
+        solver: object = backend.factory(options)
     except QpmheError:
         raise
     except (Exception, SystemExit) as error:
         remedy = (
-            f"reinstall {entry.distribution}, or take another backend"
-            if entry.distribution
-            else "mend the factory: factory(options) is to return a Solver"
+            f"reinstall {backend.distribution}, or take another backend"
+            if backend.distribution
+            else "correct the factory: factory(options) is to return a Solver"
         )
         raise BackendError(
-            f"backend {entry.name!r} cannot be made: {type(error).__name__}: {error}; {remedy}."
+            f"backend {backend.name!r} cannot be made: {type(error).__name__}: {error}; {remedy}."
         ) from error
     if not isinstance(solver, Solver):
         raise BackendError(
-            f"the factory of backend {entry.name!r} made {solver!r}; expected an instance of a "
+            f"the factory of backend {backend.name!r} made {solver!r}; expected an instance of a "
             "subclass of qpmhe.solvers.Solver."
         )
     if not isinstance(getattr(solver, "options", None), SolverOptions):
         raise BackendError(
-            f"the solver of backend {entry.name!r} has no options; call "
+            f"the solver of backend {backend.name!r} has no options; call "
             "super().__init__(options) in its __init__."
         )
     return solver

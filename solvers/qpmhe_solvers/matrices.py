@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .patterns import Pattern, chosen_rows, hessian_pattern
 from .qp import QP
 
-__all__ = ["Form", "pattern_of_limits"]
+__all__ = ["QpsolversMatrices", "pattern_of_limits"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -20,7 +20,7 @@ _ONE = np.ones(1)
 
 
 def pattern_of_limits(qp: QP) -> Hashable:
-    """All that a `Form` depends on: the sizes, and which limits are finite or equal."""
+    """What `QpsolversMatrices` depends on: the sizes, and which limits are finite or equal."""
     return (
         qp.stages, qp.n, qp.rows,
         np.isfinite(qp.lower).tobytes(), np.isfinite(qp.upper).tobytes(),
@@ -29,7 +29,7 @@ def pattern_of_limits(qp: QP) -> Hashable:
     )
 
 
-class Form:
+class QpsolversMatrices:
     r"""The arrays of a QP in the form of qpsolvers, for one pattern of limits.
 
     .. math::
@@ -163,7 +163,7 @@ class _Rows(NamedTuple):
 
     @staticmethod
     def of(qp: QP, box: bool) -> _Rows:
-        """The order of rows that `Form` promises."""
+        """The order of rows that `QpsolversMatrices` promises."""
         size = qp.size
         lower = np.concatenate((qp.lower, qp.row_lower), axis=None)
         upper = np.concatenate((qp.upper, qp.row_upper), axis=None)
@@ -180,12 +180,12 @@ class _Rows(NamedTuple):
 
 
 class _Multipliers:
-    """The way back: what the rows and the box were told, added up for each constraint."""
+    """Multipliers of the constraints, added up from those of the rows and the box."""
 
     def __init__(self, rows: _Rows, size: int, count: int) -> None:
         ends = np.cumsum([rows.sign.size, rows.equality.size, size if rows.boxed else 0])
-        self._size, self._told = size, np.zeros(ends[-1] + 1)  # the last one stays 0
-        self._parts = np.split(self._told, ends)[:-1]
+        self._size, self._given = size, np.zeros(ends[-1] + 1)  # the last one stays 0
+        self._parts = np.split(self._given, ends)[:-1]
         # Each constraint's multiplier is one of these less one of those.
         self._upper, self._lower = np.full((2, count), ends[-1])
         self._upper[rows.inequality[rows.sign > 0]] = np.flatnonzero(rows.sign > 0)
@@ -202,5 +202,5 @@ class _Multipliers:
             if numbers.size < part.size:
                 return None, None
             part[...] = numbers[: part.size]
-        duals = self._told[self._upper] - self._told[self._lower]
+        duals = self._given[self._upper] - self._given[self._lower]
         return duals[: self._size], duals[self._size :]
