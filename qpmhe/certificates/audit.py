@@ -36,26 +36,7 @@ _SCALES = (1e-3, 1e-1, 1.0, 10.0)  # of fitting errors that are tried, in sizes 
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """Whether one assumption holds, and what that rests on.
-
-    Parameters
-    ----------
-    name : str
-        Which: ``output Lipschitz``, ``no correction without error``, ``correction bound``,
-        ``cost bounds``, ``states stay in X``, ``candidate in the sets``.
-    label : str
-        The paper's label.
-    holds : bool or None
-        Whether it holds, as far as the evidence goes; None if it was not examined.
-    evidence : Evidence or None
-        What that rests on; a counterexample is a proof that it does not.
-    text : str
-        What was found, with its numbers.
-    value : float or None
-        The constant, where the assumption has one.
-    counterexample : dict
-        Where it fails: names to numbers.
-    """
+    """Whether one assumption holds, and what that rests on."""
 
     name: str
     label: str

@@ -103,11 +103,7 @@ def _jump(system: System, low: Array, high: Array) -> str:
 
 
 def _traced(function: BatchedFunction, low: Array, high: Array, n: int) -> tuple[Array, Array]:
-    """Where the largest change on each segment is, and its size if it is a jump, else 0.
-
-    The change is traced to ever smaller parts of the segment: where the function has
-    derivatives it vanishes, at a jump it stays.
-    """
+    """Where the largest change on each segment is, and its size if it is a jump, else 0."""
 
     def at(points: Array) -> Array:
         return np.array(function.batch(points[:, :n], points[:, n:]), np.float64)

@@ -42,23 +42,7 @@ _RELATIVE, _ABSOLUTE = 1e-9, 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Attack:
-    """Result of an attempt to refute a bound.
-
-    Parameters
-    ----------
-    trials : int
-        Trajectories, or pairs of them, that were tried.
-    comparisons : int
-        Times at which an error was compared with its bound.
-    violations : int
-        Comparisons in which the error was above it, by more than rounding.
-    ratio : float
-        The largest error, as a share of its bound.
-    example : dict of str to array
-        The trajectories with the largest share.
-    run : str
-        What they are of, where there are several settings.
-    """
+    """Result of an attempt to refute a bound."""
 
     trials: int
     comparisons: int
@@ -392,17 +376,7 @@ NOISES: dict[str, Callable[[Generator, int, int], Array]] = {
 
 @dataclass(eq=False)
 class ClosedRuns:
-    """Results of the attempt, for each kind of bound.
-
-    Parameters
-    ----------
-    attacks : dict of str to Attack
-        By kind of bound; an example's ``run`` names backend, cap and noises.
-    lost : int
-        Runs in which a hypothesis failed before the end; compared up to there.
-    by_backend : dict of str to float
-        The largest share of the paper's bound that was reached with each backend.
-    """
+    """Results of the attempt, for each kind of bound."""
 
     attacks: dict[Kind, Attack]
     lost: int = 0

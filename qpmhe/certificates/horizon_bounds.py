@@ -38,18 +38,7 @@ _SEARCHED, _SEARCHED_AGAIN = 4, 2
 
 @dataclass(frozen=True, eq=False)
 class HorizonBounds:
-    """What bounds the error for one horizon.
-
-    Parameters
-    ----------
-    paper : TheoremConstants
-        The theorem's constants as in the paper.
-    summed : SummedBound or None
-        Beyond the paper: its proof with the sums kept; None for an exponent below 1.
-    weighted : WeightedBound or None
-        Beyond the paper: with the norms kept as well; None unless the cost is quadratic and
-        detectability and observer were certified with matrices.
-    """
+    """What bounds the error for one horizon."""
 
     paper: TheoremConstants
     summed: SummedBound | None
@@ -60,13 +49,7 @@ class HorizonBounds:
         return self.summed if self.weighted is None else self.weighted
 
     def to_dict(self, sizes: Sizes) -> dict[str, Any]:
-        """All constants in types that JSON knows.
-
-        Parameters
-        ----------
-        sizes : Sizes
-            Errors and noises for which the bounds are evaluated.
-        """
+        """All constants in types that JSON knows."""
         c = self.paper
         content: dict[str, Any] = {
             "horizon": c.horizon,

@@ -149,24 +149,7 @@ def checked_system(system: Any) -> System:
 def bounded_region(
     system: System, region: ConvexSet | Region | None, inputs: Box | None = None
 ) -> Region:
-    """Check a set of states, and put a box around it.
-
-    Parameters
-    ----------
-    system : System
-        The system whose states and inputs they are.
-    region : Box, Polytope, Region or None
-        The set; None for the system's own states.
-    inputs : Box, optional
-        Bounds on the inputs; needed exactly if the system has any.
-
-    Raises
-    ------
-    SetError
-        If the set is unbounded, empty, missing, or of the wrong dimension.
-    ModelError
-        If the system is none.
-    """
+    """Check a set of states, and put a box around it."""
     checked_system(system)
     if isinstance(region, Region):
         if region.n != system.n or region.lower.size != system.n + system.m:

@@ -34,32 +34,10 @@ _SEARCHED = 4
 
 @dataclass(frozen=True)
 class TheoremConstants:
-    r"""All constants of the theorem for one horizon, with the paper's symbols.
+    """All constants of the theorem for one horizon, with the paper's symbols.
 
     Made by `theorem`. Triples are in the order initial error, disturbance, noise: p, w, v
     and 1, 2, 3 in the paper.
-
-    Parameters
-    ----------
-    horizon : int
-        N.
-    detectability : DecayingSums
-        eta, c_p, c_w, c_v of (eq:eIOSS).
-    observer : DecayingSums
-        rho, C_p, C_w, C_v of (eq:RGES).
-    cost : CostConstants
-        a and the constants of (eq:exp_bounds).
-    kappa : float
-        Of (eq:kappa).
-    lipschitz : float
-        L_h of Assumption ass:lipschitz.
-
-    Notes
-    -----
-    The proof was derived again line by line. Its constants are right as printed. Slips that
-    change nothing: in (eq:eIOSS) a parenthesis of h(x_1(t-tau)) is missing; at the lemma's
-    end, the primed rho_bar's are meant at t, not N; two hats are missing in the sentence
-    after (eq:bound_hat_x).
     """
 
     horizon: int
@@ -136,21 +114,7 @@ class TheoremConstants:
         )
 
     def terms(self, *, full: bool = True) -> Array:
-        """What C_i'(N) or C_i''(N) is the sum of.
-
-        Parameters
-        ----------
-        full : bool
-            Whether the window is full, which gives C_i'(N), for t >= N; otherwise C_i''(N).
-
-        Returns
-        -------
-        (5, 3) array
-            A row each for the estimate's prior, disturbance and noise terms (eq:proof_eta2),
-            (eq:proof_eta4), the observer's error at t - N (eq:proof_eta1), and what acts
-            directly (eq:proof_eta3) (for C_1'', the initial error itself); a column each for
-            C_1, C_2, C_3.
-        """
+        """What C_i'(N) or C_i''(N) is the sum of."""
         c_p, c_w, c_v = self.detectability.constants
         eta, N = self.detectability.rate, self.horizon
         prior, disturbance, noise = self.factors
@@ -193,20 +157,7 @@ class TheoremConstants:
         return names[0], names[1], names[2]
 
     def cost_bound(self, initial: float, disturbances: ArrayLike, noises: ArrayLike) -> Array:
-        """The lemma's bound of the estimate's cost, (eq:lem_1), at t = 0, ..., T.
-
-        Parameters
-        ----------
-        initial : float
-            |x_0 - z_0|.
-        disturbances, noises : (T,) array_like
-            Lengths of w(t) and v(t).
-
-        Returns
-        -------
-        (T + 1,) array
-            In units of the cost.
-        """
+        """The lemma's bound of the estimate's cost, (eq:lem_1), at t = 0, ..., T."""
         start, w, v = lengths(initial, disturbances, noises)
         C_p, C_w, C_v = self.observer.constants
         a, rho = self.cost.exponent, self.observer.rate

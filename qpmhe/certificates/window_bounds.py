@@ -54,21 +54,6 @@ class WindowBound(ABC):
     step by step from p E(t-N), or from the initial error itself as long as t <= N, and
     :math:`\alpha_k` the most that it makes of estimated ones that cost 1. See the page "What
     is guaranteed, and what is not" for the derivation.
-
-    Parameters
-    ----------
-    horizon : int
-        N >= 1.
-    rho, eta : float
-        Rates of the observer and of detectability.
-    exponent : float
-        a >= 1.
-    slope : float
-        l, from the observer's error to the root of the candidate's cost.
-    entry : float
-        p, from the observer's error to the norm of detectability.
-    scales : (1 + n,) array
-        s, from the norm of detectability to the Euclidean one, and to each component.
     """
 
     def __init__(
@@ -106,15 +91,7 @@ class WindowBound(ABC):
 
     @abstractmethod
     def parts(self, initial: Array, disturbances: Array, noises: Array) -> Parts:
-        """The norms of an initial error, disturbances and noises.
-
-        Parameters
-        ----------
-        initial : (n,) or () array
-            The initial error, or its Euclidean length.
-        disturbances, noises : (T, n) and (T, p), or (T,) arrays
-            The vectors, or their Euclidean lengths.
-        """
+        """The norms of an initial error, disturbances and noises."""
 
     def bound(
         self,
@@ -124,27 +101,7 @@ class WindowBound(ABC):
         *,
         costs: ArrayLike | None = None,
     ) -> Array:
-        """The bound of |x(t) - x_hat(t)| at t = 0, ..., T.
-
-        Parameters
-        ----------
-        initial : (n,) array_like or float
-            x_0 - z_0, or a bound of its length.
-        disturbances, noises : (T, n) and (T, p), or (T,) array_like
-            w(t) and v(t), or bounds of their lengths.
-        costs : (T,) array_like, optional
-            Costs J of the estimates of x(1), ..., x(T), where they are known: they replace
-            their bound where they are smaller.
-
-        Returns
-        -------
-        (T + 1,) array
-
-        Raises
-        ------
-        ShapeError, OptionError
-            If shapes do not fit, or a length is negative.
-        """
+        """The bound of |x(t) - x_hat(t)| at t = 0, ..., T."""
         value: Array = self.scales[0] * self._evaluate(initial, disturbances, noises, costs)
         return value
 
@@ -156,13 +113,7 @@ class WindowBound(ABC):
         *,
         costs: ArrayLike | None = None,
     ) -> Array:
-        """The bound of each component's error, (T + 1, n); arguments as of `bound`.
-
-        Parameters
-        ----------
-        initial, disturbances, noises, costs
-            As of `bound`.
-        """
+        """The bound of each component's error, (T + 1, n); arguments as of `bound`."""
         norm = self._evaluate(initial, disturbances, noises, costs)
         return np.multiply.outer(norm, self.scales[1:])
 
@@ -183,15 +134,7 @@ class WindowBound(ABC):
         return self.along(self.parts(start, w, v), costs)
 
     def along(self, parts: Parts, costs: ArrayLike | None = None) -> Array:
-        """The bound in the norm of detectability, at t = 0, ..., T, (..., T + 1).
-
-        Parameters
-        ----------
-        parts : Parts
-            What enters, in one run or in several.
-        costs : (T,) array_like, optional
-            As of `bound`.
-        """
+        """The bound in the norm of detectability, at t = 0, ..., T, (..., T + 1)."""
         N, a = self.horizon, self.exponent
         several, steps = parts.disturbances.shape[:-1], parts.disturbances.shape[-1]
         lengths = np.minimum(np.arange(steps + 1), N)
@@ -218,32 +161,11 @@ class WindowBound(ABC):
         return total
 
     def funnel(self, initial: float, disturbance: float, noise: float, steps: int) -> Array:
-        """The bound at t = 0, ..., steps for all |w| <= disturbance and |v| <= noise.
-
-        Parameters
-        ----------
-        initial : float
-            Bound of |x_0 - z_0|.
-        disturbance, noise : float
-            Bounds of |w(t)| and |v(t)|.
-        steps : int
-            How far.
-        """
+        """The bound at t = 0, ..., steps for all |w| <= disturbance and |v| <= noise."""
         return self.bound(initial, np.full(steps, disturbance), np.full(steps, noise))
 
     def limit(self, disturbance: float, noise: float) -> float:
-        """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows.
-
-        Parameters
-        ----------
-        disturbance, noise : float
-            As above.
-
-        Raises
-        ------
-        OptionError
-            If one is negative or not finite.
-        """
+        """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows."""
         checked_length("disturbance", disturbance)
         checked_length("noise", noise)
         parts = self.parts(np.zeros(()), np.array([disturbance]), np.array([noise]))
@@ -261,16 +183,6 @@ class WindowBound(ABC):
         The bound is sublinear, so its value for a sum of impulses is below the sum of its
         values for each. Impulses are tried at each time before the window is full, and until
         they have left it; from then on their effect decays with rho.
-
-        Parameters
-        ----------
-        rate : float, optional
-            lambda, at least rho; max(eta, rho) as in the paper if left out.
-
-        Raises
-        ------
-        OptionError
-            If the rate is below rho, or not below 1.
         """
         lam = max(self.eta, self.rho) if rate is None else positive("rate", rate)
         if not self.rho <= lam < 1.0:
@@ -351,16 +263,6 @@ class SummedBound(WindowBound):
         \alpha_k^b = (c_p \eta^k \underline c_p^{-1/a})^b + \sum_{\tau=1}^k \big(
             (c_w \eta^\tau \underline c_w^{-1/a})^b + (c_v \eta^\tau \underline c_v^{-1/a})^b
         \big)
-
-    Parameters
-    ----------
-    constants : TheoremConstants
-        Where the numbers come from.
-
-    Raises
-    ------
-    OptionError
-        If a < 1.
     """
 
     def __init__(self, constants: TheoremConstants) -> None:
@@ -427,29 +329,6 @@ class WeightedBound(WindowBound):
         \alpha_{k+1}^2 = \max\{\eta^2 \alpha_k^2, \lambda(V R^{-1})\} + \lambda(P Q^{-1})
 
     where lambda is the largest eigenvalue.
-
-    Parameters
-    ----------
-    cost : QuadraticCost
-        Its weights; no discount.
-    horizon : int
-        N >= 1.
-    P, eta : (n, n) array_like and float
-        Norm and rate of detectability.
-    noise_weight : (p, p) array_like
-        V, positive semidefinite.
-    observer_norm, rho : (n, n) array_like and float
-        O, and the observer's rate.
-    gain : (n, p) array_like
-        K, of the discrete-time observer.
-    slope : float
-        The largest :math:`|h(x) - h(z)|_M / |x - z|_O` on the certified set; see `fit_weight`
-        for M.
-
-    Raises
-    ------
-    OptionError, ShapeError, WeightError
-        If something does not fit.
     """
 
     def __init__(

@@ -34,38 +34,7 @@ def certify(
     seed: int = 0,
     seconds: float = 60.0,
 ) -> bool:
-    """Certify a model with `qpmhe.certificates.certify_model`, and show the result.
-
-    Parameters
-    ----------
-    console : rich.console.Console
-        Where to print.
-    model : str
-        Name of the catalogue, ``package.module:function`` or ``file.py:function``.
-    box : str, optional
-        The set of states: ``low:high`` of each component between commas, such as
-        ``0.1:9,-1:9``; left out, the model's own if bounded, or one around a simulated record.
-    horizon : str, optional
-        N, or several between commas; left out, the model's own.
-    report : Path, optional
-        JSON file of everything; the picture goes beside it, as PNG and SVG.
-    input_box : str, optional
-        Bounds on the inputs, in the same form; left out, those of the simulated record.
-    seed : int
-        Of the simulated record.
-    seconds : float
-        How long the search may take, about.
-
-    Returns
-    -------
-    bool
-        Whether the error could be bounded.
-
-    Raises
-    ------
-    QpmheError
-        If an option, the model or the set does not fit.
-    """
+    """Certify a model with `qpmhe.certificates.certify_model`, and show the result."""
     horizons = _horizons(horizon)
     if report is not None:
         _check_report(report)  # before any work

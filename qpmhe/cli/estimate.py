@@ -137,16 +137,7 @@ def estimate(
 def run(
     console: Console, model: str, record: str, out: str, *, quiet: bool = False, **options: Any
 ) -> None:
-    """Call `qpmhe.records.estimate_record` with the options, and print what happened.
-
-    Raises
-    ------
-    QpmheError
-        As `estimate_record`.
-    SystemExit
-        With 1 if the reader of the rows has gone; with 3 if the whole record was estimated
-        with a model that is wrong, or failed at most of the samples.
-    """
+    """Call `qpmhe.records.estimate_record` with the options, and print what happened."""
     from ..records import estimate_record
 
     # A bar would stand among the rows.

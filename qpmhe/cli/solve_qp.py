@@ -35,21 +35,7 @@ _STYLES = {SolveStatus.SOLVED: "green", SolveStatus.FAILED: "red"}
 
 
 class Replay(NamedTuple):
-    """What came of one QP in one backend.
-
-    Parameters
-    ----------
-    backend : str
-        The backend, or who had answered before.
-    solution : Solution
-        The answer.
-    residuals : Residuals or None
-        Recomputed from the QP's data; None without an iterate.
-    objective : float
-        Value of the objective, NaN without an iterate.
-    seconds : float
-        Median time of a first solve, NaN if not known.
-    """
+    """What came of one QP in one backend."""
 
     backend: str
     solution: Solution
@@ -67,35 +53,7 @@ def run(
     tolerance: float | None = None,
     every: bool = False,
 ) -> bool:
-    """Solve each QP of the files with each backend, and print a table for each file.
-
-    Parameters
-    ----------
-    console : rich.console.Console
-        Where to print.
-    paths : sequence of Path
-        Files of `qpmhe.solvers.dump`, or folders of such.
-    backends : sequence of str
-        Names of backends. Without any, the one that the file names, or ``auto``.
-    max_iterations : int, optional
-        Cap on each solver's iterations; as dumped if left out.
-    tolerance : float, optional
-        Absolute tolerance; as dumped if left out.
-    every : bool
-        Whether to take all installed backends.
-
-    Returns
-    -------
-    bool
-        Whether each of the QPs was solved by one of the backends.
-
-    Raises
-    ------
-    InvalidInputError
-        If a file cannot be read, or an option is out of its range; before anything is solved.
-    BackendError
-        If a backend is unknown or not installed; likewise.
-    """
+    """Solve each QP of the files with each backend, and print a table for each file."""
     changes: dict[str, int | float] = {}
     if max_iterations is not None:
         changes["max_iterations"] = max_iterations
@@ -127,22 +85,7 @@ def run(
 
 
 def replay(stored: StoredQP, name: str, options: SolverOptions) -> Replay:
-    """Solve a QP with a backend, each time with a fresh solver, as a first sample does.
-
-    Parameters
-    ----------
-    stored : StoredQP
-        The QP.
-    name : str
-        A backend.
-    options : SolverOptions
-        Limits and accuracy.
-
-    Raises
-    ------
-    BackendError
-        If the backend is unknown or not installed.
-    """
+    """Solve a QP with a backend, each time with a fresh solver, as a first sample does."""
     solution = create(name, options).solve(stored.qp, stored.start)  # untimed: with imports
     times: list[float] = []
     while len(times) < _REPEATS and sum(times) < _ENOUGH:

@@ -47,13 +47,7 @@ _MANY_STATES, _FEW_SAMPLES = 40, 12
 
 
 class Interpreter:
-    """A model by CasADi's virtual machine; NaN where it breaks off.
-
-    Parameters
-    ----------
-    model : CasadiModel
-        The model.
-    """
+    """A model by CasADi's virtual machine; NaN where it breaks off."""
 
     def __init__(self, model: CasadiModel) -> None:
         self.model, n = model, model.n
@@ -144,15 +138,6 @@ def points(interpreter: Interpreter, states: ConvexSet | None, seed: int) -> Ite
     """Batches of states within bounds, inputs and steps, with all functions' values.
 
     Each has one magnitude. Where the model is not finite, other magnitudes are tried.
-
-    Parameters
-    ----------
-    interpreter : Interpreter
-        The model.
-    states : ConvexSet or None
-        Where it is defined.
-    seed : int
-        Of the random numbers.
     """
     model, generator = interpreter.model, np.random.default_rng(seed)
     last = 0
@@ -213,17 +198,7 @@ def model_fault(
     maker: Callable[[bool, int, tuple[str, ...]], Buffers],
     batches: Sequence[Batch],
 ) -> str:
-    """Where a model's machine code differs from the interpreter; empty where it does not.
-
-    Parameters
-    ----------
-    interpreter : Interpreter
-        The model.
-    maker : callable
-        ``maker(timed, count, names)`` gives buffers for the machine code.
-    batches : sequence
-        Of `points`.
-    """
+    """Where a model's machine code differs from the interpreter; empty where it does not."""
     for xs, us, steps, found in batches:
         count = len(xs)
         usual = interpreter.model.dt
@@ -278,15 +253,6 @@ def estimator_fault(
 
     Short records are run through all of its functions. Costs, residuals and the candidate's
     dynamics are recomputed from the trajectories that come out.
-
-    Parameters
-    ----------
-    interpreter : Interpreter
-        The model.
-    library : EstimatorLibrary
-        The estimator.
-    states : ConvexSet or None
-        Where the model is defined.
     """
     given, other = library.settings.copy(), library.settings.copy()
     given["max_qps"], other["max_qps"] = np.clip(given["max_qps"], 1, 3), 2

@@ -81,25 +81,6 @@ def compiled_library(
 
     Compilers make mistakes. What `check` finds wrong is compiled again with less
     optimisation, and the cache remembers the level.
-
-    Parameters
-    ----------
-    files : dict
-        Text of each file, by name.
-    main : str
-        Name of the file to compile.
-    key : str, optional
-        What distinguishes libraries, if not the files' whole text.
-    check : callable, optional
-        Says what is wrong with a library; an empty text if nothing is. Called once a
-        process for each library.
-
-    Raises
-    ------
-    WrongCodeError
-        If `check` finds the code wrong at every level of optimisation.
-    CompilationError
-        If there is no C compiler, or it fails.
     """
     compiler = find_compiler()
     if compiler is None:

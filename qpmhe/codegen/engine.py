@@ -42,15 +42,7 @@ _PIECE = 256
 
 
 class RunLog:
-    """Arrays for what `mhe_run` writes, and the structure that points to them.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Leading dimensions: (samples,), or (members, samples).
-    n : int
-        Number of states.
-    """
+    """Arrays for what `mhe_run` writes, and the structure that points to them."""
 
     def __init__(self, shape: tuple[int, ...], n: int) -> None:
         self.states, self.filtered, self.delayed = (np.empty((*shape, n)) for _ in range(3))
@@ -58,13 +50,7 @@ class RunLog:
         self.flags, self.qps, self.iterations = (np.empty(shape, np.int32) for _ in range(3))
 
     def pointers(self, first: int) -> Any:
-        """The C structure of pointers to the entries from an index on.
-
-        Parameters
-        ----------
-        first : int
-            Index along the first dimension.
-        """
+        """The C structure of pointers to the entries from an index on."""
         arrays = (
             self.states, self.filtered, self.delayed, self.costs, self.candidate_costs,
             self.flags, self.qps, self.iterations,
@@ -74,20 +60,7 @@ class RunLog:
 
 
 class CompiledEngine:
-    """The loop body in C; in all else as `PythonEngine`.
-
-    Parameters
-    ----------
-    system, observer, cost, settings, initial_state
-        The estimator's.
-
-    Raises
-    ------
-    OptionError
-        If something has no C form.
-    CompilationError
-        If there is no compiler, or it fails.
-    """
+    """The loop body in C; in all else as `PythonEngine`."""
 
     name = "compiled"
 
@@ -271,10 +244,7 @@ class CompiledEngine:
         self._replace(memory)
 
     def _check(self, record: Any, linearized: bool) -> None:
-        """Insist on a possible window, whose stages are what is computed of them here.
-
-        Terms are computed where they were not wanted before.
-        """
+        """Insist on a possible window, whose stages are what is computed of them here."""
         horizon, system, settings = self._sizes[2], self._system, self._library.settings
         time, length = int(record["time"]), int(record["length"])
         sets = sum(1 << k for k, name in enumerate(SET_NAMES) if getattr(system, name))

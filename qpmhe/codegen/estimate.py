@@ -20,22 +20,7 @@ _MESSAGE = "the factorisation failed: H is not positive definite, or not finite"
 
 
 class CompiledEstimate(Estimate):
-    """An estimate whose arrays are views of one block, made when they are asked for.
-
-    Parameters
-    ----------
-    block : (k,) array
-        cost, candidate cost, trajectory, candidate, disturbances, noises, each padded to the
-        horizon.
-    numbers : list of int
-        Window length, status, QPs, iterations, corrections, dropped sets.
-    time : int
-        Index of the newest measurement.
-    sizes : (int, int, int)
-        n, p, N.
-    delay : int
-        Of the delayed estimate.
-    """
+    """An estimate whose arrays are views of one block, made when they are asked for."""
 
     __slots__ = ("_block", "_delay", "_numbers", "_sizes")
 

@@ -16,13 +16,7 @@ Array = NDArray[np.float64]
 
 
 def may_fail(function: Any) -> bool:
-    """Whether an evaluation can break off: one of scalar operations alone cannot.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        The function, not mapped.
-    """
+    """Whether an evaluation can break off: one of scalar operations alone cannot."""
     call = import_casadi().OP_CALL
     return not function.is_a("SXFunction") or any(
         function.instruction_id(k) == call for k in range(function.n_instructions())
@@ -35,15 +29,6 @@ def fixed_call(
     """A call of a function on arrays in place, which tells whether it worked.
 
     Where it did not, the results are not written, or only in part.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        The function, of dense arguments and results.
-    arguments, results : sequence of array
-        Contiguous, one for each.
-    fallible : bool
-        Whether there is a failure to look for (see `may_fail`).
     """
     buffer, run = function.buffer()
     for i, array in enumerate(arguments):
@@ -69,17 +54,7 @@ def fixed_call(
 def separate_calls(
     functions: dict[str, Any], states: Array, inputs: Array, results: dict[str, Array]
 ) -> Callable[[], None]:
-    """Evaluation of each function at each state by itself, NaN where it fails.
-
-    Parameters
-    ----------
-    functions : dict
-        casadi.Functions of (x, u), by name.
-    states, inputs : (K, n) and (K, m) array
-        Arguments.
-    results : dict
-        For each name, a contiguous array of K results.
-    """
+    """Evaluation of each function at each state by itself, NaN where it fails."""
     calls = []
     for name, function in functions.items():
         rows = results[name].reshape(len(states), -1)  # a view

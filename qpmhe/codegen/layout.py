@@ -27,20 +27,7 @@ _POLICIES = ("drop", "project", "keep")
 
 @dataclass(frozen=True)
 class Layout:
-    """Sizes that are fixed when an estimator is compiled.
-
-    Parameters
-    ----------
-    nx, ny, nu, horizon : int
-        Numbers of states, outputs and inputs; N.
-    sets : tuple of (bool, int)
-        Whether there is a set of states, disturbances and noises, and how many general
-        inequalities it has.
-    continuous : int
-        0 for a map, 1 for an Euler step of a rate, 4 for a Runge-Kutta step.
-    real : str
-        ``double`` or ``float``.
-    """
+    """Sizes that are fixed when an estimator is compiled."""
 
     nx: int
     ny: int
@@ -65,13 +52,7 @@ class Layout:
         return np.float64 if self.real == "double" else np.float32
 
     def header_values(self, name: str) -> dict[str, Any]:
-        """What the header's template is filled with.
-
-        Parameters
-        ----------
-        name : str
-            Prefix of public names.
-        """
+        """What the header's template is filled with."""
         bits = (f"    {name.upper()}_{flag.name} = {flag.value}" for flag in Status)
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
@@ -141,20 +122,7 @@ def settings_record(
     cost: Cost,
     settings: Settings,
 ) -> NDArray[Any]:
-    """The estimator's data and options as one ``mhe_settings``.
-
-    Parameters
-    ----------
-    layout : Layout
-        The sizes.
-    system, observer, cost, settings
-        The estimator's.
-
-    Raises
-    ------
-    OptionError
-        If a number is beyond the precision's range.
-    """
+    """The estimator's data and options as one ``mhe_settings``."""
     # What single precision cannot hold becomes infinite, and is refused below.
     with np.errstate(over="ignore", under="ignore"):
         record = _filled(layout, system, observer, cost, settings)

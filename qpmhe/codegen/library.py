@@ -29,13 +29,7 @@ _CONSTANT_GAIN = (Luenberger, HighGain, SteadyStateKalman)
 
 
 def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings) -> str:
-    """Why an estimator has no C form, with the remedy; empty if it has one.
-
-    Parameters
-    ----------
-    system, observer, cost, settings
-        The estimator's.
-    """
+    """Why an estimator has no C form, with the remedy; empty if it has one."""
     if system.symbolic is None:
         return "the system has no CasADi form; make it by qpmhe.System.from_casadi."
     if type(observer) not in _CONSTANT_GAIN:
@@ -118,22 +112,7 @@ def generated(
     name: str = "mhe",
     real: str = "double",
 ) -> tuple[dict[str, str], str, Layout, NDArray[Any]]:
-    """Source of an estimator, its structure, its layout and its settings.
-
-    Parameters
-    ----------
-    system, observer, cost, settings
-        The estimator's.
-    name : str
-        Prefix of public names.
-    real : {"double", "float"}
-        Precision.
-
-    Raises
-    ------
-    OptionError
-        If something has no C form; the text names it and the remedy.
-    """
+    """Source of an estimator, its structure, its layout and its settings."""
     reason = uncovered(system, observer, cost, settings)
     if reason:
         raise OptionError(f"no C code for this estimator: {reason}")
@@ -149,11 +128,6 @@ def generated(
 class EstimatorLibrary:
     """Functions and structures of one compiled estimator.
 
-    Parameters
-    ----------
-    system, observer, cost, settings
-        The estimator's.
-
     Attributes
     ----------
     layout : Layout
@@ -162,13 +136,6 @@ class EstimatorLibrary:
         The ``mhe_settings`` in use; must outlive all estimators that point to it.
     update, update_members, amend, reset, run : ctypes functions
         The C functions of these names; `update` is ``mhe_update_undoable``.
-
-    Raises
-    ------
-    OptionError
-        If something has no C form.
-    CompilationError
-        If it cannot be compiled or loaded.
     """
 
     def __init__(
@@ -227,13 +194,7 @@ class EstimatorLibrary:
         return _memory(self.workspace_size, np.dtype(np.uint8), "the compiled step's scratch")
 
     def estimators(self, states: NDArray[np.float64]) -> NDArray[Any]:
-        """Memory of one estimator for each row of initial states, reset.
-
-        Parameters
-        ----------
-        states : (K, n) array
-            Where they start.
-        """
+        """Memory of one estimator for each row of initial states, reset."""
         memory = _memory(
             len(states), self.estimator_type, f"the memory of {len(states)} estimators"
         )

@@ -28,17 +28,7 @@ _LEAST = 16
 
 
 class CompiledMembers:
-    """The generated C step for each member of a batch.
-
-    Parameters
-    ----------
-    system, observer, cost, settings
-        What the members have in common.
-    states : (K, n) array
-        The initial estimates.
-    threads : int or None
-        How many threads share the members; None for one for each processor.
-    """
+    """The generated C step for each member of a batch."""
 
     def __init__(
         self,
@@ -75,13 +65,7 @@ class CompiledMembers:
         return {"memory": memory}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where an engine of the same arguments stopped.
-
-        Parameters
-        ----------
-        state : dict
-            What `state_dict` gave.
-        """
+        """Go on where an engine of the same arguments stopped."""
         self._memory = state["memory"].copy().view(self._memory.dtype)
         self._memory["settings"] = self._library.settings.ctypes.data
 
@@ -114,13 +98,7 @@ class CompiledMembers:
         }
 
     def run(self, y: Array, u: Array) -> dict[str, Any]:
-        """Take records (K, T, p) and (K, T, m) in without leaving C.
-
-        Parameters
-        ----------
-        y, u : array
-            Measurements and inputs.
-        """
+        """Take records (K, T, p) and (K, T, m) in without leaving C."""
         ys, us, start = np.ascontiguousarray(y), np.ascontiguousarray(u), self.states
         samples = ys.shape[1]
         log = RunLog(ys.shape[:2], self._n)
@@ -141,10 +119,7 @@ class CompiledMembers:
         }
 
     def _share(self, work: Callable[[slice, NDArray[np.uint8]], None]) -> None:
-        """Do the work on all members, a part a thread; C runs without the interpreter's lock.
-
-        An interrupt is raised when all members have done their work, or none.
-        """
+        """Do the work on all members, a part a thread; C runs without the interpreter's lock."""
         pending = set(range(len(self._parts)))
         done = [Event() for _ in pending]
 

@@ -52,24 +52,7 @@ def prologue() -> str:
 
 
 def model_source(model: CasadiModel) -> str:
-    """The model in C: CasADi's code for f, h and their Jacobians, and the discretisation.
-
-    Parameters
-    ----------
-    model : CasadiModel
-        The model.
-
-    Returns
-    -------
-    str
-        C source, to come after `prologue`.
-
-    Raises
-    ------
-    CompilationError
-        If CasADi has no C code for a part of the model that tells where it fails, or the
-        model has too many states.
-    """
+    """The model in C: CasADi's code for f, h and their Jacobians, and the discretisation."""
     if model.n > _MOST_STATES:
         raise CompilationError(
             f"the model has {model.n} states; compiled code, which keeps (n, n) arrays on the "
@@ -125,10 +108,7 @@ _EXPORTED = re.compile(
 
 
 def _bare(text: str) -> str:
-    """CasADi's code without what only a caller from outside needs, all of it static.
-
-    Static, so that a compiler can inline it and no name leaves the file.
-    """
+    """CasADi's code without what only a caller from outside needs, all of it static."""
 
     def kept(match: re.Match[str]) -> str:
         wanted = "casadi_real** arg" in match["head"]
@@ -152,10 +132,7 @@ def _named(ca: Any, function: Any, name: str, model: CasadiModel) -> Any:
 
 
 def _call(name: str, inner: str, function: Any) -> str:
-    """A C function of plain arrays around one with CasADi's calling convention.
-
-    Its results are NaN where CasADi's function tells that it failed.
-    """
+    """A C function of plain arrays around one with CasADi's calling convention."""
     sizes = [function.nnz_out(i) for i in range(function.n_out())]
     results = ", ".join(f"real *out{i}" for i in range(len(sizes)))
     return (
@@ -194,26 +171,7 @@ def header(name: str, values: dict[str, Any]) -> str:
 def estimator_files(
     model: CasadiModel, layout: Layout, settings: NDArray[Any], name: str = "mhe"
 ) -> tuple[dict[str, str], str]:
-    """Header and source of a whole estimator.
-
-    Parameters
-    ----------
-    model : CasadiModel
-        The model.
-    layout : Layout
-        Sizes and precision.
-    settings : structured array
-        The default settings, a ``mhe_settings``.
-    name : str
-        Prefix of all public names, and name of the files.
-
-    Returns
-    -------
-    files : dict
-        Text of ``<name>.h`` and ``<name>.c``.
-    structure : str
-        The text without the default settings: equal texts make equal machine code.
-    """
+    """Header and source of a whole estimator."""
     head = header(name, {**layout.header_values(name), "version": __version__})
     parts = ("window.c", "factor.c", "interior_point.c", "optimizer.c", "step.c")
     body = prologue() + model_source(model) + "\n".join(template(part) for part in parts)

@@ -16,24 +16,12 @@ Array = NDArray[np.float64]
 
 
 def window_covariances(problem: Problem, trajectory: Array) -> Array:
-    r"""Covariances (K + 1, n, n) of the states of a trajectory, given its window.
+    """Covariances (K + 1, n, n) of the states of a trajectory, given its window.
 
     Diagonal blocks of the inverse of the Gauss-Newton Hessian of J/2, by the Kalman filter
     and the smoother of Bryson and Frazier of the linearisation: that inverse in covariance
     form. It inverts no covariance of a state, so that noise-free components (zero
     covariance of w) are taken as they are.
-
-    Parameters
-    ----------
-    problem : Problem
-        The problem, bound to the window.
-    trajectory : (K + 1, n) array
-        Where to linearise.
-
-    Raises
-    ------
-    InvalidInputError
-        If the model cannot be evaluated along the trajectory.
 
     References
     ----------

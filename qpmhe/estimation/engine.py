@@ -39,13 +39,6 @@ class PythonEngine:
 
     Everything it is given was checked by `MovingHorizonEstimator`, whose methods of the
     same names document these.
-
-    Parameters
-    ----------
-    system : System
-        The estimator's own; how its functions are called may change.
-    observer, cost, settings, initial_state
-        The estimator's.
     """
 
     name = "python"

@@ -83,13 +83,6 @@ class StageTerms:
     - ``own[i]``: :math:`-G_i^\top W_i r_i`, the gradient with respect to :math:`d_i`;
     - ``following[i]``: :math:`Q_i w_i`, the gradient with respect to :math:`d_{i+1}`.
 
-    Parameters
-    ----------
-    stages : int
-        How many stages there is room for.
-    n, p : int
-        Numbers of states and outputs.
-
     Attributes
     ----------
     linear : (stages, n + p, 1 + n) array
@@ -127,20 +120,7 @@ class StageTerms:
         return -self.linear[:, :, 1:]
 
     def set_stage(self, stage: Stage, weight: Array) -> float:
-        """Compute the terms of a stage from its linear map, which is in place already.
-
-        Parameters
-        ----------
-        stage : Stage
-            One of these.
-        weight : (n + p, n + p) array
-            Its weight.
-
-        Returns
-        -------
-        float
-            :math:`|r|_W^2`; NaN or infinite where some number of the stage is.
-        """
+        """Compute the terms of a stage from its linear map, which is in place already."""
         flat, weighted = self._flat, self._weighted
         weight.dot(stage.linear, weighted)
         stage.transposed.dot(weighted, self._square)
@@ -151,15 +131,7 @@ class StageTerms:
         return float(flat[0] + flat.dot(self._zeros))
 
     def set_all(self, count: int, weight: Array) -> None:
-        """Compute the terms of the first stages, their linear maps in place.
-
-        Parameters
-        ----------
-        count : int
-            How many stages.
-        weight : (q, q) or (count, q, q) array
-            One weight for all stages, or one for each.
-        """
+        """Compute the terms of the first stages, their linear maps in place."""
         linear = self.linear[:count]
         weighted = np.matmul(weight, linear)
         square = np.matmul(linear.transpose(0, 2, 1), weighted)

@@ -29,13 +29,6 @@ _NONE = Status(0)
 class Outcome:
     """What the sequence of QPs came to.
 
-    Parameters
-    ----------
-    candidate : Trial
-        Where it begins.
-    deadline : float
-        Reading of the clock after which nothing is begun.
-
     Attributes
     ----------
     reference : Trial
@@ -98,20 +91,11 @@ class Outcome:
 
 
 class Optimizer:
-    r"""Gauss-Newton steps from the candidate, each judged by the true problem.
+    """Gauss-Newton steps from the candidate, each judged by the true problem.
 
     A trial that does not lower J over the best trajectory so far is shortened towards it,
     and dropped if no length helps. So J of the result is never above the candidate's, and
     the result satisfies the constraints, whatever the solver returns.
-
-    Parameters
-    ----------
-    subproblem : Subproblem
-        Where the QPs come from.
-    solver : ContainedSolver
-        Where they go.
-    settings : Settings
-        Cap on the QPs, tolerance, and what to do with a candidate outside of the sets.
     """
 
     def __init__(
@@ -131,19 +115,7 @@ class Optimizer:
         start: Array | None = None,
         deadline: float = math.inf,
     ) -> Outcome:
-        """Run the sequence on a bound problem; never raises on account of solver or model.
-
-        Parameters
-        ----------
-        problem : Problem
-            The problem, bound to the window.
-        window : Window
-            The window.
-        start : (K + 1, n) array, optional
-            A trajectory to start from where it is better than the candidate.
-        deadline : float
-            Reading of ``time.perf_counter`` after which no QP is begun.
-        """
+        """Run the sequence on a bound problem; never raises on account of solver or model."""
         candidate = problem.candidate(window)
         outcome = Outcome(candidate, deadline)
         if problem.constrained and not self._reconcile(problem, window, outcome):

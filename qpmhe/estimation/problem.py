@@ -32,21 +32,7 @@ _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
 @dataclass(slots=True)
 class Trial:
-    """A trajectory with its verdict.
-
-    Parameters
-    ----------
-    trajectory : (K + 1, n) array
-        The states.
-    residuals : (K, n + p) array
-        w and v along them.
-    weights : (n + p, n + p) or (K, n + p, n + p) array
-        Weights of the quadratic forms that majorise the stage costs here.
-    cost : float
-        J; infinite where the model cannot be evaluated or a constraint is violated.
-    violation : float
-        The largest amount by which a set is missed; infinite where the model fails.
-    """
+    """A trajectory with its verdict."""
 
     trajectory: Array
     residuals: Array
@@ -65,13 +51,6 @@ class Problem:
     .. math::
         \min_x\; \gamma^K \Gamma(x_0 - \bar x) + \sum_{i<K} \gamma^{K-1-i} l(w_i, v_i)
         \quad \text{s.t.} \quad x_i \in \mathbb X,\ w_i \in \mathbb W,\ v_i \in \mathbb V.
-
-    Parameters
-    ----------
-    system : System
-        f, h and the sets.
-    cost : Cost
-        The cost.
     """
 
     def __init__(self, system: System, cost: Cost) -> None:

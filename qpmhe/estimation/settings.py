@@ -20,19 +20,7 @@ _SAFETY_LIMIT = 100
 
 @dataclass(frozen=True)
 class Settings:
-    """Options of `MovingHorizonEstimator`, where each is explained.
-
-    Parameters
-    ----------
-    horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance, engine,
-    outside, warm_start, candidate, time_budget, delay, isolated
-        As there.
-
-    Raises
-    ------
-    OptionError
-        If a value is outside its range; the text names it and what was expected.
-    """
+    """Options of `MovingHorizonEstimator`, where each is explained."""
 
     horizon: int
     backend: str = "auto"

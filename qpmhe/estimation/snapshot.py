@@ -37,11 +37,6 @@ def described(
     Functions are described by values of f and h at some points; what else a user's function
     does shows when the stored stages are computed once more. Caps, backend and policies of
     the QPs are left out: they may change between snapshot and restart.
-
-    Parameters
-    ----------
-    system, observer, cost, settings
-        The estimator's.
     """
     found: dict[str, Any] = {"candidate": settings.candidate, "sampling time": system.dt}
     for name in SET_NAMES:
@@ -85,18 +80,7 @@ def _describe(name: str, value: Any, found: dict[str, Any]) -> None:
 
 
 def check_description(found: Any, mine: dict[str, Any]) -> None:
-    """Refuse the state of an estimator that differs, and name what does.
-
-    Parameters
-    ----------
-    found, mine : dict
-        What `described` gave of it, and of this one.
-
-    Raises
-    ------
-    InvalidInputError
-        If they differ.
-    """
+    """Refuse the state of an estimator that differs, and name what does."""
     if not isinstance(found, dict):
         raise TypeError("it does not describe its estimator")
     for name in (*mine, *found):
@@ -118,16 +102,7 @@ def _alike(one: Any, two: Any) -> bool:
 
 
 def near(found: Array | float, expected: Array | float, size: Array | float) -> bool:
-    """Whether numbers differ by no more than the rounding of terms of this size.
-
-    Parameters
-    ----------
-    found, expected : array or float
-        The numbers. What is not finite, as some bounds and a failed model's values are, must
-        be the same.
-    size : array or float
-        Sizes of the terms that they are sums of.
-    """
+    """Whether numbers differ by no more than the rounding of terms of this size."""
     found, expected = np.asarray(found), np.asarray(expected)
     there = np.isfinite(expected)
     if not np.array_equal(found[~there], expected[~there], equal_nan=True):
@@ -166,21 +141,7 @@ def reading() -> Iterator[None]:
 def taken(
     name: str, value: Any, shape: tuple[int, ...], kind: Any = np.float64, finite: bool = True
 ) -> Array:
-    """A copy of an array of a snapshot; `reading` turns what it raises into our error.
-
-    Parameters
-    ----------
-    name : str
-        What error texts call it.
-    value : object
-        What the snapshot has in its place.
-    shape : tuple of int
-        The shape that it must have.
-    kind : type
-        Of its entries.
-    finite : bool
-        Whether they must be finite.
-    """
+    """A copy of an array of a snapshot; `reading` turns what it raises into our error."""
     if not isinstance(value, np.ndarray) or value.dtype != kind or value.shape != shape:
         found = (value.shape, value.dtype) if isinstance(value, np.ndarray) else type(value)
         raise TypeError(f"{name} is {found}; expected an array {shape} of {np.dtype(kind)}")

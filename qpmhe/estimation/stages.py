@@ -31,23 +31,6 @@ class Stages:
 
     The arrays are longer than the window, which slides along them; at the end its stages
     move back to the front. Thus every window is a plain slice.
-
-    Parameters
-    ----------
-    n, p, m : int
-        Numbers of states, outputs and inputs.
-    horizon : int
-        Most stages of a window.
-    initial_state : (n,) array
-        z(0).
-    covariance : (n, n) array or None
-        The observer's, of z(0).
-    stage_weight : (n + p, n + p) array
-        Weight of a usual stage.
-    quadratic : bool
-        Whether the cost's weights majorise it themselves.
-    step : float
-        The usual length of a step, 0 where there is none.
     """
 
     def __init__(
@@ -181,13 +164,7 @@ class Stages:
             array[first : first + len(part)] = part
 
     def mark(self, whole: bool) -> Mark:
-        """What `roll_back` needs.
-
-        Parameters
-        ----------
-        whole : bool
-            Whether stages of the window are to change, too, and not only one to enter.
-        """
+        """What `roll_back` needs."""
         return (
             self.start, self.end, self.time, self._last_special, self._last_irregular,
             self.unusual, self._own_noise.copy() if self._own_noise else None,
@@ -195,13 +172,7 @@ class Stages:
         )
 
     def roll_back(self, mark: Mark) -> None:
-        """Undo all that was done since a mark, except for a move to the front.
-
-        Parameters
-        ----------
-        mark : tuple
-            What `mark` gave, when there was room for a stage.
-        """
+        """Undo all that was done since a mark, except for a move to the front."""
         (
             self.start, self.end, self.time, self._last_special, self._last_irregular,
             unusual, own_noise, kept,
@@ -235,13 +206,6 @@ class Stages:
         """Take over what `state_dict` of an equal window gave, into a fresh window.
 
         Raises whatever comes of a state that is damaged; the window is void then.
-
-        Parameters
-        ----------
-        state : dict
-            The state.
-        irregular : bool
-            Whether there may be steps of unusual length.
         """
         time = check_size("time", state["time"], lambda found: found >= 0)
         length = min(time, self.horizon)

@@ -26,7 +26,7 @@ _NO_BAND: Array = np.zeros(0)
 
 
 class Subproblem:
-    r"""Gauss-Newton QPs in the increments d of a trajectory.
+    """Gauss-Newton QPs in the increments d of a trajectory.
 
     The objective is half of J with linearised residuals (see `StageTerms`): its gradient
     at d = 0 is that of J/2, its Hessian the Gauss-Newton one. Sets become
@@ -36,15 +36,6 @@ class Subproblem:
       of W of zero width gives an equality row.
 
     One QP, of the present window length, is kept and overwritten at each use.
-
-    Parameters
-    ----------
-    system : System
-        Dimensions, Jacobians and sets.
-    cost : Cost
-        The weights.
-    horizon : int
-        The longest window, N.
     """
 
     def __init__(self, system: System, cost: Cost, horizon: int) -> None:
@@ -113,15 +104,6 @@ class Subproblem:
         trial up to third order: a second-order correction. It is carried a little further,
         so that the third order does not leave the sets again, and by twice what the solver
         itself left violated.
-
-        Parameters
-        ----------
-        qp : QP
-            The QP around a trajectory, whose iterate was tried; overwritten.
-        problem : Problem
-            The sets.
-        around, trial : Trial
-            That trajectory, and what became of it.
         """
         n, step = self._n, trial.trajectory - around.trajectory
         linear = around.residuals + np.matmul(self._minus_jacobian, step[:-1, :, None])[:, :, 0]

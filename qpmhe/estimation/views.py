@@ -20,13 +20,7 @@ View = TypeVar("View")
 
 
 def read_only(array: Array) -> Array:
-    """A view that cannot be written to.
-
-    Parameters
-    ----------
-    array : array
-        What it shows.
-    """
+    """A view that cannot be written to."""
     view = array.view()
     view.flags.writeable = False
     return view
@@ -92,15 +86,7 @@ class Frame:
 
 
 class Views(Sequence[View]):
-    """Views that are made when they are wanted, of which only the last is kept.
-
-    Parameters
-    ----------
-    count : int
-        How many there can be.
-    make : callable
-        Makes the one of this index.
-    """
+    """Views that are made when they are wanted, of which only the last is kept."""
 
     def __init__(self, count: int, make: Callable[[int], View]) -> None:
         self._count, self._make = count, make

@@ -23,22 +23,11 @@ Array = NDArray[np.float64]
 
 
 class Window(Stages):
-    r"""Samples y(t-N), ..., y(t-1) with the observer's states z(t-N), ..., z(t).
+    """Samples y(t-N), ..., y(t-1) with the observer's states z(t-N), ..., z(t).
 
     The observer's trajectory changes only where a late measurement or a restart makes it,
     so what depends on it alone is computed when a stage enters and kept while it stays: the
     residuals :math:`(L(i), v_z(i))`, their cost, the Jacobians and the Gauss-Newton terms.
-
-    Parameters
-    ----------
-    system, observer, cost
-        The problem.
-    horizon : int
-        N >= 1.
-    initial_state : (n,) array
-        z(0), the prior of the first windows.
-    linearized : bool
-        Whether the Gauss-Newton terms are wanted at all.
     """
 
     def __init__(
@@ -83,16 +72,7 @@ class Window(Stages):
     def push(
         self, y: Array, u: Array, dt: float | None = None, noise_weight: Array | None = None
     ) -> tuple[bool, bool, bool]:
-        """Take the sample y(t), u(t) in, and advance the observer to z(t+1).
-
-        Returns
-        -------
-        missing, held, flat : bool
-            Whether a component of y is not finite; whether f, h or the observer raised or
-            were not finite at z(t); whether only the Jacobians did. A held stage keeps its
-            measurement; the observer goes on where the model last worked, and the
-            candidate's cost is infinite while the stage stays.
-        """
+        """Take the sample y(t), u(t) in, and advance the observer to z(t+1)."""
         if self.end == self.room:
             self.make_room()
         k, m = self.end, self._m
@@ -117,15 +97,7 @@ class Window(Stages):
         return outcome
 
     def amend(self, time: int, y: Array) -> None:
-        """Put the finite components of y into a sample of the window, and redo the rest.
-
-        Parameters
-        ----------
-        time : int
-            The sample's time, within the window.
-        y : (p,) array
-            The late measurement.
-        """
+        """Put the finite components of y into a sample of the window, and redo the rest."""
         k = self.end - (self.time - time)
         new = np.abs(y) < LARGEST
         self._y[k, new] = y[new]
@@ -137,13 +109,6 @@ class Window(Stages):
         """Redo the last stages, from another state of the observer if one is given.
 
         What `push` tells is told of the newest one.
-
-        Parameters
-        ----------
-        steps : int
-            How many stages, at most the window's length.
-        state : (n,) array, optional
-            The observer's state where they begin.
         """
         first = self.end - steps
         if state is not None:
@@ -278,10 +243,7 @@ class Window(Stages):
         return cost
 
     def _hold(self, k: int) -> None:
-        """Fill a stage at which the model cannot be evaluated: x(t+1) about x(t).
-
-        The observer goes on where the model last worked: z(t) is where it does not.
-        """
+        """Fill a stage at which the model cannot be evaluated: x(t+1) about x(t)."""
         self._z[k + 1], covariance = self._last_good(k)
         if self._covariance is not None:
             self._covariance[k + 1] = covariance
@@ -299,18 +261,6 @@ class Window(Stages):
         """Compute the stages of an equal window once more, and insist on what was kept of them.
 
         Afterwards this window is that one with all of it computed here.
-
-        Parameters
-        ----------
-        kept : Window
-            What a snapshot gave. It was loaded into this window, too.
-        terms : bool
-            Whether it holds Jacobians and Gauss-Newton terms exactly if this one does.
-
-        Raises
-        ------
-        InvalidInputError
-            If another model, observer or cost was at work.
         """
         n, count, first = self._n, self.end, self.time - self.end
         with np.errstate(all="ignore"):

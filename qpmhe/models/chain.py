@@ -118,12 +118,7 @@ class _Chain:
 def _pattern(
     linear: Array, masses: int, dimension: int, width: int
 ) -> tuple[Array, Array, NDArray[np.intp]]:
-    r"""The Jacobian's different entries, as a map and constants, and which stands where.
-
-    With e = d / |d|, the pull e of a spring's rest length has the derivative
-    :math:`(I - e e^\top) / |d|`, and :math:`\operatorname{tr}(e e^\top) = 1`: it is linear in
-    the entries of :math:`e e^\top / |d|`, of all links one after the other.
-    """
+    """The Jacobian's different entries, as a map and constants, and which stands where."""
     eye = np.eye(width)
     projection = np.einsum("ab,cd->cdab", eye, eye) - np.einsum("ac,bd->cdab", eye, eye)
     one_link = projection[..., :dimension, :dimension].reshape(width**2, dimension**2)

@@ -155,18 +155,7 @@ def build(source: ModelSource) -> Any:
 
 @lru_cache(maxsize=16)
 def load(source: ModelSource) -> Example:
-    """Make a model with its scenario; the same object for the same source within a process.
-
-    Parameters
-    ----------
-    source : ModelSource
-        From `find`.
-
-    Raises
-    ------
-    ModelError
-        If the model cannot be built, or is anything but (system, observer, cost, scenario).
-    """
+    """Make a model with its scenario; the same object for the same source within a process."""
     name, parts = source.name, build(source)
     if not isinstance(parts, tuple) or len(parts) != 4:
         raise ModelError(
@@ -183,20 +172,7 @@ def load(source: ModelSource) -> Example:
 
 
 def code_place(error: BaseException, file: Path | None) -> str:
-    """File and line of the user's code that raised an error, as ``file, line 3: ``.
-
-    Parameters
-    ----------
-    error : BaseException
-        What was raised; its first cause counts.
-    file : Path or None
-        The model's file. Files of its folder count as the user's, this package's do not.
-
-    Returns
-    -------
-    str
-        Empty where no line of the user's is involved.
-    """
+    """File and line of the user's code that raised an error, as ``file, line 3: ``."""
     chain: list[BaseException] = []
     one: BaseException | None = error
     while one is not None and one not in chain:
@@ -275,18 +251,7 @@ def _failure(source: ModelSource, what: str, error: BaseException) -> ModelError
 
 
 def module_file(place: str) -> Path | None:
-    """The file of a module, found without importing it; packages above it are imported.
-
-    Parameters
-    ----------
-    place : str
-        Such as ``package.module``.
-
-    Returns
-    -------
-    Path or None
-        None where there is no such module, or it has no file.
-    """
+    """The file of a module, found without importing it; packages above it are imported."""
     importlib.invalidate_caches()
     try:
         with _working_directory():
@@ -300,18 +265,7 @@ def module_file(place: str) -> Path | None:
 
 
 def fingerprint(path: Path) -> str:
-    """Digest of a file, and of the files of its own folder that it imports.
-
-    Parameters
-    ----------
-    path : Path
-        The file. Only statements ``import`` and ``from ... import`` are followed.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be read.
-    """
+    """Digest of a file, and of the files of its own folder that it imports."""
     digest = hashlib.sha256(path.read_bytes())
     for file in sorted(_files(path)[1:]):
         digest.update(f"\0{file.relative_to(path.parent).as_posix()}\0".encode())
@@ -320,25 +274,7 @@ def fingerprint(path: Path) -> str:
 
 
 def imported(place: str) -> tuple[ModuleType, str]:
-    """Import a module as its files are now, again if they have changed in this process.
-
-    Parameters
-    ----------
-    place : str
-        ``package.module``, or the absolute path of a file in .py.
-
-    Returns
-    -------
-    module : ModuleType
-        The module.
-    fingerprint : str
-        Of its file; empty if it has none.
-
-    Raises
-    ------
-    Exception
-        Whatever the import raises.
-    """
+    """Import a module as its files are now, again if they have changed in this process."""
     path = Path(place) if place.endswith(".py") else module_file(place)
     now = "" if path is None else fingerprint(path)
     if path is not None and _imported_as.get(place, now) != now:

@@ -112,22 +112,7 @@ def design_luenberger(
 
 
 def linearize(system: System, at: ArrayLike, u: ArrayLike | None) -> tuple[Array, Array, Array]:
-    """The Jacobians A (n, n) and C (p, n) at a point, and the point (n,).
-
-    Parameters
-    ----------
-    system : System
-        The system.
-    at : (n,) array_like
-        The state.
-    u : (m,) array_like or None
-        The input, if the system has any.
-
-    Raises
-    ------
-    InvalidInputError
-        If the point does not fit, or the model or its Jacobians are not finite there.
-    """
+    """The Jacobians A (n, n) and C (p, n) at a point, and the point (n,)."""
     point = vector("at", at, system.n)
     if u is None and system.m:
         raise InvalidInputError(
@@ -156,22 +141,7 @@ def linearize(system: System, at: ArrayLike, u: ArrayLike | None) -> tuple[Array
 
 
 def stationary(a: Array, c: Array, q: Array, r: Array, point: Array) -> tuple[Array, Array]:
-    """Gain (n, p) and covariance (n, n) of the stationary Kalman predictor.
-
-    Parameters
-    ----------
-    a, c : (n, n) and (p, n) array
-        Jacobians at the point.
-    q, r : (n, n) and (p, p) array
-        Covariances of w and v, positive definite.
-    point : (n,) array
-        The point, for error texts.
-
-    Raises
-    ------
-    ModelError
-        If there is no stationary predictor, or it cannot be computed.
-    """
+    """Gain (n, p) and covariance (n, n) of the stationary Kalman predictor."""
     from scipy.linalg import solve_discrete_are
 
     hidden = _unobservable_modes(a, c)
@@ -207,13 +177,6 @@ def ackermann(a: Array, c: Array, poles: ComplexArray) -> Array:
 
     .. math::
         K = p(A)\, [C;\ C A;\ \dots;\ C A^{n-1}]^{-1} e_n
-
-    Parameters
-    ----------
-    a, c : (n, n) and (1, n) array
-        An observable pair.
-    poles : (n,) complex array
-        Roots of the polynomial p.
     """
     # A shift and a scaling of A move the poles along. They part the rows of the
     # observability matrix, which short sampling times bring close to each other.

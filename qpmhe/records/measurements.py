@@ -85,13 +85,7 @@ class RecordReader:
         return f"{self.name}{line} (time {sample.time.text})"
 
     def samples(self, held: Array | None = None) -> Iterator[Measurement]:
-        """The samples in order of time; `held` are the inputs before the first one.
-
-        Raises
-        ------
-        RecordError
-            At the first sample that cannot be used.
-        """
+        """The samples in order of time; `held` are the inputs before the first one."""
         before: Measurement | None = None
         blank: Row | None = None
         for row in self._table:

@@ -21,11 +21,6 @@ def standard_output_for_rows() -> Iterator[BinaryIO]:
     The C code of solvers prints on file descriptor 1, past ``sys.stdout``. So the rows go to a
     duplicate of the descriptor, and 1 itself is pointed at standard error, in the whole process.
     Where ``sys.stdout`` is no file descriptor 1, as in a notebook, only it is replaced.
-
-    Yields
-    ------
-    binary stream
-        For the rows.
     """
     text = sys.stdout
     assert text is not None

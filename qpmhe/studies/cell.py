@@ -125,14 +125,7 @@ class OutOfTimeError(Exception):
 
 
 def compute(task: Task) -> Result:
-    """Run a cell; whatever is raised in it becomes a row.
-
-    Returns
-    -------
-    dict
-        The row: the cell's fields, ``outcome``, ``reason``, the metrics, ``environment``, and
-        ``trajectory`` where the task asks for it.
-    """
+    """Run a cell; whatever is raised in it becomes a row."""
     began = perf_counter()
     with _ended_after(task.hard_limit):
         try:

@@ -21,14 +21,7 @@ _PACKAGES = ("numpy", "scipy", "qpsolvers", "cvxpy", "casadi", "jax", "joblib")
 
 @lru_cache(maxsize=1)
 def environment() -> dict[str, Any]:
-    """What this process runs on.
-
-    Returns
-    -------
-    dict
-        ``versions`` (package to version), ``cpu``, ``cores`` (that this process may use),
-        ``python``, ``os``, ``host``, ``threads`` (of the linear algebra, if limited).
-    """
+    """What this process runs on."""
     packages = dict.fromkeys(
         [*_PACKAGES, *(entry.distribution for entry in backends() if entry.distribution)]
     )

@@ -24,30 +24,13 @@ Array = NDArray[np.float64]
 
 
 class IpoptEstimator:
-    r"""The estimator of Definition def:estimator with Ipopt on the nonlinear program.
+    """The estimator of Definition def:estimator with Ipopt on the nonlinear program.
 
     The program is (eq:optiMHE) in the state trajectory, as in `Problem`: with disturbances
     as variables of their own and the dynamics as constraints, Ipopt took a quarter longer.
     It is built once for each window length and started at the candidate. An iterate is
     judged as everywhere else in this package: by its state trajectory, the true cost and
     the true constraints, against the candidate.
-
-    Parameters
-    ----------
-    system, observer, cost, horizon, initial_state
-        As for `qpmhe.MovingHorizonEstimator`; the system without inputs, the prior weight
-        constant.
-    f, h : callable
-        The same model for CasADi: a symbolic column (n) to (n) and (p).
-    max_iterations : int or None
-        Ipopt's iterations per sample; None goes to convergence.
-    tolerance : float
-        Ipopt's ``tol``.
-
-    Raises
-    ------
-    InvalidInputError
-        If CasADi is not installed, or the problem is not of the stated kind.
     """
 
     def __init__(

@@ -247,13 +247,7 @@ class Writer:
             yield self._connection
 
     def begin(self, settings: dict[str, Any], fingerprints: dict[str, str]) -> None:
-        """Note that a study begins, with its settings and the fingerprints of its models' files.
-
-        Raises
-        ------
-        StoreError
-            If a model's file has changed since cells of it were stored.
-        """
+        """Note that a study begins, with its settings and the fingerprints of its models' files."""
         with self._transaction() as connection:
             known = dict(connection.execute("SELECT name, fingerprint FROM models").fetchall())
             for name, fingerprint in fingerprints.items():

@@ -192,27 +192,7 @@ def _list_mean(lists: Series) -> list[float] | None:
 def pareto_front(
     times: ArrayLike, errors: ArrayLike, tolerance: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Which points no other point beats: none is at least as good in both and better in one.
-
-    Parameters
-    ----------
-    times, errors : (k,) array_like
-        Less is better. A point that is not finite is never on the front.
-    tolerance : float
-        A slower point is on the front only if its error is below those of all faster points
-        on it by more than this part. Solvers that converge to the same solution differ in
-        the last digits, and without a tolerance each would have a place of its own.
-
-    Returns
-    -------
-    (k,) array of bool
-        True on the front; points that agree in both are on it together.
-
-    Raises
-    ------
-    ShapeError
-        If the two are not of one length.
-    """
+    """Which points no other point beats: none is at least as good in both and better in one."""
     t, e = numbers("times", times, finite=False), numbers("errors", errors, finite=False)
     if t.ndim != 1 or t.shape != e.shape:
         raise ShapeError(

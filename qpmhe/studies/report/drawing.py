@@ -304,21 +304,7 @@ def static(
     title: str,
     columns: Sequence[tuple[str, Mapping[str, Any]]] = (("", {}),),
 ) -> Figure:
-    """The figure with matplotlib: a row for each panel, a column for each choice of marks.
-
-    Parameters
-    ----------
-    drawing : Drawing
-        What to draw.
-    drawn : mapping of backend to Style
-        How backends look.
-    size : (float, float)
-        Inches.
-    title : str
-        Above the figure.
-    columns : sequence of (heading, choice)
-        See `Drawing.choose`.
-    """
+    """The figure with matplotlib: a row for each panel, a column for each choice of marks."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
