@@ -118,7 +118,7 @@ class BatchEstimator:
 
     def _checked(self, states: Array) -> Array:
         """The initial states, if a single estimator takes each of them."""
-        own = self.system._private()
+        own = self.system.copy()
         for k in np.unique(states, axis=0, return_index=True)[1].tolist():
             check_start(own, self.observer, states[k], f"initial_states[{k}]")
         return states
@@ -264,7 +264,7 @@ class _Looped:
         self, system: System, observer: Observer, cost: Cost, settings: Settings, states: Array
     ) -> None:
         self._engines = [
-            PythonEngine(system._private(), observer, cost, settings, state.copy())
+            PythonEngine(system.copy(), observer, cost, settings, state.copy())
             for state in states
         ]
 

@@ -112,7 +112,7 @@ def casadi_model(
     Parameters
     ----------
     f, h : casadi.Function or callable
-        As for `qpmhe.System.from_casadi`.
+        As for `qpmhe.from_casadi`.
     n, p, m, dt, method
         As there.
 

@@ -38,7 +38,7 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         The estimator's.
     """
     if system.symbolic is None:
-        return "the system has no CasADi form; make it by qpmhe.System.from_casadi."
+        return "the system has no CasADi form; make it with qpmhe.from_casadi."
     if type(observer) not in _CONSTANT_GAIN:
         return (
             f"{type(observer).__name__} has no C form; take an observer with constant gain "

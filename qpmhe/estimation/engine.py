@@ -302,8 +302,8 @@ class PythonEngine:
         try:
             with reading():
                 check_description(state["estimator"], self._description())
-                found = self._checked_calling(state["modes"], state["methods"])
-                self._system.use_call_modes(found)
+                modes = self._checked_calling(state["modes"], state["methods"])
+                self._system.use_call_modes(modes)
                 found = self._read(state)
                 self._solver.forget()
             self.replace(*found)

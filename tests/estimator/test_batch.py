@@ -530,7 +530,7 @@ def test_models_and_steps_in_c(engine):
     if find_compiler() is None:
         pytest.skip("no C compiler")
     reactor = qpmhe.models.batch_reactor()
-    system = qpmhe.System.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2)
+    system = qpmhe.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2)
     Y = np.array([reactor.scenario.simulate(seed, 25).measurements for seed in range(4)])
     Y[2, 3] = np.nan
     mode = "vectorised" if engine == "python" else "compiled"

@@ -18,7 +18,7 @@ BOX = qpmhe.Box([-0.1, -0.1], [0.1, 0.1])
 
 def reactor(**sets):
     model = qpmhe.models.batch_reactor()
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         casadi_rate, casadi_output, dt=0.1, method="euler", n=2, **sets
     )
     return system, model.observer, model.cost
@@ -82,7 +82,7 @@ def test_inputs_of_each_member_and_shared_ones():
     def f(x, u):
         return [0.9 * x[0] + u[0], 0.8 * x[1] + 0.1 * x[0] * u[1]]
 
-    system = qpmhe.System.from_casadi(f, lambda x: x[0] + x[1], n=2, m=2)
+    system = qpmhe.from_casadi(f, lambda x: x[0] + x[1], n=2, m=2)
     cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[4.0]])
     generator = np.random.default_rng(2)
     y, u = generator.normal(size=(20, 12, 1)), generator.normal(size=(20, 12, 2))
@@ -162,7 +162,7 @@ def test_bad_input():
 )
 def test_copies_go_on_where_they_were_made(mode, engine, sets, compiled, copied):
     model = qpmhe.models.batch_reactor()
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         casadi_rate, casadi_output, dt=0.1, method="euler", n=2, compiled=compiled, **sets
     )
     members, cut = 20, 14
