@@ -15,7 +15,13 @@ __all__ = ["CasadiModel", "casadi_model", "import_casadi"]
 
 
 def import_casadi() -> Any:
-    """The casadi package, which is imported late."""
+    """The casadi package, which is imported late.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is not installed.
+    """
     try:
         import casadi
     except ImportError as error:
@@ -27,7 +33,19 @@ def import_casadi() -> Any:
 
 @dataclass(frozen=True)
 class CasadiModel:
-    """f and h, or the rate of an ODE and h, as functions of (x, u)."""
+    """f and h, or the rate of an ODE and h, as functions of (x, u).
+
+    Parameters
+    ----------
+    f, h : casadi.Function
+        (x, u) to a dense column; u has no rows where there are no inputs.
+    n, p, m : int
+        Numbers of states, outputs and inputs.
+    dt : float or None
+        Sampling time of an ODE; None where f is the discrete-time map itself.
+    method : str or None
+        Its discretisation.
+    """
 
     f: Any
     h: Any
@@ -38,7 +56,20 @@ class CasadiModel:
     method: str | None = None
 
     def with_jacobian(self, which: str) -> tuple[Any, list[int]]:
-        """A function of (x, u) to the value and the nonzeros of its Jacobian by x."""
+        """A function of (x, u) to the value and the nonzeros of its Jacobian by x.
+
+        Parameters
+        ----------
+        which : {"f", "h"}
+            The function.
+
+        Returns
+        -------
+        function : casadi.Function
+            (x, u) to the value and a column of nonzeros.
+        places : list of int
+            Where each nonzero is in the dense Jacobian, counted by rows.
+        """
         ca, function = import_casadi(), getattr(self, which)
         x, u = _symbols(ca, function, self.n, self.m)
         value = function(x, u)
@@ -76,7 +107,20 @@ def casadi_model(
     dt: float | None = None,
     method: str = "rk4",
 ) -> CasadiModel:
-    """Check a model given to CasADi and bring it to the common form."""
+    """Check a model given to CasADi and bring it to the common form.
+
+    Parameters
+    ----------
+    f, h : casadi.Function or callable
+        As for `qpmhe.from_casadi`.
+    n, p, m, dt, method
+        As there.
+
+    Raises
+    ------
+    InvalidInputError
+        If CasADi is missing, or an argument does not fit; subclasses tell what.
+    """
     ca = import_casadi()
     if method not in METHODS:
         raise OptionError(f"method is {method!r}; expected one of {', '.join(METHODS)}.")
