@@ -65,7 +65,8 @@ class Capabilities:
         backend : Backend
             Its description.
         """
-        return Capabilities(**{one.name: getattr(backend, one.name) for one in fields(Capabilities)})
+        names = [one.name for one in fields(Capabilities)]
+        return Capabilities(**{name: getattr(backend, name) for name in names})
 
 
 def measure(name: str) -> Capabilities:

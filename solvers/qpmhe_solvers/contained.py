@@ -86,12 +86,12 @@ class ContainedSolver:
 
     def shift(self) -> None:
         """Say that the trajectory moved on by one stage; see `Solver.shift`."""
-        if self.solver._user == self._number:  # otherwise it keeps nothing of this trajectory
+        if self.solver._user in (0, self._number):  # else it keeps nothing of this trajectory
             _quietly(self.solver.shift)
 
     def forget(self) -> None:
         """Drop what is kept from solve to solve; see `Solver.forget`."""
-        if self.solver._user == self._number:
+        if self.solver._user in (0, self._number):
             _quietly(self.solver.forget)
 
     def prepare(self, size: int) -> None:

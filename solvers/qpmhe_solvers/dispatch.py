@@ -79,17 +79,19 @@ class Translation:
 # 1e-7 to the Hessian's diagonal, which is much where weights spread over decades.
 TRANSLATIONS: Mapping[str, Translation] = {
     "clarabel": Translation(
-        "interior point", "clarabel", "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"), ("tol_gap_rel",), "time_limit",
-        needs_row=True,
-        reports_infeasibility=True,
+        "interior point", "clarabel", "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"),
+        ("tol_gap_rel",), "time_limit", needs_row=True, reports_infeasibility=True,
     ),
-    "cvxopt": Translation("interior point", "cvxopt", "csc", "rows", "maxiters", ("abstol", "feastol"), ("reltol",)),
+    "cvxopt": Translation(
+        "interior point", "cvxopt", "csc", "rows", "maxiters", ("abstol", "feastol"), ("reltol",),
+    ),
     "daqp": Translation(
-        "dual active set", "daqp", "dense", "box", "iter_limit", ("primal_tol", "dual_tol"), time_limit="time_limit",
-        start=True, beyond_cap=1,
+        "dual active set", "daqp", "dense", "box", "iter_limit", ("primal_tol", "dual_tol"),
+        time_limit="time_limit", start=True, beyond_cap=1,
     ),
     "ecos": Translation(
-        "interior point", "ecos", "dense", "rows", "max_iters", ("abstol", "feastol", "reltol"), needs_row=True
+        "interior point", "ecos", "dense", "rows", "max_iters", ("abstol", "feastol", "reltol"),
+        needs_row=True,
     ),
     "highs": Translation(
         "active set", "highspy", "csc", "box", "qp_iteration_limit",
@@ -97,25 +99,27 @@ TRANSLATIONS: Mapping[str, Translation] = {
         needs_row=True, others=(("qp_regularization_value", 1e-12),),
     ),
     "osqp": Translation(
-        "ADMM", "osqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", start=True,
-        reports_infeasibility=True,
+        "ADMM", "osqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit",
+        start=True, reports_infeasibility=True,
     ),
     "piqp": Translation(
-        "interior point", "piqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), keep_empty=True,
-        reports_infeasibility=True,
+        "interior point", "piqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),
+        keep_empty=True, reports_infeasibility=True,
     ),
     "proxqp": Translation(
-        "augmented Lagrangian", "proxsuite", "dense", "box", "max_iter", ("eps_abs",), ("eps_rel",), default_cap=200,
-        reports_infeasibility=True,
+        "augmented Lagrangian", "proxsuite", "dense", "box", "max_iter", ("eps_abs",),
+        ("eps_rel",), default_cap=200, reports_infeasibility=True,
     ),
     "qpalm": Translation(
-        "augmented Lagrangian", "qpalm", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit",
-        reports_infeasibility=True,
+        "augmented Lagrangian", "qpalm", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),
+        "time_limit", reports_infeasibility=True,
     ),
-    "quadprog": Translation("dual active set", "quadprog", "dense", "rows", None, ()),
+    "quadprog": Translation(
+        "dual active set", "quadprog", "dense", "rows", None, (),
+    ),
     "scs": Translation(
-        "ADMM", "scs", "csc", "rows", "max_iters", ("eps_abs",), ("eps_rel",), "time_limit_secs", start=True,
-        needs_row=True,
+        "ADMM", "scs", "csc", "rows", "max_iters", ("eps_abs",), ("eps_rel",), "time_limit_secs",
+        start=True, needs_row=True,
     ),
 }
 
