@@ -317,14 +317,16 @@ def test_gives_what_python_gives(case, tmp_path):
 
 
 WIDE = {"states": 0.6, "disturbances": 0.05, "noises": 0.15}
-POLICIES = [("drop", "candidate"), ("project", "candidate"), ("keep", "best"), ("project", "best")]
+POLICIES = [("drop", False), ("project", False), ("keep", True), ("project", True)]
 
 
 def constrained(outside="drop", warm_start=False, **options):
     sets = {
         name: polytope(2 if name == "noises" else 3, width) for name, width in WIDE.items()
     }
-    return estimator(model(m=1, **sets), outside=outside, start=start, max_qps=20, **options)
+    return estimator(
+        model(m=1, **sets), outside=outside, warm_start=warm_start, max_qps=20, **options
+    )
 
 
 @pytest.fixture(scope="module")
@@ -341,7 +343,7 @@ def test_inequalities_bind_as_in_python(outside, start, with_sets):
     check(found, expected, 1e-5, statuses=False)
     outcome = Status.SETS_DROPPED | Status.PROJECTED | Status.CANDIDATE_OUTSIDE | Status.IMPROVED
     assert [one.status & outcome for one in found] == [one.status & outcome for one in expected]
-    free = estimator(model(m=1), start=start, max_qps=20)
+    free = estimator(model(m=1), warm_start=start, max_qps=20)
     _, without = record(free, 16, spread=0.06)
     moved = [abs(one.cost - other.cost) for one, other in zip(found, without, strict=True)]
     assert max(moved) > 1e-3  # otherwise nothing was active

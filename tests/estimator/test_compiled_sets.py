@@ -202,7 +202,8 @@ def test_other_options_with_sets(name, kind):
     in_step(name, kind, 1, max_qps=0)
     in_step(name, kind, 1, max_qps=None, warm_start=True)
     # The candidate hangs on the estimate before: what differs adds up.
-    mhe, Y = estimator(name, kind, candidate="reinitialized", warm_start=True), case.record(1, STEPS)
+    mhe = estimator(name, kind, candidate="reinitialized", warm_start=True)
+    Y = case.record(1, STEPS)
     for y in Y:
         promised(name, kind, mhe.update(y), Y)
     discounted = qpmhe.QuadraticCost(**weights, discount=0.8)

@@ -175,7 +175,7 @@ BATCHES = {
     "looped": {},
     "looped best": {"warm_start": True, "max_qps": 2, "delay": 1},
     "looped alone": {"max_qps": 0},
-    "looped": {"candidate": "reinitialized"},
+    "looped anew": {"candidate": "reinitialized"},
     "compiled": {"engine": "compiled"},
 }
 
