@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
-from ..observers import Luenberger, Observer, OutputInjection, SteadyStateKalman
+from ..observers import Luenberger, Observer, OutputInjection
 from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
 from .decay import checked_rate
 from .evidence import CertificateError, JumpError, NotCertifiedError, OutOfTimeError
@@ -35,13 +35,11 @@ def constant_gain(observer: Observer, system: System) -> Array:
         raise InvalidInputError(
             f"observer is {observer!r}; expected an observer, such as qpmhe.Luenberger(gain)."
         )
-    # A class derived from these may correct in another way.
-    plain = type(observer).correct in (Luenberger.correct, SteadyStateKalman.correct)
-    if plain and isinstance(observer, (Luenberger, SteadyStateKalman)):
-        shape = system.n, system.p
-        if observer.gain.shape != shape:
-            raise ShapeError(f"gain has shape {observer.gain.shape}; expected (n, p) = {shape}.")
-        return observer.gain
+    gain, shape = observer.constant_gain, (system.n, system.p)
+    if gain is not None:
+        if gain.shape != shape:
+            raise ShapeError(f"gain has shape {gain.shape}; expected (n, p) = {shape}.")
+        return gain
     kind = type(observer).__name__
     reason = (
         "its correction is a function of the state as well"

@@ -15,7 +15,7 @@ from ..estimation.limits import c_definitions
 from ..estimation.settings import Settings
 from ..model.sets import ConvexSet
 from ..model.system import System
-from ..observers import Luenberger, SteadyStateKalman
+from ..observers import Observer
 
 __all__ = ["SET_NAMES", "Layout", "settings_record"]
 
@@ -118,7 +118,7 @@ class Layout:
 def settings_record(
     layout: Layout,
     system: System,
-    observer: Luenberger | SteadyStateKalman,
+    observer: Observer,
     cost: Cost,
     settings: Settings,
 ) -> NDArray[Any]:
@@ -138,12 +138,14 @@ def settings_record(
 def _filled(
     layout: Layout,
     system: System,
-    observer: Luenberger | SteadyStateKalman,
+    observer: Observer,
     cost: Cost,
     settings: Settings,
 ) -> NDArray[Any]:
     record = np.zeros((), layout.settings_type())
-    record["gain"] = observer.gain.ravel()
+    gain = observer.constant_gain
+    assert gain is not None
+    record["gain"] = gain.ravel()
     record["prior_weight"] = np.asarray(cost.prior).ravel()
     record["disturbance_weight"] = cost.disturbance.ravel()
     record["noise_weight"] = cost.noise.ravel()

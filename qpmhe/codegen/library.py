@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from ..costs import Cost, ObserverPrior, QuadraticCost
+from ..costs import Cost, QuadraticCost
 from ..errors import CompilationError, OptionError
 from ..estimation.limits import FEASIBLE
 from ..estimation.settings import Settings
 from ..model.sets import ConvexSet
 from ..model.system import System
-from ..observers import HighGain, Luenberger, Observer, SteadyStateKalman
+from ..observers import Observer
 from .comparison import Interpreter, estimator_fault
 from .compiler import compiled_library
 from .layout import SET_NAMES, Layout, settings_record
@@ -25,21 +25,20 @@ __all__ = ["EstimatorLibrary", "generated", "uncovered"]
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
 _MOST_BYTES = 2**31 - 1
-_CONSTANT_GAIN = (Luenberger, HighGain, SteadyStateKalman)
 
 
 def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings) -> str:
     """Why an estimator has no C form, with the remedy; empty if it has one."""
     if system.symbolic is None:
         return "the system has no CasADi form; make it with qpmhe.from_casadi."
-    if type(observer) not in _CONSTANT_GAIN:
+    if observer.constant_gain is None:
         return (
             f"{type(observer).__name__} has no C form; take an observer with constant gain "
             "(Luenberger, SteadyStateKalman, HighGain)."
         )
     if type(cost) is not QuadraticCost:
         return f"{type(cost).__name__} has no C form; take a QuadraticCost."
-    if isinstance(cost.prior, ObserverPrior):
+    if cost.observer_prior is not None:
         return "a prior weight from the observer has no C form; take a constant one."
     for name in SET_NAMES:
         one = getattr(system, name)
@@ -118,7 +117,6 @@ def generated(
         raise OptionError(f"no C code for this estimator: {reason}")
     model = system.symbolic
     assert model is not None
-    assert isinstance(observer, _CONSTANT_GAIN)
     layout = Layout.of(system, settings.horizon, CONTINUOUS[model.method], real)
     record = settings_record(layout, system, observer, cost, settings)
     files, structure = estimator_files(model, layout, record, name)

@@ -92,6 +92,11 @@ class Cost(ABC):
         self._kept = max(_KEPT_LEAST, _KEPT_BYTES // self.stage_weight.nbytes)
 
     @property
+    def observer_prior(self) -> ObserverPrior | None:
+        """The rule by which the observer's covariance gives the prior weight, if there is one."""
+        return self.prior if isinstance(self.prior, ObserverPrior) else None
+
+    @property
     @abstractmethod
     def constants(self) -> CostConstants | None:
         """The constants of (eq:exp_bounds), or None if the cost has none."""

@@ -140,12 +140,12 @@ class PythonEngine:
             with np.errstate(all="ignore"):
                 if window.length == self._settings.horizon:
                     self._solver.shift()
-                missing, held, flat = window.push(y, u, dt, noise_weight)
+                missing, model_failed, jacobian_failed = window.push(y, u, dt, noise_weight)
                 if again:
                     # The history reaches back to the estimate of the window's first state.
                     first = self._history[len(self._history) - window.length]
-                    missing, held, flat = window.replay(window.length, first)
-                estimate = self._estimate(missing, held, flat, began)
+                    missing, model_failed, jacobian_failed = window.replay(window.length, first)
+                estimate = self._estimate(missing, model_failed, jacobian_failed, began)
             assert self._trajectory is not None
             newest = self._trajectory[-1]
             # Of many states, views would keep as many trajectories.
@@ -164,8 +164,8 @@ class PythonEngine:
                 self._window.amend(time, y)
                 self._trajectory = None  # it does not belong to the window before this one
                 missing = not self._window.observed[-1].all()
-                held = self._window.newest_is_held
-                estimate = self._estimate(missing, held, False, began)
+                model_failed = self._window.newest_failed
+                estimate = self._estimate(missing, model_failed, False, began)
             self._history[-1] = estimate.state.copy()
             return estimate
         except BaseException:
@@ -196,7 +196,9 @@ class PythonEngine:
             problem.leave_out(self._dropped)
             return window_covariances(problem, self._trajectory.copy())
 
-    def _estimate(self, missing: bool, held: bool, flat: bool, began: float) -> Estimate:
+    def _estimate(
+        self, missing: bool, model_failed: bool, jacobian_failed: bool, began: float
+    ) -> Estimate:
         """Solve the window's problem as it stands."""
         window, problem, settings = self._window, self._problem, self._settings
         problem.bind(window)
@@ -210,7 +212,7 @@ class PythonEngine:
             status |= outcome.events
         if missing:
             status |= Status.MISSING
-        if held or flat:
+        if model_failed or jacobian_failed:
             status |= Status.MODEL_FAILED
         elif not math.isfinite(reference.cost):
             status |= Status.FAILED_STAGE
@@ -238,7 +240,7 @@ class PythonEngine:
             outcome.dropped,
             settings.delay,
         )
-        if held and outcome.improved:
+        if model_failed and outcome.improved:
             window.restart(estimate.state)
         # The estimate's arrays are the user's.
         self._trajectory, self._dropped = trajectory.copy(), outcome.dropped

@@ -42,7 +42,7 @@ class Status(enum.Flag):
     MISSING = enum.auto()
     #: The candidate is outside of sets; these were left out in this step.
     SETS_DROPPED = enum.auto()
-    #: The candidate is outside of sets; the nearest trajectory inside took its place.
+    #: The candidate is outside of sets; the nearest trajectory inside took its view.
     PROJECTED = enum.auto()
     #: The candidate is outside of sets, and is the estimate as the policy "keep" demands.
     CANDIDATE_OUTSIDE = enum.auto()

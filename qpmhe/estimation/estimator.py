@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import positive, positive_definite, record, vector
-from ..costs import Cost, ObserverPrior
+from ..costs import Cost
 from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
 from ..model.system import System
 from ..observers import Observer
@@ -141,7 +141,7 @@ class MovingHorizonEstimator:
                 f"the cost is for {cost.n} states and {cost.p} outputs; expected {system.n} "
                 f"and {system.p}, the system's."
             )
-        if isinstance(cost.prior, ObserverPrior) and observer.initial_covariance() is None:
+        if cost.observer_prior is not None and observer.initial_covariance() is None:
             raise InvalidInputError(
                 f"the prior weight is to come from the observer, but {type(observer).__name__} "
                 "has no covariance; take a Kalman-type observer, such as qpmhe.ExtendedKalman, "

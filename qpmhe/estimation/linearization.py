@@ -23,12 +23,19 @@ class Stage:
         The parts w (n,) and v (p,) of r.
     minus_f, minus_h : array
         The parts -A (n, n) and -C (p, n) of -G.
-    panel, own, following : array
+    panel, current, next : array
         The stage's terms.
     """
 
     __slots__ = (
-        "disturbance", "following", "linear", "minus_f", "minus_h", "noise", "own", "panel",
+        "current",
+        "disturbance",
+        "linear",
+        "minus_f",
+        "minus_h",
+        "next",
+        "noise",
+        "panel",
         "transposed",
     )
 
@@ -38,7 +45,7 @@ class Stage:
         n = linear.shape[1] - 1
         self.disturbance, self.noise = linear[:n, 0], linear[n:, 0]
         self.minus_f, self.minus_h = linear[:n, 1:], linear[n:, 1:]
-        self.panel, self.own, self.following = terms.panel[k], terms.own[k], terms.following[k]
+        self.panel, self.current, self.next = terms.panel[k], terms.current[k], terms.next[k]
 
 
 class Span:
@@ -50,23 +57,29 @@ class Span:
         The :math:`-G_i`.
     panel : (count, n, 2n) array
         The panels.
-    own_first, own_rest : array
-        ``own`` of the first stage, and of all behind it.
-    following_rest, following_last : array
-        ``following`` of all stages but the last, and of the last.
+    current_first, current_rest : array
+        ``current`` of the first stage, and of all behind it.
+    next_rest, next_last : array
+        ``next`` of all stages but the last, and of the last.
     """
 
     __slots__ = (
-        "following_last", "following_rest", "minus_jacobian", "own_first", "own_rest", "panel",
+        "current_first",
+        "current_rest",
+        "minus_jacobian",
+        "next_last",
+        "next_rest",
+        "panel",
     )
 
     def __init__(self, terms: StageTerms, first: int, count: int) -> None:
         last = first + count
         self.minus_jacobian = terms.linear[first:last, :, 1:]
         self.panel = terms.panel[first:last]
-        self.own_first, self.own_rest = terms.own[first], terms.own[first + 1 : last]
-        self.following_rest = terms.following[first : last - 1]
-        self.following_last = terms.following[last - 1]
+        self.current_first = terms.current[first]
+        self.current_rest = terms.current[first + 1 : last]
+        self.next_rest = terms.next[first : last - 1]
+        self.next_last = terms.next[last - 1]
 
 
 class StageTerms:
@@ -80,8 +93,8 @@ class StageTerms:
 
     - ``panel[i]``: the band of :math:`G_i^\top W_i G_i` and of the coupling block
       :math:`-Q_i A_i` below it, without :math:`Q_{i-1}` of the stage before;
-    - ``own[i]``: :math:`-G_i^\top W_i r_i`, the gradient with respect to :math:`d_i`;
-    - ``following[i]``: :math:`Q_i w_i`, the gradient with respect to :math:`d_{i+1}`.
+    - ``current[i]``: :math:`-G_i^\top W_i r_i`, the gradient with respect to :math:`d_i`;
+    - ``next[i]``: :math:`Q_i w_i`, the gradient with respect to :math:`d_{i+1}`.
 
     Attributes
     ----------
@@ -89,13 +102,23 @@ class StageTerms:
         :math:`[r_i, -G_i]`.
     residuals : (stages, n + p) array
         The :math:`r_i` in it, a view.
-    panel, own, following : array
+    panel, current, next : array
         (stages, n, 2n), (stages, n), (stages, n).
     """
 
     __slots__ = (
-        "_first", "_flat", "_index", "_own", "_square", "_weighted", "_zeros",
-        "following", "linear", "own", "panel", "residuals",
+        "_first",
+        "_flat",
+        "_index",
+        "_own",
+        "_square",
+        "_weighted",
+        "_zeros",
+        "current",
+        "linear",
+        "next",
+        "panel",
+        "residuals",
     )
 
     def __init__(self, stages: int, n: int, p: int) -> None:
@@ -103,8 +126,8 @@ class StageTerms:
         self.linear: Array = np.zeros((stages, q, 1 + n))
         self.residuals: Array = self.linear[:, :, 0]
         self.panel: Array = np.zeros((stages, n, 2 * n))
-        self.own: Array = np.zeros((stages, n))
-        self.following: Array = np.zeros((stages, n))
+        self.current: Array = np.zeros((stages, n))
+        self.next: Array = np.zeros((stages, n))
         # Of one stage, with M = [r, -G]: M^T W M, behind it W M, and a number that stays 0.
         self._flat = np.zeros((1 + n) ** 2 + q * (1 + n) + 1)
         self._square = self._flat[: (1 + n) ** 2].reshape(1 + n, 1 + n)
@@ -125,13 +148,13 @@ class StageTerms:
         weight.dot(stage.linear, weighted)
         stage.transposed.dot(weighted, self._square)
         flat.take(self._index, None, stage.panel, "clip")
-        stage.own[...] = self._own
-        stage.following[...] = self._first
+        stage.current[...] = self._own
+        stage.next[...] = self._first
         # 0 times what is not finite is NaN, and no square overflows on the way.
         return float(flat[0] + flat.dot(self._zeros))
 
     def set_all(self, count: int, weight: Array) -> None:
-        """Compute the terms of the first stages, their linear maps in place."""
+        """Compute the terms of the first stages, their linear maps in view."""
         linear = self.linear[:count]
         weighted = np.matmul(weight, linear)
         square = np.matmul(linear.transpose(0, 2, 1), weighted)
@@ -139,8 +162,8 @@ class StageTerms:
             (square.reshape(count, -1), weighted.reshape(count, -1), np.zeros((count, 1))), axis=1
         )
         flat.take(self._index, axis=1, out=self.panel[:count], mode="clip")
-        self.own[:count] = square[:, 1:, 0]
-        self.following[:count] = weighted[:, : self.own.shape[1], 0]
+        self.current[:count] = square[:, 1:, 0]
+        self.next[:count] = weighted[:, : self.current.shape[1], 0]
 
     def copy_scaled(self, terms: StageTerms, first: int, factors: Array) -> None:
         """Take over the stages of other terms from ``first`` on, each times its factor."""
@@ -148,12 +171,12 @@ class StageTerms:
         stages = slice(first, first + count)
         self.linear[:count] = terms.linear[stages]
         np.multiply(terms.panel[stages], factors[:, None, None], out=self.panel[:count])
-        np.multiply(terms.own[stages], factors[:, None], out=self.own[:count])
-        np.multiply(terms.following[stages], factors[:, None], out=self.following[:count])
+        np.multiply(terms.current[stages], factors[:, None], out=self.current[:count])
+        np.multiply(terms.next[stages], factors[:, None], out=self.next[:count])
 
     def arrays(self) -> tuple[Array, ...]:
         """The arrays, each with one entry a stage."""
-        return self.linear, self.panel, self.own, self.following
+        return self.linear, self.panel, self.current, self.next
 
 
 def _places(n: int, p: int) -> NDArray[np.intp]:

@@ -16,11 +16,11 @@ from ..model.functions import contained
 from ..model.sets import ConvexSet
 from ..model.system import System
 from .limits import FEASIBLE
-from .views import read_only
+from .stages import read_only
 from .window import Window
 
 if TYPE_CHECKING:
-    from .views import Frame
+    from .stages import WindowView
 
 __all__ = ["Problem", "Trial"]
 
@@ -58,7 +58,7 @@ class Problem:
         self._n, self._q = system.n, system.n + system.p
         self._stage_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
         self._prior_cost = contained(cost.prior_cost)
-        self._prior_rule = cost.prior if isinstance(cost.prior, ObserverPrior) else None
+        self._prior_rule = cost.observer_prior
         #: Weight of the initial error, before discount and majorisation.
         self.prior_weight: Array = (
             np.eye(system.n) if isinstance(cost.prior, ObserverPrior) else cost.prior
@@ -67,7 +67,7 @@ class Problem:
         self._discounted = cost.discount < 1.0
         self._candidate: Trial | None = None
         #: Views of the bound window.
-        self.frame: Frame
+        self.view: WindowView
         self.model = system
         self.prior: Array = np.zeros(system.n)
         self.inputs: Array = np.zeros((0, system.m))
@@ -95,8 +95,8 @@ class Problem:
     def bind(self, window: Window) -> None:
         """Take over the window's data, all sets, and the prior z(t-N) as in (eq:prior)."""
         self._candidate = None
-        self.frame = frame = window.frame
-        self.prior, self.measurements = frame.prior, frame.measurements
+        self.view = view = window.view
+        self.prior, self.measurements = view.prior, view.measurements
         # Decided by what the window holds: an estimator that goes on from a snapshot must round
         # as the one that it was taken of.
         unusual = window.unusual and (window.has_special_weights or window.has_irregular_steps)
@@ -105,7 +105,7 @@ class Problem:
             self.stage_weights = window.stage_weights
             self.observed = window.observed if window.has_special_weights else None
         else:
-            self.inputs, self.model = frame.inputs, self._system
+            self.inputs, self.model = view.inputs, self._system
             self.stage_weights, self.observed = self._cost.stage_weight, None
         if self._discounted:
             self.discounts = window.discounts
@@ -233,9 +233,9 @@ class Problem:
             weights = self.stage_weights if self._quadratic else window.majorising_weights
             if self.discounts is not None:
                 weights = weights * self.discounts[1:, None, None]
-            frame = self.frame
+            view = self.view
             self._candidate = Trial(
-                frame.candidate, frame.residuals, weights, window.cost_over(frame)
+                view.candidate, view.residuals, weights, window.cost_over(view)
             )
         return self._candidate
 

@@ -1,4 +1,4 @@
-"""Options of the estimator, validated in one place."""
+"""Options of the estimator, validated in one view."""
 
 from __future__ import annotations
 

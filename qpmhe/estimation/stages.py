@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import positive_definite
-from .linearization import StageTerms
+from .linearization import Span, Stage, StageTerms
 from .snapshot import check_size, other, taken
-from .views import Frame, Place, Views, read_only
 
-__all__ = ["Mark", "Stages"]
+__all__ = ["Mark", "StageView", "Stages", "Views", "WindowView", "read_only"]
 
 Array = NDArray[np.float64]
 Mark = tuple[
@@ -24,6 +23,92 @@ Mark = tuple[
 
 # Views of longer windows are not kept: they would outweigh the arrays, and are little of a step.
 _KEPT = 1000
+View = TypeVar("View")
+
+
+def read_only(array: Array) -> Array:
+    """A view that cannot be written to."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+class StageView:
+    """Views of one stage's entries in all arrays.
+
+    Attributes
+    ----------
+    z, next : (n,) array
+        State of the observer, and the one after it.
+    arguments : tuple
+        What the functions of the usual model take, read-only: z, and the inputs if there are any.
+    error : (p,) array
+        The fitting error, read-only.
+    y, u : array
+        The measurement (p,), and the input (m,).
+    weight : (n + p, n + p) array
+        The stage's.
+    terms : Stage
+        Its linear map and terms.
+    """
+
+    __slots__ = ("arguments", "error", "next", "terms", "u", "weight", "y", "z")
+
+    def __init__(self, stages: Stages, k: int) -> None:
+        self.z, self.next = stages._z[k], stages._z[k + 1]
+        self.y, self.u = stages._y[k], stages._u[k, :-1]
+        self.arguments: tuple[Array, ...] = tuple(
+            read_only(one) for one in ((self.z, self.u) if self.u.size else (self.z,))
+        )
+        self.weight = stages._weight[k]
+        self.terms = Stage(stages.terms, k)
+        self.error = read_only(self.terms.noise)
+
+
+class WindowView:
+    """Views of a whole window.
+
+    Attributes
+    ----------
+    candidate : (K + 1, n) array
+        The observer's trajectory.
+    prior : (n,) array
+        Its first state.
+    residuals, measurements, inputs : array
+        (K, n + p), (K, p) and (K, m).
+    costs : (K,) array
+        The stages' costs.
+    span : Span
+        The stages' terms.
+    """
+
+    __slots__ = ("candidate", "costs", "inputs", "measurements", "prior", "residuals", "span")
+
+    def __init__(self, stages: Stages, first: int, last: int) -> None:
+        self.candidate, self.prior = stages._z[first : last + 1], stages._z[first]
+        self.residuals = stages.terms.residuals[first:last]
+        self.measurements, self.inputs = stages._y[first:last], stages._u[first:last, :-1]
+        self.costs = stages._stage_cost[first:last]
+        self.span = Span(stages.terms, first, last - first)
+
+
+class Views(Sequence[View]):
+    """Views that are made when they are wanted, of which only the last is kept."""
+
+    def __init__(self, count: int, make: Callable[[int], View]) -> None:
+        self._count, self._make = count, make
+        self._k = -1
+        self._view: View | None = None
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, k: Any) -> Any:
+        if k >= self._count:
+            raise IndexError(k)
+        if k != self._k:
+            self._k, self._view = k, self._make(k)
+        return self._view
 
 
 class Stages:
@@ -72,12 +157,13 @@ class Stages:
             read_only(array) for array in (self._weight, self.terms.residuals)
         )
         # By stage; and of the full windows, by their first stage.
-        self._places: Sequence[Place] = Views(room, partial(Place, self))
-        self._frames: Sequence[Frame] = Views(
-            room + 1 - horizon, lambda k: Frame(self, k, k + horizon)
+        self._stage_views: Sequence[StageView] = Views(room, partial(StageView, self))
+        self._window_views: Sequence[WindowView] = Views(
+            room + 1 - horizon, lambda k: WindowView(self, k, k + horizon)
         )
         if horizon <= _KEPT:
-            self._places, self._frames = list(self._places), list(self._frames)
+            self._stage_views = list(self._stage_views)
+            self._window_views = list(self._window_views)
         self.time = 0  # samples ever pushed: the window ends at x(time)
         self.start = self.end = 0
         self._last_special = self._last_irregular = -self.horizon - 1
@@ -99,14 +185,14 @@ class Stages:
         return self.end - self.start
 
     @property
-    def frame(self) -> Frame:
+    def view(self) -> WindowView:
         """The views of the present window, which has at least one stage."""
         if self.end - self.start < self.horizon:
-            return Frame(self, self.start, self.end)
-        return self._frames[self.start]
+            return WindowView(self, self.start, self.end)
+        return self._window_views[self.start]
 
     @property
-    def newest_is_held(self) -> bool:
+    def newest_failed(self) -> bool:
         """Whether the newest stage could not be evaluated."""
         return not math.isfinite(self._stage_cost[self.end - 1])
 

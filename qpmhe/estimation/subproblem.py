@@ -61,7 +61,7 @@ class Subproblem:
         """The QP around the candidate, from what the window has kept."""
         trial = problem.candidate(window)
         if self._scaled is None:
-            return self._assemble(problem, trial, problem.frame.span, True)
+            return self._assemble(problem, trial, problem.view.span, True)
         self._scaled.copy_scaled(window.terms, window.start, window.discounts[1:])
         return self._assemble(problem, trial, Span(self._scaled, 0, window.length), True)
 
@@ -136,14 +136,14 @@ class Subproblem:
         prior_band = problem.prior_band_at(offset)
         if prior_band is not self._prior_band:
             self._added[0] = self._prior_band = prior_band
-        own_first, own_rest, last, band_rest, band_last = self._views
+        current_first, current_rest, last, band_rest, band_last = self._views
         np.add(span.panel, self._added[:-1], band_rest)
         band_last[...] = self._added[-1]
-        np.add(span.own_rest, span.following_rest, own_rest)
-        own_first[...] = span.own_first
+        np.add(span.current_rest, span.next_rest, current_rest)
+        current_first[...] = span.current_first
         if not at_candidate:
-            own_first += problem.prior_weight_at(offset).dot(offset)
-        last[...] = span.following_last
+            current_first += problem.prior_weight_at(offset).dot(offset)
+        last[...] = span.next_last
         self._minus_jacobian = span.minus_jacobian
         if problem.constrained:
             self._bound(qp, problem, trial)

@@ -14,8 +14,7 @@ from ..observers import Observer, Sample
 from .limits import LARGEST
 from .linearization import Stage, StageTerms
 from .snapshot import near, other
-from .stages import Stages
-from .views import Frame
+from .stages import Stages, WindowView
 
 __all__ = ["Window"]
 
@@ -76,10 +75,10 @@ class Window(Stages):
         if self.end == self.room:
             self.make_room()
         k, m = self.end, self._m
-        place = self._places[k]
-        place.y[...] = y
+        view = self._stage_views[k]
+        view.y[...] = y
         if m:
-            place.u[...] = u
+            view.u[...] = u
         if dt is not None:
             self._irregular[k] = self.unusual = True
             self._u[k, m] = dt
@@ -120,7 +119,7 @@ class Window(Stages):
 
     def _enter(self, k: int, time: int) -> tuple[bool, bool, bool]:
         """Compute stage k from z(k) and its sample; what `push` tells."""
-        y = self._places[k].y
+        y = self._stage_views[k].y
         observed: NDArray[np.bool_] | None = None
         if not math.isfinite(y.dot(y)):
             self._observed[k] = observed = np.abs(y) < LARGEST  # false for NaN, too
@@ -134,12 +133,12 @@ class Window(Stages):
                 self._observed[k] = observed = there
                 self._set_weight(k, time)
                 cost = self._advance(k, time, observed)
-        held = not math.isfinite(cost)
-        if held:
+        model_failed = not math.isfinite(cost)
+        if model_failed:
             self._hold(k)
         self._stage_cost[k] = cost
-        flat = not held and self._linearized and not self._linear
-        return observed is not None, held, flat
+        jacobian_failed = not model_failed and self._linearized and not self._linear
+        return observed is not None, model_failed, jacobian_failed
 
     def _set_weight(self, k: int, time: int) -> None:
         """The weight of stage k, at this time, from what is observed of it and its noise."""
@@ -159,8 +158,8 @@ class Window(Stages):
 
     def _advance(self, k: int, time: int, observed: NDArray[np.bool_] | None) -> float:
         """Evaluate stage k at z and step the observer; the stage's cost, or infinity."""
-        place = self._places[k]
-        z, following, u, terms = place.z, place.following, place.u, place.terms
+        view = self._stage_views[k]
+        z, following, u, terms = view.z, view.next, view.u, view.terms
         model, error, sample = self._system, terms.noise, self._sample
         try:
             if self.unusual and self._irregular[k]:
@@ -168,16 +167,16 @@ class Window(Stages):
             kernel = model.kernel if self._jacobians else None
             if kernel is None:
                 usual = model is self._system
-                arguments = place.arguments if usual else (place.arguments[0], u)
+                arguments = view.arguments if usual else (view.arguments[0], u)
                 f, h = self._read if usual else (model.f, model.h)
                 # Used up at once: the functions may return one array every time.
-                np.subtract(place.y, h(*arguments), error)
+                np.subtract(view.y, h(*arguments), error)
                 if self._jacobians:
                     slopes = self._slopes if usual else (model.f_jacobian, model.h_jacobian)
                     self._differentiate(terms, slopes, arguments)
             else:
                 ahead, output, slope = kernel.stage(z, u)
-                np.subtract(place.y, output, error)
+                np.subtract(view.y, output, error)
                 np.negative(slope, terms.linear[:, 1:])
             if observed is not None:
                 error[~observed] = 0.0
@@ -188,7 +187,7 @@ class Window(Stages):
                 sample.noise_weight = self._own_noise.get(time)
             if self._covariance_seen is not None:
                 sample.covariance = self._covariance_seen[k]
-            correction, posterior = self._correct(place.arguments[0], place.error, sample)
+            correction, posterior = self._correct(view.arguments[0], view.error, sample)
             terms.disturbance[...] = correction
             np.add(f(*arguments) if kernel is None else ahead, correction, following)
         except Exception:  # a model function outside its domain: bad luck, not bad input
@@ -202,7 +201,7 @@ class Window(Stages):
         self._linear = True
         if self._quadratic:
             # Even where no terms are wanted: so the cost is the same to the last digit.
-            cost = self.terms.set_stage(terms, place.weight)
+            cost = self.terms.set_stage(terms, view.weight)
             if math.isfinite(cost):
                 return cost
         return self._weigh(k)
@@ -221,7 +220,7 @@ class Window(Stages):
 
     def _weigh(self, k: int) -> float:
         """The cost of stage k, or infinity, and its Gauss-Newton terms; where they are unusual."""
-        weight, stage = self._weight_seen[k], self._places[k].terms
+        weight, stage = self._weight_seen[k], self._stage_views[k].terms
         terms, residual = self.terms, self._residuals_seen[k]
         try:
             cost = float(self._stage_costs(residual[None], weight)[0])
@@ -247,7 +246,7 @@ class Window(Stages):
         self._z[k + 1], covariance = self._last_good(k)
         if self._covariance is not None:
             self._covariance[k + 1] = covariance
-        stage = self._places[k].terms
+        stage = self._stage_views[k].terms
         stage.linear[:, 0], stage.linear[:, 1:] = 0.0, self._no_jacobian
         self._majorising[k] = self._weight[k]
         if self._linearized:
@@ -331,11 +330,11 @@ class Window(Stages):
     @property
     def candidate_cost(self) -> float:
         """J of the candidate; its prior term is 0 exactly."""
-        return self.cost_over(self.frame)
+        return self.cost_over(self.view)
 
-    def cost_over(self, frame: Frame) -> float:
-        """The same, of the window's present frame."""
-        costs = frame.costs
+    def cost_over(self, view: WindowView) -> float:
+        """The same, of the window's present view."""
+        costs = view.costs
         if self._ages is None:
             return float(costs.dot(self._ones[: costs.size]))
         cost = float(costs.dot(self.discounts[1:]))

@@ -71,6 +71,11 @@ class Observer(ABC):
             If it does not fit.
         """
 
+    @property
+    def constant_gain(self) -> Array | None:
+        """The gain K (n, p) of an observer whose correction is K v at all times; None otherwise."""
+        return None
+
     def initial_covariance(self) -> Array | None:
         """The covariance (n, n) of the initial estimate; None for observers without one."""
         return None

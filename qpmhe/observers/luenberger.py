@@ -46,6 +46,11 @@ class Luenberger(Observer):
             )
 
     @property
+    def constant_gain(self) -> Array | None:
+        """The gain K, unless a derived class corrects in another way."""
+        return self.gain if type(self).correct is Luenberger.correct else None
+
+    @property
     def kappa(self) -> float:
         """The constant of (eq:kappa)."""
         return float(np.linalg.norm(self.gain, 2))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..costs import ObserverPrior, QuadraticCost
+from ..costs import QuadraticCost
 from ..errors import InvalidInputError
 from ..estimation.estimate import Estimate, Status
 from ..estimation.problem import Problem
@@ -52,7 +52,7 @@ class IpoptEstimator:
             raise InvalidInputError(
                 "Ipopt comes with CasADi, which is not installed; pip install 'qpmhe[casadi]'."
             ) from error
-        if system.m or isinstance(cost.prior, ObserverPrior):
+        if system.m or cost.observer_prior is not None:
             raise InvalidInputError(
                 "the comparison with Ipopt takes systems without inputs and constant prior weights."
             )

@@ -229,6 +229,6 @@ def test_a_long_window_keeps_no_views_and_is_the_same(name, monkeypatch):
     measurements, kept = record(80), make(**OPTIONS[name])
     monkeypatch.setattr("qpmhe.estimation.stages._KEPT", 5)
     fresh = make(**OPTIONS[name])
-    assert isinstance(kept._engine._window._places, list)
-    assert not isinstance(fresh._engine._window._places, list)
+    assert isinstance(kept._engine._window._stage_views, list)
+    assert not isinstance(fresh._engine._window._stage_views, list)
     assert_equal(feed(fresh, measurements), feed(kept, measurements))
