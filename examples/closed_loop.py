@@ -254,7 +254,7 @@ def main() -> None:
     deadline = 1e-3 * arguments.deadline
 
     model = step()
-    system = qpmhe.System.from_casadi(model, lambda x: x[0])
+    system = qpmhe.from_casadi(model, lambda x: x[0])
     loops: dict[str, list[Loop]] = {}
     for seed in track(range(arguments.seeds), "records", console=console):
         candidates = {**estimators(system, deadline), "full state": None}

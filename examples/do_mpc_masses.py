@@ -101,7 +101,7 @@ def with_qpmhe(record: Record, max_qps: int | None) -> Result:
         value = value + step / 6 * (k1 + 2 * (k2 + k3) + k4)
     f = ca.Function("f", [x, u], [ca.vertcat(value, x[8])])
     limit = np.full(8, np.inf)
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         f, lambda x: x[:3],
         states=qpmhe.Box(np.append(-limit, BOUNDS[0]), np.append(limit, BOUNDS[1])),
         disturbances=qpmhe.Box(np.append(-limit, 0.0), np.append(limit, 0.0)),
@@ -110,7 +110,7 @@ def with_qpmhe(record: Record, max_qps: int | None) -> Result:
     # The observer's gain is for the guessed inertia, which it leaves as it is.
     known = ca.Function("known", [x[:8], u], [ca.substitute(value, x[8], GUESS)])
     gain = qpmhe.design_luenberger(
-        qpmhe.System.from_casadi(known, lambda x: x[:3]), np.zeros(8), np.zeros(2),
+        qpmhe.from_casadi(known, lambda x: x[:3]), np.zeros(8), np.zeros(2),
         disturbance=disturbance, noise=noise,
     ).gain
     cost = qpmhe.QuadraticCost.from_covariances(

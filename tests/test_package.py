@@ -8,7 +8,8 @@ import qpmhe
 import qpmhe_solvers
 
 HEAVY = (
-    "casadi", "clarabel", "cvxpy", "matplotlib", "osqp", "proxsuite", "qpsolvers", "rich", "typer"
+    "casadi", "clarabel", "control", "cvxpy", "jax", "matplotlib", "osqp", "proxsuite", "qpsolvers",
+    "rich", "sympy", "typer",
 )
 
 
@@ -18,6 +19,14 @@ def test_import_loads_no_solver_and_no_plotting():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert answer.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", ["from_casadi", "from_control", "from_jax", "from_sympy"])
+def test_former_methods_of_a_system_name_the_function(name):
+    assert callable(getattr(qpmhe, name))
+    with pytest.raises(AttributeError, match=rf"is now qpmhe\.{name}"):
+        getattr(qpmhe.System, name)
+    assert not hasattr(qpmhe.models.batch_reactor().system, name)
 
 
 def public_classes_and_functions():

@@ -37,7 +37,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     plain, observer, cost, scenario = qpmhe.models.batch_reactor()
-    model = qpmhe.System.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2)
+    model = qpmhe.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2)
     records = np.array([
         scenario.simulate(seed, arguments.steps).measurements for seed in range(arguments.members)
     ])

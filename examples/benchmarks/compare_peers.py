@@ -39,7 +39,7 @@ NOTES = [
     "(qpmhe, EKF) run, on growing windows.",
     "Peers are handed the observer's trajectory, prior and window; qpmhe's time includes them, "
     "and the verdict by the true J.",
-    "qpmhe NumPy: plain NumPy model. CasADi: System.from_casadi, the functions compiled in C. "
+    "qpmhe NumPy: plain NumPy model. CasADi: qpmhe.from_casadi, the functions compiled in C. "
     "compiled: the whole step in C. start best: from the shifted previous estimate, where its J "
     "is lower.",
     "CasADi's programs: (x), the states are the variables; (x, w), the disturbances as well; C, "

@@ -80,7 +80,7 @@ def main() -> None:
     scenario = plain.scenario
     spread = [np.sqrt(np.diag(c)) for c in
               (scenario.disturbance_covariance, scenario.noise_covariance)]
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         casadi_rate(MASSES, DIMENSION), casadi_output(MASSES, DIMENSION), dt=scenario.dt,
         n=plain.system.n,
         disturbances=qpmhe.Box(-arguments.width * spread[0], arguments.width * spread[0]),

@@ -77,7 +77,7 @@ class Problem:
 
     def casadi_system(self) -> qpmhe.System:
         """The same system made from the CasADi model."""
-        return qpmhe.System.from_casadi(
+        return qpmhe.from_casadi(
             self.rate, self.output, n=self.n, p=self.p, dt=self.scenario.dt, method=self.method
         )
 

@@ -47,7 +47,7 @@ def write(
     Parameters
     ----------
     estimator : MovingHorizonEstimator
-        What to write: its system made by `System.from_casadi`, its observer of constant
+        What to write: its system made with `qpmhe.from_casadi`, its observer of constant
         gain, its cost quadratic. What it has measured so far is not written.
     directory : str or path
         Where; made if need be.

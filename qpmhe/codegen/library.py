@@ -31,7 +31,7 @@ _CONSTANT_GAIN = (Luenberger, HighGain, SteadyStateKalman)
 def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings) -> str:
     """Why an estimator has no C form, with the remedy; empty if it has one."""
     if system.symbolic is None:
-        return "the system has no CasADi form; make it by qpmhe.System.from_casadi."
+        return "the system has no CasADi form; make it with qpmhe.from_casadi."
     if type(observer) not in _CONSTANT_GAIN:
         return (
             f"{type(observer).__name__} has no C form; take an observer with constant gain "

@@ -64,7 +64,7 @@ class MovingHorizonEstimator:
         this share of it.
     engine : {"python", "compiled"}
         How the step is carried out. ``compiled`` generates C code for the whole step from a
-        system made by `System.from_casadi`, a quadratic cost and an observer with constant
+        system made by `qpmhe.from_casadi`, a quadratic cost and an observer with constant
         gain, compiles it once and keeps it in a cache on disk; QPs with active inequalities
         are solved by an interior-point method in it. Without a C compiler, a warning tells
         so and the Python step is taken.

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.adapters.casadi import casadi_system
+from qpmhe import from_casadi
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import (
     CompilationError,
@@ -130,7 +130,7 @@ def slopes(function, x, u):
 def made(name, compiled, way="SX", **options):
     _, _, n, _, m = MODELS[name]
     f, h = symbolic(name, way)
-    return qpmhe.System.from_casadi(f, h, n=n, m=m, compiled=compiled, **options)
+    return from_casadi(f, h, n=n, m=m, compiled=compiled, **options)
 
 
 @cache
@@ -206,7 +206,7 @@ def test_ways_of_writing(name, way):
     check(system, plain_step(name, 0.1, "rk4"), numeric(name, "h"), *points(name))
     if way in WAYS[:4]:  # the functions tell their sizes
         f, h = symbolic(name, way)
-        told = qpmhe.System.from_casadi(f, h, compiled=False)
+        told = from_casadi(f, h, compiled=False)
         assert (told.n, told.p, told.m) == MODELS[name][2:]
 
 
@@ -216,7 +216,7 @@ def test_matrix_functions_that_cannot_be_expanded(compiled):
     table = ca.interpolant("table", "bspline", [np.linspace(-4, 4, 12)], np.linspace(-4, 4, 12)**2)
     f = ca.Function("f", [x, u], [0.3 * x + ca.logsumexp(x) + u * table(x[1])])
     h = ca.Function("h", [x], [ca.vertcat(ca.logsumexp(2.0 * x), x[0])])
-    system = qpmhe.System.from_casadi(f, h, compiled=compiled)
+    system = from_casadi(f, h, compiled=compiled)
     assert system.symbolic.f.is_a("MXFunction")
     generator = np.random.default_rng(4)
     xs, us = generator.uniform(-1.0, 1.0, (5, 3)), generator.uniform(-1.0, 1.0, (5, 1))
@@ -308,7 +308,7 @@ def test_results_are_fresh(compiled):
 @pytest.mark.parametrize("compiled", BOTH)
 def test_threads(compiled):
     """A fresh system used by threads at once: buffers must be made for each of them."""
-    system, count = casadi_system(*symbolic("crane", "SX"), dt=0.1, compiled=compiled), 4
+    system, count = from_casadi(*symbolic("crane", "SX"), dt=0.1, compiled=compiled), 4
     step, wrong, gate = plain_step("crane", 0.1, "rk4"), [], threading.Barrier(count)
 
     def work(seed):
@@ -433,7 +433,7 @@ def value_of(data):
 @pytest.mark.parametrize("compiled", BOTH)
 def test_pickled_here_and_in_a_spawned_process(compiled, monkeypatch):
     box = qpmhe.Box([-9.0] * 4, [9.0] * 4)
-    system = casadi_system(*symbolic("crane", "SX"), dt=0.1, compiled=compiled, states=box)
+    system = from_casadi(*symbolic("crane", "SX"), dt=0.1, compiled=compiled, states=box)
     xs, us = points("crane", 1)
     data = pickle.dumps((system, xs[0], us[0]))
     expected = value_of(pickle.dumps((made("crane", compiled, dt=0.1), xs[0], us[0])))
@@ -468,7 +468,7 @@ def test_observer_designs_and_parameters(compiled):
     x, theta = ca.SX.sym("x", 2), ca.SX.sym("theta", 1)
     f = ca.Function("f", [x, theta], [ca.vertcat(theta * x[0], 0.5 * x[1] + ca.sin(x[0]))])
     h = ca.Function("h", [x, theta], [x[1]])
-    inner = qpmhe.System.from_casadi(f, h, compiled=compiled)
+    inner = from_casadi(f, h, compiled=compiled)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         joint = qpmhe.augment_parameters(inner.f, inner.h, n=2, p=1, nominal=[0.7])
@@ -487,11 +487,11 @@ def test_observer_designs_and_parameters(compiled):
 def test_without_a_compiler_the_virtual_machine_evaluates(monkeypatch):
     monkeypatch.setenv("CC", "/nowhere/cc")
     f, h = symbolic("pond", "SX")
-    system = qpmhe.System.from_casadi(f, h)
+    system = from_casadi(f, h)
     x = np.array([0.3, 0.4])
     np.testing.assert_allclose(system.f(x, NONE), numeric("pond", "f")(x), rtol=1e-14)
     with pytest.raises(CompilationError, match="compiler"):
-        qpmhe.System.from_casadi(f, h, compiled=True)
+        from_casadi(f, h, compiled=True)
 
 
 X, U = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
@@ -541,7 +541,7 @@ WRONG = {
 def test_wrong_input_fails_at_construction(case):
     functions, options, error, text = WRONG[case]
     with pytest.raises(error, match=text):
-        qpmhe.System.from_casadi(*functions, **{"compiled": False, **options})
+        from_casadi(*functions, **{"compiled": False, **options})
 
 
 @pytest.mark.parametrize("compiled", BOTH)
@@ -555,7 +555,7 @@ def test_states_of_a_wrong_size_are_not_broadcast(compiled):
 
 def test_constants_of_nan_are_told():
     """math.sin turns a symbol into NaN without a word; the estimator must not start so."""
-    system = qpmhe.System.from_casadi(
+    system = from_casadi(
         lambda x: [math.sin(x[0]), x[1]], lambda x: x[0], n=2, compiled=False
     )
     with pytest.raises(ModelError, match=r"f is .*nan"):
@@ -571,16 +571,16 @@ def test_functions_without_code(compiled):
     h = ca.Function("h", [x], [x[0]])
     if compiled:
         with pytest.raises(CompilationError):
-            qpmhe.System.from_casadi(f, h, compiled=True)
+            from_casadi(f, h, compiled=True)
         return
-    system = qpmhe.System.from_casadi(f, h, compiled=compiled)
+    system = from_casadi(f, h, compiled=compiled)
     z = system.f(np.array([0.7, 0.2]), NONE)
     assert z[0] + 0.1 * np.sin(z[0]) == pytest.approx(0.7, abs=1e-7)
 
 
 def test_an_input_of_the_output_alone():
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
-    system = qpmhe.System.from_casadi(
+    system = from_casadi(
         ca.Function("f", [x], [0.5 * x]), ca.Function("h", [x, u], [x[0] * u]), compiled=False
     )
     assert system.m == 1
@@ -619,7 +619,7 @@ FALLING = ["linear solver", "QP", "root"]
 @pytest.mark.parametrize("case", FALLING)
 def test_an_evaluation_that_breaks_off_is_no_number(case):
     f, h, value = falling(case)
-    system = qpmhe.System.from_casadi(f, h, compiled=False)
+    system = from_casadi(f, h, compiled=False)
     xs = np.array([[0.5, 0.2], [3.0, 0.1], [0.25, 0.3], [2.0, 0.4], [-0.2, 0.5]])
     us, bad = np.zeros((5, 0)), np.array([False, True, False, True, False])
     expected = np.array([[np.nan if k else value(x)] for x, k in zip(xs, bad, strict=True)])
@@ -644,7 +644,7 @@ def test_an_evaluation_that_breaks_off_is_no_number(case):
 @pytest.mark.skipif(find_compiler() is None, reason="no compiler")
 def test_an_evaluation_that_breaks_off_in_compiled_code():
     f, h, value = falling("QP")
-    system = qpmhe.System.from_casadi(f, h, compiled=True)
+    system = from_casadi(f, h, compiled=True)
     xs, us = np.array([[0.5, 0.2], [3.0, 0.1], [-0.2, 0.5]]), np.zeros((3, 0))
     expected = np.array([[value(xs[0])], [np.nan], [value(xs[2])]])
     np.testing.assert_allclose(system.h.batch(xs, us), expected)
@@ -656,8 +656,8 @@ def test_an_evaluation_that_breaks_off_in_compiled_code():
 def test_rootfinders_that_do_not_tell_are_not_compiled():
     f, h, value = falling("root")
     with pytest.raises(CompilationError, match="fast_newton"):
-        qpmhe.System.from_casadi(f, h, compiled=True)
-    system = qpmhe.System.from_casadi(f, h)  # evaluated by CasADi
+        from_casadi(f, h, compiled=True)
+    system = from_casadi(f, h)  # evaluated by CasADi
     assert system.h(np.array([0.5, 0.0]), NONE)[0] == pytest.approx(value([0.5, 0.0]))
     assert np.isnan(system.h(np.array([3.0, 0.0]), NONE)[0])
 
@@ -665,7 +665,7 @@ def test_rootfinders_that_do_not_tell_are_not_compiled():
 @pytest.mark.parametrize("case", FALLING)
 def test_a_step_in_which_the_evaluation_breaks_off(case):
     f, h, _ = falling(case)
-    system = qpmhe.System.from_casadi(f, h, compiled=False)
+    system = from_casadi(f, h, compiled=False)
     cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[5.0]])
     mhe = qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger([0.5, 0.1]), cost, horizon=3, initial_state=[0.4, 0.0],
@@ -697,7 +697,7 @@ def test_assertions_hold(way, compiled):
         "callable": lambda x: inner(x),
         "mapped": ca.Function("h", [x], [ca.sum2(inner.map(2)(ca.horzcat(x, x))) / 2]),
     }[way]
-    system = qpmhe.System.from_casadi(ca.Function("f", [x], [0.9 * x]), h, compiled=compiled)
+    system = from_casadi(ca.Function("f", [x], [0.9 * x]), h, compiled=compiled)
     xs, us = np.array([[0.5, 1.0], [-2.0, 1.0], [2.0, 0.0]]), np.zeros((3, 0))
     expected = np.array([[0.6], [np.nan], [2.0]])
     for x, y in zip(xs, expected, strict=True):

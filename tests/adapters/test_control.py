@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import cont2discrete
 
 import qpmhe
-from qpmhe import System
+from qpmhe import System, from_control
 from qpmhe.errors import InvalidInputError, ModelError, OptionError
 
 control = pytest.importorskip("control")
@@ -44,7 +44,7 @@ def linear(a, b):
 
 def test_a_linear_system_in_continuous_time_is_sampled_exactly():
     ad, bd, *_ = cont2discrete((A, B, C, D), 0.1, "zoh")
-    same(System.from_control(control.ss(A, B, C, D), dt=0.1), linear(ad, bd))
+    same(from_control(control.ss(A, B, C, D), dt=0.1), linear(ad, bd))
 
 
 @pytest.mark.parametrize("method", ["euler", "rk4"])
@@ -53,12 +53,12 @@ def test_a_linear_system_is_discretised_like_any_rate(method):
         lambda x, u: x @ A.T + u @ B.T, lambda x, u: x @ C.T + u @ D.T, dt=0.1, n=2, p=1, m=1,
         method=method,
     )
-    same(System.from_control(control.ss(A, B, C, D), dt=0.1, method=method), plain)
+    same(from_control(control.ss(A, B, C, D), dt=0.1, method=method), plain)
 
 
 @pytest.mark.parametrize("dt", [True, 0.1])
 def test_a_linear_system_in_discrete_time_is_taken_as_it_is(dt):
-    same(System.from_control(control.ss(0.5 * A, B, C, D, dt)), linear(0.5 * A, B))
+    same(from_control(control.ss(0.5 * A, B, C, D, dt)), linear(0.5 * A, B))
 
 
 def test_a_nonlinear_system_is_discretised():
@@ -69,7 +69,7 @@ def test_a_nonlinear_system_is_discretised():
         ),
         lambda x, u: x[..., :1], dt=0.05, n=2, p=1, m=1,
     )
-    same(System.from_control(theirs, dt=0.05), plain, tolerance=1e-8)
+    same(from_control(theirs, dt=0.05), plain, tolerance=1e-8)
 
 
 def test_a_nonlinear_system_in_discrete_time_without_inputs():
@@ -77,13 +77,13 @@ def test_a_nonlinear_system_in_discrete_time_without_inputs():
         lambda t, x, u, params: 0.9 * np.sin(x), lambda t, x, u, params: x[:1],
         inputs=0, outputs=1, states=2, dt=True,
     )
-    system = System.from_control(theirs)
+    system = from_control(theirs)
     assert system.m == 0
     np.testing.assert_allclose(system.f.batch(POINTS, np.empty((7, 0))), 0.9 * np.sin(POINTS))
 
 
 def test_an_estimator_runs_on_it_and_it_pickles():
-    system = System.from_control(
+    system = from_control(
         control.ss(A, B, C, 0), dt=0.1, states=qpmhe.Box([-5, -5], [5, 5])
     )
     copy = pickle.loads(pickle.dumps(system))
@@ -120,7 +120,7 @@ def rotating():
 )
 def test_what_does_not_fit_is_refused(made, options, error, words):
     with pytest.raises(error, match=words):
-        System.from_control(made(), **options)
+        from_control(made(), **options)
 
 
 def in_time(change, where):
@@ -154,7 +154,7 @@ def test_a_system_that_depends_on_time_is_refused(change, where):
         *in_time(change, where), inputs=1, outputs=1, states=2
     )
     with pytest.raises(ModelError, match=rf"the {where} of .*at time 0 and .*an input"):
-        System.from_control(theirs, dt=0.125)
+        from_control(theirs, dt=0.125)
 
 
 def test_a_map_that_depends_on_time_is_refused():
@@ -162,7 +162,7 @@ def test_a_map_that_depends_on_time_is_refused():
         *in_time(lambda t: float(t > 0.0), "dynamics"), inputs=1, outputs=1, states=2, dt=0.1
     )
     with pytest.raises(ModelError, match=r"dynamics of .*at time 0\.1"):
-        System.from_control(theirs)
+        from_control(theirs)
 
 
 def test_a_map_is_asked_at_its_own_times_only():
@@ -171,10 +171,10 @@ def test_a_map_is_asked_at_its_own_times_only():
         return 0.5 * np.sqrt(x - 0.7)  # not a number at some probes, at all times
 
     theirs = control.NonlinearIOSystem(update, angle, inputs=1, outputs=1, states=2, dt=True)
-    assert System.from_control(theirs).n == 2
+    assert from_control(theirs).n == 2
 
 
 def test_without_python_control_there_is_a_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "control", None)
     with pytest.raises(InvalidInputError, match="pip install control"):
-        System.from_control(object())
+        from_control(object())

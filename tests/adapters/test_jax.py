@@ -15,7 +15,7 @@ from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError
 jax = pytest.importorskip("jax")
 jnp = jax.numpy
 
-from qpmhe.adapters.jax import jax_system  # noqa: E402
+from qpmhe import from_jax  # noqa: E402
 
 NONE = np.zeros(0)
 
@@ -123,7 +123,7 @@ def at_one_state(function, xp):
 def by_jax(name, method=None):
     f, h, (n, p, m), *_ = MODELS[name]
     timing = {} if method is None else {"dt": DT, "method": method}
-    return jax_system(at_one_state(f, jnp), at_one_state(h, jnp), n=n, p=p, m=m, **timing)
+    return from_jax(at_one_state(f, jnp), at_one_state(h, jnp), n=n, p=p, m=m, **timing)
 
 
 @cache
@@ -235,7 +235,7 @@ def test_batches_that_differ_in_length_only():
     ],
 )
 def test_ways_of_writing(f, h):
-    system = jax_system(f, h, n=2, p=1)
+    system = from_jax(f, h, n=2, p=1)
     twin = qpmhe.System(
         lambda x: np.stack([x[..., 1], -np.sin(x[..., 0])], -1), lambda x: x[..., :1], n=2, p=1
     )
@@ -244,7 +244,7 @@ def test_ways_of_writing(f, h):
 
 
 def test_functions_that_do_not_see_the_input():
-    system = jax_system(lambda x: 0.5 * x, lambda x, u: x + u, n=1, p=1, m=1)
+    system = from_jax(lambda x: 0.5 * x, lambda x, u: x + u, n=1, p=1, m=1)
     np.testing.assert_array_equal(system.f(np.array([3.0]), np.array([8.0])), [1.5])
     np.testing.assert_array_equal(system.h(np.array([3.0]), np.array([8.0])), [11.0])
 
@@ -318,7 +318,7 @@ def test_a_run_to_convergence_within_sets():
     }
     options = {"n": n, "p": p, "m": m, "dt": DT, **sets}
     systems = (
-        jax_system(at_one_state(f, jnp), at_one_state(h, jnp), **options),
+        from_jax(at_one_state(f, jnp), at_one_state(h, jnp), **options),
         qpmhe.System.from_ode(at_one_state(f, np), at_one_state(h, np), **options),
     )
     assert systems[0].states is sets["states"]
@@ -440,11 +440,11 @@ AT_FIRST = precision()
 def test_the_precision_of_the_process_is_left_alone():
     before = precision()
     assert before == AT_FIRST
-    system = jax_system(lambda x: 0.1 * x, lambda x: x, n=1, p=1)
+    system = from_jax(lambda x: 0.1 * x, lambda x: x, n=1, p=1)
     assert system.f(np.array([1.0]), NONE)[0] == 0.1
     assert precision() == before
     with pytest.raises(ModelError):
-        jax_system(lambda x: x[0, 0, 0], lambda x: x, n=1, p=1)
+        from_jax(lambda x: x[0, 0, 0], lambda x: x, n=1, p=1)
     assert precision() == before
     for y in np.random.default_rng(11).standard_normal((5, 1)):
         estimators("reactor", "euler")[0].update(y)
@@ -456,7 +456,7 @@ def test_results_are_double_whatever_the_default(double):
     switch = jax.enable_x64 if hasattr(jax, "enable_x64") else jax.experimental.enable_x64
     third = np.array([1.0 / 3.0])
     with switch(double):
-        system = jax_system(lambda x: x + 1e-12, lambda x: jnp.exp(x), n=1, p=1)
+        system = from_jax(lambda x: x + 1e-12, lambda x: jnp.exp(x), n=1, p=1)
         assert system.f(third, NONE)[0] == third[0] + 1e-12
         assert precision()[0] is double
     for _ in range(2):  # made under one default, used under the other
@@ -498,7 +498,7 @@ def test_lengths_that_share_a_size_are_compiled_once():
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, duration, **more: compiled.append(event) if "backend_compile" in event else 0
     )
-    system = jax_system(lambda x: 0.9 * x, lambda x: x[:1] ** 2, n=2, p=1)
+    system = from_jax(lambda x: 0.9 * x, lambda x: x[:1] ** 2, n=2, p=1)
     at_first = len(compiled)
     assert at_first >= 3
     x = np.random.default_rng(12).standard_normal((32, 2))
@@ -528,7 +528,7 @@ def calls(monkeypatch):
 
 
 def test_one_call_serves_both_functions(calls):
-    system = jax_system(lambda x: 0.9 * x, lambda x: x[:1] ** 2, n=2, p=1)
+    system = from_jax(lambda x: 0.9 * x, lambda x: x[:1] ** 2, n=2, p=1)
     x = np.random.default_rng(14).standard_normal((2, 5, 2))
     nothing = np.empty((5, 0))
     calls.clear()
@@ -542,7 +542,7 @@ def test_one_call_serves_both_functions(calls):
 
 @pytest.mark.parametrize("max_qps", [0, 1])
 def test_calls_of_a_step(calls, max_qps):
-    system = jax_system(*(at_one_state(g, jnp) for g in MODELS["reactor"][:2]), n=2, p=1, dt=DT)
+    system = from_jax(*(at_one_state(g, jnp) for g in MODELS["reactor"][:2]), n=2, p=1, dt=DT)
     mhe = qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger(MODELS["reactor"][3]),
         qpmhe.QuadraticCost(prior=np.eye(2), disturbance=20.0 * np.eye(2), noise=5.0),
@@ -574,7 +574,7 @@ def test_calls_of_a_step(calls, max_qps):
 )
 def test_a_function_of_the_wrong_shape_is_refused(f, shape, dt):
     with pytest.raises(ModelError, match=rf"f returned shape {shape}; expected \(2,\)"):
-        jax_system(f, lambda x: x[:1], n=2, p=1, dt=dt)
+        from_jax(f, lambda x: x[:1], n=2, p=1, dt=dt)
 
 
 @pytest.mark.parametrize(
@@ -583,7 +583,7 @@ def test_a_function_of_the_wrong_shape_is_refused(f, shape, dt):
 )
 def test_an_output_of_the_wrong_shape_is_refused(h, p, shape):
     with pytest.raises(ModelError, match=rf"h returned shape {shape.replace('(1', '.1, 1')}"):
-        jax_system(lambda x: x, h, n=2, p=p)
+        from_jax(lambda x: x, h, n=2, p=p)
 
 
 @pytest.mark.parametrize(
@@ -608,7 +608,7 @@ def test_an_output_of_the_wrong_shape_is_refused(h, p, shape):
 )
 def test_a_function_that_cannot_be_used_is_refused_in_words(f, words):
     with pytest.raises(ModelError, match=words):
-        jax_system(f, lambda x: x[:1], n=2, p=1)
+        from_jax(f, lambda x: x[:1], n=2, p=1)
 
 
 def test_a_wrong_derivative_is_refused():
@@ -618,9 +618,9 @@ def test_a_wrong_derivative_is_refused():
 
     squared.defjvp(lambda x, dx: (x[0] ** 2, 3.0 * x[0] * dx[0]))
     with pytest.raises(ModelError, match=r"f_jacobian\[0, 0\] is .* Here it is JAX's: look for"):
-        jax_system(squared, lambda x: x, n=1, p=1)
+        from_jax(squared, lambda x: x, n=1, p=1)
     with pytest.raises(ModelError, match=r"h_jacobian.* derivative of its own within h"):
-        jax_system(lambda x: x, lambda x: x.astype(jnp.float32).astype(float), n=1, p=1)
+        from_jax(lambda x: x, lambda x: x.astype(jnp.float32).astype(float), n=1, p=1)
 
 
 @pytest.mark.parametrize(
@@ -637,13 +637,13 @@ def test_a_wrong_derivative_is_refused():
 )
 def test_wrong_options_are_refused(options, error, words):
     with pytest.raises(error, match=words):
-        jax_system(lambda x: x, lambda x: x[:1], **{"n": 2, "p": 1, **options})
+        from_jax(lambda x: x, lambda x: x[:1], **{"n": 2, "p": 1, **options})
 
 
 def test_without_jax_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax", None)
     with pytest.raises(InvalidInputError, match=r"pip install 'qpmhe\[jax\]'"):
-        jax_system(lambda x: x, lambda x: x, n=1, p=1)
+        from_jax(lambda x: x, lambda x: x, n=1, p=1)
 
 
 def test_without_a_cpu_the_remedy_is_named(monkeypatch):
@@ -652,7 +652,7 @@ def test_without_a_cpu_the_remedy_is_named(monkeypatch):
 
     monkeypatch.setattr(jax, "local_devices", none)
     with pytest.raises(InvalidInputError, match=r"Unknown backend cpu.*JAX_PLATFORMS"):
-        jax_system(lambda x: x, lambda x: x, n=1, p=1)
+        from_jax(lambda x: x, lambda x: x, n=1, p=1)
 
 
 def test_a_model_that_is_not_a_number_far_away_falls_back():
@@ -667,7 +667,7 @@ def test_a_model_that_is_not_a_number_far_away_falls_back():
             horizon=4, initial_state=[0.5], max_qps=2,
         )
         for system in (
-            jax_system(lambda x: rate(jnp, x), lambda x: x, n=1, p=1, dt=0.1),
+            from_jax(lambda x: rate(jnp, x), lambda x: x, n=1, p=1, dt=0.1),
             qpmhe.System.from_ode(lambda x: rate(np, x), lambda x: x, n=1, p=1, dt=0.1),
         )
     ]
@@ -688,7 +688,7 @@ def test_a_model_that_is_not_a_number_far_away_falls_back():
 @pytest.mark.parametrize("start", [0.0, 1.0])
 def test_the_estimation_may_start_at_a_kink(start):
     # Differences across it give the mean of both slopes, JAX one of them.
-    system = jax_system(
+    system = from_jax(
         lambda x: jnp.where(x > start, 0.9 * x, 0.9 * start + 0.3 * (x - start)),
         lambda x: x, n=1, p=1,
     )
@@ -714,7 +714,7 @@ def angle(x):
 
 @cache
 def pickled():
-    return jax_system(
+    return from_jax(
         swing, angle, n=2, p=1, m=1, dt=0.1, method="euler",
         states=qpmhe.Box([-9.0, -9.0], [9.0, 9.0]),
     )
@@ -806,18 +806,18 @@ def test_an_index_out_of_range_is_refused(name):
     for method in (None, "rk4"):
         timing = {} if method is None else {"dt": 0.1, "method": method}
         with pytest.raises(ModelError) as caught:
-            jax_system(function, lambda x: x[0], n=2, p=1, m=1, **timing)
+            from_jax(function, lambda x: x[0], n=2, p=1, m=1, **timing)
         assert str(caught.value).startswith("f uses index ")
         assert told in str(caught.value)
         assert "jnp.clip" in str(caught.value)
     with pytest.raises(ModelError, match=r"^h uses index "):
-        jax_system(lambda x: x, lambda x, u: function(x, u), n=2, p=2, m=1)
+        from_jax(lambda x: x, lambda x, u: function(x, u), n=2, p=2, m=1)
 
 
 @pytest.mark.parametrize("name", IN_RANGE)
 def test_indices_in_range_or_with_a_meaning_are_taken(name):
     function = IN_RANGE[name]
-    system = jax_system(function, lambda x: x[0], n=2, p=1, m=1)
+    system = from_jax(function, lambda x: x[0], n=2, p=1, m=1)
     x, u = np.array([0.4, 0.7]), np.array([0.2])
     home = jax if hasattr(jax, "enable_x64") else jax.experimental
     with home.enable_x64(True):
@@ -830,16 +830,16 @@ def test_indices_are_checked_within_the_set_of_states():
     def lookup(x):
         return x * jnp.asarray(TABLE)[place(x)]
 
-    assert jax_system(lookup, lambda x: x[0], n=2, p=1, states=inside).n == 2
+    assert from_jax(lookup, lambda x: x[0], n=2, p=1, states=inside).n == 2
     with pytest.raises(ModelError, match="f uses index"):
-        jax_system(lookup, lambda x: x[0], n=2, p=1)
+        from_jax(lookup, lambda x: x[0], n=2, p=1)
 
 
 def test_functions_without_such_indices_are_not_compiled_for_the_check(monkeypatch):
     from jax.experimental import checkify
 
     monkeypatch.setattr(checkify, "checkify", None)
-    system = jax_system(lambda x: 0.5 * x[::-1], lambda x: x[1:], n=2, p=1)
+    system = from_jax(lambda x: 0.5 * x[::-1], lambda x: x[1:], n=2, p=1)
     assert system.n == 2
 
 

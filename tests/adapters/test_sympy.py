@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from qpmhe import System
+from qpmhe import System, from_sympy
 from qpmhe.errors import InvalidInputError, ModelError
 from qpmhe.models.batch_reactor import batch_reactor
 
@@ -28,7 +28,7 @@ def same(one, other, u, tolerance=1e-12):
 @pytest.mark.parametrize("method", ["euler", "rk4"])
 def test_the_reactor_is_the_reactor(method):
     reaction = sympy.Rational(16, 100) * X[0] ** 2 - sympy.Rational(64, 100) * X[1]
-    system = System.from_sympy(
+    system = from_sympy(
         [-2 * reaction, reaction], X[0] + X[1], X, dt=0.1, method=method
     )
     plain = batch_reactor(method).system
@@ -39,7 +39,7 @@ def test_the_reactor_is_the_reactor(method):
 
 def test_discrete_time_inputs_and_constants():
     u = sympy.Symbol("u")
-    system = System.from_sympy(
+    system = from_sympy(
         sympy.Matrix([X[0] * sympy.cos(X[1]) + u, sympy.Integer(1)]), [X[1], X[0] * u], X, [u]
     )
     plain = System(
@@ -53,7 +53,7 @@ def test_discrete_time_inputs_and_constants():
 
 def test_one_state():
     x = sympy.Symbol("x")
-    system = System.from_sympy([x**2 / 2], [x], [x])
+    system = from_sympy([x**2 / 2], [x], [x])
     assert system.f_jacobian.batch(np.array([[3.0]]), np.empty((1, 0))).tolist() == [[[3.0]]]
 
 
@@ -78,7 +78,7 @@ def test_one_state():
 )
 def test_what_does_not_fit_is_refused(f, h, words):
     with pytest.raises(ModelError, match=words):
-        System.from_sympy(f, h, X)
+        from_sympy(f, h, X)
 
 
 @pytest.mark.parametrize(
@@ -96,13 +96,13 @@ def test_what_does_not_fit_is_refused(f, h, words):
 )
 def test_symbols_that_do_not_fit_are_refused(x, u, words):
     with pytest.raises(ModelError, match=words):
-        System.from_sympy([X[0], X[1]], [X[0]], x, u)
+        from_sympy([X[0], X[1]], [X[0]], x, u)
 
 
 def test_plain_symbols_are_real():
     """|a| and sign(a) have a derivative at real a only; a positive symbol stays positive."""
     a, b = sympy.Symbol("a"), sympy.Symbol("b", positive=True)
-    system = System.from_sympy(
+    system = from_sympy(
         [-a * sympy.Abs(a), sympy.sqrt(b**2)], [sympy.sign(a) + b, sympy.Abs(a * b)], [a, b]
     )
     x = np.array([[-1.5, 2.0], [0.5, 1.0]])
@@ -119,14 +119,14 @@ def test_plain_symbols_are_real():
 
 def test_one_symbol_needs_no_list():
     a, u = sympy.symbols("a u")
-    system = System.from_sympy(a * u, a, a, u)
+    system = from_sympy(a * u, a, a, u)
     assert (system.n, system.m, system.p) == (1, 1, 1)
     assert system.f(np.array([3.0]), np.array([2.0])).tolist() == [6.0]
 
 
 @pytest.mark.parametrize("x", [sympy.Matrix(X), sympy.Matrix([X]), sympy.MatrixSymbol("x", 2, 1)])
 def test_matrices_are_taken_entry_by_entry(x):
-    system = System.from_sympy(sympy.Matrix([[0, 1], [2, 0]]) * sympy.Matrix(list(x)), [[x[0]]], x)
+    system = from_sympy(sympy.Matrix([[0, 1], [2, 0]]) * sympy.Matrix(list(x)), [[x[0]]], x)
     assert system.f(np.array([3.0, 4.0]), np.empty(0)).tolist() == [4.0, 6.0]
     assert system.h(np.array([3.0, 4.0]), np.empty(0)).tolist() == [3.0]
 
@@ -135,7 +135,7 @@ def test_states_may_be_functions_of_time():
     t = sympy.Symbol("t")
     q, u = sympy.Function("q")(t), sympy.Function("u")(t)
     speed = q.diff(t)
-    system = System.from_sympy([speed, -sympy.sin(q) + u], [q], [q, speed], [u], dt=0.1)
+    system = from_sympy([speed, -sympy.sin(q) + u], [q], [q, speed], [u], dt=0.1)
     plain = System.from_ode(
         lambda x, u: np.stack((x[..., 1], -np.sin(x[..., 0]) + u[..., 0]), axis=-1),
         lambda x, u: x[..., :1], dt=0.1, n=2, p=1, m=1,
@@ -144,16 +144,16 @@ def test_states_may_be_functions_of_time():
     same(system, plain, inputs, 1e-7)
     same(pickle.loads(pickle.dumps(system)), plain, inputs, 1e-7)
     with pytest.raises(ModelError, match=r"Derivative\(q\(t\), t\).*solve the equations"):
-        System.from_sympy([speed], [q], [q])
+        from_sympy([speed], [q], [q])
     with pytest.raises(ModelError, match=r"f contains t, .*on time an input"):
-        System.from_sympy([q * t], [q], [q])
+        from_sympy([q * t], [q], [q])
 
 
 def test_special_functions_are_those_of_scipy():
     from scipy import special
 
     a = sympy.Symbol("a")
-    system = System.from_sympy(
+    system = from_sympy(
         [sympy.besselj(0, a)], [sympy.erf(a), sympy.LambertW(a)], [a]
     )
     assert system.f.mode == system.h.mode == "batched"
@@ -171,4 +171,4 @@ def test_special_functions_are_those_of_scipy():
 def test_without_sympy_there_is_a_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "sympy", None)
     with pytest.raises(InvalidInputError, match="pip install sympy"):
-        System.from_sympy([X[0]], [X[0]], [X[0]])
+        from_sympy([X[0]], [X[0]], [X[0]])

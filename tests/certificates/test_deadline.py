@@ -85,7 +85,7 @@ def test_output_of_a_casadi_model_is_enclosed_alone():
     pytest.importorskip("casadi")
     from qpmhe.models.batch_reactor import casadi_output, casadi_rate
 
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         casadi_rate, casadi_output, dt=0.1, method="rk4", n=2, compiled=False
     )
     region = bounded_region(system, qpmhe.Box([0.1, 0.0], [3.0, 3.0]))

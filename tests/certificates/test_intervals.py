@@ -125,7 +125,7 @@ def test_casadi_model_has_the_enclosure_of_its_numpy_twin():
     pytest.importorskip("casadi")
     from qpmhe.models.batch_reactor import casadi_output, casadi_rate
 
-    twin = qpmhe.System.from_casadi(
+    twin = qpmhe.from_casadi(
         casadi_rate, casadi_output, dt=0.1, method="rk4", n=2, compiled=False
     )
     plain = qpmhe.models.batch_reactor("rk4")[0]

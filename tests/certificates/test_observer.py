@@ -125,7 +125,7 @@ def test_casadi_system_is_certified_alike():
     pytest.importorskip("casadi")
     from qpmhe.models.batch_reactor import casadi_output, casadi_rate
 
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         casadi_rate, casadi_output, dt=0.1, method="euler", n=2, compiled=False
     )
     found = certify_observer(system, qpmhe.Luenberger([0.05, 0.05]), REACTOR, rho=0.95)

@@ -62,7 +62,7 @@ def answer(files=ANSWER, **options):
 def estimator(factor=0.9, weight=1.0, sets=None, **options):
     ca = pytest.importorskip("casadi")
     x = ca.SX.sym("x", 2)
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         ca.Function("f", [x], [factor * x]), ca.Function("h", [x], [x[0]]), compiled=False,
         states=sets,
     )
@@ -169,10 +169,10 @@ def test_no_compiler_on_the_path(monkeypatch, tmp_path):
     ca = pytest.importorskip("casadi")
     x = ca.SX.sym("x", 2)
     f, h = ca.Function("f", [x], [0.9 * x]), ca.Function("h", [x], [x[0]])
-    system = qpmhe.System.from_casadi(f, h)  # CasADi's virtual machine takes its place
+    system = qpmhe.from_casadi(f, h)  # CasADi's virtual machine takes its place
     assert system.f(np.ones(2), np.zeros(0)) == pytest.approx([0.9, 0.9])
     with pytest.raises(CompilationError):
-        qpmhe.System.from_casadi(f, h, compiled=True)
+        qpmhe.from_casadi(f, h, compiled=True)
 
 
 def test_failing_compiler_is_quoted(wrapped, monkeypatch):

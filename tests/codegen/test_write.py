@@ -138,7 +138,7 @@ def model(kind="SX", n=3, p=2, m=0, method=None, **sets):
     outputs = [(1 + 0.1 * i) * x[i % n] + 0.1 * x[(i + 1) % n] ** 2 for i in range(p)]
     h = ca.vertcat(*outputs) + (0.1 * u[-1] if m else 0)
     given = [x, u] if m else [x]
-    return qpmhe.System.from_casadi(
+    return qpmhe.from_casadi(
         ca.Function("f", given, [rate if method else x + 0.2 * rate]),
         ca.Function("h", given, [h]),
         dt=0.2 if method else None, method=method or "rk4", compiled=False, **sets,
@@ -352,7 +352,7 @@ def test_curved_sets_of_more_outputs_than_states(horizon, tmp_path):
     x, none = ca.SX.sym("x", 1), np.zeros(0)
     rng = np.random.default_rng(1)
     h = ca.vertcat(*[ca.sin((1 + i) * x) + 0.3 * x**2 for i in range(3)])
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         ca.Function("f", [x], [0.9 * x + 0.2 * ca.sin(x)]), ca.Function("h", [x], [h]),
         compiled=False, noises=box(3, 0.12),
     )
@@ -384,7 +384,7 @@ def test_any_number_of_states(n, tmp_path):
 def broken(horizon, **options):
     """A system that has no value where x < 0."""
     x = ca.SX.sym("x")
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         ca.Function("f", [x], [0.7 * x + 0.2 * ca.sqrt(x)]), ca.Function("h", [x], [x]),
         compiled=False,
     )
@@ -644,7 +644,7 @@ def test_functions_without_code_are_refused(tmp_path):
     """CasADi writes an #error in their place."""
     z, q, x = ca.SX.sym("z"), ca.SX.sym("q"), ca.MX.sym("x", 2)
     root = ca.rootfinder("root", "newton", {"x": z, "p": q, "g": z + 0.1 * ca.sin(z) - q})
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         ca.Function("f", [x], [ca.vertcat(root(0, x[0]), 0.5 * x[1])]),
         ca.Function("h", [x], [x[0]]), compiled=False,
     )
@@ -676,7 +676,7 @@ MATRIX_MODELS = {
 @pytest.mark.parametrize("case", MATRIX_MODELS)
 def test_matrix_expressions(case, tmp_path):
     x = ca.MX.sym("x", 2)
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         ca.Function("f", [x], [MATRIX_MODELS[case](x)]),
         ca.Function("h", [x], [x[0] + 0.1 * x[1] ** 2]), compiled=False,
     )
@@ -689,7 +689,7 @@ def test_matrix_expressions(case, tmp_path):
 
 def test_what_does_not_fit_into_c_is_refused(tmp_path):
     def made(n, horizon, compiled=False):
-        system = qpmhe.System.from_casadi(
+        system = qpmhe.from_casadi(
             lambda x: 0.9 * x, lambda x: x[0], n=n, compiled=compiled
         )
         cost = qpmhe.QuadraticCost(prior=np.eye(n), disturbance=np.eye(n), noise=[[1.0]])
@@ -714,7 +714,7 @@ def test_what_does_not_fit_into_c_is_refused(tmp_path):
 def test_failed_stages_whose_discount_underflows(discount, real, tmp_path):
     """Zero times infinity: the cost of such a window is infinite, not NaN."""
     x = ca.SX.sym("x", 1)
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         ca.Function("f", [x], [0.9 * x]), ca.Function("h", [x], [ca.sqrt(x)]), compiled=False
     )
     mhe = qpmhe.MovingHorizonEstimator(

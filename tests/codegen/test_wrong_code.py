@@ -76,7 +76,7 @@ def liar(tmp_path, monkeypatch, cache):
 
 
 def linear(compiled=None, a=A, c=C, dt=0.1):
-    return qpmhe.System.from_casadi(
+    return qpmhe.from_casadi(
         lambda x: ca.mtimes(ca.DM(a), x), lambda x: ca.mtimes(ca.DM(c), x), n=len(a), dt=dt,
         method="rk4", compiled=compiled,
     )
@@ -172,7 +172,7 @@ def test_processes_at_once_with_a_compiler_that_lies(liar, cache):
     calls = liar(MODEL_LIES["residuals"], [FAST])
     program = (
         "import numpy as np, casadi as ca, qpmhe\n"
-        f"s = qpmhe.System.from_casadi(lambda x: ca.mtimes(ca.DM({A.tolist()}), x), lambda x: x, "
+        f"s = qpmhe.from_casadi(lambda x: ca.mtimes(ca.DM({A.tolist()}), x), lambda x: x, "
         "n=2, compiled=True)\n"
         "print(s.kernel.residuals(np.ones((3, 2)), 3 * np.ones((2, 2)), np.zeros((2, 0)))[1, 3])\n"
     )
@@ -233,7 +233,7 @@ def test_linear_models_at_every_level(n, level, cache, monkeypatch):
     ids=["no squares", "overflow", "hardly finite", "beyond the largest"],
 )
 def test_what_is_not_finite_is_no_fault(h, cache):
-    system = qpmhe.System.from_casadi(lambda x: 0.9 * x, lambda x: h(x[0]), n=2, compiled=True)
+    system = qpmhe.from_casadi(lambda x: 0.9 * x, lambda x: h(x[0]), n=2, compiled=True)
     assert estimator(system).engine == "compiled"
     assert not notes(cache)
 

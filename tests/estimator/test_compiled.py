@@ -38,7 +38,7 @@ class Model(NamedTuple):
 
 def system_of(f, h, **options):
     # The Python side is evaluated by CasADi's virtual machine: nothing in common but the model.
-    return qpmhe.System.from_casadi(f, h, compiled=False, **options)
+    return qpmhe.from_casadi(f, h, compiled=False, **options)
 
 
 def weights_of(seed, n, p):
@@ -287,7 +287,7 @@ x = casadi.MX.sym("x", 2)
 A = casadi.MX(np.array([[2.0, 0.3], [0.1, 1.5]])) + 0.1 * casadi.diag(x) ** 2
 table = casadi.MX(casadi.DM([0.7, 0.8, 0.9]))[casadi.floor(casadi.fmin(casadi.fmax(x[0], 0), 2))]
 f = {expression}
-system = qpmhe.System.from_casadi(
+system = qpmhe.from_casadi(
     casadi.Function("f", [x], [f]), lambda x: x[0] + 0.1 * x[1] ** 2, n=2, compiled=False
 )
 assert not system.symbolic.f.is_a("SXFunction")

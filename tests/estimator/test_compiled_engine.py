@@ -87,7 +87,7 @@ def test_a_cache_that_cannot_be_written(monkeypatch, tmp_path):
 
 PROGRAM = """
 import casadi, qpmhe
-system = qpmhe.System.from_casadi(lambda x: 0.9 * x, lambda x: x, n=1, compiled=False)
+system = qpmhe.from_casadi(lambda x: 0.9 * x, lambda x: x, n=1, compiled=False)
 cost = qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0)
 mhe = qpmhe.MovingHorizonEstimator(
     system, qpmhe.Luenberger([0.3]), cost, horizon=2, initial_state=[0.0], engine="compiled"
@@ -186,7 +186,7 @@ def equality():
 @pytest.mark.parametrize(
     ("remedy", "given"),
     [
-        ("System.from_casadi", {"system": plain}),
+        ("qpmhe.from_casadi", {"system": plain}),
         ("OwnGain has no C form.*constant gain", {"observer": lambda: OwnGain([0.3])}),
         ("OutputInjection has no C form",
          {"observer": lambda: qpmhe.OutputInjection(lambda z, v: 0.3 * v)}),

@@ -41,7 +41,7 @@ def case_of(name, kind):
     else:
         case = SYSTEMS[name]()
     states, disturbances, noises = case.sets[kind]
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         **case.symbolic(), n=case.n, compiled=False,
         states=states, disturbances=disturbances, noises=noises,
     )
@@ -239,7 +239,7 @@ def test_missing_and_late_samples_with_sets(name, kind):
 @pytest.mark.parametrize("far", [1e20, 1e200, 1e300])
 def test_bounds_that_are_all_but_infinite(far):
     case, system = case_of("parts", "all open")
-    wide = qpmhe.System.from_casadi(
+    wide = qpmhe.from_casadi(
         **case.symbolic(), n=2, compiled=False, states=Box([0.0, -far], [far, 3.5]),
         disturbances=Box([-far, -0.05], [0.05, far]) & around([0, 0], 0.1, 0.1),
         noises=Box(-1.2, far) & Polytope([[1.0]], [0.3]),
@@ -260,7 +260,7 @@ def test_bounds_that_are_all_but_infinite(far):
 def test_sets_of_almost_no_width(width):
     """However narrow, nothing worse than the candidate comes out."""
     case, _ = case_of("reactor", "polytope")
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         **case.symbolic(), n=2, compiled=False, states=case.sets["polytope"][0],
         disturbances=Polytope([[1, 1], [-1, -1], [1, 0], [-1, 0]], [width, width, 0.1, 0.1]),
         noises=Polytope([[1.0], [-1.0]], [0.4, 1.2]),
@@ -282,7 +282,7 @@ def test_sets_of_almost_no_width(width):
 @pytest.mark.parametrize("width", [0.0, 1e-12, 1e-9])
 def test_sets_of_less_width_than_they_are_kept_to(width):
     case, _ = case_of("reactor", "polytope")
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         **case.symbolic(), n=2, compiled=False,
         disturbances=Polytope([[1, 1], [-1, -1]], [width, width]),
     )

@@ -186,7 +186,7 @@ def test_no_update_imports_anything():
 @pytest.mark.parametrize("horizon", [3, 16, 40])
 def test_programs_of_jax_are_compiled_when_the_estimator_is_made(horizon):
     jnp = pytest.importorskip("jax.numpy")
-    system = qpmhe.System.from_jax(
+    system = qpmhe.from_jax(
         lambda x: jnp.array([x[0] + 0.1 * x[1], x[1] - 0.1 * jnp.sin(x[0])]), lambda x: x[:1],
         n=2, p=1,
     )
@@ -206,7 +206,7 @@ def test_programs_of_jax_are_compiled_when_the_estimator_is_made(horizon):
 def test_programs_of_casadi_for_full_windows_are_made_with_the_estimator(compiled):
     ca = pytest.importorskip("casadi")
     x = ca.SX.sym("x", 2)
-    system = qpmhe.System.from_casadi(
+    system = qpmhe.from_casadi(
         ca.Function("f", [x], [ca.vertcat(x[0] + 0.1 * x[1], x[1] - 0.1 * ca.sin(x[0]))]),
         ca.Function("h", [x], [x[0]]), compiled=compiled,
     )

@@ -35,7 +35,7 @@ def system_of(engine, sets=None):
             method="euler", **(sets or {}),
         )
     ca = pytest.importorskip("casadi")
-    return qpmhe.System.from_casadi(
+    return qpmhe.from_casadi(
         lambda x, u: [x[1], u[0] - ca.sin(x[0])], lambda x, u: x[0] + 0.1 * x[0] ** 2, dt=0.1,
         method="euler", n=2, m=1, **(sets or {}),
     )

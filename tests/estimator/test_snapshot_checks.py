@@ -51,7 +51,7 @@ def other_model(engine, f=1.0, h=0.1):
             method="euler",
         )
     ca = pytest.importorskip("casadi")
-    return qpmhe.System.from_casadi(
+    return qpmhe.from_casadi(
         lambda x, u: [x[1], u[0] - f * ca.sin(x[0])], lambda x, u: x[0] + h * x[0] ** 2, dt=0.1,
         method="euler", n=2, m=1,
     )

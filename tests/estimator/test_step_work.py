@@ -117,7 +117,7 @@ def test_a_step_takes_no_more_calls_than_it_did(options, most):
 
 def test_a_casadi_model_is_called_twice_in_a_step():
     reactor = qpmhe.models.batch_reactor()
-    system = qpmhe.System.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2)
+    system = qpmhe.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2)
     kernel, counts = system.kernel, {"stage": 0, "residuals": 0}
 
     class Counting:
@@ -143,7 +143,7 @@ def test_a_casadi_model_is_called_twice_in_a_step():
 
 def test_a_compiled_step_is_one_call_into_c():
     reactor = qpmhe.models.batch_reactor()
-    system = qpmhe.System.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2)
+    system = qpmhe.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2)
     mhe = qpmhe.MovingHorizonEstimator(
         system, reactor.observer, reactor.cost, horizon=10, initial_state=[3.0, 0.0],
         engine="compiled",

@@ -482,7 +482,7 @@ def test_what_is_no_clear_input_is_refused(f, words):
 
 
 def test_inputs_that_no_function_takes_are_refused_from_casadi_and_jax():
-    for make in (qpmhe.System.from_casadi, qpmhe.System.from_jax):
+    for make in (qpmhe.from_casadi, qpmhe.from_jax):
         with pytest.raises(ModelError, match="neither f nor h takes an input"):
             make(lambda x: 0.9 * x, lambda x: x, n=1, p=1, m=1)
 

@@ -25,7 +25,7 @@ def example():
 @pytest.fixture(scope="module")
 def parts(example):
     model = example.step()
-    return model, example.qpmhe.System.from_casadi(model, lambda x: x[0], compiled=False)
+    return model, example.qpmhe.from_casadi(model, lambda x: x[0], compiled=False)
 
 
 def test_the_program_prints_its_table_and_draws(tmp_path):

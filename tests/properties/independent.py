@@ -276,7 +276,7 @@ class Model:
                 return ca.vertcat(*self._written(x, u, XP, where, output))
 
             compiled = None if self.writing == "compiled" else False
-            return qpmhe.System.from_casadi(
+            return qpmhe.from_casadi(
                 self._with_arity(lambda x, u: write(x, u, False)),
                 self._with_arity(lambda x, u: write(x, u, True)),
                 compiled=compiled, **timing, **sizes,
@@ -289,7 +289,7 @@ class Model:
 
             return jnp.stack(self._written(x, u, jnp, where, output))
 
-        return qpmhe.System.from_jax(
+        return qpmhe.from_jax(
             self._with_arity(lambda x, u: write(x, u, False)),
             self._with_arity(lambda x, u: write(x, u, True)),
             **timing, **sizes,
