@@ -85,7 +85,7 @@ def from_control(
         matrices = {name: _real(name, getattr(system, name)) for name in "ABCD"}
         return _linear(**matrices, dt=length, method=method, sets=sets)
     made = _nonlinear(system, length, method, sets)
-    _refuse_time(system, made, dt)
+    _check_no_time(system, made, dt)
     made.recipe = (
         from_control, {"system": system, "dt": dt, "method": method, **sets}
     )
@@ -142,15 +142,15 @@ def _linear(
             rate, output, dt=dt, method=method, rate_jacobian=rate_jacobian,
             h_jacobian=output_jacobian, **options,
         )
-        return _remembered(system, A, B, C, D, dt, method, sets)
+        return _with_recipe(system, A, B, C, D, dt, method, sets)
     step, step_jacobian = _affine(a, b, m)
     system = System(
         step, output, f_jacobian=step_jacobian, h_jacobian=output_jacobian, **options
     )
-    return _remembered(system, A, B, C, D, dt, method, sets)
+    return _with_recipe(system, A, B, C, D, dt, method, sets)
 
 
-def _remembered(system: System, *arguments: Any) -> System:
+def _with_recipe(system: System, *arguments: Any) -> System:
     names = ("A", "B", "C", "D", "dt", "method", "sets")
     # A control.StateSpace does not pickle, its matrices do.
     system.recipe = (_linear, dict(zip(names, arguments, strict=True)))
@@ -183,7 +183,7 @@ def _nonlinear(
     options: dict[str, Any] = {"n": system.nstates, "p": system.noutputs, "m": m, **sets}
 
     def at(function: Function) -> Function:
-        # python-control's functions are of one state, and of a time that a System has not.
+        # python-control's functions take one state, and a time that a System does not have.
         if m == 0:
             return lambda x: np.asarray(function(0.0, x, np.zeros(0)))
         return lambda x, u: np.asarray(function(0.0, x, u))
@@ -196,8 +196,8 @@ def _nonlinear(
     return System.from_ode(update, output, dt=dt, method=method or "rk4", **options)
 
 
-def _refuse_time(system: Any, made: System, dt: float | None) -> None:
-    """Insist that dynamics and output are the same at all times, as a `System` has none."""
+def _check_no_time(system: Any, made: System, dt: float | None) -> None:
+    """Check that dynamics and output do not depend on time, which a `System` cannot express."""
     unit = float(dt or (1.0 if system.dt in (None, True) else system.dt) or 1.0)
     steps = np.unique(np.geomspace(1.0, 1e6, 25).round())
     times = [unit * steps]

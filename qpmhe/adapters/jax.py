@@ -144,7 +144,7 @@ def _assembled(model: _Model, m: int, sets: dict[str, Any]) -> System:
             raise
         raise ModelError(
             f"{error} Here it is JAX's: look for single precision, stop_gradient or a "
-            f"derivative of its own within {name}."
+            f"custom derivative within {name}."
         ) from error
     system.f_jacobian.method = system.h_jacobian.method = "jax"
     system.kernel = model

@@ -97,7 +97,7 @@ class Programs:
                 lambda *point: stage(*(block[0] for block in point)), 1, [(n + p,), (n + p, n)]
             )
         except Exception as error:  # whatever JAX has against the user's functions
-            raise ModelError(f"JAX cannot differentiate f and h: {_told(error)}.") from error
+            raise ModelError(f"JAX cannot differentiate f and h: {_reason(error)}.") from error
         #: f and h at a state.
         self.value = self._compiled(
             lambda *point: [value(*(block[0] for block in point))], 1, [(n,), (p,)]
@@ -159,7 +159,7 @@ class Programs:
                 raise
             except Exception as error:  # whatever JAX has against the user's function
                 raise ModelError(
-                    f"JAX cannot trace {name}: {_told(error)}. Write it for one state with "
+                    f"JAX cannot trace {name}: {_reason(error)}. Write it for one state with "
                     "jax.numpy, with jnp.where or lax.cond in place of if."
                 ) from error
             (device,) = self._device.device_set
@@ -217,13 +217,13 @@ def _imported() -> tuple[Any, Function, Any]:
         device = jax.local_devices(backend="cpu")[0]
     except RuntimeError as error:
         raise InvalidInputError(
-            f"JAX has no CPU device ({_told(error)}); include cpu in JAX_PLATFORMS."
+            f"JAX has no CPU device ({_reason(error)}); include cpu in JAX_PLATFORMS."
         ) from error
     # Before JAX 0.8 the switch was among the experiments.
     home = jax if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental")
     return jax, home.enable_x64, jax.sharding.SingleDeviceSharding(device)
 
 
-def _told(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     lines = str(error).splitlines() or [""]
     return f"{type(error).__name__}: {lines[0]}".rstrip(".")

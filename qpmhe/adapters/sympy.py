@@ -242,7 +242,7 @@ def _numeric(
             f"{name} contains {list(matrix.xreplace(names))}, which NumPy and SciPy cannot "
             f"evaluate ({error}); {remedy}"
         ) from error
-    # What a printer does not know, it prints as it is, and only the call would tell.
+    # A printer prints what it does not know as it is; without this, only a call would fail.
     called = {one.argval for one in get_instructions(entries) if one.opname == "LOAD_GLOBAL"}
     absent = called - {*entries.__globals__, *dir(builtins)}
     if absent:

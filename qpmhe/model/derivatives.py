@@ -1,4 +1,4 @@
-"""Jacobians of model functions, the best that can be had: given, complex step, differences."""
+"""Jacobians of model functions: given, or by the complex step, or by finite differences."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ class Jacobian:
         return bool(usable)
 
     def check(self, x: Array, u: Array) -> None:
-        """Try the method once more at a state that is to be used.
+        """Try the method again at a state that will be used.
 
         Parameters
         ----------
@@ -160,7 +160,7 @@ class Jacobian:
             self.use("finite differences")
 
     def copy(self, function: BatchedFunction) -> Jacobian:
-        """The same Jacobian, with a method of its own, of a copy of its function.
+        """The same Jacobian, of a copy of its function; its method can change independently.
 
         Parameters
         ----------
@@ -177,7 +177,7 @@ class Jacobian:
         return other
 
     def use(self, method: str) -> None:
-        """Compute by a certain one of the two methods from now on, unless one was given.
+        """Compute by this method from now on, unless the user gave the Jacobian.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class Jacobian:
 
 
 def _close(found: Array, expected: Array, value: Array) -> Array:
-    """Entry by entry, up to what differences of functions with these values can tell."""
+    """Entry by entry, up to the accuracy of differences of functions with these values."""
     row = np.abs(expected).max(axis=1, keepdims=True)
     floor = 1e-6 * (1.0 + row) + 1e-9 * np.abs(value).reshape(-1, 1)
     close: Array = np.abs(found - expected) <= 1e-4 * np.abs(expected) + floor

@@ -40,7 +40,7 @@ def contained(function: Callable[..., Any]) -> Callable[..., Any]:
     Parameters
     ----------
     function : callable
-        The function; a SystemExit of its own, say, becomes an `EvaluationError`.
+        The function; a SystemExit that it raises becomes an `EvaluationError`.
     """
 
     def call(*arguments: Any) -> Any:
@@ -55,7 +55,7 @@ def contained(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class BatchedFunction:
-    """g(x) or g(x, u), evaluated over leading dimensions whatever way it was written.
+    """g(x) or g(x, u), evaluated over leading dimensions however it was written.
 
     A function is called state by state (``looped``), with a copy of each argument, unless a
     trace proves that it needs neither: called on symbols, it returns without asking for a
@@ -83,7 +83,7 @@ class BatchedFunction:
     takes_input : bool
         Whether it is a function of u as well.
     reads_only : bool
-        Whether it is proved to write into no argument, and to return one kind of value.
+        Whether a trace proved that it writes into no argument and returns one kind of value.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class BatchedFunction:
         return self._as_value(raw)
 
     def _as_value(self, raw: Any) -> Array:
-        """What a function without proof has returned, if it is a value."""
+        """The checked value of a function that was not traced."""
         value = np.asarray(raw)
         if value.dtype == np.object_:
             value = np.array(value.tolist())
@@ -238,7 +238,7 @@ class BatchedFunction:
         return value.reshape(self.shape) if np.isfinite(value).all() else None
 
     def copy(self) -> BatchedFunction:
-        """The same function, with a mode of its own."""
+        """The same function, whose mode can change independently."""
         return copy(self)
 
     @property
@@ -255,7 +255,7 @@ class BatchedFunction:
         return self.mode == "batched" and takes_all and self._returns_array and not self._short
 
     def check(self, x: Array, u: Array) -> None:
-        """Insist on a finite value of the right shape at a state that is to be used."""
+        """Check that the value is finite and of the right shape at a state that will be used."""
         if self.mode == "unknown":
             self._detect([(x, u), (x * (1 + 1e-6) + 1e-9, u + 1e-3)])
         try:
@@ -305,7 +305,7 @@ def takes_input(name: str, function: Callable[..., Any], inputs: int) -> bool:
         return function.nin == 2
     try:
         parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):  # of a compiled function: it takes all that there is
+    except (TypeError, ValueError):  # compiled functions have no signature: pass all arguments
         return inputs > 0
     positional = [q for q in parameters if q.kind in (q.POSITIONAL_ONLY, q.POSITIONAL_OR_KEYWORD)]
     rest = any(q.kind is q.VAR_POSITIONAL for q in parameters)

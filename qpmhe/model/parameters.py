@@ -108,20 +108,20 @@ def augment_parameters(
     chosen = _chosen(estimated, values.size)
     k = chosen.size
     for name, one, dimension in (("states", states, n), ("disturbances", disturbances, n)):
-        _insist_on(name, one, dimension, "that of x alone: the parameters' are added here")
+        _check_set(name, one, dimension, "the dimension of x alone: the parameters are added here")
     if parameter_bounds is not None and k == 0:
         raise SetError("parameter_bounds was given, but no parameter is estimated; leave it out.")
-    _insist_on("parameter_bounds", parameter_bounds, k, "the number of estimated parameters")
+    _check_set("parameter_bounds", parameter_bounds, k, "the number of estimated parameters")
     if parameter_bounds is not None and parameter_bounds.violation(values[chosen]) > 0.0:
         raise SetError(
             f"nominal is {values[chosen].tolist()} for the estimated parameters, outside of "
             f"parameter_bounds {parameter_bounds!r}; the prior value must be within."
         )
     probes = _parameter_probes(probe_points(states, n, m), values, chosen, parameter_bounds)
-    joint = _Joint(n, m, values, chosen)
+    model = _AugmentedModel(n, m, values, chosen)
     return System(
-        joint.function("f", f, n, probes, append=True),
-        joint.function("h", h, p, probes, append=False),
+        model.function("f", f, n, probes, append=True),
+        model.function("h", h, p, probes, append=False),
         n=n + k, p=p, m=m,
         states=_product(states, n, parameter_bounds, k),
         disturbances=_product(disturbances, n, Box(np.zeros(k), np.zeros(k)) if k else None, k),
@@ -129,8 +129,8 @@ def augment_parameters(
     )
 
 
-class _Joint:
-    """Turns functions of (x, u, theta) into functions of the joint state z = (x, theta_e)."""
+class _AugmentedModel:
+    """Turns functions of (x, u, theta) into functions of the augmented state z = (x, theta_e)."""
 
     def __init__(self, n: int, m: int, nominal: Array, chosen: Index) -> None:
         self._n, self._m, self._nominal, self._chosen = n, m, nominal, chosen
@@ -144,7 +144,7 @@ class _Joint:
         With ``append``, the estimated parameters stand behind its value, unchanged.
         """
         n, m = self._n, self._m
-        _insist_on_arguments(name, written, m)
+        _check_arguments(name, written, m)
         tried = _Split(name, written, n, m, size, probes)
         if tried.batched.mode == "unknown":
             tried.explain_failure(probes)
@@ -163,7 +163,7 @@ class _Joint:
         return Trusted(evaluate)
 
     def _theta(self, z: Array) -> Array:
-        """All parameters at joint states z (..., n + k_e)."""
+        """All parameters at augmented states z (..., n + k_e)."""
         if self._whole:
             return z[..., self._n :]
         theta = np.empty((*z.shape[:-1], self._nominal.size), z.dtype)
@@ -193,7 +193,7 @@ class _Split:
         return self._written(x, theta) if m == 0 else self._written(x, u, theta)
 
     def _by_columns(self, x: Array) -> bool:
-        """Whether the states are the columns of x; shapes alone do not tell where it is square.
+        """Whether the states are the columns of x; shapes do not say so where it is square.
 
         While the ways of writing are tried out, it never is.
         """
@@ -202,7 +202,7 @@ class _Split:
         return self._found.mode == "columns"
 
     def explain_failure(self, probes: Probes) -> None:
-        """Raise where the function fails by its writing, and not by the point it is tried at."""
+        """Raise if the function is written wrongly; pass over points outside its domain."""
         x, known = probes[0]
         try:
             with np.errstate(all="ignore"):
@@ -265,7 +265,7 @@ def _chosen(estimated: ArrayLike | None, size: int) -> Index:
     return given.astype(np.intp)
 
 
-def _insist_on(name: str, one: ConvexSet | None, dimension: int, meaning: str) -> None:
+def _check_set(name: str, one: ConvexSet | None, dimension: int, meaning: str) -> None:
     if one is None:
         return
     if not isinstance(one, ConvexSet):
@@ -274,13 +274,13 @@ def _insist_on(name: str, one: ConvexSet | None, dimension: int, meaning: str) -
         raise SetError(f"{name} has dimension {one.dimension}; expected {dimension}, {meaning}.")
 
 
-def _insist_on_arguments(name: str, written: Function, m: int) -> None:
+def _check_arguments(name: str, written: Function, m: int) -> None:
     if not callable(written):
         raise ModelError(f"{name} is {written!r}; expected a function.")
     arguments = ("x", "theta") if m == 0 else ("x", "u", "theta")
     try:
         signature = inspect.signature(written)
-    except (TypeError, ValueError):  # some compiled functions do not tell
+    except (TypeError, ValueError):  # some compiled functions have no signature
         return
     try:
         signature.bind(*arguments)

@@ -105,10 +105,10 @@ class ConvexSet:
             np.append(self.row_lower, other.row_lower),
             np.append(self.row_upper, other.row_upper),
         )
-        both._insist_not_empty()
+        both._check_not_empty()
         return both
 
-    def _insist_not_empty(self) -> None:
+    def _check_not_empty(self) -> None:
         from scipy.optimize import Bounds, LinearConstraint, milp
 
         # A linear program without objective: milp takes two-sided rows as they are.
@@ -208,4 +208,4 @@ class Polytope(ConvexSet):
             )
         free = np.full(rows.shape[1], np.inf)
         super().__init__(-free, free, rows, np.full(side.size, -np.inf), side)
-        self._insist_not_empty()
+        self._check_not_empty()

@@ -159,7 +159,7 @@ class System:
     ) -> System:
         r"""Discretise :math:`\dot x = f_c(x, u)` with a fixed step; u is held over the step.
 
-        The disturbance w stays that of the discrete-time system: it is added once a step.
+        The disturbance w acts in discrete time: it is added once a step.
 
         Parameters
         ----------

@@ -442,7 +442,7 @@ def build(**changes):
         ({"states": Box([0.0] * 4, [1.0] * 4)}, "SetError", "states has dimension 4; expected 2"),
         ({"states": [0.0, 1.0]}, "SetError", "states is .*; expected a qpmhe.Box"),
         ({"disturbances": Box([0.0], [1.0])}, "SetError",
-         "disturbances has dimension 1; expected 2, that of x alone"),
+         "disturbances has dimension 1; expected 2, the dimension of x alone"),
         ({"noises": Box([0.0] * 2, [1.0] * 2)}, "SetError", "noises has dimension 2; expected 1"),
         ({"parameter_bounds": Box([0.0], [9.0])}, "SetError",
          "parameter_bounds has dimension 1; expected 2"),

@@ -24,20 +24,15 @@ void mhe_jacobians(int64_t count, const real *x, const real *u, const real *step
     }
 }
 
-/* The residual (w, v) of a stage from its state and the next one, which follows it. */
-static void mhe_residual(const real *x, const real *u, real step, const real *y, real *residual)
-{
-    real f[NX], h[NY];
-    mhe_f(x, u, step, f);
-    mhe_h(x, u, h);
-    for (int j = 0; j < NX; j++) residual[j] = x[NX + j] - f[j];
-    for (int j = 0; j < NY; j++) residual[NX + j] = y[j] - h[j];
-}
-
-/* Residuals of each stage along a trajectory of count + 1 states. */
+/* The residual (w, v) of each stage along a trajectory of count + 1 states. */
 void mhe_residuals(int64_t count, const real *x, const real *u, const real *step, real usual,
                    const real *y, real *residuals)
 {
-    for (int64_t k = 0; k < count; k++, x += NX, u += NU, y += NY, residuals += NX + NY)
-        mhe_residual(x, u, step ? step[k] : usual, y, residuals);
+    real f[NX], h[NY];
+    for (int64_t k = 0; k < count; k++, x += NX, u += NU, y += NY, residuals += NX + NY) {
+        mhe_f(x, u, step ? step[k] : usual, f);
+        mhe_h(x, u, h);
+        for (int j = 0; j < NX; j++) residuals[j] = x[NX + j] - f[j];
+        for (int j = 0; j < NY; j++) residuals[NX + j] = y[j] - h[j];
+    }
 }
