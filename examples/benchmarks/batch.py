@@ -45,7 +45,7 @@ def main() -> None:
     single = qpmhe.MovingHorizonEstimator(
         plain, observer, cost, horizon=HORIZON, initial_state=START
     )
-    batches = {"loop, NumPy": qpmhe.BatchEstimator(plain, observer, cost, **shared)}
+    batches = {}
     if find_compiler() is not None:
         threads = sorted({1, len(os.sched_getaffinity(0))})
         for count in threads:
