@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ._checks import count, numbers
 from .costs import Cost
-from .errors import InvalidInputError, OptionError, ShapeError
+from .errors import InvalidInputError, OptionError, ShapeError, UnknownOptionError
 from .estimation.engine import PythonEngine
 from .estimation.estimate import Estimate, Status
 from .estimation.estimator import MovingHorizonEstimator, check_start
@@ -97,6 +97,11 @@ class BatchEstimator:
         if not isinstance(system, System):
             raise InvalidInputError(f"system is {system!r}; expected a qpmhe.System.")
         self._threads = None if threads is None else count("threads", threads, 1)
+        if "initial_state" in options:
+            raise UnknownOptionError(
+                "BatchEstimator has no option 'initial_state'; pass initial_states, one for all "
+                "members or one for each."
+            )
         states = _starts(initial_states, self.members, system.n)
         self.system, self.observer, self.cost = system, observer, cost
         if isinstance(observer, Observer):
@@ -209,6 +214,8 @@ class BatchEstimator:
         return self._step(y, _inputs(U, self.members, self.system.m))
 
     def _step(self, y: Array, u: Array) -> BatchEstimate:
+        if isinstance(self._engine, _Looped):
+            return self._engine.step(y, u)
         return BatchEstimate(**self._engine.step(y, u), delay=self.settings.delay)
 
     def run(self, Y: ArrayLike, U: ArrayLike | None = None) -> BatchRun:
@@ -263,6 +270,7 @@ class _Looped:
     def __init__(
         self, system: System, observer: Observer, cost: Cost, settings: Settings, states: Array
     ) -> None:
+        self._delay = settings.delay
         self._engines = [
             PythonEngine(system.copy(), observer, cost, settings, state.copy())
             for state in states
@@ -293,13 +301,13 @@ class _Looped:
                 engine.replace(*memory)
             raise
 
-    def step(self, y: Array, u: Array) -> dict[str, Any]:
+    def step(self, y: Array, u: Array) -> BatchEstimate:
         time = self.time
         try:
             return _collected([
                 engine.step(y[k], u[k], None, None, perf_counter())
                 for k, engine in enumerate(self._engines)
-            ])
+            ], self._delay)
         except BaseException:
             for engine in self._engines:
                 if engine.time > time:
@@ -307,17 +315,17 @@ class _Looped:
             raise
 
 
-def _collected(found: list[Estimate]) -> dict[str, Any]:
-    """What makes a `BatchEstimate`."""
-    return {
-        "time": found[0].time,
-        "trajectories": np.array([one.trajectory for one in found]),
-        "costs": np.array([one.cost for one in found]),
-        "candidates": np.array([one.candidate for one in found]),
-        "candidate_costs": np.array([one.candidate_cost for one in found]),
-        "flags": np.array([one.status.value for one in found], np.int64),
-        "qps": np.array([one.qps for one in found], np.intp),
-    }
+def _collected(found: list[Estimate], delay: int) -> BatchEstimate:
+    return BatchEstimate(
+        found[0].time,
+        np.array([one.trajectory for one in found]),
+        np.array([one.cost for one in found]),
+        np.array([one.candidate for one in found]),
+        np.array([one.candidate_cost for one in found]),
+        np.array([one.status.value for one in found], np.int64),
+        np.array([one.qps for one in found], np.intp),
+        delay,
+    )
 
 
 class BatchEstimate:

@@ -185,7 +185,7 @@ def answers(program, options, *parts):
     """What a program writes; options: those of an estimator it was not written from."""
     given = [0] if options is None else [
         1, options.qp_limit, ["drop", "project", "keep"].index(options.outside),
-        options.start == "best", options.delay,
+        options.warm_start, options.delay,
     ]
     parts = (given, *parts)
     data = np.concatenate([np.ravel(np.asarray(part, np.float64)) for part in parts])

@@ -37,7 +37,7 @@ def fallen_back(model, match):
 @pytest.mark.parametrize("command", ["", " ", "/nowhere/cc", "no-such-compiler -O2", "/tmp"])
 def test_no_compiler(monkeypatch, command):
     monkeypatch.setenv("CC", command)
-    fallen_back(made("n=1"), "carried out by the Python step: there is no C compiler.*install")
+    fallen_back(made("n=1"), "falls back to the Python step: there is no C compiler.*install")
 
 
 def test_no_compiler_on_the_path(monkeypatch, tmp_path):
@@ -48,7 +48,7 @@ def test_no_compiler_on_the_path(monkeypatch, tmp_path):
 
 def test_a_compiler_that_cannot_be_read(monkeypatch):
     monkeypatch.setenv("CC", 'gcc "')
-    fallen_back(made("n=1"), "carried out by the Python step")
+    fallen_back(made("n=1"), "falls back to the Python step")
 
 
 def test_a_compiler_that_fails(monkeypatch, tmp_path):
@@ -174,7 +174,10 @@ def uncovered(**given):
 
 
 class OwnGain(qpmhe.Luenberger):
-    """May correct by anything."""
+    """Corrects by something else."""
+
+    def correct(self, z, v, sample):
+        return 2.0 * super().correct(z, v, sample)[0], None
 
 
 def equality():

@@ -197,7 +197,7 @@ def test_records_and_samples_in_turn():
         Y, U = model.Y[first:last], model.U[first:last]
         kept = other.state.copy()
         if first == 3:
-            run = qpmhe.run.Run.of(kept, [other.update(Y[0], U[0])])
+            run = qpmhe.Run.of(kept, [other.update(Y[0], U[0])])
         else:
             run = other.run(Y[::-1][::-1], np.asfortranarray(U))
         expected = [one.update(y, u) for y, u in zip(Y, U, strict=True)]
