@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qpmhe_solvers import SolverOptions, create
+from qpmhe_solvers import Solver, create
 from qpmhe_solvers.contained import ContainedSolver
 
 from .._checks import check_problem
@@ -53,13 +53,10 @@ class PythonEngine:
     ) -> None:
         self._system, self._observer, self._cost = system, observer, cost
         self._settings = settings
-        options = SolverOptions(
-            max_iterations=settings.max_solver_iterations,
-            absolute_tolerance=float(settings.solver_tolerance),
-            time_limit=None if settings.time_budget is None else float(settings.time_budget),
-        )
+        given = settings.backend
         self._solver = solver = ContainedSolver(
-            create(settings.backend, options, isolated=settings.isolated)
+            given if isinstance(given, Solver)
+            else create(given, settings.solver_options, isolated=settings.isolated)
         )
         if settings.qp_limit:
             solver.prepare((settings.horizon + 1) * system.n)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qpmhe_solvers import Solver
 from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import positive, positive_definite, record, vector
@@ -47,18 +49,21 @@ class MovingHorizonEstimator:
         N >= 1. Until N samples are there, all of them are used (Remark rem:emtpyN).
     initial_state : (n,) array_like
         Initial estimate, at the time of the first measurement; within the state set.
-    backend : str
+    backend : str or Solver
         QP solver, one of ``qpmhe.solvers.available()``. ``auto`` uses a banded Cholesky
         factorisation and another solver only where inequalities bind; a named backend is
-        always really used.
+        always really used. Or a solver made by ``qpmhe.solvers.create``, which brings its own
+        cap and tolerances. It may serve several estimators of one thread, and starts afresh
+        whenever it passes from one to another.
     max_qps : int or None
         QPs per sample, the paper's i; 0 gives the observer. None goes on to convergence,
         at most 100.
     max_solver_iterations : int or None
-        Cap on the solver's own iterations in each QP; None leaves the solver's default.
+        Cap on the solver's own iterations in each QP; None leaves the solver's default, or the
+        cap of the solver given as ``backend``.
     solver_tolerance : float
         Tolerance on the QP's residuals in scaled numbers, which have no unit; see
-        `qpmhe.solvers.SolverOptions`.
+        `qpmhe.solvers.SolverOptions`. If left out, that of a solver given as ``backend``.
     tolerance : float
         The sequence of QPs has converged when a QP that was solved lowers J by less than
         this share of it.
@@ -115,7 +120,7 @@ class MovingHorizonEstimator:
         *,
         horizon: int,
         initial_state: ArrayLike,
-        backend: str = "auto",
+        backend: str | Solver = "auto",
         max_qps: int | None = 1,
         max_solver_iterations: int | None = None,
         solver_tolerance: float = 1e-7,
@@ -371,6 +376,16 @@ class MovingHorizonEstimator:
         self._engine.load_state_dict(state)
 
     def __getstate__(self) -> dict[str, Any]:
+        solver = self.settings.backend
+        if isinstance(solver, Solver):
+            try:
+                pickle.dumps(solver)
+            except Exception as error:
+                raise InvalidInputError(
+                    f"the solver {solver!r} given as backend cannot be pickled "
+                    f"({type(error).__name__}: {error}), nor can its estimator; give the name of "
+                    "a registered backend, or keep state_dict() instead."
+                ) from error
         return {
             "arguments": (self.system, self.observer, self.cost),
             "settings": self.settings,

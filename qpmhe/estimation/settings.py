@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from qpmhe_solvers import Solver, SolverOptions
+
 from .._checks import count, positive
-from ..errors import OptionError
+from ..errors import BackendError, OptionError
 
 __all__ = ["Candidate", "Engine", "Policy", "Settings"]
 
@@ -16,6 +18,7 @@ Engine = Literal["python", "compiled"]
 
 # With max_qps=None the sequence ends by convergence; this bounds it where that fails.
 _SAFETY_LIMIT = 100
+_SOLVER_TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)
@@ -23,10 +26,10 @@ class Settings:
     """Options of `MovingHorizonEstimator`, where each is explained."""
 
     horizon: int
-    backend: str = "auto"
+    backend: str | Solver = "auto"
     max_qps: int | None = 1
     max_solver_iterations: int | None = None
-    solver_tolerance: float = 1e-7
+    solver_tolerance: float = _SOLVER_TOLERANCE
     tolerance: float = 1e-9
     engine: str = "python"
     outside: str = "drop"
@@ -75,6 +78,57 @@ class Settings:
                 "isolated is True, but engine='compiled' solves its QPs itself, without a "
                 "backend; take engine='python', or leave isolated out."
             )
+        if isinstance(self.backend, Solver):
+            self._take_limits_of(self.backend)
+
+    def _take_limits_of(self, solver: Solver) -> None:
+        """Let the limits be those of a solver, and refuse others."""
+        options = getattr(solver, "options", None)
+        if not isinstance(options, SolverOptions):
+            raise BackendError(
+                f"the solver {type(solver).__name__} has no options; call "
+                "super().__init__(options) in its __init__."
+            )
+        if self.engine == "compiled":
+            raise OptionError(
+                f"backend is {solver!r}, but engine='compiled' solves its QPs itself; take "
+                "engine='python', or leave backend out."
+            )
+        if self.isolated:
+            raise OptionError(
+                f"isolated is True, but backend is {solver!r}, which is made already; make it by "
+                "qpmhe.solvers.create(name, options, isolated=True)."
+            )
+        tolerance = float(self.solver_tolerance)
+        for name, value, default, option in (
+            ("max_solver_iterations", self.max_solver_iterations, None, "max_iterations"),
+            ("solver_tolerance", tolerance, _SOLVER_TOLERANCE, "absolute_tolerance"),
+        ):
+            own = getattr(options, option)
+            if value not in (default, own):
+                raise OptionError(
+                    f"{name} is {value!r}, but the solver given as backend has {option}={own!r}; "
+                    f"leave {name} out, or make the solver with "
+                    f"SolverOptions({option}={value!r})."
+                )
+            object.__setattr__(self, name, own)
+        if None not in (self.time_budget, options.time_limit) and (
+            self.time_budget != options.time_limit
+        ):
+            raise OptionError(
+                f"time_budget is {self.time_budget!r}, but the solver given as backend has "
+                f"time_limit={options.time_limit!r}; leave one of them out: with a budget, each "
+                "QP gets what remains of it."
+            )
+
+    @property
+    def solver_options(self) -> SolverOptions:
+        """Limits and accuracy of a solver that is made for these settings."""
+        return SolverOptions(
+            max_iterations=self.max_solver_iterations,
+            absolute_tolerance=float(self.solver_tolerance),
+            time_limit=None if self.time_budget is None else float(self.time_budget),
+        )
 
     @property
     def qp_limit(self) -> int:
