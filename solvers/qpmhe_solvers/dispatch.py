@@ -51,6 +51,8 @@ class Translation:
         Whether its words say so where a QP has no feasible point.
     others : tuple
         Keywords with values that suit numbers of order one.
+    objective : float
+        Factor of the objective, a power of two.
     keep_empty : bool
         Whether to give matrices without rows, which qpsolvers would make at each solve.
     """
@@ -70,13 +72,16 @@ class Translation:
     default_cap: int | None = None
     beyond_cap: int = 0
     others: tuple[tuple[str, float], ...] = ()
+    objective: float = 1.0
 
 
 # Caps, tolerances and traps as measured (qpsolvers 4.13). cvxopt is harmed by its start; the
 # IPMs and quadprog ignore it; clarabel and scs hand a QP without rows to a least-squares
 # routine that calls it unbounded; ecos and cvxopt choke on infinite bounds, and ecos on a
 # relative tolerance of 0. highs without rows claims to be optimal far from the optimum, and adds
-# 1e-7 to the Hessian's diagonal, which is much where weights spread over decades.
+# 1e-7 to the Hessian's diagonal, which is much where weights spread over decades. proxqp takes
+# a direction d with |H d| <= 1e-4 |d| for an unbounded one, and so does osqp; qpsolvers lets nobody
+# change that of proxqp.
 TRANSLATIONS: Mapping[str, Translation] = {
     "clarabel": Translation(
         "interior point", "clarabel", "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"),
@@ -100,7 +105,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
     ),
     "osqp": Translation(
         "ADMM", "osqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit",
-        start=True, reports_infeasibility=True,
+        start=True, reports_infeasibility=True, others=(("eps_dual_inf", 1e-12),),
     ),
     "piqp": Translation(
         "interior point", "piqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),
@@ -108,7 +113,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
     ),
     "proxqp": Translation(
         "augmented Lagrangian", "proxsuite", "dense", "box", "max_iter", ("eps_abs",),
-        ("eps_rel",), default_cap=200, reports_infeasibility=True,
+        ("eps_rel",), default_cap=200, reports_infeasibility=True, objective=2.0**10,
     ),
     "qpalm": Translation(
         "augmented Lagrangian", "qpalm", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),
@@ -195,6 +200,7 @@ class DispatchSolver(Solver):
             form = QpsolversMatrices(
                 qp, dense=how.matrices == "dense", box=how.bounds == "box",
                 needs_row=how.needs_row, keep_empty=how.keep_empty,
+                objective=how.objective,
             )
             made = form, self._problem(*form.arguments)
             if len(self._forms) == _KEPT:

@@ -52,6 +52,8 @@ class QpsolversMatrices:
         Whether a G without rows gets a void one.
     keep_empty : bool
         Whether a G or A without rows is given as such, not as None.
+    objective : float
+        Factor of P and q.
 
     Attributes
     ----------
@@ -60,11 +62,13 @@ class QpsolversMatrices:
     """
 
     def __init__(
-        self, qp: QP, *, dense: bool, box: bool, needs_row: bool, keep_empty: bool
+        self, qp: QP, *, dense: bool, box: bool, needs_row: bool, keep_empty: bool,
+        objective: float = 1.0,
     ) -> None:
         size, count = qp.size, qp.size + qp.stages * qp.rows
         rows = _Rows.of(qp, box)
         self._multipliers = _Multipliers(rows, size, count)
+        self._objective = objective
         # Where the numbers stand in `_numbers`, in the order in which `fill` puts them there.
         gradient = qp.band.size + np.arange(size)
         lower = qp.band.size + size + np.arange(count)
@@ -86,7 +90,7 @@ class QpsolversMatrices:
         above, level = side.size or empty, rows.equality.size or empty
         box_height, boxed = (size, slice(size)) if rows.boxed else (None, slice(0))
         parts = (
-            _Part(size, p.source, 1.0, p), _Part(size, gradient),
+            _Part(size, p.source, objective, p), _Part(size, gradient, objective),
             _Part(above, own + g.source, sign[g.rows], g), _Part(above, side, sign),
             _Part(level, own + a.source, 1.0, a), _Part(level, upper[rows.equality]),
             _Part(box_height, lower[boxed]), _Part(box_height, upper[boxed]),
@@ -141,7 +145,7 @@ class QpsolversMatrices:
 
     def multipliers(self, answer: Any) -> tuple[Array | None, Array | None]:
         """Multipliers of the QP's bounds and rows; None twice where some are missing."""
-        return self._multipliers.of(answer)
+        return self._multipliers.of(answer, 1.0 / self._objective)
 
 
 class _Part(NamedTuple):
@@ -194,7 +198,7 @@ class _Multipliers:
         if rows.boxed:
             self._upper[:size] = np.arange(ends[1], ends[2])
 
-    def of(self, answer: Any) -> tuple[Array | None, Array | None]:
+    def of(self, answer: Any, unit: float) -> tuple[Array | None, Array | None]:
         for values, part in zip((answer.z, answer.y, answer.z_box), self._parts, strict=True):
             if part.size == 0:
                 continue
@@ -202,5 +206,5 @@ class _Multipliers:
             if numbers.size < part.size:
                 return None, None
             part[...] = numbers[: part.size]
-        duals = self._given[self._upper] - self._given[self._lower]
+        duals = unit * (self._given[self._upper] - self._given[self._lower])
         return duals[: self._size], duals[self._size :]

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 import qpmhe_solvers.auto
 import qpmhe_solvers.dispatch
 import qpmhe_solvers.native.workspace
-from qpmhe_solvers import SolverOptions, SolveStatus, backend, create
+from qpmhe_solvers import QP, SolverOptions, SolveStatus, backend, create
+from qpmhe_solvers.qp import band_of
 
 from .problems import (
     ARRAYS,
@@ -357,3 +358,13 @@ def test_auto_without_any_solver_is_banded(monkeypatch):
     solution = create("auto").solve(qp)
     assert solution.status is SolveStatus.UNCONSTRAINED
     np.testing.assert_array_equal(solution.d, create("banded").solve(qp).d)
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if "proxqp" in name or "osqp" in name])
+def test_a_long_step_along_a_weak_direction_is_not_called_unbounded(name):
+    qp, weak = QP(1, 2), 3e-5
+    qp.band[0] = band_of(np.array([[1.0, 1.0 - weak], [1.0 - weak, 1.0]]))
+    qp.gradient[0] = weak, -weak
+    solution = create(name, SolverOptions(absolute_tolerance=1e-9)).solve(qp)
+    assert "infeasible" not in solution.message.lower()
+    np.testing.assert_allclose(solution.d, [[-1.0, 1.0]], rtol=1e-6)

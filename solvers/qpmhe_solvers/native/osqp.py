@@ -38,6 +38,7 @@ class OsqpSolver(NativeSolver):
         self._settings: dict[str, Any] = {
             "eps_abs": options.absolute_tolerance, "eps_rel": options.relative_tolerance,
             "verbose": False, "rho": _RHO,
+            "eps_dual_inf": 1e-12,  # H is positive definite: there is always a minimiser
         }
         if cap is not None:
             self._settings["max_iter"] = int(cap)

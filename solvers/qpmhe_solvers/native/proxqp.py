@@ -45,6 +45,7 @@ class ProxqpSolver(NativeSolver):
         settings.eps_abs = settings.eps_duality_gap_abs = options.absolute_tolerance
         settings.eps_rel = settings.eps_duality_gap_rel = options.relative_tolerance
         settings.check_duality_gap = True
+        settings.eps_dual_inf = 0.0  # H is positive definite: there is always a minimiser
         settings.max_iter = _CAP if options.max_iterations is None else int(options.max_iterations)
         handle.init(**self._parts(layout))
         return handle
