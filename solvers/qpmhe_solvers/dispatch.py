@@ -80,8 +80,8 @@ class Translation:
 # routine that calls it unbounded; ecos and cvxopt choke on infinite bounds, and ecos on a
 # relative tolerance of 0. highs without rows claims to be optimal far from the optimum, and adds
 # 1e-7 to the Hessian's diagonal, which is much where weights spread over decades. proxqp takes
-# a direction d with |H d| <= 1e-4 |d| for an unbounded one, and so does osqp; qpsolvers lets nobody
-# change that of proxqp.
+# a direction d with |H d| <= 1e-4 |d| for an unbounded one, as osqp and piqp do; qpsolvers lets
+# nobody change that of proxqp.
 TRANSLATIONS: Mapping[str, Translation] = {
     "clarabel": Translation(
         "interior point", "clarabel", "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"),
@@ -109,7 +109,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
     ),
     "piqp": Translation(
         "interior point", "piqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),
-        keep_empty=True, reports_infeasibility=True,
+        keep_empty=True, reports_infeasibility=True, others=(("eps_dual_inf", 1e-12),),
     ),
     "proxqp": Translation(
         "augmented Lagrangian", "proxsuite", "dense", "box", "max_iter", ("eps_abs",),
