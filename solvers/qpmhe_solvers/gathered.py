@@ -14,6 +14,7 @@ __all__ = ["GatheredQP"]
 Array = NDArray[np.float64]
 
 _ONE = np.ones(1)
+_peaks, _all = np.maximum.reduceat, np.logical_and.reduce
 # Spread of the Hessian's diagonal over the stages at which the least known stage, rather than the
 # best, is what the accuracy is for; and below which share double precision has none.
 _SPREAD, _LEAST = 2.0**10, 2.0**-34
@@ -42,9 +43,9 @@ class GatheredQP(QP):
     """
 
     __slots__ = (
-        "_columns", "_data", "_diagonal", "_entries", "_looked_at", "_magnitudes", "_starts",
-        "_steps", "_uppers", "all_lower", "all_upper", "gradient_at", "key", "limits", "lower_at",
-        "numbers", "one_at", "own_at", "sizes", "upper_at",
+        "_data", "_diagonal", "_entries", "_magnitudes", "_negated", "_ordered", "_positive",
+        "_seen", "_starts", "_steps", "all_lower", "all_upper", "gradient_at", "key", "limits",
+        "lower_at", "numbers", "one_at", "own_at", "sizes", "upper_at",
     )
 
     def __init__(self, stages: int, n: int, rows: int) -> None:
@@ -70,6 +71,7 @@ class GatheredQP(QP):
         self.row_lower, self.row_upper = (
             limits[size:].reshape(stages, rows) for limits in (self.all_lower, self.all_upper)
         )
+        self._ordered = np.empty(self.all_lower.size, np.bool_)
         self._prepare_peaks()
 
     @classmethod
@@ -94,17 +96,19 @@ class GatheredQP(QP):
             np.concatenate((own[:, row], following[:-1, row]), axis=None) for row in range(rows)
         ]
         gradient = np.arange(self.gradient_at, self.own_at).reshape(stages, n).T
-        # Gradients, then steps, then violations at zero, which are lower - 0 and 0 - upper.
+        # Gradients, then steps, then violations at zero, which are lower - 0 and 0 - upper, then
+        # the diagonal with the other sign, whose largest entries are its smallest.
         groups += [gradient.ravel(), gradient.ravel(), np.arange(self.lower_at, self.numbers.size)]
+        groups += list(diagonal)
         self._entries = np.concatenate(groups, axis=None)
-        seen = self._looked_at = np.empty(self._entries.size)
-        limits = self.limits.size
-        self._magnitudes = seen[: seen.size - limits]
-        self._diagonal = seen[: stages * n]
-        self._steps = self._magnitudes[self._magnitudes.size - stages * n :]
-        self._uppers = seen[seen.size - self.all_upper.size :]
+        seen = self._seen = np.empty(self._entries.size)
+        size, limits = self.size, self.limits.size
+        magnitudes = seen.size - limits - size
+        self._magnitudes, self._diagonal = seen[:magnitudes], seen[:size]
+        self._steps = seen[magnitudes - size : magnitudes]
+        self._negated = seen[magnitudes + limits // 2 :]
+        self._positive = np.empty(size, np.bool_)
         self._starts = np.cumsum([0] + [group.size for group in groups[:-1]])
-        self._columns = self._starts[:n]
 
     def gather(self, qp: QP) -> None:
         """Copy the numbers of a QP."""
@@ -129,23 +133,30 @@ class GatheredQP(QP):
             The smaller of the largest entry of the gradient and the largest step ``g / H`` of
             an entry of the diagonal, or the violation at zero if that is larger.
         """
-        self.numbers.take(self._entries, out=self._looked_at, mode="clip")
-        np.abs(self._magnitudes, out=self._magnitudes)
-        np.divide(self._steps, self._diagonal, out=self._steps, where=self._diagonal > 0.0)
-        np.negative(self._uppers, out=self._uppers)
-        found: list[float] = np.maximum.reduceat(self._looked_at, self._starts).tolist()
-        least = np.minimum.reduceat(self._diagonal, self._columns).tolist()
-        missed, step, slope = found.pop(), found.pop(), found.pop()
-        found.append(max(min(slope, step), missed))
-        for at, low in enumerate(least):
-            found[at] = min(found[at], _SPREAD * max(low, _LEAST * found[at]))
+        # Any mode but the default one writes into ``out`` without a buffer between.
+        self.numbers.take(self._entries, out=self._seen, mode="clip")
+        diagonal, steps, positive = self._diagonal, self._steps, self._positive
+        np.absolute(self._magnitudes, out=self._magnitudes)
+        np.greater(diagonal, 0.0, out=positive)
+        np.divide(steps, diagonal, out=steps, where=positive)
+        np.negative(self._negated, out=self._negated)
+        found: list[float] = _peaks(self._seen, self._starts).tolist()
+        n = self.n
+        negated = found[-n:]
+        slope, step, missed = found[-n - 3 : -n]
+        del found[-n - 2 :]
+        found[-1] = max(min(slope, step), missed)
+        for at, low in enumerate(negated):
+            most = found[at]
+            if -low * _SPREAD < most:
+                found[at] = min(most, _SPREAD * max(-low, _LEAST * most))
         return found
 
     def fault(self) -> str:
         """What no solver must be given: NaN hangs some and comes back as success from others."""
         # Squares may overflow where the numbers do not: then each one is looked at.
         finite = math.isfinite(self._data.dot(self._data)) or np.isfinite(self._data).all()
-        ordered = (self.all_lower <= self.all_upper).all()
+        ordered = _all(np.less_equal(self.all_lower, self.all_upper, out=self._ordered))
         if finite and ordered:
             return ""
         if not finite or np.isnan(self.all_lower).any() or np.isnan(self.all_upper).any():

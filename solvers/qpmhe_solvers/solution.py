@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,11 +169,12 @@ class Errors:
     def unscaled(self, scale: Scale) -> Residuals:
         """The residuals in the user's units, of an iterate of a scaled QP."""
         missed, force = self.missed, self.force
-        if missed.size:
-            missed = missed * scale.units
-        if force is not None:
-            force = force * scale.duals[: force.size]
-        return Residuals(_worst(missed), _peak(force), self.gap * scale.cost)
+        with np.errstate(all="ignore"):
+            if missed.size:
+                missed = missed * scale.units
+            if force is not None:
+                force = force * scale.duals[: force.size]
+            return Residuals(_worst(missed), _peak(force), self.gap * scale.cost)
 
 
 def _worst(missed: Array) -> float:
@@ -208,13 +210,7 @@ class Solution:
     """
 
     __slots__ = (
-        "bound_duals",
-        "d",
-        "iterations",
-        "message",
-        "residuals",
-        "row_duals",
-        "status",
+        "_residuals", "bound_duals", "d", "iterations", "message", "row_duals", "status",
     )
 
     def __init__(
@@ -222,14 +218,28 @@ class Solution:
         d: Array | None,
         status: SolveStatus,
         iterations: int | None = None,
-        residuals: Residuals | None = None,
+        residuals: Residuals | Callable[[], Residuals] | None = None,
         bound_duals: Array | None = None,
         row_duals: Array | None = None,
         message: str = "",
     ) -> None:
         self.d, self.status, self.iterations = d, status, iterations
-        self.residuals, self.message = residuals, message
+        self._residuals, self.message = residuals, message
         self.bound_duals, self.row_duals = bound_duals, row_duals
+
+    @property
+    def residuals(self) -> Residuals | None:
+        """Recomputed from the data, when they are first asked for."""
+        found = self._residuals
+        if callable(found):
+            found = self._residuals = found()
+        return found
+
+    def __reduce__(self) -> tuple[type[Solution], tuple[Any, ...]]:
+        return Solution, (
+            self.d, self.status, self.iterations, self.residuals, self.bound_duals,
+            self.row_duals, self.message,
+        )
 
     def __repr__(self) -> str:
         return f"Solution({self.status.name}, iterations={self.iterations}, {self.residuals})"

@@ -6,7 +6,7 @@ import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -255,7 +255,7 @@ class Solver(ABC):
             message = "the solver returned an iterate that is not finite in the user's units"
             return Solution(None, SolveStatus.FAILED, count, message=message)
         return Solution(
-            d, status, count, errors.unscaled(scale), bound_duals, row_duals, message
+            d, status, count, partial(errors.unscaled, scale), bound_duals, row_duals, message
         )
 
     def _confirmed(self, qp: QP, d: Array, found: tuple[float, float, float]) -> bool:
