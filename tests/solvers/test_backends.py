@@ -360,7 +360,9 @@ def test_auto_without_any_solver_is_banded(monkeypatch):
     np.testing.assert_array_equal(solution.d, create("banded").solve(qp).d)
 
 
-@pytest.mark.parametrize("name", [name for name in EVERY if name.endswith(("osqp", "piqp", "proxqp"))])
+@pytest.mark.parametrize(
+    "name", [name for name in EVERY if name.endswith(("osqp", "piqp", "proxqp"))]
+)
 def test_a_long_step_along_a_weak_direction_is_not_called_unbounded(name):
     qp, weak = QP(1, 2), 3e-5
     qp.band[0] = band_of(np.array([[1.0, 1.0 - weak], [1.0 - weak, 1.0]]))
