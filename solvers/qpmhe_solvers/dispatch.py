@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from .gathered import GatheredQP
 from .matrices import QpsolversMatrices, pattern_of_limits
 from .options import SolverOptions
 from .qp import QP
@@ -174,6 +175,7 @@ class DispatchSolver(Solver):
         self._forms.clear()
 
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
+        qp = GatheredQP.of(qp)
         form, problem = self._form(qp)
         form.fill(qp)
         initial = None

@@ -29,8 +29,9 @@ def expected(dense, box, needs_row, keep_empty):
         (np.eye(size), dense.lower, dense.upper, 0),
     )
     rows, limits, origins = [], [], []
-    for matrix, lower, upper, first in sides[:1] if box else sides:
-        for sign, side in ((1.0, upper), (-1.0, lower)):
+    for sign in (1.0, -1.0):
+        for matrix, lower, upper, first in sides[:1] if box else sides[::-1]:
+            side = upper if sign > 0 else lower
             for i, row in enumerate(matrix):
                 if np.isfinite(side[i]) and (first == 0 or lower[i] != upper[i]):
                     rows.append(sign * row)

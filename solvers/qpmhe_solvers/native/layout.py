@@ -40,6 +40,10 @@ class Style:
         Whether a row has an upper side only, or both.
     infinite : bool
         Whether a row may have infinite limits on all its sides; otherwise it is made void.
+    needs_row : bool
+        Whether a matrix of one-sided rows that has none gets a void one.
+    objective : float
+        Factor of the objective, a power of two.
     """
 
     matrices: Literal["csc", "dense"]
@@ -48,6 +52,8 @@ class Style:
     equalities: Literal["apart", "among"] = "apart"
     sides: Literal[1, 2] = 2
     infinite: bool = True
+    needs_row: bool = False
+    objective: float = 1.0
 
 
 class Structure(NamedTuple):
@@ -142,7 +148,9 @@ class Layout:
         patterns = [hessian] + [
             chosen_rows(stages, n, rows, chosen) for chosen in (self.constraints, self.equalities)
         ]
-        lower, upper = places.lower_at + np.arange(count), places.upper_at + np.arange(count)
+        # Behind the limits of the constraints stands the upper limit of a void row: 0 x <= 1.
+        lower = np.append(places.lower_at + np.arange(count), places.one_at)
+        upper = np.append(places.upper_at + np.arange(count), places.one_at)
         box = slice(size if self.boxed else 0)
         above = np.where(self.signs > 0, upper[self.constraints], lower[self.constraints])
         below = lower[self.constraints] if style.sides == 2 else lower[:0]
@@ -165,6 +173,7 @@ class Layout:
         self._negated = None
         if style.sides == 1:
             self._negated = self.signs[self._entry_rows]
+        self._objective = (views[0], self.gradient) if style.objective != 1.0 else ()
         self._dense: list[tuple[Array, Index, Array]] = []
         heights = (size, self.constraints.size, self.equalities.size)
         self.hessian, self.matrix, self.equality_matrix = (
@@ -213,6 +222,8 @@ class Layout:
         """
         # Any mode but the default one writes into ``out`` without a buffer between.
         qp.numbers.take(self._source, out=self._values, mode="clip")
+        for part in self._objective:
+            part *= self.style.objective
         if self._negated is not None:
             self._c_entries *= self._negated
             self.upper *= self.signs
@@ -235,7 +246,7 @@ class Layout:
         -------
         (K n + K rows,) array
         """
-        duals = np.zeros(self.count)
+        duals = np.zeros(self.count + 1)  # the last one is that of a void row
         if self._negated is None:
             duals[self.constraints] = rows
         else:  # a constraint may have two rows
@@ -245,8 +256,10 @@ class Layout:
         if equalities is not None and self.equalities.size:
             duals[self.equalities] = equalities
         if box is not None and self.boxed:
-            duals[: self.size] = box
-        return duals
+            duals[: self.size] += box
+        if self._objective:
+            duals /= self.style.objective
+        return duals[: self.count]
 
 
 def _rows(style: Style, structure: Structure, size: int) -> tuple[Index, Index, Array]:
@@ -259,6 +272,8 @@ def _rows(style: Style, structure: Structure, size: int) -> tuple[Index, Index, 
         parts = [np.flatnonzero(lower | upper)]
     else:
         parts = [np.flatnonzero(upper), np.flatnonzero(lower)]
+    if style.needs_row and not any(part.size for part in parts):
+        parts[0] = np.array([lower.size])
     signs = np.repeat([1.0, -1.0][: len(parts)], [part.size for part in parts])
     if style.equalities == "apart":
         return equal, np.concatenate(parts), signs
