@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qpmhe_solvers import Solver
+
 from ._checks import count, numbers
 from .costs import Cost
 from .errors import InvalidInputError, OptionError, ShapeError, UnknownOptionError
@@ -96,6 +98,11 @@ class BatchEstimator:
         self.members = count("members", members, 1)
         if not isinstance(system, System):
             raise InvalidInputError(f"system is {system!r}; expected a qpmhe.System.")
+        if isinstance(options.get("backend"), Solver):
+            raise OptionError(
+                f"backend is {options['backend']!r}; expected the name of a backend, since each "
+                "member of a batch has its own solver."
+            )
         self._threads = None if threads is None else count("threads", threads, 1)
         if "initial_state" in options:
             raise UnknownOptionError(

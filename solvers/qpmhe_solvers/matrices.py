@@ -63,12 +63,14 @@ class QpsolversMatrices:
         gathered = GatheredQP.of(qp)
         equal = gathered.all_lower == gathered.all_upper
         equal[: qp.size] = False
-        sides = (np.isfinite(side) & ~equal for side in (gathered.all_lower, gathered.all_upper))
+        lower, upper = (
+            np.isfinite(side) & ~equal for side in (gathered.all_lower, gathered.all_upper)
+        )
         style = Style(
             "dense" if dense else "csc", bounds="box" if box else "rows", sides=1,
             needs_row=needs_row, objective=objective,
         )
-        self._layout = layout = Layout(style, Structure(*sides, equal), *gathered.sizes)
+        self._layout = layout = Layout(style, Structure(lower, upper, equal), *gathered.sizes)
         rows = keep_empty or layout.upper.size > 0
         level = keep_empty or layout.level.size > 0
         self.arguments = (
