@@ -139,13 +139,14 @@ def test_bad_arguments_are_told_before_anything_is_solved(
     assert screen.text() == ""
 
 
-def test_an_export_tells_what_to_run(stored, tmp_path, screen):
+def test_an_export_says_what_to_run(stored, tmp_path, monkeypatch, capsys):
     spoilt = QP(2, 1)
     spoilt.gradient[0] = np.nan
     dump(spoilt, tmp_path / "spoilt.npz")
     out = tmp_path / "set"
-    export_qps.run(screen.console, [tmp_path], out)
-    text = screen.text()
+    monkeypatch.setenv("COLUMNS", "300")
+    export_qps.export_qps([tmp_path], out)
+    text = " ".join(capsys.readouterr().out.split())
     assert f"qpbenchmark {out}/mhe_qpbenchmark.py --results-path {out}/results.csv run" in text
     assert "wrote 1 QPs" in text
     assert "its data are not finite" in text
