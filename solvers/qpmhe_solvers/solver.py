@@ -153,7 +153,8 @@ class Solver(ABC):
             If the user interrupts. Nothing else gets out: a solver that wants to end the process
             with SystemExit has failed, too.
         """
-        expect_qp(qp)
+        if type(qp) is not QP:
+            expect_qp(qp)
         try:
             if self._judges:
                 return cast("Solution", self._solve(qp, start))
