@@ -1,8 +1,8 @@
 """Which tests run: a sample of about three minutes, or everything with ``--all``.
 
-The sample holds every test. Of the cases of a parametrised test it holds at least a handful, and
-every value of every parameter, so that products of options are thinned and nothing else. Tests
-marked ``slow`` are left out. The choice depends on the names of the cases only, so that the
+The sample holds every test but those marked ``slow``. Of a test with many cases it holds a handful
+and a share of the others: first those that bring new values of the parameters, and in `oracles`
+and `properties` all of these. The choice depends on the names of the cases only, so that the
 processes of pytest-xdist agree on it.
 """
 
@@ -12,8 +12,9 @@ from collections import defaultdict
 import pytest
 
 SEED = 1
-# Cases that every test keeps, and the share of its further cases that is aimed at.
-HANDFUL, SHARE = 4, 0.1
+# Cases that every test keeps, and the share of its further cases.
+HANDFUL, SHARE = 5, 0.1
+WHOLE = {"oracles", "properties"}  # folders that keep every value of every parameter
 LEFT_OUT = pytest.StashKey[int]()
 COLLECTED = pytest.StashKey[int]()
 
@@ -34,7 +35,7 @@ def named(config, item):
 
 
 def sample(cases):
-    """A handful of the cases and a share of the others, with every value of every parameter."""
+    """A handful of the cases and a share of the others, new values of the parameters first."""
     cases = sorted(cases, key=lambda item: hashlib.sha256(f"{SEED}{item.nodeid}".encode()).digest())
     seen, kept, others = set(), [], []
     for item in cases:
@@ -42,7 +43,9 @@ def sample(cases):
         (others if values <= seen else kept).append(item)
         seen |= values
     wanted = HANDFUL + round(SHARE * (len(cases) - HANDFUL))
-    return kept + others[: max(0, wanted - len(kept))]
+    if cases[0].path.parent.name in WHOLE:
+        wanted = max(wanted, len(kept))
+    return (kept + others)[:wanted]
 
 
 @pytest.hookimpl(trylast=True)

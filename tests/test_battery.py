@@ -135,6 +135,7 @@ def test_an_implausible_prior_is_scaled_back(cell):
     assert np.all(np.sqrt(np.diag(huge.initial_covariance())) <= 0.3001)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_warming_cell_is_followed_in_spite_of_outliers(cell, seed):
     bench = study.Bench(cell, 0.6)

@@ -189,6 +189,7 @@ def fetched_by_styles(text):
 RAW = re.compile(r"\\[a-zA-Z(\[]|\$\S|:math:|\.\. math::")
 
 
+@pytest.mark.slow
 def test_the_site_needs_no_network_and_leaves_no_formula_raw(tmp_path):
     pytest.importorskip("mkdocs")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]

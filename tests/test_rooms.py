@@ -53,3 +53,11 @@ def test_no_room_takes_private_names_of_another(root):
 ])  # fmt: skip
 def test_the_check_sees_them(file, text, found):
     assert private_names(Path(file), text) == found
+
+
+def test_the_walk_names_files_that_exist():
+    text = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text("utf-8")
+    walk = text.partition("## From a measurement")[2].partition("\n## ")[0]
+    named = set(re.findall(r"`(\w+\.py)`", walk))
+    assert len(named) > 8
+    assert named <= {path.name for path in (ROOTS[0] / "estimation").iterdir()}

@@ -35,6 +35,7 @@ def rmse(result, record, settled=20):
     return np.sqrt(np.mean(speeds**2)), np.sqrt(np.mean(inertia**2))
 
 
+@pytest.mark.slow
 def test_the_program_prints_its_table_and_draws(tmp_path):
     answer = subprocess.run(
         [sys.executable, PROGRAM, "--steps", "25", "--seeds", "1", "--out", tmp_path],

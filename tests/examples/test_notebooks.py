@@ -53,6 +53,7 @@ def test_outputs_are_kept_and_are_small(name):
     assert (FOLDER / name).stat().st_size < 400_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_runs_and_shows_the_same(name, tmp_path):
     kept = read(name)

@@ -181,6 +181,7 @@ def growth(solver, qps, solves=1000):
         tracemalloc.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WAYS)
 def test_our_part_of_a_solve_leaves_no_memory_behind(name):
     solver, qps, answers = create(name), patterns(12), []
@@ -196,6 +197,7 @@ def test_our_part_of_a_solve_leaves_no_memory_behind(name):
     assert len(solver._forms) < len(qps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in ("qpsolvers:daqp", "quadprog") if name in NAMES])
 def test_a_whole_solve_leaves_no_memory_behind(name):
     assert growth(create(name), [make(**CASES["boxes"])[0]]) < 20_000  # no array a solve

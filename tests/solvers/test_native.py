@@ -230,6 +230,7 @@ def test_sparse_matrices_are_made_once_for_a_structure(name, monkeypatch):
     assert count.made == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NATIVE)
 def test_our_part_leaves_no_memory_behind(name):
     solver, qps = create(name), patterns(12)

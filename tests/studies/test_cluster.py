@@ -57,6 +57,7 @@ def test_results_are_those_of_this_machine(address, tmp_path):
     assert there["shared"].all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "words", "timeout"),
     [
@@ -107,6 +108,7 @@ def kill_after(rows, process, monkeypatch):
     monkeypatch.setattr(Writer, "put", counting)
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_dies_loses_nothing_and_the_same_call_resumes(tmp_path, monkeypatch):
     path, contact = tmp_path / "store.sqlite", tmp_path / "scheduler.json"
     study = Study(**{**SMALL, "seeds": 100, "steps": 150})

@@ -134,6 +134,7 @@ def test_the_script_yields_the_problems_in_order(
     assert f"backend auto ({len(CASES)})" in test_set.description
 
 
+@pytest.mark.slow
 def test_the_runner_and_report_of_qpbenchmark_take_it(folder, tmp_path):
     pytest.importorskip("qpbenchmark", reason="qpbenchmark is not installed")
     exported = export_qpbenchmark(folder, tmp_path / "set", title="Fourteen")
