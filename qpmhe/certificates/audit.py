@@ -61,9 +61,7 @@ class Finding:
             "name": self.name, "label": self.label, "holds": self.holds, "needed": self.needed,
             "evidence": None if self.evidence is None else self.evidence.value,
             "text": self.text, "value": _plain(self.value),
-            "counterexample": {
-                key: _plain(value) for key, value in self.counterexample.items()
-            },
+            "counterexample": {key: _plain(value) for key, value in self.counterexample.items()},
         }
 
 
@@ -120,9 +118,7 @@ def _no_correction_finding(system: System, observer: Observer, region: Region) -
                 name, label, False, Evidence.PROVED,
                 f"L(z, 0) = {value.tolist()} at z = {z.tolist()}", None, {"z": z, "L": value},
             )
-    return Finding(
-        name, label, True, Evidence.SAMPLED, f"L(z, 0) = 0 at {points.shape[0]} states"
-    )
+    return Finding(name, label, True, Evidence.SAMPLED, f"L(z, 0) = 0 at {points.shape[0]} states")
 
 
 def _kappa_finding(
@@ -259,9 +255,7 @@ def _invariance_finding(system: System, region: Region) -> Finding:
 def _candidate_finding(system: System, region: Region, run: _ObserverRun | None) -> Finding:
     """Whether the candidate lies in X, W and V along a run."""
     name, label = "candidate in the sets", "ass:observer"
-    sets = (
-        ("X", "z", system.states), ("W", "L", system.disturbances), ("V", "v_z", system.noises)
-    )
+    sets = (("X", "z", system.states), ("W", "L", system.disturbances), ("V", "v_z", system.noises))
     if all(one is None for _, _, one in sets):
         return Finding(
             name, label, True, Evidence.PROVED, "X, W and V are the whole space"
@@ -351,15 +345,9 @@ class Audit:
 
 
 def audit(
-    system: System,
-    observer: Observer,
-    cost: Cost,
-    region: ConvexSet | Region | None = None,
-    run: Record | ArrayLike | None = None,
-    *,
-    initial_state: ArrayLike | None = None,
-    inputs: Box | None = None,
-    seconds: float | Deadline = PART_SECONDS,
+    system: System, observer: Observer, cost: Cost, region: ConvexSet | Region | None = None,
+    run: Record | ArrayLike | None = None, *, initial_state: ArrayLike | None = None,
+    inputs: Box | None = None, seconds: float | Deadline = PART_SECONDS,
 ) -> Audit:
     r"""Check each assumption of the theorem, and show where it fails.
 

@@ -72,9 +72,7 @@ def cover(
         broken = _broken(form, enclosure.centre[left])
         broken &= region.contains(middle[:, : model.n])
         if broken.any():
-            return Cover(
-                False, cells, margin, middle[broken], enclosure.centre[left][broken]
-            )
+            return Cover(False, cells, margin, middle[broken], enclosure.centre[left][broken])
         if cells > most_cells:
             return Cover(False, cells, margin, *nowhere)
         low, high, _ = _halved(

@@ -171,14 +171,8 @@ class Certificate:
         return tuple(kinds)
 
     def bound(
-        self,
-        run: Run | None,
-        disturbances: ArrayLike,
-        noises: ArrayLike,
-        *,
-        initial_error: ArrayLike,
-        horizon: int | None = None,
-        kind: Kind = "paper",
+        self, run: Run | None, disturbances: ArrayLike, noises: ArrayLike, *,
+        initial_error: ArrayLike, horizon: int | None = None, kind: Kind = "paper",
         source: MovingHorizonEstimator | CheckedRun | None = None,
     ) -> Array:
         """The bound of the error |x(t) - x_hat(t)| along a run.
@@ -246,14 +240,8 @@ class Certificate:
         return _OUTWARD * window_bound(chosen, kind, self.kinds).bound(start, w, v, costs=costs)
 
     def funnel(
-        self,
-        w_max: float,
-        v_max: float,
-        *,
-        initial_error: float,
-        steps: int,
-        horizon: int | None = None,
-        kind: Kind = "paper",
+        self, w_max: float, v_max: float, *, initial_error: float, steps: int,
+        horizon: int | None = None, kind: Kind = "paper",
     ) -> Array:
         """The bound before anything is measured, for all |w| <= w_max and |v| <= v_max.
 
@@ -313,11 +301,7 @@ class Certificate:
         return _OUTWARD * window_bound(chosen, kind, self.kinds).limit(w, v)
 
     def vacuous(
-        self,
-        w_max: float | None = None,
-        v_max: float | None = None,
-        *,
-        horizon: int | None = None,
+        self, w_max: float | None = None, v_max: float | None = None, *, horizon: int | None = None,
         kind: Kind = "paper",
     ) -> bool:
         """Whether the bound says nothing: its limit is no less than the region's diameter.
@@ -437,9 +421,7 @@ def _signals(
 ) -> tuple[Array, Array]:
     """Vectors or lengths at each sample."""
     w, v = numbers("disturbances", disturbances), numbers("noises", noises)
-    steps = len(run) if run is not None else next(
-        (len(x) for x in (w, v) if x.ndim), None
-    )
+    steps = len(run) if run is not None else next((len(x) for x in (w, v) if x.ndim), None)
     if steps is None:
         raise ShapeError(
             "disturbances and noises are numbers and there is no run; expected a sequence "
@@ -451,9 +433,7 @@ def _signals(
                 f"{name} has shape {x.shape}; expected ({steps}, {width}), their lengths "
                 f"({steps},), or a number."
             )
-    return (
-        w if w.ndim else np.full(steps, float(w)), v if v.ndim else np.full(steps, float(v))
-    )
+    return (w if w.ndim else np.full(steps, float(w)), v if v.ndim else np.full(steps, float(v)))
 
 
 def _checked_costs(

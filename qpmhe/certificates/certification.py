@@ -48,18 +48,10 @@ _AUDIT, _FIRST, _LATER = 0.25, 0.4, 0.25
 
 
 def certify(
-    system: System,
-    observer: Observer,
-    cost: Cost,
-    *,
-    horizon: int | Sequence[int],
-    region: ConvexSet | Region | None = None,
-    inputs: Box | None = None,
-    sizes: Sizes | None = None,
-    detectability: Detectability | None = None,
-    stability: ObserverStability | None = None,
-    run: Record | ArrayLike | None = None,
-    initial_state: ArrayLike | None = None,
+    system: System, observer: Observer, cost: Cost, *, horizon: int | Sequence[int],
+    region: ConvexSet | Region | None = None, inputs: Box | None = None, sizes: Sizes | None = None,
+    detectability: Detectability | None = None, stability: ObserverStability | None = None,
+    run: Record | ArrayLike | None = None, initial_state: ArrayLike | None = None,
     seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Certificate:
     """Check the theorem's assumptions on a set of states, and bound the estimator's error.
@@ -143,9 +135,7 @@ def certify(
 
     def observed_at(rate: float | None) -> ObserverStability:
         share = deadline.part(_FIRST if rate is None else _LATER)
-        return certify_observer(
-            system, observer, place, rho=rate, weights=noisy, seconds=share
-        )
+        return certify_observer(system, observer, place, rho=rate, weights=noisy, seconds=share)
 
     # One of each before the others: what cannot be certified fails soon.
     detected = [detected_at(None) if detectability is None else detectability]
@@ -228,8 +218,7 @@ def _family(first: Result, certified: Callable[[float | None], Result]) -> list[
 
 
 def _refined(
-    found: list[Result],
-    certified: Callable[[float | None], Result],
+    found: list[Result], certified: Callable[[float | None], Result],
     value: Callable[[Result], float],
 ) -> list[Result]:
     """The same results, and others about the rate of the best of them."""

@@ -27,12 +27,8 @@ _STAY = "it holds for trajectories that stay in the region, both of a pair, with
 
 
 def certify_detectability(
-    system: System,
-    region: ConvexSet | Region | None = None,
-    *,
-    eta: float | None = None,
-    inputs: Box | None = None,
-    weights: tuple[float, float] = (1.0, 1.0),
+    system: System, region: ConvexSet | Region | None = None, *, eta: float | None = None,
+    inputs: Box | None = None, weights: tuple[float, float] = (1.0, 1.0),
     seconds: float | Deadline = PART_SECONDS,
 ) -> Detectability:
     r"""Find and verify constants of e-IOSS, Definition def:eIOSS.
@@ -109,9 +105,7 @@ def certify_detectability(
     )
 
 
-def _explained(
-    search: Search, error: NotCertifiedError, eta: float | None
-) -> NotCertifiedError:
+def _explained(search: Search, error: NotCertifiedError, eta: float | None) -> NotCertifiedError:
     if isinstance(error, (OutOfTimeError, JumpError)):
         return error
     try:

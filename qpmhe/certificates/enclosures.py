@@ -60,9 +60,7 @@ class Enclosure:
             error = (error + np.abs(self.slopes[:, rest]).sum(axis=1)) * (1.0 + 1e-12)
         signs = np.array(list(itertools.product((-1.0, 1.0), repeat=active.size)))
         signs = signs.reshape(2**active.size, active.size)
-        moved = self.centre[:, None] + np.einsum(
-            "kj,bjqn->bkqn", signs, self.slopes[:, active]
-        )
+        moved = self.centre[:, None] + np.einsum("kj,bjqn->bkqn", signs, self.slopes[:, active])
         rounding = 1e-15 * (active.size + 2) * (
             np.abs(self.centre) + np.abs(self.slopes[:, active]).sum(axis=1)
         )
@@ -126,9 +124,7 @@ class SmoothModel:
             raise OutsideDomainError("a value that is not finite on the set")
         return entries
 
-    def enclose(
-        self, lower: Array, upper: Array, *, output_only: bool = False
-    ) -> Enclosure:
+    def enclose(self, lower: Array, upper: Array, *, output_only: bool = False) -> Enclosure:
         """The joint Jacobian over cells."""
         with np.errstate(all="ignore"):
             found = self._enclosed(lower, upper, output_only)

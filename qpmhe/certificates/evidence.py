@@ -69,10 +69,7 @@ class NotCertifiedError(QpmheError):
     """
 
     def __init__(
-        self,
-        message: str,
-        suggestions: tuple[str, ...] = (),
-        smallest_rate: float | None = None,
+        self, message: str, suggestions: tuple[str, ...] = (), smallest_rate: float | None = None
     ) -> None:
         self.suggestions = tuple(suggestions)
         self.smallest_rate = smallest_rate

@@ -58,15 +58,8 @@ class Attack:
 
 
 def attack_detectability(
-    system: System,
-    region: ConvexSet | Region | None,
-    claim: DecayingSums,
-    *,
-    trials: int,
-    steps: int = 20,
-    polish: int = 40,
-    seed: int = 0,
-    inputs: Box | None = None,
+    system: System, region: ConvexSet | Region | None, claim: DecayingSums, *, trials: int,
+    steps: int = 20, polish: int = 40, seed: int = 0, inputs: Box | None = None,
 ) -> Attack:
     """Look for two trajectories in the region that violate (eq:eIOSS).
 
@@ -124,16 +117,8 @@ def attack_detectability(
 
 
 def attack_observer(
-    system: System,
-    region: ConvexSet | Region | None,
-    gain: ArrayLike,
-    claim: DecayingSums,
-    *,
-    trials: int,
-    steps: int = 30,
-    polish: int = 40,
-    seed: int = 0,
-    inputs: Box | None = None,
+    system: System, region: ConvexSet | Region | None, gain: ArrayLike, claim: DecayingSums, *,
+    trials: int, steps: int = 30, polish: int = 40, seed: int = 0, inputs: Box | None = None,
 ) -> Attack:
     """Look for a run of an observer with constant gain that violates (eq:RGES).
 
@@ -190,9 +175,7 @@ def attack_observer(
             misfit = y[:, t] - system.h.batch(held, acting[:, t])
             z = system.f.batch(held, acting[:, t]) + misfit @ K.T
             error[:, t + 1] = np.linalg.norm(x[:, t + 1] - z, axis=-1)
-        bound = _bounds(
-            claim, error[:, 0], np.linalg.norm(w, axis=-1), np.linalg.norm(v, axis=-1)
-        )
+        bound = _bounds(claim, error[:, 0], np.linalg.norm(w, axis=-1), np.linalg.norm(v, axis=-1))
         return np.where(alive, error, np.nan), bound
 
     def change(runs: Array, size: float) -> Array:
@@ -289,9 +272,7 @@ def _pairs(
 
 def _hidden(system: System, points: Array, like: Array, u: Array) -> Array:
     """Points moved so that, to first order, they have the outputs of others."""
-    C = np.broadcast_to(
-        system.h_jacobian.batch(points, u), (len(points), system.p, system.n)
-    )
+    C = np.broadcast_to(system.h_jacobian.batch(points, u), (len(points), system.p, system.n))
     apart = system.h.batch(like, u) - system.h.batch(points, u)
     moved: Array = points + np.einsum("bnp,bp->bn", np.linalg.pinv(C), apart)
     return np.where(np.isfinite(moved), moved, points)
@@ -315,10 +296,8 @@ def _share(error: Array, bound: Array) -> Array:
 
 
 def _polished(
-    states: Array,
-    shares: Callable[[Array], tuple[Array, Array]],
-    change: Callable[[Array, float], Array],
-    rounds: int,
+    states: Array, shares: Callable[[Array], tuple[Array, Array]],
+    change: Callable[[Array, float], Array], rounds: int,
 ) -> tuple[Array, Array, Array]:
     """Change what is drawn at random, and keep what raises the largest share of each."""
     error, bound = shares(states)
@@ -403,16 +382,9 @@ class _Trial:
 
 
 def attack_estimator(
-    certificate: Certificate,
-    *,
-    horizon: int | None = None,
-    trials: int = 60,
-    steps: int = 15,
-    backends: Sequence[str] | None = None,
-    caps: Sequence[int | None] = (0, 1, 2, 5),
-    polished: int = 4,
-    rounds: int = 10,
-    seed: int = 0,
+    certificate: Certificate, *, horizon: int | None = None, trials: int = 60, steps: int = 15,
+    backends: Sequence[str] | None = None, caps: Sequence[int | None] = (0, 1, 2, 5),
+    polished: int = 4, rounds: int = 10, seed: int = 0,
 ) -> ClosedRuns:
     """Look for a run of the estimator whose error exceeds a bound of the certificate.
 

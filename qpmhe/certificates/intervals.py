@@ -102,9 +102,7 @@ class Interval:
 
     def __add__(self, other: Any) -> Interval:
         other = Interval.of(other)
-        return Interval(
-            _sum(self.low, other.low, -np.inf), _sum(self.high, other.high, np.inf)
-        )
+        return Interval(_sum(self.low, other.low, -np.inf), _sum(self.high, other.high, np.inf))
 
     __radd__ = __add__
 
@@ -170,9 +168,7 @@ class Interval:
             return self
         # Odd powers increase: the ends are those of the ends.
         low, high = Interval.of(self.low), Interval.of(self.high)
-        return Interval(
-            (low * low.power(exponent - 1)).low, (high * high.power(exponent - 1)).high
-        )
+        return Interval((low * low.power(exponent - 1)).low, (high * high.power(exponent - 1)).high)
 
     def _increasing(self, function: Callable[[Array], Any], ulps: int = _LIBRARY_ULPS) -> Interval:
         with np.errstate(over="ignore", under="ignore"):
@@ -413,9 +409,7 @@ class Jet:
     def arctan(self) -> Jet:
         """The arc tangent."""
         first = (1.0 + self.value.square()).reciprocal()
-        return self._composed(
-            self.value.arctan(), first, -2.0 * (self.value * first.square())
-        )
+        return self._composed(self.value.arctan(), first, -2.0 * (self.value * first.square()))
 
     def arctan2(self, other: Any) -> Jet:
         """The angle of the point (other, self), off the cut along negative abscissas."""

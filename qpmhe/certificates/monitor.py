@@ -370,9 +370,7 @@ def monitor(
 
 
 def monitored_run(
-    certificate: Certificate,
-    estimator: MovingHorizonEstimator,
-    measurements: ArrayLike,
+    certificate: Certificate, estimator: MovingHorizonEstimator, measurements: ArrayLike,
     inputs: ArrayLike | None = None,
 ) -> tuple[Run, MonitorSummary]:
     """Run an estimator over a record, and count for how many steps the certificate applied.
@@ -436,9 +434,7 @@ def _costs(
 
 
 def _in_sets(system: System, states: Array, w: Array, v: Array) -> bool:
-    pairs = (
-        (system.states, states[:-1]), (system.disturbances, w), (system.noises, v)
-    )
+    pairs = ((system.states, states[:-1]), (system.disturbances, w), (system.noises, v))
     return all(
         one is None or one.violation(values, rounding=_FEASIBLE) == 0.0 for one, values in pairs
     )

@@ -55,13 +55,8 @@ def constant_gain(observer: Observer, system: System) -> Array:
 
 
 def certify_observer(
-    system: System,
-    observer: Observer,
-    region: ConvexSet | Region | None = None,
-    *,
-    rho: float | None = None,
-    inputs: Box | None = None,
-    weights: tuple[float, float] = (1.0, 1.0),
+    system: System, observer: Observer, region: ConvexSet | Region | None = None, *,
+    rho: float | None = None, inputs: Box | None = None, weights: tuple[float, float] = (1.0, 1.0),
     seconds: float | Deadline = PART_SECONDS,
 ) -> ObserverStability:
     r"""Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
@@ -201,13 +196,8 @@ class Synthesis:
 
 
 def synthesise_gain(
-    system: System,
-    region: ConvexSet | Region | None = None,
-    *,
-    criterion: Criterion = "trade",
-    rho: float | None = None,
-    inputs: Box | None = None,
-    weights: tuple[float, float] = (1.0, 1.0),
+    system: System, region: ConvexSet | Region | None = None, *, criterion: Criterion = "trade",
+    rho: float | None = None, inputs: Box | None = None, weights: tuple[float, float] = (1.0, 1.0),
     seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Synthesis:
     r"""Find a constant gain L whose observer contracts on a region, and verify it.

@@ -29,9 +29,7 @@ _MOST_CORNERS = 8
 _VALUES, _SLOPES = 1e-9, 1e-5
 
 
-def _discounted(
-    initial: ArrayLike, first: Array, second: Array, rate: float
-) -> Array:
+def _discounted(initial: ArrayLike, first: Array, second: Array, rate: float) -> Array:
     r"""The bound :math:`a \rho^t + \sum_{\tau=1}^t \rho^\tau (b(t-\tau) + c(t-\tau))`."""
     bound = np.empty((first.shape[0] + 1, *first.shape[1:]))
     bound[0] = initial
@@ -131,9 +129,7 @@ class Detectability:
         """All but the region, in types that JSON knows; infinite numbers become None."""
         return _to_dict(self)
 
-    def bound(
-        self, initial: ArrayLike, disturbances: ArrayLike, outputs: ArrayLike
-    ) -> Array:
+    def bound(self, initial: ArrayLike, disturbances: ArrayLike, outputs: ArrayLike) -> Array:
         """The right-hand side of the definition along a pair of trajectories.
 
         Parameters
@@ -254,13 +250,7 @@ class ObserverStability:
 
     @classmethod
     def assumed(
-        cls,
-        *,
-        rho: float,
-        C_p: float,
-        C_w: float,
-        C_v: float,
-        kappa: float,
+        cls, *, rho: float, C_p: float, C_w: float, C_v: float, kappa: float,
         region: ConvexSet | Region | None = None,
     ) -> ObserverStability:
         """Constants that the user states without proof.

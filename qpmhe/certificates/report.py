@@ -196,14 +196,9 @@ class Report:
 
 
 def certify_model(
-    example: Example,
-    *,
-    horizon: int | list[int] | None = None,
-    region: ConvexSet | Region | None = None,
-    inputs: Box | None = None,
-    seed: int = 0,
-    seconds: float | Deadline = DEFAULT_SECONDS,
-    name: str = "",
+    example: Example, *, horizon: int | list[int] | None = None,
+    region: ConvexSet | Region | None = None, inputs: Box | None = None, seed: int = 0,
+    seconds: float | Deadline = DEFAULT_SECONDS, name: str = "",
 ) -> Report:
     """Certify a model as far as possible, and monitor its estimator on a simulated record.
 
@@ -297,9 +292,7 @@ def _parts(
         system, region, seconds=deadline.part(0.5)))
     observed = attempt("the observer", lambda: certify_observer(
         system, observer, region, seconds=deadline.part(0.9)))
-    return Report(
-        name, example, record, findings, None, detected, observed, errors or {"": reason}
-    )
+    return Report(name, example, record, findings, None, detected, observed, errors or {"": reason})
 
 
 def _used(certificate: Certificate) -> tuple[Detectability, ObserverStability]:
@@ -345,19 +338,12 @@ def _sizes(example: Example) -> Sizes:
         _SIGMAS * float(np.sqrt(np.linalg.eigvalsh(matrix)[-1]))
         for matrix in (scenario.disturbance_covariance, scenario.noise_covariance)
     )
-    return Sizes(
-        float(np.linalg.norm(scenario.initial_state - scenario.initial_estimate)), w, v
-    )
+    return Sizes(float(np.linalg.norm(scenario.initial_state - scenario.initial_estimate)), w, v)
 
 
 def error_and_bounds(
-    times: Array,
-    error: Array | None,
-    bounds: Mapping[str, Array],
-    *,
-    diameter: float | None = None,
-    time_label: str = "time t",
-    error_label: str = "error",
+    times: Array, error: Array | None, bounds: Mapping[str, Array], *,
+    diameter: float | None = None, time_label: str = "time t", error_label: str = "error",
     axes: Any = None,
 ) -> Any:
     """The error's length and its bounds over time, on a logarithmic axis.

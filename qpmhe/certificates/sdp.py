@@ -82,11 +82,7 @@ class Program:
     """
 
     def __init__(
-        self,
-        kind: Kind,
-        jacobians: Array,
-        scales: Scales,
-        weights: tuple[float, float],
+        self, kind: Kind, jacobians: Array, scales: Scales, weights: tuple[float, float],
         gain: Array | None = None,
     ) -> None:
         cp: Any = importlib.import_module("cvxpy")

@@ -63,13 +63,8 @@ class Search:
     """
 
     def __init__(
-        self,
-        system: System,
-        region: Region,
-        kind: Kind | None,
-        weights: tuple[float, float],
-        gain: Array | None = None,
-        seconds: float | Deadline = PART_SECONDS,
+        self, system: System, region: Region, kind: Kind | None, weights: tuple[float, float],
+        gain: Array | None = None, seconds: float | Deadline = PART_SECONDS,
     ) -> None:
         self._deadline = Deadline.of(seconds)
         self.system, self.region, self.gain, self._weights = system, region, gain, weights
@@ -126,9 +121,7 @@ class Search:
     def _feasible(self, rate: float, deadline: Deadline) -> Answer:
         return self._solved(rate, _MARGINS[0] * min(1.0, rate * rate), deadline, thorough=False)
 
-    def _solved(
-        self, rate: float, margin: float, deadline: Deadline, *, thorough: bool
-    ) -> Answer:
+    def _solved(self, rate: float, margin: float, deadline: Deadline, *, thorough: bool) -> Answer:
         """What the program returns; an error if there is no time for it, or not enough."""
         if deadline.passed:
             raise self._out_of_time("it was over while matrices were sought and verified")
@@ -194,9 +187,7 @@ class Search:
         status = "no round was left"
         for turn in range(1, _ROUNDS + 1):
             try:
-                answer = self._solved(
-                    rate, _MARGINS[level] * size, self._deadline, thorough=True
-                )
+                answer = self._solved(rate, _MARGINS[level] * size, self._deadline, thorough=True)
             except OutOfTimeError:
                 if best is None:
                     raise
@@ -249,9 +240,7 @@ class Search:
             return self._sampled(
                 form, f"f and h cannot be run with intervals ({self.model.reason})"
             )
-        found = cover(
-            self.model, self.region, form, seconds=self._deadline.part(_VERIFICATION)
-        )
+        found = cover(self.model, self.region, form, seconds=self._deadline.part(_VERIFICATION))
         if found.proved:
             return Found(form, Evidence.PROVED, found.margin, found.cells, ())
         if found.violations.shape[0]:
@@ -265,9 +254,7 @@ class Search:
         shown, least = definite(form.matrices(Matrices.exact(self.jacobians)))
         if not shown.all():
             broken = ~shown
-            return Cover(
-                False, 0, float(least.min()), self.points[broken], self.jacobians[broken]
-            )
+            return Cover(False, 0, float(least.min()), self.points[broken], self.jacobians[broken])
         jump = self.jump(everywhere=True)
         if jump is not None:
             raise jump
@@ -313,9 +300,7 @@ def checked_weights(value: tuple[float, float]) -> tuple[float, float]:
     return positive("weights[0]", first), positive("weights[1]", second)
 
 
-def _check_derivatives(
-    model: SmoothModel, system: System, points: Array, jacobians: Array
-) -> None:
+def _check_derivatives(model: SmoothModel, system: System, points: Array, jacobians: Array) -> None:
     """Raise a ModelError where a given Jacobian is not the derivative, at states far apart."""
     n = system.n
     if "given" not in system.derivatives.values():

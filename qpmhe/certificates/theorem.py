@@ -109,9 +109,7 @@ class TheoremConstants:
             each[0] ** (-1.0 / self.cost.exponent)
             for each in (self.cost.prior, self.cost.disturbance, self.cost.noise)
         ]
-        return (
-            c_p * inverse[0], c_w * self.eta_bar * inverse[1], c_v * self.eta_bar * inverse[2]
-        )
+        return (c_p * inverse[0], c_w * self.eta_bar * inverse[1], c_v * self.eta_bar * inverse[2])
 
     def terms(self, *, full: bool = True) -> Array:
         """What C_i'(N) or C_i''(N) is the sum of."""
@@ -168,13 +166,8 @@ class TheoremConstants:
 
 
 def theorem(
-    detectability: DecayingSums,
-    observer: DecayingSums,
-    cost: CostConstants,
-    *,
-    kappa: float,
-    lipschitz: float,
-    horizon: int,
+    detectability: DecayingSums, observer: DecayingSums, cost: CostConstants, *, kappa: float,
+    lipschitz: float, horizon: int,
 ) -> TheoremConstants:
     """Compute the theorem's constants from those of its assumptions.
 
@@ -286,14 +279,8 @@ def level(bound: DecayingSums, sizes: Sizes) -> float:
 
 
 def tighten(
-    detectabilities: Iterable[DecayingSums],
-    observers: Iterable[DecayingSums],
-    cost: CostConstants,
-    *,
-    kappa: float,
-    lipschitz: float,
-    horizon: int,
-    sizes: Sizes | None = None,
+    detectabilities: Iterable[DecayingSums], observers: Iterable[DecayingSums], cost: CostConstants,
+    *, kappa: float, lipschitz: float, horizon: int, sizes: Sizes | None = None,
     searched: int = _SEARCHED,
 ) -> TheoremConstants:
     r"""The theorem's constants for its best free choices.
@@ -357,10 +344,8 @@ def tighten(
 
 
 def _search(
-    tried: Callable[[DecayingSums, DecayingSums], float],
-    detectability: DecayingSums,
-    observer: DecayingSums,
-    lipschitz: float,
+    tried: Callable[[DecayingSums, DecayingSums], float], detectability: DecayingSums,
+    observer: DecayingSums, lipschitz: float,
 ) -> None:
     """Try rates and noise constants of the observer; `tried` keeps the best."""
 

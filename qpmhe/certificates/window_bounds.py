@@ -57,14 +57,7 @@ class WindowBound(ABC):
     """
 
     def __init__(
-        self,
-        *,
-        horizon: int,
-        rho: float,
-        eta: float,
-        exponent: float,
-        slope: float,
-        entry: float,
+        self, *, horizon: int, rho: float, eta: float, exponent: float, slope: float, entry: float,
         scales: Array,
     ) -> None:
         self.horizon = count("horizon", horizon, 1)
@@ -94,11 +87,7 @@ class WindowBound(ABC):
         """The norms of an initial error, disturbances and noises."""
 
     def bound(
-        self,
-        initial: ArrayLike,
-        disturbances: ArrayLike,
-        noises: ArrayLike,
-        *,
+        self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike, *,
         costs: ArrayLike | None = None,
     ) -> Array:
         """The bound of |x(t) - x_hat(t)| at t = 0, ..., T."""
@@ -106,11 +95,7 @@ class WindowBound(ABC):
         return value
 
     def components(
-        self,
-        initial: ArrayLike,
-        disturbances: ArrayLike,
-        noises: ArrayLike,
-        *,
+        self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike, *,
         costs: ArrayLike | None = None,
     ) -> Array:
         """The bound of each component's error, (T + 1, n); arguments as of `bound`."""
@@ -332,16 +317,8 @@ class WeightedBound(WindowBound):
     """
 
     def __init__(
-        self,
-        cost: QuadraticCost,
-        *,
-        horizon: int,
-        P: ArrayLike,
-        eta: float,
-        noise_weight: ArrayLike,
-        observer_norm: ArrayLike,
-        rho: float,
-        gain: ArrayLike,
+        self, cost: QuadraticCost, *, horizon: int, P: ArrayLike, eta: float,
+        noise_weight: ArrayLike, observer_norm: ArrayLike, rho: float, gain: ArrayLike,
         slope: float,
     ) -> None:
         n, p = cost.n, cost.p
@@ -411,9 +388,7 @@ def norms(values: Array, weight: Array) -> Array:
         scaled: Array = math.sqrt(max(0.0, top)) * values
         return scaled
     if values.shape[1] != weight.shape[0]:
-        raise ShapeError(
-            f"vectors have {values.shape[1]} components; expected {weight.shape[0]}."
-        )
+        raise ShapeError(f"vectors have {values.shape[1]} components; expected {weight.shape[0]}.")
     squares: Array = np.einsum("ti,ij,tj->t", values, weight, values)
     return np.sqrt(np.maximum(squares, 0.0))
 

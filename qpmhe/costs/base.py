@@ -69,11 +69,7 @@ class Cost(ABC):
     quadratic: bool = False
 
     def __init__(
-        self,
-        prior: Array | ObserverPrior,
-        disturbance: Array,
-        noise: Array,
-        discount: float,
+        self, prior: Array | ObserverPrior, disturbance: Array, noise: Array, discount: float
     ) -> None:
         kinds = (int, float, np.integer, np.floating)
         if (

@@ -194,9 +194,7 @@ class Power(Loss):
     loss everywhere; the judgement by the true cost takes care of that.
     """
 
-    def __init__(
-        self, weight: ArrayLike, exponent: float, per_component: bool = False
-    ) -> None:
+    def __init__(self, weight: ArrayLike, exponent: float, per_component: bool = False) -> None:
         super().__init__(weight, per_component)
         self.exponent: float = positive("exponent", exponent)
         if self.exponent < 1.0:

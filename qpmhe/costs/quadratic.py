@@ -56,11 +56,7 @@ class QuadraticCost(Cost):
     quadratic = True
 
     def __init__(
-        self,
-        *,
-        prior: ArrayLike | ObserverPrior,
-        disturbance: ArrayLike,
-        noise: ArrayLike,
+        self, *, prior: ArrayLike | ObserverPrior, disturbance: ArrayLike, noise: ArrayLike,
         discount: float = 1.0,
     ) -> None:
         w = positive_definite("disturbance", disturbance)
@@ -73,11 +69,7 @@ class QuadraticCost(Cost):
 
     @classmethod
     def from_covariances(
-        cls,
-        *,
-        prior: ArrayLike | ObserverPrior,
-        disturbance: ArrayLike,
-        noise: ArrayLike,
+        cls, *, prior: ArrayLike | ObserverPrior, disturbance: ArrayLike, noise: ArrayLike,
         discount: float = 1.0,
     ) -> QuadraticCost:
         """The same cost, given covariances instead of weights.

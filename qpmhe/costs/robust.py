@@ -50,12 +50,8 @@ class RobustCost(Cost):
     """
 
     def __init__(
-        self,
-        *,
-        prior: Loss | ArrayLike | ObserverPrior,
-        disturbance: Loss | ArrayLike,
-        noise: Loss | ArrayLike,
-        discount: float = 1.0,
+        self, *, prior: Loss | ArrayLike | ObserverPrior, disturbance: Loss | ArrayLike,
+        noise: Loss | ArrayLike, discount: float = 1.0,
     ) -> None:
         self.disturbance_loss = _loss("disturbance", disturbance)
         self.noise_loss = _loss("noise", noise)
@@ -67,9 +63,7 @@ class RobustCost(Cost):
         else:
             self.prior_loss = _loss("prior", prior)
             weight = positive_definite("prior", self.prior_loss.weight, n)
-        super().__init__(
-            weight, self.disturbance_loss.weight, self.noise_loss.weight, discount
-        )
+        super().__init__(weight, self.disturbance_loss.weight, self.noise_loss.weight, discount)
 
     @property
     def constants(self) -> CostConstants | None:

@@ -41,9 +41,7 @@ def _voltage(charge: Array) -> Array:
 
 
 def _voltage_slope(charge: Array) -> Array:
-    slope: Array = (
-        0.2156 + charge * (-0.2356 + 0.9603 * charge) + 36.085 * np.exp(-35.0 * charge)
-    )
+    slope: Array = (0.2156 + charge * (-0.2356 + 0.9603 * charge) + 36.085 * np.exp(-35.0 * charge))
     return slope
 
 

@@ -32,9 +32,7 @@ __all__ = [
 ]
 
 _FORM = re.compile(r"(?P<where>[^()]+)(?:\((?P<arguments>.*)\))?", re.DOTALL)
-_PARTS = (
-    (System, "system"), (Observer, "observer"), (Cost, "cost"), (Scenario, "scenario"),
-)
+_PARTS = ((System, "system"), (Observer, "observer"), (Cost, "cost"), (Scenario, "scenario"))
 _EXPECTED = (
     "expected a name of the catalogue, name(keyword=value), package.module:function or "
     "path/file.py:function"

@@ -212,9 +212,7 @@ def _insist_on_member(name: str, state: Array, states: ConvexSet | None) -> None
 
 
 def _inside(
-    drawn: Array,
-    spread: Array,
-    generator: np.random.Generator,
+    drawn: Array, spread: Array, generator: np.random.Generator,
     *sets: tuple[ConvexSet | None, Any],
 ) -> Array | None:
     """What was drawn, or drawn again until what each set bounds, s + offset, lies in it."""

@@ -24,13 +24,8 @@ _UNSEEN = float(np.sqrt(np.finfo(np.float64).eps))
 
 
 def design_luenberger(
-    system: System,
-    at: ArrayLike,
-    u: ArrayLike | None = None,
-    *,
-    poles: ArrayLike | None = None,
-    disturbance: ArrayLike | None = None,
-    noise: ArrayLike | None = None,
+    system: System, at: ArrayLike, u: ArrayLike | None = None, *, poles: ArrayLike | None = None,
+    disturbance: ArrayLike | None = None, noise: ArrayLike | None = None,
 ) -> Luenberger:
     r"""A Luenberger observer for the linearisation of a system about a point.
 

@@ -102,12 +102,7 @@ class HighGain(Luenberger):
     """
 
     def __init__(
-        self,
-        n: int,
-        *,
-        epsilon: float,
-        dt: float,
-        coefficients: ArrayLike | None = None,
+        self, n: int, *, epsilon: float, dt: float, coefficients: ArrayLike | None = None,
         sampling: Sampling = "exact",
     ) -> None:
         n = count("n", n, 1)

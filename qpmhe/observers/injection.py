@@ -54,9 +54,7 @@ class OutputInjection(Observer):
                 f"correction raised {type(error).__name__}: {error} at z = {z.tolist()}, v = 0."
             ) from error
         if value.shape != z.shape:
-            raise ModelError(
-                f"correction returned shape {value.shape}; expected (n,) = {z.shape}."
-            )
+            raise ModelError(f"correction returned shape {value.shape}; expected (n,) = {z.shape}.")
         state, misfit = z.copy(), np.full(outputs, 0.1)
         try:
             with np.errstate(all="ignore"):

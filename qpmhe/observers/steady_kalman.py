@@ -83,14 +83,8 @@ class SteadyStateKalman(Observer):
     """
 
     def __init__(
-        self,
-        system: System,
-        at: ArrayLike,
-        u: ArrayLike | None = None,
-        *,
-        disturbance: ArrayLike,
-        noise: ArrayLike,
-        prior: ArrayLike | None = None,
+        self, system: System, at: ArrayLike, u: ArrayLike | None = None, *, disturbance: ArrayLike,
+        noise: ArrayLike, prior: ArrayLike | None = None,
     ) -> None:
         self._a, self._c, point = linearize(system, at, u)
         self._disturbance = positive_definite("disturbance covariance", disturbance, system.n)

@@ -79,11 +79,7 @@ class UnscentedKalman(KalmanType):
     """
 
     def __init__(
-        self,
-        *,
-        prior: ArrayLike,
-        disturbance: ArrayLike,
-        noise: ArrayLike,
+        self, *, prior: ArrayLike, disturbance: ArrayLike, noise: ArrayLike,
         spread: float = math.sqrt(3.0),
     ) -> None:
         super().__init__(prior=prior, disturbance=disturbance, noise=noise)

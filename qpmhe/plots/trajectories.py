@@ -22,12 +22,8 @@ Array = NDArray[np.float64]
 
 
 def trajectories(
-    times: Array,
-    truth: Array | None,
-    estimates: Mapping[str, Array],
-    labels: Sequence[str],
-    time_label: str,
-    axes: Any = None,
+    times: Array, truth: Array | None, estimates: Mapping[str, Array], labels: Sequence[str],
+    time_label: str, axes: Any = None,
 ) -> list[Any]:
     """True states and estimates over time, one panel a state, as in the paper's figure.
 
@@ -76,13 +72,8 @@ def trajectories(
 
 
 def states(
-    run: Run,
-    *,
-    dt: float = 1.0,
-    labels: Sequence[str] | None = None,
-    time_label: str = "time t (samples)",
-    truth: Array | None = None,
-    sigmas: float = 2.0,
+    run: Run, *, dt: float = 1.0, labels: Sequence[str] | None = None,
+    time_label: str = "time t (samples)", truth: Array | None = None, sigmas: float = 2.0,
     axes: Any = None,
 ) -> list[Any]:
     """The estimates of a run, with bands of their covariances where it has them.
@@ -138,12 +129,8 @@ def states(
 
 
 def window(
-    estimate: Estimate,
-    *,
-    dt: float = 1.0,
-    labels: Sequence[str] | None = None,
-    time_label: str = "time t (samples)",
-    axes: Any = None,
+    estimate: Estimate, *, dt: float = 1.0, labels: Sequence[str] | None = None,
+    time_label: str = "time t (samples)", axes: Any = None,
 ) -> list[Any]:
     """The window of one estimate: the observer's candidate, and what became of it.
 
