@@ -309,7 +309,6 @@ class Audit:
     constants : CostConstants or None
         The cost's constants, rounded outward where possible.
     region : Region
-        Where.
     """
 
     findings: tuple[Finding, ...]
@@ -349,21 +348,17 @@ def audit(
     run: Record | ArrayLike | None = None, *, initial_state: ArrayLike | None = None,
     inputs: Box | None = None, seconds: float | Deadline = PART_SECONDS,
 ) -> Audit:
-    r"""Check each assumption of the theorem, and show where it fails.
+    """Check each assumption of the theorem, and show where it fails.
 
     Parameters
     ----------
-    system, observer, cost
-        What the estimator is made of.
-    region : Box, Polytope or Region, optional
-        A bounded set of states; the system's own if left out.
+    system, observer, cost, region, inputs
+        As for `certify`.
     run : Record or (T, p) array_like, optional
         A record, simulated or measured, along which the candidate is checked; a record with
         inputs is needed for a system with inputs.
     initial_state : (n,) array_like, optional
         z(0) of that run; needed with it.
-    inputs : Box, optional
-        Bounds on the inputs, for a system with inputs.
     seconds : float or Deadline
         How long the output's Lipschitz constant may take, about.
 

@@ -84,8 +84,7 @@ class Certificate:
     sizes : Sizes
         For which errors the bounds are tight.
     origin : tuple
-        What `certify` made it of. A certificate whose parts are others, or that was made by
-        hand, is assumed.
+        What `certify` made it of. Certificates made or changed by hand are assumed.
 
     Raises
     ------
@@ -175,7 +174,7 @@ class Certificate:
         initial_error: ArrayLike, horizon: int | None = None, kind: Kind = "paper",
         source: MovingHorizonEstimator | CheckedRun | None = None,
     ) -> Array:
-        """The bound of the error |x(t) - x_hat(t)| along a run.
+        """The bound of the error |x(t) - x_hat(t)| along a run at t = 0, ..., T, (T + 1,).
 
         Parameters
         ----------
@@ -195,14 +194,9 @@ class Certificate:
             estimates' own costs in place of their bound.
         source : MovingHorizonEstimator or Monitor, optional
             The estimator that made the run, as the run left it, or the monitor that checked
-            all its estimates: a run does not say its horizon and cost. Checked
-            where given, and needed for ``kind="measured"``; without one, the bound is that
-            of an estimator with this certificate's cost and this horizon, whatever the run.
-
-        Returns
-        -------
-        (T + 1,) array
-            At t = 0, ..., T.
+            all its estimates, for the horizon and cost of the run. Needed for
+            ``kind="measured"``; without one, the bound is that of an estimator with this
+            certificate's cost and this horizon, whatever the run.
 
         Raises
         ------
@@ -243,22 +237,16 @@ class Certificate:
         self, w_max: float, v_max: float, *, initial_error: float, steps: int,
         horizon: int | None = None, kind: Kind = "paper",
     ) -> Array:
-        """The bound before anything is measured, for all |w| <= w_max and |v| <= v_max.
+        """The bound before anything is measured, for |w| <= w_max and |v| <= v_max, (T + 1,).
 
         Parameters
         ----------
-        w_max, v_max : float
-            Bounds on the lengths of w(t) and v(t).
-        initial_error : float
-            A bound on |x_0 - z_0|.
+        w_max, v_max, initial_error : float
+            Bounds on the lengths of w(t), v(t) and x_0 - z_0.
         steps : int
             T.
         horizon, kind
-            As of `bound`; not "measured".
-
-        Returns
-        -------
-        (T + 1,) array
+            As for `bound`; not "measured".
 
         Raises
         ------
@@ -282,18 +270,7 @@ class Certificate:
     def limit(
         self, w_max: float, v_max: float, *, horizon: int | None = None, kind: Kind = "paper"
     ) -> float:
-        """What the funnel tends to as t grows.
-
-        Parameters
-        ----------
-        w_max, v_max, horizon, kind
-            As of `funnel`.
-
-        Raises
-        ------
-        OptionError
-            As of `funnel`.
-        """
+        """What the funnel tends to as t grows; arguments and errors as for `funnel`."""
         w, v = checked_length("w_max", w_max), checked_length("v_max", v_max)
         chosen = self.of(horizon)
         if kind == "paper":
@@ -307,35 +284,17 @@ class Certificate:
         """Whether the bound says nothing: its limit is no less than the region's diameter.
 
         State and estimate are both in the region, so that their distance is never more.
-
-        Parameters
-        ----------
-        w_max, v_max : float, optional
-            As of `funnel`; left out, the certificate's `sizes`.
-        horizon, kind
-            As of `funnel`.
-
-        Raises
-        ------
-        OptionError
-            As of `funnel`.
+        Arguments and errors are those of `funnel`; w_max and v_max are by default those of
+        the certificate's `sizes`.
         """
         w = self.sizes.disturbance if w_max is None else w_max
         v = self.sizes.noise if v_max is None else v_max
         return not self.limit(w, v, horizon=horizon, kind=kind) < self.diameter
 
     def of(self, horizon: int | None = None) -> HorizonBounds:
-        """The constants for a horizon.
+        """The constants for a horizon N, which may be left out if there is only one.
 
-        Parameters
-        ----------
-        horizon : int, optional
-            N; may be left out if there is only one.
-
-        Raises
-        ------
-        OptionError
-            If there are none for it.
+        An `OptionError` says which there are if there are none for this one.
         """
         if horizon is None and len(self.bounds) == 1:
             return next(iter(self.bounds.values()))
@@ -347,18 +306,7 @@ class Certificate:
         return self.bounds[horizon]
 
     def check_estimator(self, estimator: MovingHorizonEstimator) -> None:
-        """Require that an estimator has the very system, observer and cost of this certificate.
-
-        Parameters
-        ----------
-        estimator : MovingHorizonEstimator
-            The estimator.
-
-        Raises
-        ------
-        MismatchError
-            If one of the three is another object.
-        """
+        """Raise a `MismatchError` unless the estimator has this very system, observer and cost."""
         for name in ("system", "observer", "cost"):
             if getattr(self, name) is not getattr(estimator, name):
                 raise MismatchError(

@@ -77,14 +77,10 @@ def certify(
     seconds : float or Deadline
         How long the audit and the search for constants may take, about, from when the solvers
         are loaded. What is not proved when its share is over rests on samples, and says so;
-        better rates are sought in what is left. The bounds are computed from the constants
-        after that, which takes a fraction of a second for each horizon (longer for N in the
-        hundreds): all pairs of rates are tried for up to six horizons, of more only those
-        that were best at the smallest, the middle and the largest one.
-
-    Returns
-    -------
-    Certificate
+        better rates are sought in what is left. The bounds are computed after that, in a
+        fraction of a second for each horizon (longer for N in the hundreds): up to six horizons
+        try all pairs of rates, more only those that were best at the smallest, the middle and
+        the largest one.
 
     Raises
     ------

@@ -31,7 +31,7 @@ def certify_detectability(
     inputs: Box | None = None, weights: tuple[float, float] = (1.0, 1.0),
     seconds: float | Deadline = PART_SECONDS,
 ) -> Detectability:
-    r"""Find and verify constants of e-IOSS, Definition def:eIOSS.
+    """Find and verify constants of e-IOSS, Definition def:eIOSS.
 
     A constant P with one of the inequalities of `qpmhe.certificates.inequalities` is sought by
     semidefinite programs at some states of the region, and then verified on all of it: the
@@ -42,15 +42,11 @@ def certify_detectability(
 
     Parameters
     ----------
-    system : System
-        The system.
-    region : Box, Polytope or Region, optional
-        A bounded set of states; the system's own if left out.
+    system, region, inputs
+        As for `certify`.
     eta : float, optional
         The rate; left out, one is chosen between the smallest feasible one and 1 for which
         lasting disturbances are bounded best.
-    inputs : Box, optional
-        Bounds on the inputs, for a system with inputs.
     weights : (float, float)
         How much the constants c_w and c_v matter, such as typical sizes of disturbance and
         noise; the programs minimise the sum of squares of the products.
@@ -65,12 +61,9 @@ def certify_detectability(
 
     Raises
     ------
-    SetError
-        If the region is not a bounded set of the right dimension.
-    OptionError
-        If eta, the weights or the seconds are out of range.
-    ModelError
-        If the Jacobians are not finite in the region.
+    SetError, OptionError, ModelError
+        If the region is no bounded set of states, eta, the weights or the seconds are out of
+        range, or the Jacobians are not finite in the region.
     NotCertifiedError
         If there are no such constants, or none were found; the text gives the smallest feasible
         rate and what is not detected. An `OutOfTimeError` says that it is not known which.

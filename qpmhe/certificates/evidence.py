@@ -56,16 +56,9 @@ class NotCertifiedError(QpmheError):
     message : str
         What was asked, and what was found.
     suggestions : sequence of str
-        What may help.
+        What may help; the text of the error lists them.
     smallest_rate : float, optional
         The smallest rate that was found to be feasible, where the one asked for was not.
-
-    Attributes
-    ----------
-    suggestions : tuple of str
-        As given; the text of the error lists them.
-    smallest_rate : float or None
-        As given.
     """
 
     def __init__(

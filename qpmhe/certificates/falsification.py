@@ -70,22 +70,18 @@ def attack_detectability(
 
     Parameters
     ----------
-    system : System
-        The system.
+    system, inputs
+        As for `certify`; a region with inputs needs no others.
     region : Box, Polytope, Region or None
         Where both trajectories stay; None for the system's own states.
     claim : DecayingSums
         eta, c_p, c_w and c_v.
-    trials : int
-        Number of pairs.
-    steps : int
-        Their length.
+    trials, steps : int
+        Number of pairs, and their length.
     polish : int
         Rounds of changes.
     seed : int
         Of the random numbers.
-    inputs : Box, optional
-        Bounds on the inputs, for a system with inputs, unless the region has them.
 
     Raises
     ------
@@ -127,14 +123,12 @@ def attack_observer(
 
     Parameters
     ----------
-    system, region
-        As of `attack_detectability`.
+    system, region, trials, steps, polish, seed, inputs
+        As for `attack_detectability`.
     gain : (n, p) array_like
         The observer's.
     claim : DecayingSums
         rho, C_p, C_w and C_v.
-    trials, steps, polish, seed, inputs
-        As of `attack_detectability`.
 
     Raises
     ------
@@ -395,7 +389,6 @@ def attack_estimator(
     Parameters
     ----------
     certificate : Certificate
-        What is to be refuted.
     horizon : int, optional
         N; the only one if left out.
     trials, steps : int
@@ -408,10 +401,6 @@ def attack_estimator(
         How many runs are made worse, and in how many rounds.
     seed : int
         Of the random numbers.
-
-    Returns
-    -------
-    ClosedRuns
 
     Raises
     ------

@@ -59,27 +59,19 @@ def certify_observer(
     rho: float | None = None, inputs: Box | None = None, weights: tuple[float, float] = (1.0, 1.0),
     seconds: float | Deadline = PART_SECONDS,
 ) -> ObserverStability:
-    r"""Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
+    """Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
 
     A constant P with the inequality of `qpmhe.certificates.inequalities.ErrorContraction` is sought
     and verified as in `certify_detectability`. It serves linear and nonlinear outputs.
 
     Parameters
     ----------
-    system : System
-        The system.
+    system, region, inputs, weights, seconds
+        As for `certify_detectability`; the weights are those of C_w and C_v.
     observer : Observer
         A `Luenberger` observer or one of its kind, or a `SteadyStateKalman`.
-    region : Box, Polytope or Region, optional
-        A bounded set of states; the system's own if left out.
     rho : float, optional
         The rate; left out, it is chosen as for `certify_detectability`.
-    inputs : Box, optional
-        Bounds on the inputs, for a system with inputs.
-    weights : (float, float)
-        How much the constants C_w and C_v matter.
-    seconds : float or Deadline
-        How long this may take, about; the result is then what was found so far, if anything.
 
     Raises
     ------
@@ -181,15 +173,7 @@ Criterion = Literal["trade", "rate"]
 
 @dataclass(frozen=True, eq=False)
 class Synthesis:
-    """An observer made for a region.
-
-    Parameters
-    ----------
-    observer : Luenberger
-        The observer.
-    stability : ObserverStability
-        Its verified constants.
-    """
+    """An observer made for a region, and its verified constants."""
 
     observer: Luenberger
     stability: ObserverStability
@@ -215,29 +199,23 @@ def synthesise_gain(
 
     Parameters
     ----------
-    system : System
-        The system.
-    region : Box, Polytope or Region, optional
-        A bounded set of states; the system's own if left out.
+    system, region, inputs, seconds
+        As for `certify_detectability`.
     criterion : {"trade", "rate"}
         How to choose rho where it is not given: ``trade`` takes the one for which lasting
         disturbances and noise are bounded best, :math:`\sqrt{d^2 \kappa + v^2 r} / (1 - \rho)`;
         ``rate`` the smallest that is feasible, plus a hundredth of its distance from 1.
     rho : float, optional
         The rate.
-    inputs : Box, optional
-        Bounds on the inputs, for a system with inputs.
     weights : (float, float)
         d and v, such as typical sizes of disturbance and noise.
-    seconds : float or Deadline
-        How long this may take, about; the result is then what was found so far, if anything.
 
     Raises
     ------
     OptionError
         If the criterion, rho or the weights are not among or within what is allowed.
     SetError, ModelError
-        As for `qpmhe.certificates.detectability.certify_detectability`.
+        As for `certify_detectability`.
     NotCertifiedError
         If there is no such gain, or none was found.
     """

@@ -187,10 +187,6 @@ def theorem(
     horizon : int
         N >= 1.
 
-    Returns
-    -------
-    TheoremConstants
-
     Raises
     ------
     OptionError
@@ -248,19 +244,9 @@ def _triple(values: Array | list[float]) -> Triple:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Errors and noises for which a bound is made tight.
+    """Largest |x_0 - z_0|, |w| and |v| for which a bound is made tight.
 
-    Parameters
-    ----------
-    initial : float
-        |x_0 - z_0|.
-    disturbance, noise : float
-        Largest |w| and |v|.
-
-    Raises
-    ------
-    OptionError
-        If one is negative or not finite, or all are zero.
+    An `OptionError` is raised if one is negative or not finite, or all are zero.
     """
 
     initial: float = 1.0
@@ -283,7 +269,7 @@ def tighten(
     *, kappa: float, lipschitz: float, horizon: int, sizes: Sizes | None = None,
     searched: int = _SEARCHED,
 ) -> TheoremConstants:
-    r"""The theorem's constants for its best free choices.
+    r"""The theorem's constants with the smallest `level`; their fields hold the free choices.
 
     Free are
 
@@ -299,21 +285,16 @@ def tighten(
     detectabilities, observers : iterable of DecayingSums
         At least one each.
     cost, kappa, lipschitz, horizon
-        As of `theorem`.
+        As for `theorem`.
     sizes : Sizes, optional
         For which errors and noises the result is to be tight; all 1 if left out.
     searched : int
         In how many pairs of the two to search, the most promising ones first.
 
-    Returns
-    -------
-    TheoremConstants
-        The constants with the smallest `level`; its fields hold the choices.
-
     Raises
     ------
     OptionError
-        As of `theorem`, or if there is nothing to choose from.
+        As for `theorem`, or if there is nothing to choose from.
     """
     wanted = Sizes() if sizes is None else sizes
     best: TheoremConstants | None = None

@@ -99,93 +99,40 @@ class Cost(ABC):
 
     @abstractmethod
     def stage_costs(self, residuals: Array, weights: Array) -> Array:
-        """l(w, v) of each stage.
-
-        Parameters
-        ----------
-        residuals : (K, n + p) array
-            w and v.
-        weights : (n + p, n + p) or (K, n + p, n + p) array
-            Joint weight of all stages, or of each.
-        """
+        """l(w, v) of residuals (w, v), (K, n + p), for the weights of all stages or of each."""
 
     @abstractmethod
     def majorise(self, residuals: Array, weights: Array) -> Array:
         """Weights W of quadratic forms that touch the stage costs at the residuals r.
 
         ``r^T W s`` is half the derivative of l at r in direction s; for exponents up to 2
-        the form also lies above l, up to a constant.
-
-        Parameters
-        ----------
-        residuals, weights
-            As for `stage_costs`.
-
-        Returns
-        -------
-        (n + p, n + p) or (K, n + p, n + p) array
+        the form also lies above l, up to a constant. Residuals and weights are as for
+        `stage_costs`; W has the shape of the weights, or (K, n + p, n + p).
         """
 
     @abstractmethod
     def prior_cost(self, offset: Array, weight: Array) -> float:
-        """Gamma.
-
-        Parameters
-        ----------
-        offset : (n,) array
-            x_0 minus the prior.
-        weight : (n, n) array
-            The prior's weight.
-        """
+        """Gamma of an offset (n,), x_0 minus the prior, with the prior's weight (n, n)."""
 
     @abstractmethod
     def majorise_prior(self, offset: Array, weight: Array) -> Array:
-        """The prior's counterpart of `majorise`.
-
-        Parameters
-        ----------
-        offset, weight
-            As for `prior_cost`.
-        """
+        """The prior's counterpart of `majorise`, for offset and weight as of `prior_cost`."""
 
     def joint_weight(self, noise: Array | None) -> Array:
-        """The weight of (w, v) with this weight of v.
-
-        Parameters
-        ----------
-        noise : (p, p) array or None
-            Weight of the measurement noise; None for the usual one.
-        """
+        """The weight of (w, v) with this weight (p, p) of the noise v; None for the usual one."""
         joint = np.zeros((self.n + self.p, self.n + self.p))
         joint[: self.n, : self.n] = self.disturbance
         joint[self.n :, self.n :] = self.noise if noise is None else noise
         return joint
 
     def check_noise(self, noise: Array) -> None:  # noqa: B027 - most costs take any weight
-        """Insist that a weight of one sample's noise fits the cost.
-
-        Parameters
-        ----------
-        noise : (p, p) array
-            Symmetric positive definite.
-
-        Raises
-        ------
-        WeightError
-            If the cost cannot use it.
-        """
+        """Raise a `WeightError` unless the cost can use this noise weight (p, p) of one sample."""
 
     def partial_weight(self, observed: Mask, noise: Array | None = None) -> Array:
-        """The stage weight where only some components of y are there; zero on the others.
+        """The stage weight where only the observed components of y are there, (p,) bool.
 
-        Those there weigh the inverse of their block of the noise covariance.
-
-        Parameters
-        ----------
-        observed : (p,) bool array
-            Which components are there.
-        noise : (p, p) array, optional
-            A weight of this sample's noise, instead of the usual one.
+        It is zero on the others; those there weigh the inverse of their block of the covariance
+        of the noise, of which this sample may have a weight of its own.
         """
         if noise is not None:
             return self._reduced(observed, noise)

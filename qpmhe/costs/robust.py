@@ -26,14 +26,15 @@ class RobustCost(Cost):
         \Gamma(\chi, \bar x) = \rho_p(\chi - \bar x), \qquad
         l(\omega, \nu) = \rho_w(\omega) + \rho_v(\nu)
 
+    Assumption ass:stagecosts asks for one exponent a in all three terms. `constants` is
+    None where the losses do not have that; the theorem does not apply then.
+
     Parameters
     ----------
     prior : Loss, (n, n) array_like or ObserverPrior
         Loss of the initial error; a matrix stands for `Quadratic`.
-    disturbance : Loss or (n, n) array_like
-        Loss of w, such as `Huber` or `Power`; a matrix stands for `Quadratic`.
-    noise : Loss or (p, p) array_like
-        Loss of v.
+    disturbance, noise : Loss or array_like
+        Losses of w and v, such as `Huber` or `Power`; a matrix stands for `Quadratic`.
     discount : float
         As for `QuadraticCost`.
 
@@ -42,11 +43,6 @@ class RobustCost(Cost):
     WeightError, ShapeError, OptionError
         If a weight is not symmetric positive definite, dimensions differ, or the discount
         is outside of (0, 1].
-
-    Notes
-    -----
-    Assumption ass:stagecosts asks for one exponent a in all three terms. `constants` is
-    None where the losses do not have that; the theorem does not apply then.
     """
 
     def __init__(

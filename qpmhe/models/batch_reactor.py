@@ -82,16 +82,6 @@ def batch_reactor(method: str = "euler") -> Example:
     method : {"euler", "rk4"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     References
     ----------
     Schiller, Knuefer, Mueller (2021), doi 10.1016/j.ifacol.2021.08.549, (ex:eq:sys).

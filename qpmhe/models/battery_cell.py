@@ -100,16 +100,6 @@ def battery_cell(method: str = "rk4") -> Example:
     method : {"rk4", "euler"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     References
     ----------
     Chen and Rincon-Mora, Accurate electrical battery model capable of predicting runtime and

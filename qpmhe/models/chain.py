@@ -202,7 +202,8 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
     The sampling time is 0.03 s, N = 30. Disturbances have standard deviations of 0.001 m and
     0.03 m/s a step, the noise 0.03 m. The chain starts displaced from rest by
     :math:`0.3 \sin(\pi i / (M+1))` m along every axis, the estimation from rest. The prior
-    weighs with 0.3 m and the velocity that goes with it, :math:`0.3 \sqrt{D/m}`.
+    weighs with 0.3 m and the velocity that goes with it, :math:`0.3 \sqrt{D/m}`. The observer's
+    constant gain is that of the stationary Kalman predictor about rest.
 
     Parameters
     ----------
@@ -212,17 +213,6 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
         Of space.
     method : {"rk4", "euler"}
         Discretisation of the model. Euler steps are stable here, too, but damp much less.
-
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-        The observer's constant gain is that of the stationary Kalman predictor about rest.
-
-    Raises
-    ------
-    OptionError
-        If there is no mass, or the dimension or method is unknown.
 
     Notes
     -----

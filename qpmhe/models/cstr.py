@@ -108,16 +108,6 @@ def cstr(method: str = "rk4") -> Example:
     method : {"rk4", "euler"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     References
     ----------
     Henson and Seborg, Nonlinear Process Control, Prentice Hall 1997. Seborg, Edgar,

@@ -55,8 +55,7 @@ class ModelSource:
     arguments : str
         Keyword arguments of the function, as ``key=value, key=value``.
     fingerprint : str
-        Digest of the file, and of the files that it imports from its own folder; empty for
-        the catalogue.
+        Digest of the file and of those it imports from its folder; empty for the catalogue.
     """
 
     name: str
@@ -86,14 +85,10 @@ def find(text: Any, folder: Path | None = None) -> ModelSource:
     ----------
     text : str
         ``name``, ``name(keyword=value)``, ``package.module:function`` or
-        ``path/file.py:function``.
+        ``path/file.py:function``. A `ModelError` is raised if it has another form, or there is
+        no such model or file.
     folder : Path, optional
         What a file's path is relative to; the working directory if left out.
-
-    Raises
-    ------
-    ModelError
-        If the text has another form, or there is no such model or file.
     """
     match = _FORM.fullmatch(text.strip()) if isinstance(text, str) else None
     if match is None:
@@ -128,20 +123,11 @@ def find(text: Any, folder: Path | None = None) -> ModelSource:
 
 
 def build(source: ModelSource) -> Any:
-    """Call the model's function, and return whatever it returns.
+    """Call the function of a source that `find` found, and return whatever it returns.
 
-    A file can import the files beside it, as it can when Python runs it.
-
-    Parameters
-    ----------
-    source : ModelSource
-        From `find`.
-
-    Raises
-    ------
-    ModelError
-        If the file cannot be imported, has changed since it was found, or lacks the function,
-        or if the function raises; the text names the line in the user's file.
+    A file can import the files beside it, as it can when Python runs it. A `ModelError` is
+    raised if the file cannot be imported, has changed since it was found, or lacks the function,
+    or if the function raises; the text names the line in the user's file.
     """
     with _neighbours(source):
         function = _function(source)

@@ -147,17 +147,6 @@ def quadrotor(method: str = "rk4") -> Example:
     method : {"rk4", "euler"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record
-        with the inputs.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     Notes
     -----
     The angles are singular at a pitch of 90 degrees; the controller tilts by 29 at most.

@@ -59,23 +59,18 @@ class Scenario:
     Parameters
     ----------
     system : System
-        The system.
-    initial_state : (n,) array
-        x(0) of the simulation.
-    initial_estimate : (n,) array
-        Where the estimation starts.
+    initial_state, initial_estimate : (n,) array
+        Where the simulation starts, and the estimation.
     disturbance_covariance, noise_covariance : array
         Covariances of w (n, n) and v (p, p), before any truncation.
-    dt : float
-        Sampling time.
+    dt, time_unit : float and str
+        Sampling time and its unit.
     horizon : int
         N of the published or recommended setting.
     steps : int
         Samples of a usual record.
     labels : tuple of str
         Names of the states with units, for figures.
-    time_unit : str
-        Unit of dt.
     inputs : callable, optional
         inputs(t, x) -> u(t) (m,), from the sample's index t = 0, 1, ... and the true state
         x(t): known inputs ignore the state, a feedback controller does not. Needed exactly
@@ -149,18 +144,12 @@ class Scenario:
         steps : int, optional
             Number T of measurements; ``self.steps`` if left out.
 
-        Returns
-        -------
-        Record
-            States (T + 1, n), measurements (T, p) and inputs (T, m), if there are any.
-
         Raises
         ------
         OptionError
             If the seed or the number of steps is not an integer >= 0.
         ModelError
-            If the state cannot be kept in its set by any disturbance that is drawn, or is
-            not finite.
+            If no disturbance that is drawn keeps the state in its set, or it is not finite.
         """
         generator = np.random.default_rng(count("seed", seed, 0))
         total = self.steps if steps is None else count("steps", steps, 0)

@@ -66,16 +66,6 @@ def van_der_pol(method: str = "rk4") -> Example:
     method : {"rk4", "euler"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     References
     ----------
     Khalil, Nonlinear Systems, 3rd edition, 2002, section 2.4.

@@ -110,16 +110,6 @@ def vehicle(method: str = "rk4") -> Example:
     method : {"rk4", "euler"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     References
     ----------
     Thrun, Burgard and Fox, Probabilistic Robotics, 2005, sections 5.3 and 6.6.

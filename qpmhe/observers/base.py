@@ -56,20 +56,7 @@ class Observer(ABC):
 
     @abstractmethod
     def check(self, system: System, initial_state: Array) -> None:
-        """Insist that the observer fits the system.
-
-        Parameters
-        ----------
-        system : System
-            The system that is to be observed.
-        initial_state : (n,) array
-            z(0).
-
-        Raises
-        ------
-        InvalidInputError
-            If it does not fit.
-        """
+        """Raise an `InvalidInputError` unless it fits the system and initial_state, z(0)."""
 
     @property
     def constant_gain(self) -> Array | None:
@@ -86,10 +73,8 @@ class Observer(ABC):
 
         Parameters
         ----------
-        z : (n,) array
-            Observer state z(t).
-        v : (p,) array
-            Fitting error y(t) - h(z(t)), with zeros where y is missing.
+        z, v : (n,) and (p,) array
+            Observer state z(t), and fitting error y(t) - h(z(t)), with zeros where y is missing.
         sample : Sample
             What else is known of the stage; overwritten at the next one.
         """

@@ -29,12 +29,8 @@ class ExtendedKalman(KalmanType):
 
     Parameters
     ----------
-    prior : (n, n) array_like
-        Covariance P(0) of the initial error x(0) - z(0).
-    disturbance : (n, n) array_like
-        Covariance Q of w.
-    noise : (p, p) array_like
-        Covariance R of v.
+    prior, disturbance, noise : (n, n), (n, n) and (p, p) array_like
+        Covariances P(0) of the initial error x(0) - z(0), Q of w and R of v.
 
     Raises
     ------

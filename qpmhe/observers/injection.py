@@ -23,13 +23,9 @@ class OutputInjection(Observer):
     Parameters
     ----------
     correction : callable
-        correction(z, v): z (n,) and the fitting error v (p,) to (n,).
-
-    Raises
-    ------
-    ModelError
-        Where it meets the system: if its value has the wrong shape or is not finite, or if
-        it does not vanish for v = 0.
+        correction(z, v): z (n,) and the fitting error v (p,) to (n,). Where it meets the
+        system, a `ModelError` is raised if its value has the wrong shape, is not finite, or
+        does not vanish for v = 0.
     """
 
     def __init__(self, correction: Callable[[Array, Array], Any]) -> None:

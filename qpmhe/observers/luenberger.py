@@ -24,12 +24,9 @@ class Luenberger(Observer):
     Parameters
     ----------
     gain : (n, p) array_like
-        K, of the discrete-time observer; a vector (n,) will do where p is 1.
-
-    Raises
-    ------
-    InvalidInputError
-        If the gain is not finite; its shape is checked where it meets the system.
+        K, of the discrete-time observer; a vector (n,) will do where p is 1. An
+        `InvalidInputError` is raised if it is not finite; its shape is checked where it meets
+        the system.
     """
 
     def __init__(self, gain: ArrayLike) -> None:

@@ -38,27 +38,15 @@ def costs(
     Parameters
     ----------
     run : Run
-        The run.
-    dt : float
-        Time between samples, in the unit of ``time_label``.
-    time_label : str
-        Label of the time axis, with its unit.
+    dt, time_label
+        As for `states`.
     axes : matplotlib Axes, optional
         Where to draw; a figure is made if left out.
 
-    Returns
-    -------
-    Axes
-        The axes.
-
     Raises
     ------
-    InvalidInputError
-        If run is no `Run`, or axes are no axes.
-    ShapeError
-        If axes are more than one.
-    OptionError
-        If dt is not above zero.
+    InvalidInputError, ShapeError, OptionError
+        As for `states`.
     """
     check_run(run)
     dt = positive("dt", dt)
@@ -85,32 +73,17 @@ def costs(
 def outcomes(
     run: Run, *, dt: float = 1.0, time_label: str = "time t (samples)", axes: Any = None
 ) -> Any:
-    """Marks of what happened at each step: improved, kept, and why.
+    """Marks of what happened at each step, a row for each kind of event: improved, kept, and why.
 
     Parameters
     ----------
-    run : Run
-        The run.
-    dt : float
-        Time between samples, in the unit of ``time_label``.
-    time_label : str
-        Label of the time axis, with its unit.
-    axes : matplotlib Axes, optional
-        Where to draw; a figure is made if left out.
-
-    Returns
-    -------
-    Axes
-        The axes; a row for each kind of event that occurred.
+    run, dt, time_label, axes
+        As for `costs`.
 
     Raises
     ------
-    InvalidInputError
-        If run is no `Run`, or axes are no axes.
-    ShapeError
-        If axes are more than one.
-    OptionError
-        If dt is not above zero.
+    InvalidInputError, ShapeError, OptionError
+        As for `states`.
     """
     check_run(run)
     dt = positive("dt", dt)
@@ -138,26 +111,15 @@ def step_times(run: Run, *, deadline: float | None = None, axes: Any = None) -> 
 
     Parameters
     ----------
-    run : Run
-        The run.
+    run, axes
+        As for `costs`.
     deadline : float, optional
         Seconds, drawn as a line.
-    axes : matplotlib Axes, optional
-        Where to draw; a figure is made if left out.
-
-    Returns
-    -------
-    Axes
-        The axes, both logarithmic.
 
     Raises
     ------
-    InvalidInputError
-        If run is no `Run`, or axes are no axes.
-    ShapeError
-        If axes are more than one.
-    OptionError
-        If the deadline is not above zero.
+    InvalidInputError, ShapeError, OptionError
+        As for `states`.
     """
     check_run(run)
     if deadline is not None:

@@ -40,12 +40,7 @@ def trajectories(
     time_label : str
         Label of the time axis, with its unit.
     axes : sequence of n matplotlib Axes, optional
-        Where to draw; a figure is made if left out.
-
-    Returns
-    -------
-    list of Axes
-        One a state; ``axes[0].figure`` is the figure, see `save`.
+        Where to draw; a figure is made if left out: ``axes[0].figure`` of the axes returned.
 
     Raises
     ------
@@ -84,21 +79,10 @@ def states(
         Of `MovingHorizonEstimator.run`, with ``covariances=True`` for the bands.
     dt : float
         Time between samples, in the unit of ``time_label``.
-    labels : sequence of str, optional
-        Axis labels of the states, with units.
-    time_label : str
-        Label of the time axis, with its unit.
-    truth : (T + 1, n) array, optional
-        The real states.
+    labels, time_label, truth, axes
+        As for `trajectories`.
     sigmas : float
         Half the width of a band, in standard deviations.
-    axes : sequence of n matplotlib Axes, optional
-        Where to draw; a figure is made if left out.
-
-    Returns
-    -------
-    list of Axes
-        One a state.
 
     Raises
     ------
@@ -107,7 +91,7 @@ def states(
     ShapeError
         If labels, truth or axes are not of the run's states and times.
     OptionError
-        If dt or sigmas is not above zero.
+        If a number is not above zero.
     """
     check_run(run)
     count, n = run.states.shape
@@ -138,28 +122,13 @@ def window(
     ----------
     estimate : Estimate
         Of `MovingHorizonEstimator.update`.
-    dt : float
-        Time between samples, in the unit of ``time_label``.
-    labels : sequence of str, optional
-        Axis labels of the states, with units.
-    time_label : str
-        Label of the time axis, with its unit.
-    axes : sequence of n matplotlib Axes, optional
-        Where to draw; a figure is made if left out.
-
-    Returns
-    -------
-    list of Axes
-        One a state.
+    dt, labels, time_label, axes
+        As for `states`.
 
     Raises
     ------
-    InvalidInputError
-        If estimate is no `Estimate`, labels are no strings or axes no axes.
-    ShapeError
-        If labels or axes are not as many as states.
-    OptionError
-        If dt is not above zero.
+    InvalidInputError, ShapeError, OptionError
+        As for `states`, with an `Estimate` in place of the run.
     """
     check_estimate(estimate)
     count, n = estimate.trajectory.shape
