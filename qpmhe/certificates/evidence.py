@@ -8,13 +8,8 @@ from enum import Enum
 from ..errors import InvalidInputError, QpmheError
 
 __all__ = [
-    "CertificateError",
-    "Evidence",
-    "JumpError",
-    "MismatchError",
-    "NotCertifiedError",
-    "OutOfTimeError",
-    "weakest",
+    "CertificateError", "Evidence", "JumpError", "MismatchError", "NotCertifiedError",
+    "OutOfTimeError", "weakest",
 ]
 
 

@@ -24,12 +24,7 @@ from .monitor import Monitor
 from .regions import Region, bounded_region
 
 __all__ = [
-    "NOISES",
-    "Attack",
-    "ClosedRuns",
-    "attack_detectability",
-    "attack_estimator",
-    "attack_observer",
+    "NOISES", "Attack", "ClosedRuns", "attack_detectability", "attack_estimator", "attack_observer",
     "inside",
 ]
 

@@ -27,16 +27,8 @@ from numpy.typing import NDArray
 from .evidence import CertificateError
 
 __all__ = [
-    "ErrorContraction",
-    "Form",
-    "Matrices",
-    "OutputInjection",
-    "OutputWeight",
-    "definite",
-    "eigenvalue_bounds",
-    "euclidean_constants",
-    "norm_bound",
-    "rounded_up",
+    "ErrorContraction", "Form", "Matrices", "OutputInjection", "OutputWeight", "definite",
+    "eigenvalue_bounds", "euclidean_constants", "norm_bound", "rounded_up",
 ]
 
 Array = NDArray[np.float64]

@@ -21,13 +21,7 @@ from .certificate import Certificate
 from .evidence import MismatchError
 
 __all__ = [
-    "NEEDED",
-    "UNNEEDED",
-    "Hypotheses",
-    "Monitor",
-    "MonitorSummary",
-    "monitor",
-    "monitored_run",
+    "NEEDED", "UNNEEDED", "Hypotheses", "Monitor", "MonitorSummary", "monitor", "monitored_run"
 ]
 
 Array = NDArray[np.float64]
@@ -324,10 +318,8 @@ def monitor(
     low, high = region.lower[region.n :], region.upper[region.n :]
     usual = bool(((u >= low) & (u <= high)).all())
     return Hypotheses(
-        cost_decrease=cheaper,
-        complete=complete,
-        observer_candidate=observed and Status.PROJECTED not in estimate.status,
-        kappa=bounded,
+        cost_decrease=cheaper, complete=complete,
+        observer_candidate=observed and Status.PROJECTED not in estimate.status, kappa=bounded,
         candidate_in_region=usual and bool(region.contains(estimate.candidate[:-1]).all()),
         estimate_in_region=usual and bool(region.contains(estimate.trajectory[:-1]).all()),
         candidate_in_sets=_in_sets(system, estimate.candidate, corrections, fit),

@@ -259,12 +259,9 @@ class SummedBound(WindowBound):
             (cost.disturbance[1] * constants.kappa**a + cost.noise[1]) ** (1.0 / a)
         )
         super().__init__(
-            horizon=constants.horizon,
-            rho=constants.observer.rate,
-            eta=constants.detectability.rate,
-            exponent=a,
-            slope=self.cost_root * constants.lipschitz,
-            entry=constants.detectability.initial,
+            horizon=constants.horizon, rho=constants.observer.rate,
+            eta=constants.detectability.rate, exponent=a,
+            slope=self.cost_root * constants.lipschitz, entry=constants.detectability.initial,
             scales=np.ones(1),
         )
 

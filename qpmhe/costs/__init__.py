@@ -7,13 +7,6 @@ from .quadratic import QuadraticCost
 from .robust import RobustCost
 
 __all__ = [
-    "Cost",
-    "CostConstants",
-    "Huber",
-    "Loss",
-    "ObserverPrior",
-    "Power",
-    "Quadratic",
-    "QuadraticCost",
-    "RobustCost",
+    "Cost", "CostConstants", "Huber", "Loss", "ObserverPrior", "Power", "Quadratic",
+    "QuadraticCost", "RobustCost",
 ]

@@ -115,17 +115,10 @@ def battery_cell(method: str = "rk4") -> Example:
     disturbance = np.diag([0.0002**2, 0.001**2, 0.0005**2])
     noise = np.diag([0.005**2])
     scenario = Scenario(
-        system=system,
-        initial_state=np.array([1.0, 0.0, 0.0]),
-        initial_estimate=np.array([0.5, 0.0, 0.0]),
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=60,
-        steps=400,
-        labels=("state of charge", "v1 (V)", "v2 (V)"),
-        inputs=_current,
-        settling_time=300.0,
+        system=system, initial_state=np.array([1.0, 0.0, 0.0]),
+        initial_estimate=np.array([0.5, 0.0, 0.0]), disturbance_covariance=disturbance,
+        noise_covariance=noise, dt=_DT, horizon=60, steps=400,
+        labels=("state of charge", "v1 (V)", "v2 (V)"), inputs=_current, settling_time=300.0,
         title="Battery cell, two RC elements",
     )
     cost = QuadraticCost.from_covariances(

@@ -251,17 +251,10 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
     axes = "xyz"[:dimension]
     names = [f"{axis}{i}" for i in range(1, masses + 1) for axis in axes]
     scenario = Scenario(
-        system=system,
-        initial_state=displaced,
-        initial_estimate=rest,
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=30,
-        steps=120,
+        system=system, initial_state=displaced, initial_estimate=rest,
+        disturbance_covariance=disturbance, noise_covariance=noise, dt=_DT, horizon=30, steps=120,
         labels=(*(f"{name} (m)" for name in names), *(f"v{name} (m/s)" for name in names)),
-        settling_time=1.5,
-        title=f"Chain of {masses} mass{'es' * (masses > 1)} in {dimension} D",
+        settling_time=1.5, title=f"Chain of {masses} mass{'es' * (masses > 1)} in {dimension} D",
     )
     swing = _DISPLACEMENT * (_STIFFNESS / _MASS) ** 0.5
     cost = QuadraticCost.from_covariances(

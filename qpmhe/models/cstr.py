@@ -120,18 +120,10 @@ def cstr(method: str = "rk4") -> Example:
     )
     disturbance, noise = np.diag([0.005**2, 0.3**2]), np.diag([0.5**2])
     scenario = Scenario(
-        system=system,
-        initial_state=np.array([0.5, 350.0]),
-        initial_estimate=np.array([0.65, 347.0]),
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=20,
-        steps=200,
-        labels=("c (mol/L)", "T (K)"),
-        time_unit="min",
-        inputs=_coolant,
-        settling_time=1.0,
+        system=system, initial_state=np.array([0.5, 350.0]),
+        initial_estimate=np.array([0.65, 347.0]), disturbance_covariance=disturbance,
+        noise_covariance=noise, dt=_DT, horizon=20, steps=200, labels=("c (mol/L)", "T (K)"),
+        time_unit="min", inputs=_coolant, settling_time=1.0,
         title="Continuous stirred tank reactor, exothermic A -> B",
     )
     cost = QuadraticCost.from_covariances(

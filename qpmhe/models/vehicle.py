@@ -121,17 +121,10 @@ def vehicle(method: str = "rk4") -> Example:
     disturbance = np.diag([0.02**2, 0.02**2, 0.02**2])
     noise = np.diag(_ROOT_WEIGHTS**-2.0)
     scenario = Scenario(
-        system=system,
-        initial_state=np.array([0.0, 0.0, 0.8]),
-        initial_estimate=np.array([-1.0, 1.1, 0.3]),
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=20,
-        steps=250,
-        labels=("x (m)", "y (m)", "heading (rad)"),
-        inputs=_drive,
-        settling_time=5.0,
+        system=system, initial_state=np.array([0.0, 0.0, 0.8]),
+        initial_estimate=np.array([-1.0, 1.1, 0.3]), disturbance_covariance=disturbance,
+        noise_covariance=noise, dt=_DT, horizon=20, steps=250,
+        labels=("x (m)", "y (m)", "heading (rad)"), inputs=_drive, settling_time=5.0,
         title="Vehicle with ranges and bearings of two beacons",
     )
     cost = QuadraticCost.from_covariances(
