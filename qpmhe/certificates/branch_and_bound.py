@@ -124,8 +124,7 @@ def _scores(
     scores = enclosure.excess[left] + corner_share * corners
     known = np.isfinite(scores).all(axis=1) & (scores.max(axis=1) > 0.0)
     width = np.where(region.upper > region.lower, region.upper - region.lower, np.inf)
-    chosen: Array = np.where(known[:, None], scores, (high - low) / width)
-    return chosen
+    return np.where(known[:, None], scores, (high - low) / width)
 
 
 def _halved(

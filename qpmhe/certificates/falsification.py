@@ -509,8 +509,7 @@ def _worse(
 
         def moved(values: Array, size: float = size) -> Array:
             scale = float(np.abs(values).max(initial=0.0)) or 1e-3
-            changed: Array = values + size * scale * rng.standard_normal(values.shape)
-            return changed
+            return values + size * scale * rng.standard_normal(values.shape)
 
         other = _Trial(
             inside(region, moved(trial.start)), inside(region, moved(trial.estimate)),

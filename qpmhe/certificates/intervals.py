@@ -107,12 +107,10 @@ class Interval:
     __radd__ = __add__
 
     def __sub__(self, other: Any) -> Interval:
-        difference: Interval = self + (-Interval.of(other))
-        return difference
+        return self + (-Interval.of(other))
 
     def __rsub__(self, other: Any) -> Interval:
-        difference: Interval = Interval.of(other) + (-self)
-        return difference
+        return Interval.of(other) + (-self)
 
     def __mul__(self, other: Any) -> Interval:
         if other is self:
@@ -134,8 +132,7 @@ class Interval:
     __rmul__ = __mul__
 
     def __truediv__(self, other: Any) -> Interval:
-        quotient: Interval = self * Interval.of(other).reciprocal()
-        return quotient
+        return self * Interval.of(other).reciprocal()
 
     def __rtruediv__(self, other: Any) -> Interval:
         quotient: Interval = self.reciprocal() * other
@@ -222,8 +219,7 @@ class Interval:
 
         def reached(phase: float) -> NDArray[np.bool_]:
             first = np.ceil(low - slack - phase)
-            hit: NDArray[np.bool_] = first <= high + slack - phase
-            return hit
+            return first <= high + slack - phase
 
         return Interval(
             np.where(reached(top + 0.5), -1.0, np.maximum(least, -1.0)),

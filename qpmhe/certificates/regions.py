@@ -249,8 +249,7 @@ def _centre(states: ConvexSet, lower: Array, upper: Array) -> Array:
     )
     if answer.x is None:
         raise SetError(f"no point of {states!r} was found; is the set empty?")
-    point: Array = np.asarray(answer.x, np.float64)[:n]
-    return point
+    return np.asarray(answer.x, np.float64)[:n]
 
 
 def _shares(states: ConvexSet, centre: Array, points: Array) -> Array:

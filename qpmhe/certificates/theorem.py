@@ -161,8 +161,7 @@ class TheoremConstants:
         a, rho = self.cost.exponent, self.observer.rate
         first: Array = self.rho_bar_1 * (C_p * start * rho ** np.arange(w.size + 1.0)) ** a
         second: Array = (C_w * decaying_sums(rho, w)) ** a + (C_v * decaying_sums(rho, v)) ** a
-        total: Array = self.c_bar * (first + self.rho_bar_2 * second)
-        return total
+        return self.c_bar * (first + self.rho_bar_2 * second)
 
 
 def theorem(

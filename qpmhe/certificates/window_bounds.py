@@ -142,8 +142,7 @@ class WindowBound(ABC):
             own = np.where(lengths == N - j, entry, own)
             own = self._advance(own, *padded[..., j : j + steps + 1])
         own[..., 0] = parts.window_start
-        total: Array = self.alphas[lengths] * roots + own
-        return total
+        return self.alphas[lengths] * roots + own
 
     def funnel(self, initial: float, disturbance: float, noise: float, steps: int) -> Array:
         """The bound at t = 0, ..., steps for all |w| <= disturbance and |v| <= noise."""
@@ -374,16 +373,14 @@ def fit_weight(cost: QuadraticCost, gain: ArrayLike) -> Array:
     K = numbers("gain", gain)
     if K.shape != (cost.n, cost.p):
         raise ShapeError(f"gain has shape {K.shape}; expected {(cost.n, cost.p)}.")
-    weight: Array = K.T @ cost.disturbance @ K + cost.noise
-    return weight
+    return K.T @ cost.disturbance @ K + cost.noise
 
 
 def norms(values: Array, weight: Array) -> Array:
     """|s|_W of each row, or what it is at most for vectors of these lengths."""
     if values.ndim == 1:
         top = float(np.linalg.eigvalsh(weight)[-1])
-        scaled: Array = math.sqrt(max(0.0, top)) * values
-        return scaled
+        return math.sqrt(max(0.0, top)) * values
     if values.shape[1] != weight.shape[0]:
         raise ShapeError(f"vectors have {values.shape[1]} components; expected {weight.shape[0]}.")
     squares: Array = np.einsum("ti,ij,tj->t", values, weight, values)

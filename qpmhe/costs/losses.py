@@ -168,9 +168,7 @@ class Power(Loss):
             raise OptionError(f"exponent is {exponent!r}; expected a number >= 1: convexity.")
 
     def _value(self, q: Array) -> Array:
-        value: Array = q ** (0.5 * self.exponent)
-        return value
+        return q ** (0.5 * self.exponent)
 
     def _slope(self, q: Array) -> Array:
-        value: Array = 0.5 * self.exponent * np.maximum(q, 1e-8) ** (0.5 * self.exponent - 1.0)
-        return value
+        return 0.5 * self.exponent * np.maximum(q, 1e-8) ** (0.5 * self.exponent - 1.0)

@@ -41,8 +41,7 @@ def _voltage(charge: Array) -> Array:
 
 
 def _voltage_slope(charge: Array) -> Array:
-    slope: Array = (0.2156 + charge * (-0.2356 + 0.9603 * charge) + 36.085 * np.exp(-35.0 * charge))
-    return slope
+    return (0.2156 + charge * (-0.2356 + 0.9603 * charge) + 36.085 * np.exp(-35.0 * charge))
 
 
 def _rate(x: Array, u: Array) -> Array:
@@ -55,8 +54,7 @@ def _rate_jacobian(x: Array) -> Array:
 
 
 def _output(x: Array, u: Array) -> Array:
-    value: Array = _voltage(x[..., :1]) + x[..., 1:2] + x[..., 2:] + _R0 * u
-    return value
+    return _voltage(x[..., :1]) + x[..., 1:2] + x[..., 2:] + _R0 * u
 
 
 def _output_jacobian(x: Array) -> Array:
@@ -66,8 +64,7 @@ def _output_jacobian(x: Array) -> Array:
 
 
 def _current(t: int, x: Array) -> Array:  # noqa: ARG001
-    current: Array = _CAPACITY * _PROFILE[t // _HOLD % _PROFILE.size, None]
-    return current
+    return _CAPACITY * _PROFILE[t // _HOLD % _PROFILE.size, None]
 
 
 def battery_cell(method: str = "rk4") -> Example:

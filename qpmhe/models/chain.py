@@ -92,8 +92,7 @@ class _Chain:
 
     def output(self, x: Array) -> Array:
         """The positions, (..., n/2)."""
-        positions: Array = x[..., : self._half]
-        return positions
+        return x[..., : self._half]
 
     def output_jacobian(self, x: Array) -> Array:
         """The derivative of the output, (..., n/2, n)."""

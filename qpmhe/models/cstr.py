@@ -33,8 +33,7 @@ _GAIN, _COOLANT = 6.0, (270.0, 330.0)
 
 def _constant(temperature: Array) -> Array:
     """The rate constant k(T)."""
-    value: Array = _FREQUENCY * np.exp(-_ACTIVATION / temperature)
-    return value
+    return _FREQUENCY * np.exp(-_ACTIVATION / temperature)
 
 
 def _rate(x: Array, u: Array) -> Array:
@@ -60,8 +59,7 @@ def _rate_jacobian(x: Array) -> Array:
 
 
 def _output(x: Array) -> Array:
-    temperature: Array = x[..., 1:]
-    return temperature
+    return x[..., 1:]
 
 
 def _output_jacobian(x: Array) -> Array:

@@ -40,8 +40,7 @@ def _rate_jacobian(x: Array) -> Array:
 
 
 def _output(x: Array) -> Array:
-    angle: Array = x[..., :1]
-    return angle
+    return x[..., :1]
 
 
 def _output_jacobian(x: Array) -> Array:

@@ -88,8 +88,7 @@ def _rate_jacobian(x: Array, u: Array) -> Array:
 
 
 def _output(x: Array) -> Array:
-    measured: Array = x[..., _MEASURED]
-    return measured
+    return x[..., _MEASURED]
 
 
 def _output_jacobian(x: Array) -> Array:

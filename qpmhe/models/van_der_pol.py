@@ -39,8 +39,7 @@ def _rate_jacobian(x: Array) -> Array:
 
 
 def _output(x: Array) -> Array:
-    first: Array = x[..., :1]
-    return first
+    return x[..., :1]
 
 
 def _output_jacobian(x: Array) -> Array:

@@ -44,8 +44,7 @@ def _rate_jacobian(x: Array, u: Array) -> Array:
 
 def _offsets(x: Array) -> Array:
     """From the vehicle to each beacon, (..., 2 beacons, 2 axes)."""
-    offsets: Array = _BEACONS - x[..., None, :2]
-    return offsets
+    return _BEACONS - x[..., None, :2]
 
 
 def _output(x: Array) -> Array:

@@ -295,8 +295,7 @@ def _shift_and_scale(a: Array) -> tuple[float, float]:
 
 def _kernel(matrix: Array) -> Array:
     _, values, rows = np.linalg.svd(matrix)
-    kernel: Array = rows[int(np.count_nonzero(values > _UNSEEN)) :].T
-    return kernel
+    return rows[int(np.count_nonzero(values > _UNSEEN)) :].T
 
 
 def _text(values: ComplexArray) -> str:
