@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import record, vector
+from .._checks import Array, record, vector
 from ..costs import Cost, CostConstants, ObserverPrior, QuadraticCost
 from ..errors import InvalidInputError, ModelError, ShapeError
 from ..model.sets import Box, ConvexSet
@@ -19,14 +19,12 @@ from ..observers import Observer, Sample
 from .branch_and_bound import output_lipschitz
 from .deadline import PART_SECONDS, Deadline
 from .evaluation import evaluated
-from .evidence import CertificateError, Evidence
+from .evidence import Evidence
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
-from .observer import constant_gain
+from .observer import gain_if_constant
 from .regions import Region, bounded_region, checked_system
 
 __all__ = ["Audit", "Finding", "audit", "checked_ingredients"]
-
-Array = NDArray[np.float64]
 
 _SAMPLES = 2000
 _SEED = 20210829
@@ -98,11 +96,7 @@ def _correction(system: System, observer: Observer) -> Callable[[Array, Array], 
 def _no_correction_finding(system: System, observer: Observer, region: Region) -> Finding:
     """Whether the observer corrects where the output fits."""
     name, label = "no correction without error", "ass:observer_0"
-    try:
-        gain = constant_gain(observer, system)
-    except CertificateError:
-        gain = None
-    if gain is not None:
+    if gain_if_constant(observer, system) is not None:
         return Finding(name, label, True, Evidence.PROVED, "L(z, v) = L v vanishes with v")
     correction = _correction(system, observer)
     if correction is None:
@@ -126,11 +120,8 @@ def _kappa_finding(
 ) -> Finding:
     """The bound on the correction."""
     name, label = "correction bound", "eq:kappa"
-    try:
-        gain = constant_gain(observer, system)
-    except CertificateError:
-        pass
-    else:
+    gain = gain_if_constant(observer, system)
+    if gain is not None:
         kappa = float(norm_bound(Matrices.exact(gain[None]))[0])
         return Finding(
             name, label, True, Evidence.PROVED, f"kappa = |L| = {kappa:.6g}, of a constant gain",

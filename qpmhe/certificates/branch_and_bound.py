@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import Array
 from ..model.system import System
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel
@@ -17,8 +18,6 @@ from .inequalities import Form, Matrices, definite, norm_bound
 from .regions import Region
 
 __all__ = ["Cover", "constant_output", "cover", "output_lipschitz"]
-
-Array = NDArray[np.float64]
 
 _CHUNK = 256
 _MOST_CELLS = 40_000

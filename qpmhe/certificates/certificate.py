@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import count, numbers, vector
+from .._checks import Array, count, numbers, vector
 from ..costs import Cost
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.estimate import Status
@@ -20,16 +20,14 @@ from ..model.system import System
 from ..observers import Observer
 from .audit import Audit
 from .decay import checked_length
-from .evidence import CertificateError, Evidence, MismatchError, weakest
+from .evidence import Evidence, MismatchError, weakest
 from .horizon_bounds import HorizonBounds, Kind, window_bound
-from .observer import constant_gain
+from .observer import gain_if_constant
 from .properties import Detectability, ObserverStability, fitting, json_ready
 from .regions import Region
 from .theorem import Sizes
 
 __all__ = ["ASSUMED", "Certificate", "CheckedRun"]
-
-Array = NDArray[np.float64]
 
 # The constants are upper bounds, what is computed from them is not: this covers its rounding.
 _OUTWARD = 1.0 + 1e-9
@@ -111,10 +109,7 @@ class Certificate:
     @cached_property
     def gain(self) -> Array | None:
         """The observer's constant gain, if it has one."""
-        try:
-            return constant_gain(self.observer, self.system)
-        except CertificateError:
-            return None
+        return gain_if_constant(self.observer, self.system)
 
     @property
     def ingredients(self) -> tuple[Any, ...]:

@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .._checks import count
 from ..costs import Cost, CostConstants
@@ -32,8 +31,6 @@ from .sdp import started
 from .theorem import Sizes, level, tighten
 
 __all__ = ["certify", "cost_sizes"]
-
-Array = NDArray[np.float64]
 
 Result = TypeVar("Result", Detectability, ObserverStability)
 

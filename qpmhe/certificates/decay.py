@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import numbers, positive
+from .._checks import Array, numbers, positive
 from ..errors import OptionError, ShapeError
 
 __all__ = ["DecayingSums"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

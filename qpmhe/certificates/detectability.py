@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from .deadline import PART_SECONDS, Deadline
 from .decay import checked_rate
-from .evidence import JumpError, NotCertifiedError, OutOfTimeError
+from .evidence import NotCertifiedError
 from .inequalities import OutputInjection, OutputWeight, euclidean_constants
 from .properties import Detectability, sealed
 from .regions import Region, bounded_region
@@ -17,8 +16,6 @@ from .sdp import started
 from .search import Search, checked_weights
 
 __all__ = ["certify_detectability"]
-
-Array = NDArray[np.float64]
 
 # Of an output in its own size, for a state in the region's.
 _UNSEEN = 1e-9
@@ -99,11 +96,8 @@ def certify_detectability(
 
 
 def _explained(search: Search, error: NotCertifiedError, eta: float | None) -> NotCertifiedError:
-    if isinstance(error, (OutOfTimeError, JumpError)):
-        return error
-    try:
-        smallest = search.smallest_rate()
-    except OutOfTimeError:
+    smallest = search.explaining_rate(error)
+    if smallest is None:
         return error
     if not np.isfinite(smallest):
         jump = search.jump()

@@ -11,8 +11,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..codegen.expressions import CasadiModel, import_casadi
 from ..model.system import System
 from .evaluation import check_values
@@ -20,8 +20,6 @@ from .intervals import Interval, Jet, OutsideDomainError, variables
 from .regions import Region
 
 __all__ = ["MOST_ACTIVE", "Enclosure", "SmoothModel"]
-
-Array = NDArray[np.float64]
 
 # Beyond, corners would be many: what the other coordinates do is covered by the error.
 MOST_ACTIVE = 6

@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers import available
 
-from .._checks import count, numbers
+from .._checks import Array, count, numbers
 from ..errors import InvalidInputError, ShapeError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from .certificate import Certificate
-from .decay import DecayingSums
+from .decay import DecayingSums, decaying_sums
 from .horizon_bounds import Kind
 from .monitor import Monitor
 from .regions import Region, bounded_region
@@ -28,7 +28,6 @@ __all__ = [
     "inside",
 ]
 
-Array = NDArray[np.float64]
 Generator = np.random.Generator
 
 # Of two numbers computed in floating point, one exceeds the other by more than this, or not.
@@ -269,12 +268,9 @@ def _hidden(system: System, points: Array, like: Array, u: Array) -> Array:
 
 def _bounds(claim: DecayingSums, start: Array, w: Array, v: Array) -> Array:
     """The claimed bound of many runs at once, (B, T + 1)."""
-    bound = np.empty((start.size, w.shape[1] + 1))
-    bound[:, 0] = claim.initial * start
-    entering = claim.disturbance * w + claim.noise * v
-    for t in range(w.shape[1]):
-        bound[:, t + 1] = claim.rate * (bound[:, t] + entering[:, t])
-    return bound
+    decay = claim.rate ** np.arange(w.shape[1] + 1.0)
+    sums = decaying_sums(claim.rate, claim.disturbance * w + claim.noise * v)
+    return claim.initial * start[:, None] * decay + claim.rate * sums
 
 
 def _share(error: Array, bound: Array) -> Array:
@@ -317,10 +313,6 @@ def _verdict(
     )
 
 
-def _heavy(rng: Generator, steps: int, width: int) -> Array:
-    return np.clip(rng.standard_t(2.0, (steps, width)), -30.0, 30.0)
-
-
 #: Kinds of noise of size about 1, by name: (generator, steps, width) to (steps, width).
 NOISES: dict[str, Callable[[Generator, int, int], Array]] = {
     "none": lambda _, steps, width: np.zeros((steps, width)),
@@ -335,7 +327,9 @@ NOISES: dict[str, Callable[[Generator, int, int], Array]] = {
     * rng.choice([-1.0, 1.0], width),
     "impulses": lambda rng, steps, width: rng.standard_normal((steps, width))
     * (rng.random((steps, 1)) < 0.1),
-    "heavy tails": _heavy,
+    "heavy tails": lambda rng, steps, width: np.clip(
+        rng.standard_t(2.0, (steps, width)), -30.0, 30.0
+    ),
     "coloured": lambda rng, steps, width: np.cumsum(
         rng.standard_normal((steps, width)), axis=0
     ) / np.sqrt(steps),

@@ -9,7 +9,6 @@ from itertools import product
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..costs import Cost, CostConstants, QuadraticCost
 from ..errors import OptionError
@@ -21,7 +20,6 @@ from .window_bounds import SummedBound, WeightedBound, WindowBound, fit_weight, 
 
 __all__ = ["HorizonBounds", "Kind", "Pairs", "bounds_for", "window_bound", "window_level"]
 
-Array = NDArray[np.float64]
 Pair = tuple[int, int]
 
 Kind = Literal["paper", "summed", "weighted", "measured"]

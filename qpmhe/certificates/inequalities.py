@@ -24,6 +24,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import Array
 from .evidence import CertificateError
 
 __all__ = [
@@ -31,7 +32,6 @@ __all__ = [
     "eigenvalue_bounds", "euclidean_constants", "norm_bound", "rounded_up",
 ]
 
-Array = NDArray[np.float64]
 _UNIT = float(np.finfo(np.float64).eps)  # twice the unit roundoff: a margin in every bound
 _TINY = 1e-290  # covers what underflows
 

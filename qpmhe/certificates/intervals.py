@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Interval", "Jet", "OutsideDomainError", "variables"]
+from .._checks import Array
 
-Array = NDArray[np.float64]
+__all__ = ["Interval", "Jet", "OutsideDomainError", "variables"]
 
 # Errors of elementary functions in units in the last place: the C library and NumPy's own
 # vector versions stay within 4.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import count, record
+from .._checks import Array, count, record
 from ..costs import ObserverPrior
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.estimate import Estimate, Status
@@ -23,8 +23,6 @@ from .evidence import MismatchError
 __all__ = [
     "NEEDED", "UNNEEDED", "Hypotheses", "Monitor", "MonitorSummary", "monitor", "monitored_run"
 ]
-
-Array = NDArray[np.float64]
 
 _RELATIVE = 1e-6
 _FEASIBLE = 1e-8  # what the estimator itself takes for rounding on the sets' boundary

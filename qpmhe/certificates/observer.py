@@ -6,24 +6,22 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Luenberger, Observer, OutputInjection
 from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
 from .decay import checked_rate
-from .evidence import CertificateError, JumpError, NotCertifiedError, OutOfTimeError
+from .evidence import CertificateError, NotCertifiedError
 from .inequalities import ErrorContraction, Matrices, euclidean_constants, norm_bound
 from .properties import ObserverStability, sealed
 from .regions import Region, bounded_region, checked_system
 from .sdp import started
 from .search import Found, Search, checked_weights
 
-__all__ = ["Synthesis", "certify_observer", "constant_gain", "synthesise_gain"]
-
-Array = NDArray[np.float64]
+__all__ = ["Synthesis", "certify_observer", "constant_gain", "gain_if_constant", "synthesise_gain"]
 
 _STAY = "it holds while the states of system and observer stay in the region"
 _SEARCH = 0.7  # of the time; the rest is for smaller constants of the gain that was found
@@ -52,6 +50,14 @@ def constant_gain(observer: Observer, system: System) -> Array:
         "its constants yourself: ObserverStability.assumed(rho=..., C_p=..., C_w=..., C_v=..., "
         "kappa=...)."
     )
+
+
+def gain_if_constant(observer: Observer, system: System) -> Array | None:
+    """The gain of `constant_gain`, or None where the observer has none."""
+    try:
+        return constant_gain(observer, system)
+    except CertificateError:
+        return None
 
 
 def certify_observer(
@@ -148,17 +154,21 @@ def _check_stability(search: Search) -> None:
 
 
 def _explained(search: Search, error: NotCertifiedError) -> NotCertifiedError:
-    if isinstance(error, (OutOfTimeError, JumpError)):
+    smallest = search.explaining_rate(error)
+    if smallest is None:
         return error
-    try:
-        smallest = search.smallest_rate()
-    except OutOfTimeError:
-        return error
+    synthesis = search.gain is None
     if np.isfinite(smallest):
+        others = () if synthesis else ("another gain, such as synthesise_gain finds",)
         return NotCertifiedError(
             f"{error.args[0]}. Feasible at the states tried: rho from {smallest:.4g} on",
-            ("a larger rho", "another gain, such as synthesise_gain finds", "a smaller region"),
-            smallest,
+            ("a larger rho", *others, "a smaller region"), smallest,
+        )
+    if synthesis:
+        return NotCertifiedError(
+            "no constant gain is shown to contract on the whole region: the semidefinite program "
+            "is infeasible for every rate below 1",
+            ("a smaller region", "an observer with a varying gain", "other coordinates"),
         )
     radii = _radii(search)
     return NotCertifiedError(
@@ -235,23 +245,8 @@ def synthesise_gain(
     try:
         found = search.find_best(criterion) if rho is None else search.find(rho)
         made = stability(search, found)
-    except (OutOfTimeError, JumpError):
-        raise
     except NotCertifiedError as error:
-        try:
-            smallest = search.smallest_rate()
-        except OutOfTimeError:
-            raise error from None
-        if np.isfinite(smallest):
-            raise NotCertifiedError(
-                f"{error.args[0]}. Feasible at the states tried: rho from {smallest:.4g} on",
-                ("a larger rho", "a smaller region"), smallest,
-            ) from error
-        raise NotCertifiedError(
-            "no constant gain is shown to contract on the whole region: the semidefinite program "
-            "is infeasible for every rate below 1",
-            ("a smaller region", "an observer with a varying gain", "other coordinates"),
-        ) from error
+        raise _explained(search, error) from error
     assert made.gain is not None
     observer = Luenberger(made.gain)
     try:

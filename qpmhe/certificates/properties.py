@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import numbers, positive
+from .._checks import Array, numbers, positive
 from ..errors import OptionError
 from ..model.sets import ConvexSet
 from ..model.system import System
@@ -22,17 +22,20 @@ from .regions import Region, beyond, stated_region
 
 __all__ = ["Detectability", "ObserverStability", "Subject", "fitting", "json_ready", "sealed"]
 
-Array = NDArray[np.float64]
 _POINTS, _SEED = 24, 20210829
 _MOST_CORNERS = 8
 # Another compiler or library may round otherwise; derivatives by differences are worse.
 _VALUES, _SLOPES = 1e-9, 1e-5
 
 
-def _discounted(initial: ArrayLike, first: Array, second: Array, rate: float) -> Array:
+def _bound(rate: float, constants: tuple[float, ...], **vectors: ArrayLike) -> Array:
     r"""The bound :math:`a \rho^t + \sum_{\tau=1}^t \rho^\tau (b(t-\tau) + c(t-\tau))`."""
+    start, first, second = (
+        constant * np.linalg.norm(numbers(name, value), axis=-1)
+        for constant, (name, value) in zip(constants, vectors.items(), strict=True)
+    )
     bound = np.empty((first.shape[0] + 1, *first.shape[1:]))
-    bound[0] = initial
+    bound[0] = start
     for t in range(first.shape[0]):
         bound[t + 1] = rate * (bound[t] + first[t] + second[t])
     return bound
@@ -132,13 +135,10 @@ class Detectability:
         disturbances, outputs : (T, ..., n) and (T, ..., p) array_like
             Differences of the disturbances and of h(x), at t = 0, ..., T - 1.
         """
-        x, w, h = (
-            np.linalg.norm(numbers(name, value), axis=-1)
-            for name, value in (
-                ("initial", initial), ("disturbances", disturbances), ("outputs", outputs)
-            )
+        return _bound(
+            self.eta, (self.c_p, self.c_w, self.c_v), initial=initial, disturbances=disturbances,
+            outputs=outputs,
         )
-        return _discounted(self.c_p * x, self.c_w * w, self.c_v * h, self.eta)
 
     def squared(self, rate: float) -> tuple[float, Array, Array]:
         r"""The dissipation inequality in squares, for a rate r in (eta, 1): returns r^2, W_2, V_2.
@@ -241,13 +241,10 @@ class ObserverStability:
         disturbances, noises : (T, ..., n) and (T, ..., p) array_like
             w and v at t = 0, ..., T - 1.
         """
-        x, w, v = (
-            np.linalg.norm(numbers(name, value), axis=-1)
-            for name, value in (
-                ("initial", initial), ("disturbances", disturbances), ("noises", noises)
-            )
+        return _bound(
+            self.rho, (self.C_p, self.C_w, self.C_v), initial=initial, disturbances=disturbances,
+            noises=noises,
         )
-        return _discounted(self.C_p * x, self.C_w * w, self.C_v * v, self.rho)
 
 
 Result = TypeVar("Result", "Detectability", "ObserverStability")

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import numbers
+from .._checks import Array, numbers
 from ..errors import ModelError, SetError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 
 __all__ = ["Region", "beyond", "bounded_region", "checked_system", "stated_region"]
-
-Array = NDArray[np.float64]
 
 # Of a polytope's vertices and corners, as starting points of searches; more add little.
 _MOST_CORNERS = 256

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..errors import InvalidInputError, QpmheError, SetError, ShapeError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
@@ -33,7 +33,6 @@ from .theorem import Sizes
 
 __all__ = ["LABELS", "Report", "certify_model", "error_and_bounds"]
 
-Array = NDArray[np.float64]
 Result = TypeVar("Result")
 
 #: Names of the kinds of bounds in figures and tables.

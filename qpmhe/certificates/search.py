@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import positive
+from .._checks import Array, positive
 from ..errors import ModelError, OptionError
 from ..model.system import System
 from .branch_and_bound import Cover, cover
@@ -20,8 +20,6 @@ from .regions import Region
 from .sdp import Answer, Kind, Program, Scales, expected_seconds
 
 __all__ = ["Found", "Search", "checked_weights"]
-
-Array = NDArray[np.float64]
 
 _SAMPLES = 400
 _ROUNDS = 8
@@ -100,9 +98,7 @@ class Search:
 
         Where the time is over before, the smallest one that was tried and is.
         """
-        return self._smallest_rate(self._deadline.part(_CHOICE))
-
-    def _smallest_rate(self, deadline: Deadline) -> float:
+        deadline = self._deadline.part(_CHOICE)
         low, high = 0.0, _LARGEST_RATE
         if self._feasible(high, deadline).P is None:
             return np.inf
@@ -117,6 +113,15 @@ class Search:
             else:
                 high = middle
         return high
+
+    def explaining_rate(self, error: NotCertifiedError) -> float | None:
+        """`smallest_rate`, where an error does not say enough; None where the time is over."""
+        if isinstance(error, (OutOfTimeError, JumpError)):
+            return None
+        try:
+            return self.smallest_rate()
+        except OutOfTimeError:
+            return None
 
     def _feasible(self, rate: float, deadline: Deadline) -> Answer:
         return self._solved(rate, _MARGINS[0] * min(1.0, rate * rate), deadline, thorough=False)

@@ -9,16 +9,14 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import count
+from .._checks import Array, count
 from ..costs import CostConstants
 from ..errors import OptionError
 from .decay import DecayingSums, decaying_sums, lengths
 
 __all__ = ["Sizes", "TheoremConstants", "level", "theorem", "tighten"]
-
-Array = NDArray[np.float64]
 
 Triple = tuple[float, float, float]
 

@@ -10,15 +10,13 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import count, numbers, positive, positive_definite
+from .._checks import Array, count, numbers, positive, positive_definite
 from ..costs import ObserverPrior, QuadraticCost
 from ..errors import OptionError, ShapeError
 from .decay import DecayingSums, checked_length, decaying_sums
 from .theorem import TheoremConstants
 
 __all__ = ["Parts", "SummedBound", "WeightedBound", "WindowBound", "fit_weight", "largest"]
-
-Array = NDArray[np.float64]
 
 # About as many numbers of windows are held at once.
 _ENTRIES = 4e6

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import Array
 from ..errors import OptionError
 from .prior import ObserverPrior
 
 __all__ = ["Cost", "CostConstants"]
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Weights for patterns of missing components are kept up to so many bytes, and a few in any case.

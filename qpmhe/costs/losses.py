@@ -5,15 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import positive, positive_definite
+from .._checks import Array, positive, positive_definite
 from ..errors import OptionError, WeightError
 from .base import quadratic_form
 
 __all__ = ["Huber", "Loss", "Power", "Quadratic"]
-
-Array = NDArray[np.float64]
 
 
 class Loss(ABC):

@@ -6,13 +6,11 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..errors import OptionError
 
 __all__ = ["ObserverPrior"]
-
-Array = NDArray[np.float64]
 
 
 class ObserverPrior:

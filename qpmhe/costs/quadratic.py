@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from qpmhe_solvers.errors import report_unknown_options
 
-from .._checks import positive_definite
+from .._checks import Array, positive_definite
 from .base import Cost, CostConstants, quadratic_form
 from .prior import ObserverPrior
 
 __all__ = ["QuadraticCost"]
-
-Array = NDArray[np.float64]
 
 
 @report_unknown_options

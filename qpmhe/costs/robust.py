@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from qpmhe_solvers.errors import report_unknown_options
 
-from .._checks import positive_definite
+from .._checks import Array, positive_definite
 from ..errors import InvalidInputError
 from .base import Cost, CostConstants
 from .losses import Loss, Quadratic
 from .prior import ObserverPrior
 
 __all__ = ["RobustCost"]
-
-Array = NDArray[np.float64]
 
 
 @report_unknown_options

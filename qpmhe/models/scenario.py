@@ -8,16 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .._checks import count, positive, positive_definite, vector
+from .._checks import Array, count, positive, positive_definite, vector
 from ..errors import InvalidInputError, ModelError, OptionError
 from ..model.sets import ConvexSet
 from ..model.system import System
 
 __all__ = ["Record", "Scenario"]
-
-Array = NDArray[np.float64]
 
 # Draws for one sample until it lies in the sets: more would mean that hardly any does.
 _DRAWS = 1000

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import Array
 from ..model.system import System
 
 __all__ = ["Observer", "Sample"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(slots=True)

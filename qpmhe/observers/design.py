@@ -8,14 +8,13 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import positive_definite, vector
+from .._checks import Array, positive_definite, vector
 from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
 from ..model.system import System
 from .luenberger import Luenberger
 
 __all__ = ["design_luenberger"]
 
-Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 # Below this a direction counts as unseen. Matrices are scaled to norm one before, and the

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from .base import Sample
 from .kalman_type import KalmanType
 
 __all__ = ["ExtendedKalman"]
-
-Array = NDArray[np.float64]
 
 
 class ExtendedKalman(KalmanType):

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import count, positive, vector
+from .._checks import Array, count, positive, vector
 from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
 from ..model.system import System
 from .design import ackermann, linearize, spectral_radius
@@ -16,7 +16,6 @@ from .luenberger import Luenberger
 
 __all__ = ["HighGain"]
 
-Array = NDArray[np.float64]
 Sampling = Literal["exact", "euler"]
 
 

@@ -6,15 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..errors import ModelError
 from ..model.system import System
 from .base import Observer, Sample
 
 __all__ = ["OutputInjection"]
-
-Array = NDArray[np.float64]
 
 
 class OutputInjection(Observer):

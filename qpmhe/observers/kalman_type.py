@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import positive_definite
+from .._checks import Array, positive_definite
 from ..errors import ShapeError
 from ..model.system import System
 from .base import Observer, Sample
 
 __all__ = ["KalmanType"]
-
-Array = NDArray[np.float64]
 
 
 class KalmanType(Observer):

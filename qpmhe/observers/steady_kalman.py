@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import positive_definite
+from .._checks import Array, positive_definite
 from ..errors import ShapeError
 from ..model.system import System
 from .base import Observer, Sample
 from .design import linearize, stationary
 
 __all__ = ["SteadyStateKalman"]
-
-Array = NDArray[np.float64]
 
 
 class SteadyStateKalman(Observer):

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import positive
+from .._checks import Array, positive
 from .base import Sample
 from .kalman_type import KalmanType
 
 __all__ = ["UnscentedKalman"]
-
-Array = NDArray[np.float64]
 
 # A sigma point is drawn back into the state set, but not closer to z than this share.
 _CLOSEST = 1e-3

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._checks import positive
 from ..estimation.estimate import Status
@@ -16,8 +15,6 @@ if TYPE_CHECKING:
     from ..estimation.run import Run
 
 __all__ = ["costs", "outcomes", "step_times"]
-
-Array = NDArray[np.float64]
 
 # Below this many times the largest, a cost is drawn as this: a logarithm ends somewhere.
 _FLOOR = 1e-12

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .._checks import positive
+from .._checks import Array, positive
 from .checks import check_estimate, check_run, curve, label_list, named_curves, sample_times
 from .style import REAL, STYLES, panels
 
@@ -17,8 +16,6 @@ if TYPE_CHECKING:
     from ..estimation.run import Run
 
 __all__ = ["states", "trajectories", "window"]
-
-Array = NDArray[np.float64]
 
 
 def trajectories(
