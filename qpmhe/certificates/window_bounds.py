@@ -182,7 +182,6 @@ class WindowBound(ABC):
             third = max(third, _over_powers(of_v, lam, 1))
         return DecayingSums(lam, max(1.0, first), second, third)
 
-
     def _impulses(self, starts: NDArray[np.intp]) -> tuple[Array, Array]:
         """What unit impulses of w and of v at these times make of the N + 1 times after each."""
         N = self.horizon

@@ -1,8 +1,7 @@
 """Costs: what the prior, the disturbances and the noises weigh."""
 
-from .base import Cost, CostConstants
+from .base import Cost, CostConstants, ObserverPrior
 from .losses import Huber, Loss, Power, Quadratic
-from .prior import ObserverPrior
 from .quadratic import QuadraticCost
 from .robust import RobustCost
 

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import Array, positive_definite
-from .base import Cost, CostConstants, quadratic_form
-from .prior import ObserverPrior
+from .base import Cost, CostConstants, ObserverPrior, quadratic_form
 
 __all__ = ["QuadraticCost"]
 

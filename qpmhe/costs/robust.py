@@ -9,9 +9,8 @@ from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import Array, positive_definite
 from ..errors import InvalidInputError
-from .base import Cost, CostConstants
+from .base import Cost, CostConstants, ObserverPrior
 from .losses import Loss, Quadratic
-from .prior import ObserverPrior
 
 __all__ = ["RobustCost"]
 
@@ -90,7 +89,7 @@ class RobustCost(Cost):
         return joint
 
     def check_noise(self, noise: Array) -> None:
-        """Insist on a diagonal weight where the loss is per component; see `Cost`."""
+        """Check that the weight is diagonal where the loss is per component; see `Cost`."""
         self.noise_loss.check_weight(noise)
 
     def prior_cost(self, offset: Array, weight: Array) -> float:

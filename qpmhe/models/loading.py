@@ -318,13 +318,8 @@ def _forget(files: set[Path]) -> None:
 
 
 @contextlib.contextmanager
-def _neighbours(source: ModelSource) -> Iterator[None]:
-    """Let a file import those beside it."""
-    if not source.is_file:
-        yield
-        return
-    folder = str(Path(source.where.rpartition(":")[0]).parent)
-    sys.path.insert(0, folder)
+def _in_path(folder: str, position: int) -> Iterator[None]:
+    sys.path.insert(position, folder)
     try:
         yield
     finally:
@@ -332,18 +327,19 @@ def _neighbours(source: ModelSource) -> Iterator[None]:
             sys.path.remove(folder)
 
 
-@contextlib.contextmanager
-def _working_directory() -> Iterator[None]:
+def _neighbours(source: ModelSource) -> contextlib.AbstractContextManager[None]:
+    """Let a file import those beside it."""
+    if not source.is_file:
+        return contextlib.nullcontext()
+    return _in_path(str(Path(source.where.rpartition(":")[0]).parent), 0)
+
+
+def _working_directory() -> contextlib.AbstractContextManager[None]:
     """A console script has its own folder in the path, not the one it is called from."""
     here = str(Path.cwd())
     if "" in sys.path or here in sys.path:
-        yield
-        return
-    sys.path.append(here)
-    try:
-        yield
-    finally:
-        sys.path.remove(here)
+        return contextlib.nullcontext()
+    return _in_path(here, len(sys.path))
 
 
 def _import_file(path: Path) -> ModuleType:

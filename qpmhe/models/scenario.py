@@ -106,7 +106,7 @@ class Scenario:
         n, p = self.system.n, self.system.p
         for name in ("initial_state", "initial_estimate"):
             state = vector(name, getattr(self, name), n)
-            _insist_on_member(name, state, self.system.states)
+            _check_member(name, state, self.system.states)
             object.__setattr__(self, name, state)
         for name, size in (("disturbance_covariance", n), ("noise_covariance", p)):
             matrix = positive_definite(name.replace("_", " "), getattr(self, name), size)
@@ -190,7 +190,7 @@ def _factor(covariance: Array) -> Array:
     return np.asarray(np.linalg.cholesky(covariance).T, np.float64)
 
 
-def _insist_on_member(name: str, state: Array, states: ConvexSet | None) -> None:
+def _check_member(name: str, state: Array, states: ConvexSet | None) -> None:
     if states is not None and states.violation(state) > 0.0:
         raise InvalidInputError(
             f"{name} is {state.tolist()}, which is outside of the state set {states!r}."

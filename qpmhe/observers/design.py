@@ -36,8 +36,8 @@ def design_luenberger(
         K = A P C^\top S^{-1}, \quad S = C P C^\top + R, \quad
         P = A P A^\top + Q - K S K^\top
 
-    The observer is stable where the linearisation is a good one. How far that is, nothing
-    here tells: the point should be typical, most often a steady state.
+    The observer is stable where the linearisation is a good one. How far that is remains open:
+    the point should be typical, most often a steady state.
 
     Parameters
     ----------
@@ -51,11 +51,9 @@ def design_luenberger(
         Eigenvalues of A - K C, inside the unit circle, complex ones in conjugate pairs.
         With several outputs, none more often than the rank of C. For a continuous-time
         pole s and a sampling time dt, give exp(s dt).
-    disturbance : (n, n) array_like, optional
-        Covariance Q of w (squared state units), symmetric positive definite. Instead of
-        poles, together with the noise.
-    noise : (p, p) array_like, optional
-        Covariance R of v (squared output units), symmetric positive definite.
+    disturbance, noise : (n, n) and (p, p) array_like, optional
+        Instead of poles: covariances Q of w and R of v (squared units), symmetric positive
+        definite.
 
     Returns
     -------

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .._checks import Array
-from .base import Sample
-from .kalman_type import KalmanType
+from .base import KalmanType, Sample
 
 __all__ = ["ExtendedKalman"]
 

@@ -124,7 +124,7 @@ class HighGain(Luenberger):
         super().__init__(gain / self.dt ** np.arange(n))
 
     def check(self, system: System, initial_state: Array) -> None:
-        """Insist on one output, and on stability at z(0); see `Observer.check`."""
+        """Check that there is one output, and stability at z(0); see `Observer.check`."""
         n = self.gain.shape[0]
         if system.p != 1:
             raise ShapeError(

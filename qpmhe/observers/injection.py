@@ -32,7 +32,7 @@ class OutputInjection(Observer):
         self._correction = correction
 
     def check(self, system: System, initial_state: Array) -> None:
-        """Insist on values of shape (n,), and on L(z, 0) = 0; see `Observer.check`."""
+        """Check that values have shape (n,), and that L(z, 0) = 0; see `Observer.check`."""
         self._check_at(initial_state, system.p)
         generator = np.random.default_rng(20210829)
         for _ in range(3):

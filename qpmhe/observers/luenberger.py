@@ -32,7 +32,7 @@ class Luenberger(Observer):
         self.gain: Array = given.reshape(-1, 1) if given.ndim < 2 else given
 
     def check(self, system: System, initial_state: Array) -> None:
-        """Insist on a gain of shape (n, p); see `Observer.check`."""
+        """Check that the gain has shape (n, p); see `Observer.check`."""
         shape = (system.n, system.p)
         if self.gain.shape != shape:
             raise ShapeError(
