@@ -240,7 +240,7 @@ class Search:
     def _verified(self, form: Form) -> Found | Cover:
         """What was shown, or the cover with the states where the inequality fails."""
         if not definite(Matrices.exact(form.P[None]))[0].all():
-            return Cover(False, 0, 0.0, *(np.empty((0, 0)), np.empty((0, 0, 0))))
+            return Cover(False, 0, 0.0, np.empty((0, 0)), np.empty((0, 0, 0)))
         if self.model.reason:
             return self._sampled(
                 form, f"f and h cannot be run with intervals ({self.model.reason})"

@@ -53,12 +53,8 @@ class ObserverPrior:
     Parameters
     ----------
     minimum, maximum : float
-        Bounds on the eigenvalues of the prior weight (inverse of squared state units).
-
-    Raises
-    ------
-    OptionError
-        Unless 0 < minimum < maximum < infinity.
+        Bounds on the eigenvalues of the prior weight (inverse of squared state units); an
+        `OptionError` is raised unless 0 < minimum < maximum < infinity.
     """
 
     __slots__ = ("maximum", "minimum")
@@ -90,10 +86,8 @@ class Cost(ABC):
 
     Parameters
     ----------
-    prior : (n, n) array or ObserverPrior
-        Weight of the initial error, or the rule for it.
-    disturbance, noise : (n, n) and (p, p) array
-        Weights of w and v.
+    prior, disturbance, noise : array
+        Weights of the initial error (n, n) or the `ObserverPrior` for it, of w and of v (p, p).
     discount : float
         gamma, 1 for none.
 

@@ -34,13 +34,7 @@ def catalogue() -> dict[str, Callable[..., Example]]:
     6
     """
     functions: tuple[Callable[..., Example], ...] = (
-        batch_reactor,
-        van_der_pol,
-        cstr,
-        pendulum,
-        vehicle,
-        quadrotor,
-        chain_of_masses,
+        batch_reactor, van_der_pol, cstr, pendulum, vehicle, quadrotor, chain_of_masses,
         battery_cell,
     )
     return {function.__name__: function for function in functions}

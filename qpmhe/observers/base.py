@@ -21,16 +21,12 @@ class Sample:
 
     Parameters
     ----------
-    system : System
-        The model that holds at this stage.
-    u : (m,) array
-        The input.
+    system, u : System and (m,) array
+        The model that holds at this stage, and the input.
     f_jacobian, h_jacobian : (n, n) and (p, n) array or None
         Jacobians at z, if `Observer.needs_jacobians`.
-    observed : (p,) bool array or None
-        Which components of y are there; None if all are.
-    noise_weight : (p, p) array or None
-        Weight of this sample's noise, if it is not the usual one.
+    observed, noise_weight : (p,) bool and (p, p) array or None
+        Which components of y are there, and the weight of its noise; None as usual.
     covariance : (n, n) array or None
         Covariance of x(t) - z(t), if the observer has one.
     """

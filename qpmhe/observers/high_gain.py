@@ -73,17 +73,13 @@ class HighGain(Luenberger):
 
     Raises
     ------
-    OptionError
-        If epsilon or dt is not positive, a root not in the left half plane, or the sampling
-        unknown.
-    ShapeError
-        If there are not n coefficients. Where the observer meets the system: if that has
-        another number of states, or not one output.
-    ModelError
-        Where the observer meets the system: if A - K C, with the Jacobians at the initial
-        state (and zero input), is not stable. The text names its spectral radius.
-    InvalidInputError
-        Where the observer meets the system: if its sampling time is not dt.
+    OptionError, ShapeError
+        If epsilon or dt is not positive, there are not n coefficients, a root is not in the left
+        half plane, or the sampling is unknown.
+    ShapeError, InvalidInputError, ModelError
+        Where the observer meets the system: if that has another number of states, another
+        sampling time, or not one output, or if A - K C, with the Jacobians at the initial state
+        (and zero input), is not stable. The text names its spectral radius.
 
     References
     ----------
