@@ -76,11 +76,6 @@ def attack_detectability(
         Rounds of changes.
     seed : int
         Of the random numbers.
-
-    Raises
-    ------
-    SetError, ModelError, OptionError, InvalidInputError
-        If an argument does not fit.
     """
     place, rng = _begun(system, region, claim, inputs, trials, steps, polish, seed)
     acting = _inputs(place, trials, steps, rng)
@@ -123,11 +118,6 @@ def attack_observer(
         The observer's.
     claim : DecayingSums
         rho, C_p, C_w and C_v.
-
-    Raises
-    ------
-    SetError, ModelError, OptionError, InvalidInputError, ShapeError
-        If an argument does not fit.
     """
     place, rng = _begun(system, region, claim, inputs, trials, steps, polish, seed)
     K = numbers("gain", gain)
@@ -390,11 +380,6 @@ def attack_estimator(
         How many runs are made worse, and in how many rounds.
     seed : int
         Of the random numbers.
-
-    Raises
-    ------
-    InvalidInputError, OptionError
-        If an argument does not fit.
     """
     if not isinstance(certificate, Certificate):
         raise InvalidInputError(

@@ -32,6 +32,8 @@ def costs(
 ) -> Any:
     """True cost J of estimates and candidates, on a logarithmic axis; kept steps are marked.
 
+    Errors are those of `states`.
+
     Parameters
     ----------
     run : Run
@@ -39,11 +41,6 @@ def costs(
         As for `states`.
     axes : matplotlib Axes, optional
         Where to draw; a figure is made if left out.
-
-    Raises
-    ------
-    InvalidInputError, ShapeError, OptionError
-        As for `states`.
     """
     check_run(run)
     dt = positive("dt", dt)
@@ -75,12 +72,7 @@ def outcomes(
     Parameters
     ----------
     run, dt, time_label, axes
-        As for `costs`.
-
-    Raises
-    ------
-    InvalidInputError, ShapeError, OptionError
-        As for `states`.
+        As for `costs`, errors too.
     """
     check_run(run)
     dt = positive("dt", dt)
@@ -109,14 +101,9 @@ def step_times(run: Run, *, deadline: float | None = None, axes: Any = None) -> 
     Parameters
     ----------
     run, axes
-        As for `costs`.
+        As for `costs`, errors too.
     deadline : float, optional
         Seconds, drawn as a line.
-
-    Raises
-    ------
-    InvalidInputError, ShapeError, OptionError
-        As for `states`.
     """
     check_run(run)
     if deadline is not None:
