@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import record, vector
+from .._checks import Array, record, vector
 from ..costs import Cost, CostConstants, ObserverPrior, QuadraticCost
 from ..errors import InvalidInputError, ModelError, ShapeError
 from ..model.sets import Box, ConvexSet
@@ -19,14 +20,12 @@ from ..observers import Observer, Sample
 from .branch_and_bound import output_lipschitz
 from .deadline import PART_SECONDS, Deadline
 from .evaluation import evaluated
-from .evidence import CertificateError, Evidence
+from .evidence import Evidence
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
-from .observer import constant_gain
+from .observer import gain_if_constant
 from .regions import Region, bounded_region, checked_system
 
 __all__ = ["Audit", "Finding", "audit", "checked_ingredients"]
-
-Array = NDArray[np.float64]
 
 _SAMPLES = 2000
 _SEED = 20210829
@@ -61,9 +60,7 @@ class Finding:
             "name": self.name, "label": self.label, "holds": self.holds, "needed": self.needed,
             "evidence": None if self.evidence is None else self.evidence.value,
             "text": self.text, "value": _plain(self.value),
-            "counterexample": {
-                key: _plain(value) for key, value in self.counterexample.items()
-            },
+            "counterexample": {key: _plain(value) for key, value in self.counterexample.items()},
         }
 
 
@@ -99,47 +96,35 @@ def _correction(system: System, observer: Observer) -> Callable[[Array, Array], 
 
 def _no_correction_finding(system: System, observer: Observer, region: Region) -> Finding:
     """Whether the observer corrects where the output fits."""
-    name, label = "no correction without error", "ass:observer_0"
-    try:
-        gain = constant_gain(observer, system)
-    except CertificateError:
-        gain = None
-    if gain is not None:
-        return Finding(name, label, True, Evidence.PROVED, "L(z, v) = L v vanishes with v")
+    found = partial(Finding, "no correction without error", "ass:observer_0")
+    if gain_if_constant(observer, system) is not None:
+        return found(True, Evidence.PROVED, "L(z, v) = L v vanishes with v")
     correction = _correction(system, observer)
     if correction is None:
-        return Finding(
-            name, label, True, Evidence.ASSUMED,
+        return found(
+            True, Evidence.ASSUMED,
             f"{type(observer).__name__} multiplies v by its gain of the moment",
         )
     points = region.sample(_SAMPLES, np.random.default_rng(_SEED))[:, : system.n]
     for z in points:
         value = correction(z, np.zeros(system.p))
         if value.any():
-            return Finding(
-                name, label, False, Evidence.PROVED,
+            return found(
+                False, Evidence.PROVED,
                 f"L(z, 0) = {value.tolist()} at z = {z.tolist()}", None, {"z": z, "L": value},
             )
-    return Finding(
-        name, label, True, Evidence.SAMPLED, f"L(z, 0) = 0 at {points.shape[0]} states"
-    )
+    return found(True, Evidence.SAMPLED, f"L(z, 0) = 0 at {points.shape[0]} states")
 
 
 def _kappa_finding(
     system: System, observer: Observer, region: Region, run: _ObserverRun | None
 ) -> Finding:
     """The bound on the correction."""
-    name, label = "correction bound", "eq:kappa"
-    try:
-        gain = constant_gain(observer, system)
-    except CertificateError:
-        pass
-    else:
+    found = partial(Finding, "correction bound", "eq:kappa")
+    gain = gain_if_constant(observer, system)
+    if gain is not None:
         kappa = float(norm_bound(Matrices.exact(gain[None]))[0])
-        return Finding(
-            name, label, True, Evidence.PROVED, f"kappa = |L| = {kappa:.6g}, of a constant gain",
-            kappa,
-        )
+        return found(True, Evidence.PROVED, f"kappa = |L| = {kappa:.6g}, of a constant gain", kappa)
     correction = _correction(system, observer)
     if correction is not None:
         worst, z, v = _steepest(correction, system, region)
@@ -150,14 +135,14 @@ def _kappa_finding(
         worst = float(ratios.max(initial=0.0))
         how = f"the largest |L(t)| / |v_z(t)| on a run of {sizes.size} samples"
     else:
-        return Finding(
-            name, label, None, None,
+        return found(
+            None, None,
             f"{type(observer).__name__} has a gain that follows from what was measured: pass a "
             "run to see how large it gets",
         )
     if not np.isfinite(worst):
-        return Finding(name, label, False, Evidence.SAMPLED, f"kappa is infinite: {how}")
-    return Finding(name, label, True, Evidence.SAMPLED, f"kappa = {worst:.6g}, {how}", worst)
+        return found(False, Evidence.SAMPLED, f"kappa is infinite: {how}")
+    return found(True, Evidence.SAMPLED, f"kappa = {worst:.6g}, {how}", worst)
 
 
 def _steepest(
@@ -180,7 +165,7 @@ def _steepest(
 
 def _cost_finding(cost: Cost) -> tuple[CostConstants | None, Finding]:
     """The cost's constants, rounded outward where they could be."""
-    name, label = "cost bounds", "ass:stagecosts"
+    found = partial(Finding, "cost bounds", "ass:stagecosts")
     constants = cost.constants
     if constants is None:
         why = (
@@ -188,9 +173,7 @@ def _cost_finding(cost: Cost) -> tuple[CostConstants | None, Finding]:
             if cost.discount < 1.0
             else "its terms are not bounded by powers with one exponent, above and below"
         )
-        return None, Finding(
-            name, label, False, Evidence.PROVED, f"the cost has no constants: {why}", None
-        )
+        return None, found(False, Evidence.PROVED, f"the cost has no constants: {why}", None)
     evidence = Evidence.ASSUMED
     if isinstance(cost, QuadraticCost):
         evidence = Evidence.PROVED
@@ -212,35 +195,35 @@ def _cost_finding(cost: Cost) -> tuple[CostConstants | None, Finding]:
     text = f"a = {constants.exponent:.6g}, {terms}"
     if evidence is Evidence.ASSUMED:
         text += ", as the cost states them"
-    return constants, Finding(name, label, True, evidence, text, constants.exponent)
+    return constants, found(True, evidence, text, constants.exponent)
 
 
 def _invariance_finding(system: System, region: Region) -> Finding:
     """Whether f maps X to itself."""
-    name, label = "states stay in X", "eq:system"
+    found = partial(Finding, "states stay in X", "eq:system")
     points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
     if system.states is not None:
         points = points[[system.states.violation(x) == 0.0 for x in points[:, : system.n]]]
     x, u = points[:, : system.n], points[:, system.n :]
     if not x.shape[0]:
-        return Finding(name, label, None, None, "the region and X have no sample in common")
+        return found(None, None, "the region and X have no sample in common")
     following = evaluated("f", system.f, x, u)
     lost = ~np.isfinite(following).all(axis=1)
     if lost.any():
         k = int(np.argmax(lost))
-        return Finding(
-            name, label, False, Evidence.PROVED,
+        return found(
+            False, Evidence.PROVED,
             f"f is not finite: {following[k].tolist()} at x = {x[k].tolist()}"
             + (f", u = {u[k].tolist()}" if system.m else ""),
             None, {"x": x[k], "f(x)": following[k]} | ({"u": u[k]} if system.m else {}),
         )
     if system.states is None:
-        return Finding(name, label, True, Evidence.PROVED, "X is the whole space")
+        return found(True, Evidence.PROVED, "X is the whole space")
     missed = np.array([system.states.violation(one) for one in following])
     worst = int(missed.argmax())
     if missed[worst] == 0.0:
-        return Finding(
-            name, label, True, Evidence.SAMPLED,
+        return found(
+            True, Evidence.SAMPLED,
             f"f(x) is in X for {x.shape[0]} states x of X in the region",
         )
     counterexample: dict[str, Any] = {
@@ -248,8 +231,8 @@ def _invariance_finding(system: System, region: Region) -> Finding:
     }
     if system.m:
         counterexample["u"] = u[worst]
-    return Finding(
-        name, label, False, Evidence.PROVED,
+    return found(
+        False, Evidence.PROVED,
         f"f leaves X from {x[worst].tolist()}, which is in it, to {following[worst].tolist()}: by "
         f"{missed[worst]:.6g}; the disturbance must then lead back",
         None, counterexample,
@@ -258,17 +241,15 @@ def _invariance_finding(system: System, region: Region) -> Finding:
 
 def _candidate_finding(system: System, region: Region, run: _ObserverRun | None) -> Finding:
     """Whether the candidate lies in X, W and V along a run."""
-    name, label = "candidate in the sets", "ass:observer"
-    sets = (
-        ("X", "z", system.states), ("W", "L", system.disturbances), ("V", "v_z", system.noises)
-    )
+    found = partial(Finding, "candidate in the sets", "ass:observer")
+    sets = (("X", "z", system.states), ("W", "L", system.disturbances), ("V", "v_z", system.noises))
     if all(one is None for _, _, one in sets):
-        return Finding(
-            name, label, True, Evidence.PROVED, "X, W and V are the whole space"
+        return found(
+            True, Evidence.PROVED, "X, W and V are the whole space"
             + ("" if run is None else f"; {_within(region, run)}"),
         )
     if run is None:
-        return Finding(name, label, None, None, "pass a run, to check the candidate along it")
+        return found(None, None, "pass a run, to check the candidate along it")
     outside: list[str] = []
     counterexample: dict[str, Any] = {}
     for letter, symbol, one in sets:
@@ -286,11 +267,9 @@ def _candidate_finding(system: System, region: Region, run: _ObserverRun | None)
                 "t": t, symbol: values[t], "missed by": float(missed[t])
             }
     if outside:
-        return Finding(
-            name, label, False, Evidence.PROVED, ". ".join(outside), None, counterexample
-        )
-    return Finding(
-        name, label, True, Evidence.SAMPLED,
+        return found(False, Evidence.PROVED, ". ".join(outside), None, counterexample)
+    return found(
+        True, Evidence.SAMPLED,
         f"z, L and v_z are in X, W and V on a run of {run.noises.shape[0]} samples; "
         f"{_within(region, run)}",
     )
@@ -315,7 +294,6 @@ class Audit:
     constants : CostConstants or None
         The cost's constants, rounded outward where possible.
     region : Region
-        Where.
     """
 
     findings: tuple[Finding, ...]
@@ -351,31 +329,21 @@ class Audit:
 
 
 def audit(
-    system: System,
-    observer: Observer,
-    cost: Cost,
-    region: ConvexSet | Region | None = None,
-    run: Record | ArrayLike | None = None,
-    *,
-    initial_state: ArrayLike | None = None,
-    inputs: Box | None = None,
-    seconds: float | Deadline = PART_SECONDS,
+    system: System, observer: Observer, cost: Cost, region: ConvexSet | Region | None = None,
+    run: Record | ArrayLike | None = None, *, initial_state: ArrayLike | None = None,
+    inputs: Box | None = None, seconds: float | Deadline = PART_SECONDS,
 ) -> Audit:
-    r"""Check each assumption of the theorem, and show where it fails.
+    """Check each assumption of the theorem, and show where it fails.
 
     Parameters
     ----------
-    system, observer, cost
-        What the estimator is made of.
-    region : Box, Polytope or Region, optional
-        A bounded set of states; the system's own if left out.
+    system, observer, cost, region, inputs
+        As for `certify`.
     run : Record or (T, p) array_like, optional
         A record, simulated or measured, along which the candidate is checked; a record with
         inputs is needed for a system with inputs.
     initial_state : (n,) array_like, optional
         z(0) of that run; needed with it.
-    inputs : Box, optional
-        Bounds on the inputs, for a system with inputs.
     seconds : float or Deadline
         How long the output's Lipschitz constant may take, about.
 

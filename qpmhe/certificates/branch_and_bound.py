@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import Array
 from ..model.system import System
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel
@@ -17,8 +18,6 @@ from .inequalities import Form, Matrices, definite, norm_bound
 from .regions import Region
 
 __all__ = ["Cover", "constant_output", "cover", "output_lipschitz"]
-
-Array = NDArray[np.float64]
 
 _CHUNK = 256
 _MOST_CELLS = 40_000
@@ -72,9 +71,7 @@ def cover(
         broken = _broken(form, enclosure.centre[left])
         broken &= region.contains(middle[:, : model.n])
         if broken.any():
-            return Cover(
-                False, cells, margin, middle[broken], enclosure.centre[left][broken]
-            )
+            return Cover(False, cells, margin, middle[broken], enclosure.centre[left][broken])
         if cells > most_cells:
             return Cover(False, cells, margin, *nowhere)
         low, high, _ = _halved(
@@ -126,8 +123,7 @@ def _scores(
     scores = enclosure.excess[left] + corner_share * corners
     known = np.isfinite(scores).all(axis=1) & (scores.max(axis=1) > 0.0)
     width = np.where(region.upper > region.lower, region.upper - region.lower, np.inf)
-    chosen: Array = np.where(known[:, None], scores, (high - low) / width)
-    return chosen
+    return np.where(known[:, None], scores, (high - low) / width)
 
 
 def _halved(

@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import count, numbers, vector
+from .._checks import Array, count, numbers, vector
 from ..costs import Cost
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.estimate import Status
@@ -20,16 +20,14 @@ from ..model.system import System
 from ..observers import Observer
 from .audit import Audit
 from .decay import checked_length
-from .evidence import CertificateError, Evidence, MismatchError, weakest
+from .evidence import Evidence, MismatchError, weakest
 from .horizon_bounds import HorizonBounds, Kind, window_bound
-from .observer import constant_gain
+from .observer import gain_if_constant
 from .properties import Detectability, ObserverStability, fitting, json_ready
 from .regions import Region
 from .theorem import Sizes
 
 __all__ = ["ASSUMED", "Certificate", "CheckedRun"]
-
-Array = NDArray[np.float64]
 
 # The constants are upper bounds, what is computed from them is not: this covers its rounding.
 _OUTWARD = 1.0 + 1e-9
@@ -84,8 +82,7 @@ class Certificate:
     sizes : Sizes
         For which errors the bounds are tight.
     origin : tuple
-        What `certify` made it of. A certificate whose parts are others, or that was made by
-        hand, is assumed.
+        What `certify` made it of. Certificates made or changed by hand are assumed.
 
     Raises
     ------
@@ -112,10 +109,7 @@ class Certificate:
     @cached_property
     def gain(self) -> Array | None:
         """The observer's constant gain, if it has one."""
-        try:
-            return constant_gain(self.observer, self.system)
-        except CertificateError:
-            return None
+        return gain_if_constant(self.observer, self.system)
 
     @property
     def ingredients(self) -> tuple[Any, ...]:
@@ -171,17 +165,11 @@ class Certificate:
         return tuple(kinds)
 
     def bound(
-        self,
-        run: Run | None,
-        disturbances: ArrayLike,
-        noises: ArrayLike,
-        *,
-        initial_error: ArrayLike,
-        horizon: int | None = None,
-        kind: Kind = "paper",
+        self, run: Run | None, disturbances: ArrayLike, noises: ArrayLike, *,
+        initial_error: ArrayLike, horizon: int | None = None, kind: Kind = "paper",
         source: MovingHorizonEstimator | CheckedRun | None = None,
     ) -> Array:
-        """The bound of the error |x(t) - x_hat(t)| along a run.
+        """The bound of the error |x(t) - x_hat(t)| along a run at t = 0, ..., T, (T + 1,).
 
         Parameters
         ----------
@@ -201,14 +189,9 @@ class Certificate:
             estimates' own costs in place of their bound.
         source : MovingHorizonEstimator or Monitor, optional
             The estimator that made the run, as the run left it, or the monitor that checked
-            all its estimates: a run does not say its horizon and cost. Checked
-            where given, and needed for ``kind="measured"``; without one, the bound is that
-            of an estimator with this certificate's cost and this horizon, whatever the run.
-
-        Returns
-        -------
-        (T + 1,) array
-            At t = 0, ..., T.
+            all its estimates, for the horizon and cost of the run. Needed for
+            ``kind="measured"``; without one, the bound is that of an estimator with this
+            certificate's cost and this horizon, whatever the run.
 
         Raises
         ------
@@ -246,31 +229,19 @@ class Certificate:
         return _OUTWARD * window_bound(chosen, kind, self.kinds).bound(start, w, v, costs=costs)
 
     def funnel(
-        self,
-        w_max: float,
-        v_max: float,
-        *,
-        initial_error: float,
-        steps: int,
-        horizon: int | None = None,
-        kind: Kind = "paper",
+        self, w_max: float, v_max: float, *, initial_error: float, steps: int,
+        horizon: int | None = None, kind: Kind = "paper",
     ) -> Array:
-        """The bound before anything is measured, for all |w| <= w_max and |v| <= v_max.
+        """The bound before anything is measured, for |w| <= w_max and |v| <= v_max, (T + 1,).
 
         Parameters
         ----------
-        w_max, v_max : float
-            Bounds on the lengths of w(t) and v(t).
-        initial_error : float
-            A bound on |x_0 - z_0|.
+        w_max, v_max, initial_error : float
+            Bounds on the lengths of w(t), v(t) and x_0 - z_0.
         steps : int
             T.
         horizon, kind
-            As of `bound`; not "measured".
-
-        Returns
-        -------
-        (T + 1,) array
+            As for `bound`; not "measured".
 
         Raises
         ------
@@ -294,18 +265,7 @@ class Certificate:
     def limit(
         self, w_max: float, v_max: float, *, horizon: int | None = None, kind: Kind = "paper"
     ) -> float:
-        """What the funnel tends to as t grows.
-
-        Parameters
-        ----------
-        w_max, v_max, horizon, kind
-            As of `funnel`.
-
-        Raises
-        ------
-        OptionError
-            As of `funnel`.
-        """
+        """What the funnel tends to as t grows; arguments and errors as for `funnel`."""
         w, v = checked_length("w_max", w_max), checked_length("v_max", v_max)
         chosen = self.of(horizon)
         if kind == "paper":
@@ -313,45 +273,23 @@ class Certificate:
         return _OUTWARD * window_bound(chosen, kind, self.kinds).limit(w, v)
 
     def vacuous(
-        self,
-        w_max: float | None = None,
-        v_max: float | None = None,
-        *,
-        horizon: int | None = None,
+        self, w_max: float | None = None, v_max: float | None = None, *, horizon: int | None = None,
         kind: Kind = "paper",
     ) -> bool:
         """Whether the bound says nothing: its limit is no less than the region's diameter.
 
         State and estimate are both in the region, so that their distance is never more.
-
-        Parameters
-        ----------
-        w_max, v_max : float, optional
-            As of `funnel`; left out, the certificate's `sizes`.
-        horizon, kind
-            As of `funnel`.
-
-        Raises
-        ------
-        OptionError
-            As of `funnel`.
+        Arguments and errors are those of `funnel`; w_max and v_max are by default those of
+        the certificate's `sizes`.
         """
         w = self.sizes.disturbance if w_max is None else w_max
         v = self.sizes.noise if v_max is None else v_max
         return not self.limit(w, v, horizon=horizon, kind=kind) < self.diameter
 
     def of(self, horizon: int | None = None) -> HorizonBounds:
-        """The constants for a horizon.
+        """The constants for a horizon N, which may be left out if there is only one.
 
-        Parameters
-        ----------
-        horizon : int, optional
-            N; may be left out if there is only one.
-
-        Raises
-        ------
-        OptionError
-            If there are none for it.
+        An `OptionError` says which there are if there are none for this one.
         """
         if horizon is None and len(self.bounds) == 1:
             return next(iter(self.bounds.values()))
@@ -363,18 +301,7 @@ class Certificate:
         return self.bounds[horizon]
 
     def check_estimator(self, estimator: MovingHorizonEstimator) -> None:
-        """Require that an estimator has the very system, observer and cost of this certificate.
-
-        Parameters
-        ----------
-        estimator : MovingHorizonEstimator
-            The estimator.
-
-        Raises
-        ------
-        MismatchError
-            If one of the three is another object.
-        """
+        """Raise a `MismatchError` unless the estimator has this very system, observer and cost."""
         for name in ("system", "observer", "cost"):
             if getattr(self, name) is not getattr(estimator, name):
                 raise MismatchError(
@@ -437,9 +364,7 @@ def _signals(
 ) -> tuple[Array, Array]:
     """Vectors or lengths at each sample."""
     w, v = numbers("disturbances", disturbances), numbers("noises", noises)
-    steps = len(run) if run is not None else next(
-        (len(x) for x in (w, v) if x.ndim), None
-    )
+    steps = len(run) if run is not None else next((len(x) for x in (w, v) if x.ndim), None)
     if steps is None:
         raise ShapeError(
             "disturbances and noises are numbers and there is no run; expected a sequence "
@@ -451,9 +376,7 @@ def _signals(
                 f"{name} has shape {x.shape}; expected ({steps}, {width}), their lengths "
                 f"({steps},), or a number."
             )
-    return (
-        w if w.ndim else np.full(steps, float(w)), v if v.ndim else np.full(steps, float(v))
-    )
+    return (w if w.ndim else np.full(steps, float(w)), v if v.ndim else np.full(steps, float(v)))
 
 
 def _checked_costs(

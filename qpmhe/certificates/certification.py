@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .._checks import count
 from ..costs import Cost, CostConstants
@@ -33,8 +32,6 @@ from .theorem import Sizes, level, tighten
 
 __all__ = ["certify", "cost_sizes"]
 
-Array = NDArray[np.float64]
-
 Result = TypeVar("Result", Detectability, ObserverStability)
 
 # Rates that are tried beside the first one found, by what is left to 1; and how many more
@@ -48,18 +45,10 @@ _AUDIT, _FIRST, _LATER = 0.25, 0.4, 0.25
 
 
 def certify(
-    system: System,
-    observer: Observer,
-    cost: Cost,
-    *,
-    horizon: int | Sequence[int],
-    region: ConvexSet | Region | None = None,
-    inputs: Box | None = None,
-    sizes: Sizes | None = None,
-    detectability: Detectability | None = None,
-    stability: ObserverStability | None = None,
-    run: Record | ArrayLike | None = None,
-    initial_state: ArrayLike | None = None,
+    system: System, observer: Observer, cost: Cost, *, horizon: int | Sequence[int],
+    region: ConvexSet | Region | None = None, inputs: Box | None = None, sizes: Sizes | None = None,
+    detectability: Detectability | None = None, stability: ObserverStability | None = None,
+    run: Record | ArrayLike | None = None, initial_state: ArrayLike | None = None,
     seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Certificate:
     """Check the theorem's assumptions on a set of states, and bound the estimator's error.
@@ -85,14 +74,10 @@ def certify(
     seconds : float or Deadline
         How long the audit and the search for constants may take, about, from when the solvers
         are loaded. What is not proved when its share is over rests on samples, and says so;
-        better rates are sought in what is left. The bounds are computed from the constants
-        after that, which takes a fraction of a second for each horizon (longer for N in the
-        hundreds): all pairs of rates are tried for up to six horizons, of more only those
-        that were best at the smallest, the middle and the largest one.
-
-    Returns
-    -------
-    Certificate
+        better rates are sought in what is left. The bounds are computed after that, in a
+        fraction of a second for each horizon (longer for N in the hundreds): up to six horizons
+        try all pairs of rates, more only those that were best at the smallest, the middle and
+        the largest one.
 
     Raises
     ------
@@ -143,9 +128,7 @@ def certify(
 
     def observed_at(rate: float | None) -> ObserverStability:
         share = deadline.part(_FIRST if rate is None else _LATER)
-        return certify_observer(
-            system, observer, place, rho=rate, weights=noisy, seconds=share
-        )
+        return certify_observer(system, observer, place, rho=rate, weights=noisy, seconds=share)
 
     # One of each before the others: what cannot be certified fails soon.
     detected = [detected_at(None) if detectability is None else detectability]
@@ -228,8 +211,7 @@ def _family(first: Result, certified: Callable[[float | None], Result]) -> list[
 
 
 def _refined(
-    found: list[Result],
-    certified: Callable[[float | None], Result],
+    found: list[Result], certified: Callable[[float | None], Result],
     value: Callable[[Result], float],
 ) -> list[Result]:
     """The same results, and others about the rate of the best of them."""

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import numbers, positive
+from .._checks import Array, numbers, positive
 from ..errors import OptionError, ShapeError
 
 __all__ = ["DecayingSums"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ class DecayingSums:
         return self.initial, self.disturbance, self.noise
 
     def bound(self, initial: float, disturbances: ArrayLike, noises: ArrayLike) -> Array:
-        """The right-hand side at t = 0, ..., T.
+        """The right-hand side at t = 0, ..., T, (T + 1,).
 
         Parameters
         ----------
@@ -85,10 +83,6 @@ class DecayingSums:
             |e(0)|.
         disturbances, noises : (T,) array_like
             |w(0)|, ..., |w(T-1)| and |v(0)|, ..., |v(T-1)|.
-
-        Returns
-        -------
-        (T + 1,) array
 
         Raises
         ------
@@ -105,15 +99,7 @@ class DecayingSums:
     def limit(self, disturbance: float, noise: float) -> float:
         """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows.
 
-        Parameters
-        ----------
-        disturbance, noise : float
-            Bounds on the lengths.
-
-        Raises
-        ------
-        OptionError
-            If one is negative or not finite.
+        An `OptionError` names a length that is negative or not finite.
         """
         checked_length("disturbance", disturbance)
         checked_length("noise", noise)
@@ -126,17 +112,8 @@ class DecayingSums:
         r"""Constants of a slower bound that follows from this one.
 
         Since :math:`\tau \ge 1` in the sums, :math:`c\, r^\tau \le (c\, r / s) s^\tau` for a
-        rate s >= r: the disturbance's and noise's constants become smaller.
-
-        Parameters
-        ----------
-        rate : float
-            s, at least the present one and below 1.
-
-        Raises
-        ------
-        OptionError
-            If it is not.
+        rate s >= r: the disturbance's and noise's constants become smaller. An `OptionError`
+        is raised unless the rate, s, is at least the present one and below 1.
         """
         if not self.rate <= rate < 1.0:
             raise OptionError(

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from .deadline import PART_SECONDS, Deadline
 from .decay import checked_rate
-from .evidence import JumpError, NotCertifiedError, OutOfTimeError
+from .evidence import NotCertifiedError
 from .inequalities import OutputInjection, OutputWeight, euclidean_constants
 from .properties import Detectability, sealed
 from .regions import Region, bounded_region
@@ -18,8 +17,6 @@ from .search import Search, checked_weights
 
 __all__ = ["certify_detectability"]
 
-Array = NDArray[np.float64]
-
 # Of an output in its own size, for a state in the region's.
 _UNSEEN = 1e-9
 _STEEP = 1e6
@@ -27,15 +24,11 @@ _STAY = "it holds for trajectories that stay in the region, both of a pair, with
 
 
 def certify_detectability(
-    system: System,
-    region: ConvexSet | Region | None = None,
-    *,
-    eta: float | None = None,
-    inputs: Box | None = None,
-    weights: tuple[float, float] = (1.0, 1.0),
+    system: System, region: ConvexSet | Region | None = None, *, eta: float | None = None,
+    inputs: Box | None = None, weights: tuple[float, float] = (1.0, 1.0),
     seconds: float | Deadline = PART_SECONDS,
 ) -> Detectability:
-    r"""Find and verify constants of e-IOSS, Definition def:eIOSS.
+    """Find and verify constants of e-IOSS, Definition def:eIOSS.
 
     A constant P with one of the inequalities of `qpmhe.certificates.inequalities` is sought by
     semidefinite programs at some states of the region, and then verified on all of it: the
@@ -46,15 +39,11 @@ def certify_detectability(
 
     Parameters
     ----------
-    system : System
-        The system.
-    region : Box, Polytope or Region, optional
-        A bounded set of states; the system's own if left out.
+    system, region, inputs
+        As for `certify`.
     eta : float, optional
         The rate; left out, one is chosen between the smallest feasible one and 1 for which
         lasting disturbances are bounded best.
-    inputs : Box, optional
-        Bounds on the inputs, for a system with inputs.
     weights : (float, float)
         How much the constants c_w and c_v matter, such as typical sizes of disturbance and
         noise; the programs minimise the sum of squares of the products.
@@ -69,12 +58,9 @@ def certify_detectability(
 
     Raises
     ------
-    SetError
-        If the region is not a bounded set of the right dimension.
-    OptionError
-        If eta, the weights or the seconds are out of range.
-    ModelError
-        If the Jacobians are not finite in the region.
+    SetError, OptionError, ModelError
+        If the region is no bounded set of states, eta, the weights or the seconds are out of
+        range, or the Jacobians are not finite in the region.
     NotCertifiedError
         If there are no such constants, or none were found; the text gives the smallest feasible
         rate and what is not detected. An `OutOfTimeError` says that it is not known which.
@@ -109,14 +95,9 @@ def certify_detectability(
     )
 
 
-def _explained(
-    search: Search, error: NotCertifiedError, eta: float | None
-) -> NotCertifiedError:
-    if isinstance(error, (OutOfTimeError, JumpError)):
-        return error
-    try:
-        smallest = search.smallest_rate()
-    except OutOfTimeError:
+def _explained(search: Search, error: NotCertifiedError, eta: float | None) -> NotCertifiedError:
+    smallest = search.explaining_rate(error)
+    if smallest is None:
         return error
     if not np.isfinite(smallest):
         jump = search.jump()

@@ -11,8 +11,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..codegen.expressions import CasadiModel, import_casadi
 from ..model.system import System
 from .evaluation import check_values
@@ -20,8 +20,6 @@ from .intervals import Interval, Jet, OutsideDomainError, variables
 from .regions import Region
 
 __all__ = ["MOST_ACTIVE", "Enclosure", "SmoothModel"]
-
-Array = NDArray[np.float64]
 
 # Beyond, corners would be many: what the other coordinates do is covered by the error.
 MOST_ACTIVE = 6
@@ -60,9 +58,7 @@ class Enclosure:
             error = (error + np.abs(self.slopes[:, rest]).sum(axis=1)) * (1.0 + 1e-12)
         signs = np.array(list(itertools.product((-1.0, 1.0), repeat=active.size)))
         signs = signs.reshape(2**active.size, active.size)
-        moved = self.centre[:, None] + np.einsum(
-            "kj,bjqn->bkqn", signs, self.slopes[:, active]
-        )
+        moved = self.centre[:, None] + np.einsum("kj,bjqn->bkqn", signs, self.slopes[:, active])
         rounding = 1e-15 * (active.size + 2) * (
             np.abs(self.centre) + np.abs(self.slopes[:, active]).sum(axis=1)
         )
@@ -126,9 +122,7 @@ class SmoothModel:
             raise OutsideDomainError("a value that is not finite on the set")
         return entries
 
-    def enclose(
-        self, lower: Array, upper: Array, *, output_only: bool = False
-    ) -> Enclosure:
+    def enclose(self, lower: Array, upper: Array, *, output_only: bool = False) -> Enclosure:
         """The joint Jacobian over cells."""
         with np.errstate(all="ignore"):
             found = self._enclosed(lower, upper, output_only)

@@ -8,13 +8,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import Array
 from ..errors import ModelError
 from ..model.functions import BatchedFunction
 from ..model.system import System
 
 __all__ = ["check_values", "evaluated", "joint_jacobians", "jump_about", "jump_between"]
-
-Array = NDArray[np.float64]
 
 _REMEDY = "Take a smaller region, or make the model defined on all of it."
 # Beyond the steps of derivatives by differences.

@@ -8,13 +8,8 @@ from enum import Enum
 from ..errors import InvalidInputError, QpmheError
 
 __all__ = [
-    "CertificateError",
-    "Evidence",
-    "JumpError",
-    "MismatchError",
-    "NotCertifiedError",
-    "OutOfTimeError",
-    "weakest",
+    "CertificateError", "Evidence", "JumpError", "MismatchError", "NotCertifiedError",
+    "OutOfTimeError", "weakest",
 ]
 
 
@@ -56,23 +51,13 @@ class NotCertifiedError(QpmheError):
     message : str
         What was asked, and what was found.
     suggestions : sequence of str
-        What may help.
+        What may help; the text of the error lists them.
     smallest_rate : float, optional
         The smallest rate that was found to be feasible, where the one asked for was not.
-
-    Attributes
-    ----------
-    suggestions : tuple of str
-        As given; the text of the error lists them.
-    smallest_rate : float or None
-        As given.
     """
 
     def __init__(
-        self,
-        message: str,
-        suggestions: tuple[str, ...] = (),
-        smallest_rate: float | None = None,
+        self, message: str, suggestions: tuple[str, ...] = (), smallest_rate: float | None = None
     ) -> None:
         self.suggestions = tuple(suggestions)
         self.smallest_rate = smallest_rate

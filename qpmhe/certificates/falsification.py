@@ -11,29 +11,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers import available
 
-from .._checks import count, numbers
+from .._checks import Array, count, numbers
 from ..errors import InvalidInputError, ShapeError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from .certificate import Certificate
-from .decay import DecayingSums
+from .decay import DecayingSums, decaying_sums
 from .horizon_bounds import Kind
 from .monitor import Monitor
 from .regions import Region, bounded_region
 
 __all__ = [
-    "NOISES",
-    "Attack",
-    "ClosedRuns",
-    "attack_detectability",
-    "attack_estimator",
-    "attack_observer",
+    "NOISES", "Attack", "ClosedRuns", "attack_detectability", "attack_estimator", "attack_observer",
     "inside",
 ]
 
-Array = NDArray[np.float64]
 Generator = np.random.Generator
 
 # Of two numbers computed in floating point, one exceeds the other by more than this, or not.
@@ -58,15 +52,8 @@ class Attack:
 
 
 def attack_detectability(
-    system: System,
-    region: ConvexSet | Region | None,
-    claim: DecayingSums,
-    *,
-    trials: int,
-    steps: int = 20,
-    polish: int = 40,
-    seed: int = 0,
-    inputs: Box | None = None,
+    system: System, region: ConvexSet | Region | None, claim: DecayingSums, *, trials: int,
+    steps: int = 20, polish: int = 40, seed: int = 0, inputs: Box | None = None,
 ) -> Attack:
     """Look for two trajectories in the region that violate (eq:eIOSS).
 
@@ -77,27 +64,18 @@ def attack_detectability(
 
     Parameters
     ----------
-    system : System
-        The system.
+    system, inputs
+        As for `certify`; a region with inputs needs no others.
     region : Box, Polytope, Region or None
         Where both trajectories stay; None for the system's own states.
     claim : DecayingSums
         eta, c_p, c_w and c_v.
-    trials : int
-        Number of pairs.
-    steps : int
-        Their length.
+    trials, steps : int
+        Number of pairs, and their length.
     polish : int
         Rounds of changes.
     seed : int
         Of the random numbers.
-    inputs : Box, optional
-        Bounds on the inputs, for a system with inputs, unless the region has them.
-
-    Raises
-    ------
-    SetError, ModelError, OptionError, InvalidInputError
-        If an argument does not fit.
     """
     place, rng = _begun(system, region, claim, inputs, trials, steps, polish, seed)
     acting = _inputs(place, trials, steps, rng)
@@ -124,16 +102,8 @@ def attack_detectability(
 
 
 def attack_observer(
-    system: System,
-    region: ConvexSet | Region | None,
-    gain: ArrayLike,
-    claim: DecayingSums,
-    *,
-    trials: int,
-    steps: int = 30,
-    polish: int = 40,
-    seed: int = 0,
-    inputs: Box | None = None,
+    system: System, region: ConvexSet | Region | None, gain: ArrayLike, claim: DecayingSums, *,
+    trials: int, steps: int = 30, polish: int = 40, seed: int = 0, inputs: Box | None = None,
 ) -> Attack:
     """Look for a run of an observer with constant gain that violates (eq:RGES).
 
@@ -142,19 +112,12 @@ def attack_observer(
 
     Parameters
     ----------
-    system, region
-        As of `attack_detectability`.
+    system, region, trials, steps, polish, seed, inputs
+        As for `attack_detectability`.
     gain : (n, p) array_like
         The observer's.
     claim : DecayingSums
         rho, C_p, C_w and C_v.
-    trials, steps, polish, seed, inputs
-        As of `attack_detectability`.
-
-    Raises
-    ------
-    SetError, ModelError, OptionError, InvalidInputError, ShapeError
-        If an argument does not fit.
     """
     place, rng = _begun(system, region, claim, inputs, trials, steps, polish, seed)
     K = numbers("gain", gain)
@@ -190,9 +153,7 @@ def attack_observer(
             misfit = y[:, t] - system.h.batch(held, acting[:, t])
             z = system.f.batch(held, acting[:, t]) + misfit @ K.T
             error[:, t + 1] = np.linalg.norm(x[:, t + 1] - z, axis=-1)
-        bound = _bounds(
-            claim, error[:, 0], np.linalg.norm(w, axis=-1), np.linalg.norm(v, axis=-1)
-        )
+        bound = _bounds(claim, error[:, 0], np.linalg.norm(w, axis=-1), np.linalg.norm(v, axis=-1))
         return np.where(alive, error, np.nan), bound
 
     def change(runs: Array, size: float) -> Array:
@@ -289,9 +250,7 @@ def _pairs(
 
 def _hidden(system: System, points: Array, like: Array, u: Array) -> Array:
     """Points moved so that, to first order, they have the outputs of others."""
-    C = np.broadcast_to(
-        system.h_jacobian.batch(points, u), (len(points), system.p, system.n)
-    )
+    C = np.broadcast_to(system.h_jacobian.batch(points, u), (len(points), system.p, system.n))
     apart = system.h.batch(like, u) - system.h.batch(points, u)
     moved: Array = points + np.einsum("bnp,bp->bn", np.linalg.pinv(C), apart)
     return np.where(np.isfinite(moved), moved, points)
@@ -299,12 +258,9 @@ def _hidden(system: System, points: Array, like: Array, u: Array) -> Array:
 
 def _bounds(claim: DecayingSums, start: Array, w: Array, v: Array) -> Array:
     """The claimed bound of many runs at once, (B, T + 1)."""
-    bound = np.empty((start.size, w.shape[1] + 1))
-    bound[:, 0] = claim.initial * start
-    entering = claim.disturbance * w + claim.noise * v
-    for t in range(w.shape[1]):
-        bound[:, t + 1] = claim.rate * (bound[:, t] + entering[:, t])
-    return bound
+    decay = claim.rate ** np.arange(w.shape[1] + 1.0)
+    sums = decaying_sums(claim.rate, claim.disturbance * w + claim.noise * v)
+    return claim.initial * start[:, None] * decay + claim.rate * sums
 
 
 def _share(error: Array, bound: Array) -> Array:
@@ -315,10 +271,8 @@ def _share(error: Array, bound: Array) -> Array:
 
 
 def _polished(
-    states: Array,
-    shares: Callable[[Array], tuple[Array, Array]],
-    change: Callable[[Array, float], Array],
-    rounds: int,
+    states: Array, shares: Callable[[Array], tuple[Array, Array]],
+    change: Callable[[Array, float], Array], rounds: int,
 ) -> tuple[Array, Array, Array]:
     """Change what is drawn at random, and keep what raises the largest share of each."""
     error, bound = shares(states)
@@ -349,10 +303,6 @@ def _verdict(
     )
 
 
-def _heavy(rng: Generator, steps: int, width: int) -> Array:
-    return np.clip(rng.standard_t(2.0, (steps, width)), -30.0, 30.0)
-
-
 #: Kinds of noise of size about 1, by name: (generator, steps, width) to (steps, width).
 NOISES: dict[str, Callable[[Generator, int, int], Array]] = {
     "none": lambda _, steps, width: np.zeros((steps, width)),
@@ -367,7 +317,9 @@ NOISES: dict[str, Callable[[Generator, int, int], Array]] = {
     * rng.choice([-1.0, 1.0], width),
     "impulses": lambda rng, steps, width: rng.standard_normal((steps, width))
     * (rng.random((steps, 1)) < 0.1),
-    "heavy tails": _heavy,
+    "heavy tails": lambda rng, steps, width: np.clip(
+        rng.standard_t(2.0, (steps, width)), -30.0, 30.0
+    ),
     "coloured": lambda rng, steps, width: np.cumsum(
         rng.standard_normal((steps, width)), axis=0
     ) / np.sqrt(steps),
@@ -403,16 +355,9 @@ class _Trial:
 
 
 def attack_estimator(
-    certificate: Certificate,
-    *,
-    horizon: int | None = None,
-    trials: int = 60,
-    steps: int = 15,
-    backends: Sequence[str] | None = None,
-    caps: Sequence[int | None] = (0, 1, 2, 5),
-    polished: int = 4,
-    rounds: int = 10,
-    seed: int = 0,
+    certificate: Certificate, *, horizon: int | None = None, trials: int = 60, steps: int = 15,
+    backends: Sequence[str] | None = None, caps: Sequence[int | None] = (0, 1, 2, 5),
+    polished: int = 4, rounds: int = 10, seed: int = 0,
 ) -> ClosedRuns:
     """Look for a run of the estimator whose error exceeds a bound of the certificate.
 
@@ -423,7 +368,6 @@ def attack_estimator(
     Parameters
     ----------
     certificate : Certificate
-        What is to be refuted.
     horizon : int, optional
         N; the only one if left out.
     trials, steps : int
@@ -436,15 +380,6 @@ def attack_estimator(
         How many runs are made worse, and in how many rounds.
     seed : int
         Of the random numbers.
-
-    Returns
-    -------
-    ClosedRuns
-
-    Raises
-    ------
-    InvalidInputError, OptionError
-        If an argument does not fit.
     """
     if not isinstance(certificate, Certificate):
         raise InvalidInputError(
@@ -553,8 +488,7 @@ def _worse(
 
         def moved(values: Array, size: float = size) -> Array:
             scale = float(np.abs(values).max(initial=0.0)) or 1e-3
-            changed: Array = values + size * scale * rng.standard_normal(values.shape)
-            return changed
+            return values + size * scale * rng.standard_normal(values.shape)
 
         other = _Trial(
             inside(region, moved(trial.start)), inside(region, moved(trial.estimate)),

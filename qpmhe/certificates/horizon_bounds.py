@@ -9,7 +9,6 @@ from itertools import product
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..costs import Cost, CostConstants, QuadraticCost
 from ..errors import OptionError
@@ -21,7 +20,6 @@ from .window_bounds import SummedBound, WeightedBound, WindowBound, fit_weight, 
 
 __all__ = ["HorizonBounds", "Kind", "Pairs", "bounds_for", "window_bound", "window_level"]
 
-Array = NDArray[np.float64]
 Pair = tuple[int, int]
 
 Kind = Literal["paper", "summed", "weighted", "measured"]
@@ -84,16 +82,9 @@ class HorizonBounds:
 
 
 def bounds_for(
-    horizon: int,
-    detectabilities: Sequence[Detectability],
-    observers: Sequence[ObserverStability],
-    cost: Cost,
-    constants: CostConstants,
-    *,
-    lipschitz: float,
-    sizes: Sizes,
-    output: Matrices | None = None,
-    pairs: Pairs | None = None,
+    horizon: int, detectabilities: Sequence[Detectability], observers: Sequence[ObserverStability],
+    cost: Cost, constants: CostConstants, *, lipschitz: float, sizes: Sizes,
+    output: Matrices | None = None, pairs: Pairs | None = None,
 ) -> HorizonBounds:
     """The best bounds of each kind that follow from what was certified."""
     kappa = max(each.kappa for each in observers)
@@ -117,9 +108,7 @@ def bounds_for(
     weighted: list[tuple[float, WeightedBound]] = []
     if isinstance(cost, QuadraticCost) and cost.discount == 1.0:
         for i, j in tried.of("weighted", every):
-            sharper = _weighted(
-                cost, detectabilities[i], observers[j], lipschitz, horizon, output
-            )
+            sharper = _weighted(cost, detectabilities[i], observers[j], lipschitz, horizon, output)
             if sharper is not None:
                 weighted.append((window_level(sharper, sizes), sharper))
                 tried.note("weighted", (i, j), weighted[-1][0])

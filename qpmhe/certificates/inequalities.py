@@ -24,22 +24,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import Array
 from .evidence import CertificateError
 
 __all__ = [
-    "ErrorContraction",
-    "Form",
-    "Matrices",
-    "OutputInjection",
-    "OutputWeight",
-    "definite",
-    "eigenvalue_bounds",
-    "euclidean_constants",
-    "norm_bound",
-    "rounded_up",
+    "ErrorContraction", "Form", "Matrices", "OutputInjection", "OutputWeight", "definite",
+    "eigenvalue_bounds", "euclidean_constants", "norm_bound", "rounded_up",
 ]
 
-Array = NDArray[np.float64]
 _UNIT = float(np.finfo(np.float64).eps)  # twice the unit roundoff: a margin in every bound
 _TINY = 1e-290  # covers what underflows
 
@@ -261,9 +253,7 @@ def definite(matrices: Matrices) -> tuple[NDArray[np.bool_], Array]:
     with np.errstate(all="ignore"):
         G = S.T @ Matrices(matrices.middle[usable], radius) @ S
         size = np.abs(G.middle) + G.radius
-        own = np.diagonal(G.middle, axis1=-2, axis2=-1) - np.diagonal(
-            G.radius, axis1=-2, axis2=-1
-        )
+        own = np.diagonal(G.middle, axis1=-2, axis2=-1) - np.diagonal(G.radius, axis1=-2, axis2=-1)
         others = size.sum(axis=-1) - np.diagonal(size, axis1=-2, axis2=-1)
         room = own - others - (own.shape[-1] + 4) * _UNIT * (np.abs(own) + size.sum(axis=-1))
         proved[usable] = (room > 0.0).all(axis=-1) & (values[:, 0] > 0.0)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Interval", "Jet", "OutsideDomainError", "variables"]
+from .._checks import Array
 
-Array = NDArray[np.float64]
+__all__ = ["Interval", "Jet", "OutsideDomainError", "variables"]
 
 # Errors of elementary functions in units in the last place: the C library and NumPy's own
 # vector versions stay within 4.
@@ -102,19 +102,15 @@ class Interval:
 
     def __add__(self, other: Any) -> Interval:
         other = Interval.of(other)
-        return Interval(
-            _sum(self.low, other.low, -np.inf), _sum(self.high, other.high, np.inf)
-        )
+        return Interval(_sum(self.low, other.low, -np.inf), _sum(self.high, other.high, np.inf))
 
     __radd__ = __add__
 
     def __sub__(self, other: Any) -> Interval:
-        difference: Interval = self + (-Interval.of(other))
-        return difference
+        return self + (-Interval.of(other))
 
     def __rsub__(self, other: Any) -> Interval:
-        difference: Interval = Interval.of(other) + (-self)
-        return difference
+        return Interval.of(other) + (-self)
 
     def __mul__(self, other: Any) -> Interval:
         if other is self:
@@ -136,8 +132,7 @@ class Interval:
     __rmul__ = __mul__
 
     def __truediv__(self, other: Any) -> Interval:
-        quotient: Interval = self * Interval.of(other).reciprocal()
-        return quotient
+        return self * Interval.of(other).reciprocal()
 
     def __rtruediv__(self, other: Any) -> Interval:
         quotient: Interval = self.reciprocal() * other
@@ -170,9 +165,7 @@ class Interval:
             return self
         # Odd powers increase: the ends are those of the ends.
         low, high = Interval.of(self.low), Interval.of(self.high)
-        return Interval(
-            (low * low.power(exponent - 1)).low, (high * high.power(exponent - 1)).high
-        )
+        return Interval((low * low.power(exponent - 1)).low, (high * high.power(exponent - 1)).high)
 
     def _increasing(self, function: Callable[[Array], Any], ulps: int = _LIBRARY_ULPS) -> Interval:
         with np.errstate(over="ignore", under="ignore"):
@@ -226,8 +219,7 @@ class Interval:
 
         def reached(phase: float) -> NDArray[np.bool_]:
             first = np.ceil(low - slack - phase)
-            hit: NDArray[np.bool_] = first <= high + slack - phase
-            return hit
+            return first <= high + slack - phase
 
         return Interval(
             np.where(reached(top + 0.5), -1.0, np.maximum(least, -1.0)),
@@ -413,9 +405,7 @@ class Jet:
     def arctan(self) -> Jet:
         """The arc tangent."""
         first = (1.0 + self.value.square()).reciprocal()
-        return self._composed(
-            self.value.arctan(), first, -2.0 * (self.value * first.square())
-        )
+        return self._composed(self.value.arctan(), first, -2.0 * (self.value * first.square()))
 
     def arctan2(self, other: Any) -> Jet:
         """The angle of the point (other, self), off the cut along negative abscissas."""

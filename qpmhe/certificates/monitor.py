@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import count, record
+from .._checks import Array, count, record
 from ..costs import ObserverPrior
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.estimate import Estimate, Status
@@ -21,16 +21,8 @@ from .certificate import Certificate
 from .evidence import MismatchError
 
 __all__ = [
-    "NEEDED",
-    "UNNEEDED",
-    "Hypotheses",
-    "Monitor",
-    "MonitorSummary",
-    "monitor",
-    "monitored_run",
+    "NEEDED", "UNNEEDED", "Hypotheses", "Monitor", "MonitorSummary", "monitor", "monitored_run"
 ]
-
-Array = NDArray[np.float64]
 
 _RELATIVE = 1e-6
 _FEASIBLE = 1e-8  # what the estimator itself takes for rounding on the sets' boundary
@@ -54,8 +46,8 @@ class Hypotheses:
     kappa : bool
         (eq:kappa): |L| <= kappa |v_z| all along the candidate.
     candidate_in_region, estimate_in_region : bool
-        All states of the window but the newest lie in the certified set, and so do the
-        inputs. The newest one need not: nothing is concluded from it yet.
+        All states of the window but the newest, from which nothing is concluded yet, lie in
+        the certified set, and so do the inputs.
     candidate_in_sets : bool
         Assumption ass:observer: the candidate's states, corrections and fitting errors are in
         X, W and V.
@@ -108,10 +100,8 @@ class MonitorSummary:
         Steps at which all needed hypotheses held, whatever had happened before.
     counts : dict of str to int
         At how many steps each hypothesis held.
-    first_failure : int or None
-        The first step at which one did not.
-    failed : tuple of str
-        Which ones, then.
+    first_failure, failed : int or None, and tuple of str
+        The first step at which hypotheses failed, and which.
     """
 
     steps: int
@@ -176,17 +166,7 @@ class Monitor:
     certificate : Certificate
         Of the estimator's system, observer and cost.
     horizon : int
-        The estimator's.
-
-    Attributes
-    ----------
-    horizon : int
-        As given.
-
-    Raises
-    ------
-    OptionError
-        If the certificate has no bounds for this horizon.
+        The estimator's; an `OptionError` is raised if the certificate has no bounds for it.
     """
 
     def __init__(self, certificate: Certificate, horizon: int) -> None:
@@ -199,13 +179,6 @@ class Monitor:
     @classmethod
     def of(cls, certificate: Certificate, estimator: MovingHorizonEstimator) -> Monitor:
         """A monitor for this estimator, before its first measurement.
-
-        Parameters
-        ----------
-        certificate : Certificate
-            The certificate.
-        estimator : MovingHorizonEstimator
-            The estimator.
 
         Raises
         ------
@@ -230,14 +203,7 @@ class Monitor:
         return cls(certificate, estimator.horizon)
 
     def check(self, estimate: Estimate, u: ArrayLike | None = None) -> Hypotheses:
-        """Check the next estimate.
-
-        Parameters
-        ----------
-        estimate : Estimate
-            What `MovingHorizonEstimator.update` returned.
-        u : (m,) array_like, optional
-            The input of that update.
+        """Check the estimate that `MovingHorizonEstimator.update` returned for the next input u.
 
         Raises
         ------
@@ -311,16 +277,8 @@ def monitor(
     estimate : Estimate
         What the step returned.
     inputs : (K, m) array_like, optional
-        The inputs of the window's K samples, for a system with inputs.
-
-    Returns
-    -------
-    Hypotheses
-
-    Raises
-    ------
-    ShapeError
-        If the inputs do not fit the window.
+        The inputs of the window's K samples, for a system with inputs; a `ShapeError` is raised
+        if they do not fit.
     """
     system, region = certificate.system, certificate.region
     stages = estimate.trajectory.shape[0] - 1
@@ -358,10 +316,8 @@ def monitor(
     low, high = region.lower[region.n :], region.upper[region.n :]
     usual = bool(((u >= low) & (u <= high)).all())
     return Hypotheses(
-        cost_decrease=cheaper,
-        complete=complete,
-        observer_candidate=observed and Status.PROJECTED not in estimate.status,
-        kappa=bounded,
+        cost_decrease=cheaper, complete=complete,
+        observer_candidate=observed and Status.PROJECTED not in estimate.status, kappa=bounded,
         candidate_in_region=usual and bool(region.contains(estimate.candidate[:-1]).all()),
         estimate_in_region=usual and bool(region.contains(estimate.trajectory[:-1]).all()),
         candidate_in_sets=_in_sets(system, estimate.candidate, corrections, fit),
@@ -370,9 +326,7 @@ def monitor(
 
 
 def monitored_run(
-    certificate: Certificate,
-    estimator: MovingHorizonEstimator,
-    measurements: ArrayLike,
+    certificate: Certificate, estimator: MovingHorizonEstimator, measurements: ArrayLike,
     inputs: ArrayLike | None = None,
 ) -> tuple[Run, MonitorSummary]:
     """Run an estimator over a record, and count for how many steps the certificate applied.
@@ -383,17 +337,8 @@ def monitored_run(
         Of the estimator's system, observer and cost.
     estimator : MovingHorizonEstimator
         Before its first measurement.
-    measurements : (T, p) array_like
-        y(0), ..., y(T-1).
-    inputs : (T, m) array_like, optional
-        u(0), ..., u(T-1), for a system with inputs.
-
-    Returns
-    -------
-    run : Run
-        As `MovingHorizonEstimator.run` gives it.
-    summary : MonitorSummary
-        What the monitor saw.
+    measurements, inputs
+        As for `MovingHorizonEstimator.run`, which returns the same run.
     """
     watch = Monitor.of(certificate, estimator)
     ys = record("measurements", measurements, estimator.system.p)
@@ -436,9 +381,7 @@ def _costs(
 
 
 def _in_sets(system: System, states: Array, w: Array, v: Array) -> bool:
-    pairs = (
-        (system.states, states[:-1]), (system.disturbances, w), (system.noises, v)
-    )
+    pairs = ((system.states, states[:-1]), (system.disturbances, w), (system.noises, v))
     return all(
         one is None or one.violation(values, rounding=_FEASIBLE) == 0.0 for one, values in pairs
     )

@@ -6,24 +6,22 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Luenberger, Observer, OutputInjection
 from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
 from .decay import checked_rate
-from .evidence import CertificateError, JumpError, NotCertifiedError, OutOfTimeError
+from .evidence import CertificateError, NotCertifiedError
 from .inequalities import ErrorContraction, Matrices, euclidean_constants, norm_bound
 from .properties import ObserverStability, sealed
 from .regions import Region, bounded_region, checked_system
 from .sdp import started
 from .search import Found, Search, checked_weights
 
-__all__ = ["Synthesis", "certify_observer", "constant_gain", "synthesise_gain"]
-
-Array = NDArray[np.float64]
+__all__ = ["Synthesis", "certify_observer", "constant_gain", "gain_if_constant", "synthesise_gain"]
 
 _STAY = "it holds while the states of system and observer stay in the region"
 _SEARCH = 0.7  # of the time; the rest is for smaller constants of the gain that was found
@@ -54,37 +52,32 @@ def constant_gain(observer: Observer, system: System) -> Array:
     )
 
 
+def gain_if_constant(observer: Observer, system: System) -> Array | None:
+    """The gain of `constant_gain`, or None where the observer has none."""
+    try:
+        return constant_gain(observer, system)
+    except CertificateError:
+        return None
+
+
 def certify_observer(
-    system: System,
-    observer: Observer,
-    region: ConvexSet | Region | None = None,
-    *,
-    rho: float | None = None,
-    inputs: Box | None = None,
-    weights: tuple[float, float] = (1.0, 1.0),
+    system: System, observer: Observer, region: ConvexSet | Region | None = None, *,
+    rho: float | None = None, inputs: Box | None = None, weights: tuple[float, float] = (1.0, 1.0),
     seconds: float | Deadline = PART_SECONDS,
 ) -> ObserverStability:
-    r"""Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
+    """Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
 
     A constant P with the inequality of `qpmhe.certificates.inequalities.ErrorContraction` is sought
     and verified as in `certify_detectability`. It serves linear and nonlinear outputs.
 
     Parameters
     ----------
-    system : System
-        The system.
+    system, region, inputs, weights, seconds
+        As for `certify_detectability`; the weights are those of C_w and C_v.
     observer : Observer
         A `Luenberger` observer or one of its kind, or a `SteadyStateKalman`.
-    region : Box, Polytope or Region, optional
-        A bounded set of states; the system's own if left out.
     rho : float, optional
         The rate; left out, it is chosen as for `certify_detectability`.
-    inputs : Box, optional
-        Bounds on the inputs, for a system with inputs.
-    weights : (float, float)
-        How much the constants C_w and C_v matter.
-    seconds : float or Deadline
-        How long this may take, about; the result is then what was found so far, if anything.
 
     Raises
     ------
@@ -161,17 +154,21 @@ def _check_stability(search: Search) -> None:
 
 
 def _explained(search: Search, error: NotCertifiedError) -> NotCertifiedError:
-    if isinstance(error, (OutOfTimeError, JumpError)):
+    smallest = search.explaining_rate(error)
+    if smallest is None:
         return error
-    try:
-        smallest = search.smallest_rate()
-    except OutOfTimeError:
-        return error
+    synthesis = search.gain is None
     if np.isfinite(smallest):
+        others = () if synthesis else ("another gain, such as synthesise_gain finds",)
         return NotCertifiedError(
             f"{error.args[0]}. Feasible at the states tried: rho from {smallest:.4g} on",
-            ("a larger rho", "another gain, such as synthesise_gain finds", "a smaller region"),
-            smallest,
+            ("a larger rho", *others, "a smaller region"), smallest,
+        )
+    if synthesis:
+        return NotCertifiedError(
+            "no constant gain is shown to contract on the whole region: the semidefinite program "
+            "is infeasible for every rate below 1",
+            ("a smaller region", "an observer with a varying gain", "other coordinates"),
         )
     radii = _radii(search)
     return NotCertifiedError(
@@ -186,28 +183,15 @@ Criterion = Literal["trade", "rate"]
 
 @dataclass(frozen=True, eq=False)
 class Synthesis:
-    """An observer made for a region.
-
-    Parameters
-    ----------
-    observer : Luenberger
-        The observer.
-    stability : ObserverStability
-        Its verified constants.
-    """
+    """An observer made for a region, and its verified constants."""
 
     observer: Luenberger
     stability: ObserverStability
 
 
 def synthesise_gain(
-    system: System,
-    region: ConvexSet | Region | None = None,
-    *,
-    criterion: Criterion = "trade",
-    rho: float | None = None,
-    inputs: Box | None = None,
-    weights: tuple[float, float] = (1.0, 1.0),
+    system: System, region: ConvexSet | Region | None = None, *, criterion: Criterion = "trade",
+    rho: float | None = None, inputs: Box | None = None, weights: tuple[float, float] = (1.0, 1.0),
     seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Synthesis:
     r"""Find a constant gain L whose observer contracts on a region, and verify it.
@@ -225,29 +209,23 @@ def synthesise_gain(
 
     Parameters
     ----------
-    system : System
-        The system.
-    region : Box, Polytope or Region, optional
-        A bounded set of states; the system's own if left out.
+    system, region, inputs, seconds
+        As for `certify_detectability`.
     criterion : {"trade", "rate"}
         How to choose rho where it is not given: ``trade`` takes the one for which lasting
         disturbances and noise are bounded best, :math:`\sqrt{d^2 \kappa + v^2 r} / (1 - \rho)`;
         ``rate`` the smallest that is feasible, plus a hundredth of its distance from 1.
     rho : float, optional
         The rate.
-    inputs : Box, optional
-        Bounds on the inputs, for a system with inputs.
     weights : (float, float)
         d and v, such as typical sizes of disturbance and noise.
-    seconds : float or Deadline
-        How long this may take, about; the result is then what was found so far, if anything.
 
     Raises
     ------
     OptionError
         If the criterion, rho or the weights are not among or within what is allowed.
     SetError, ModelError
-        As for `qpmhe.certificates.detectability.certify_detectability`.
+        As for `certify_detectability`.
     NotCertifiedError
         If there is no such gain, or none was found.
     """
@@ -267,23 +245,8 @@ def synthesise_gain(
     try:
         found = search.find_best(criterion) if rho is None else search.find(rho)
         made = stability(search, found)
-    except (OutOfTimeError, JumpError):
-        raise
     except NotCertifiedError as error:
-        try:
-            smallest = search.smallest_rate()
-        except OutOfTimeError:
-            raise error from None
-        if np.isfinite(smallest):
-            raise NotCertifiedError(
-                f"{error.args[0]}. Feasible at the states tried: rho from {smallest:.4g} on",
-                ("a larger rho", "a smaller region"), smallest,
-            ) from error
-        raise NotCertifiedError(
-            "no constant gain is shown to contract on the whole region: the semidefinite program "
-            "is infeasible for every rate below 1",
-            ("a smaller region", "an observer with a varying gain", "other coordinates"),
-        ) from error
+        raise _explained(search, error) from error
     assert made.gain is not None
     observer = Luenberger(made.gain)
     try:

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import numbers, positive
+from .._checks import Array, numbers, positive
 from ..errors import OptionError
 from ..model.sets import ConvexSet
 from ..model.system import System
@@ -22,19 +22,20 @@ from .regions import Region, beyond, stated_region
 
 __all__ = ["Detectability", "ObserverStability", "Subject", "fitting", "json_ready", "sealed"]
 
-Array = NDArray[np.float64]
 _POINTS, _SEED = 24, 20210829
 _MOST_CORNERS = 8
 # Another compiler or library may round otherwise; derivatives by differences are worse.
 _VALUES, _SLOPES = 1e-9, 1e-5
 
 
-def _discounted(
-    initial: ArrayLike, first: Array, second: Array, rate: float
-) -> Array:
+def _bound(rate: float, constants: tuple[float, ...], **vectors: ArrayLike) -> Array:
     r"""The bound :math:`a \rho^t + \sum_{\tau=1}^t \rho^\tau (b(t-\tau) + c(t-\tau))`."""
+    start, first, second = (
+        constant * np.linalg.norm(numbers(name, value), axis=-1)
+        for constant, (name, value) in zip(constants, vectors.items(), strict=True)
+    )
     bound = np.empty((first.shape[0] + 1, *first.shape[1:]))
-    bound[0] = initial
+    bound[0] = start
     for t in range(first.shape[0]):
         bound[t + 1] = rate * (bound[t] + first[t] + second[t])
     return bound
@@ -69,10 +70,8 @@ class Detectability:
         The set in which both trajectories must stay; None for constants assumed everywhere.
     notes : tuple of str
         What else there is to say.
-    P : (n, n) array or None
-        The norm in which the difference contracts.
-    W, V : (n, n) and (p, p) array or None
-        Norms of the differences of disturbances and of outputs; W is P.
+    P, W, V : (n, n), (n, n) and (p, p) array or None
+        Norms of the differences of states, of disturbances (W is P) and of outputs.
     form : str
         Which inequality was shown: ``output weight``, ``output injection``, or ``assumed``.
     margin : float
@@ -108,12 +107,7 @@ class Detectability:
         cls, *, eta: float, c_p: float, c_w: float, c_v: float,
         region: ConvexSet | Region | None = None,
     ) -> Detectability:
-        """Constants that the user states without proof.
-
-        Parameters
-        ----------
-        eta, c_p, c_w, c_v, region
-            As above.
+        """Constants that the user states without proof; without a region, everywhere.
 
         Raises
         ------
@@ -131,35 +125,23 @@ class Detectability:
         """All but the region, in types that JSON knows; infinite numbers become None."""
         return _to_dict(self)
 
-    def bound(
-        self, initial: ArrayLike, disturbances: ArrayLike, outputs: ArrayLike
-    ) -> Array:
-        """The right-hand side of the definition along a pair of trajectories.
+    def bound(self, initial: ArrayLike, disturbances: ArrayLike, outputs: ArrayLike) -> Array:
+        """The right-hand side of the definition along a pair of trajectories, (T + 1, ...).
 
         Parameters
         ----------
         initial : (..., n) array_like
             Differences of the initial states.
-        disturbances : (T, ..., n) array_like
-            Differences of the disturbances.
-        outputs : (T, ..., p) array_like
-            Differences of h(x), at t = 0, ..., T - 1.
-
-        Returns
-        -------
-        (T + 1, ...) array
-            Bounds on the Euclidean norms of the differences at t = 0, ..., T.
+        disturbances, outputs : (T, ..., n) and (T, ..., p) array_like
+            Differences of the disturbances and of h(x), at t = 0, ..., T - 1.
         """
-        x, w, h = (
-            np.linalg.norm(numbers(name, value), axis=-1)
-            for name, value in (
-                ("initial", initial), ("disturbances", disturbances), ("outputs", outputs)
-            )
+        return _bound(
+            self.eta, (self.c_p, self.c_w, self.c_v), initial=initial, disturbances=disturbances,
+            outputs=outputs,
         )
-        return _discounted(self.c_p * x, self.c_w * w, self.c_v * h, self.eta)
 
     def squared(self, rate: float) -> tuple[float, Array, Array]:
-        r"""The dissipation inequality in squares, for a rate above eta.
+        r"""The dissipation inequality in squares, for a rate r in (eta, 1): returns r^2, W_2, V_2.
 
         .. math::
             |x_1^+ - x_2^+|_P^2 \le r^2 |x_1 - x_2|_P^2 + |\delta w|_{W_2}^2
@@ -168,16 +150,6 @@ class Detectability:
         The verified inequality is :math:`|A \delta x|_P^2 \le \eta^2 |\delta x|_P^2
         + |\delta h|_V^2`; with :math:`1 + \epsilon = (r/\eta)^2` and Young's inequality for
         the disturbance, :math:`W_2 = (1 + 1/\epsilon) P` and :math:`V_2 = (1 + \epsilon) V`.
-
-        Parameters
-        ----------
-        rate : float
-            r, above eta and below 1.
-
-        Returns
-        -------
-        rate_squared, W_2, V_2
-            As above.
 
         Raises
         ------
@@ -217,19 +189,11 @@ class ObserverStability:
         The constants; C_v has units of the state per unit of the output.
     kappa : float
         The constant of (eq:kappa), in units of the state per unit of the output.
-    evidence : Evidence
-        What they rest on.
-    region : Region or None
-        The set in which both must stay; None for constants assumed everywhere.
-    notes : tuple of str
-        What else there is to say.
-    P : (n, n) array or None
-        The norm in which the error contracts.
-    W, V : (n, n) and (p, p) array or None
-        Norms of disturbance and noise: W is P and V is L^T P L.
     gain : (n, p) array or None
         L, the observer's constant gain.
-    margin, cells, subject
+    P, W, V : (n, n), (n, n) and (p, p) array or None
+        Norms of error, disturbance and noise: W is P and V is L^T P L.
+    evidence, region, notes, margin, cells, subject
         As for `Detectability`.
     """
 
@@ -254,29 +218,10 @@ class ObserverStability:
 
     @classmethod
     def assumed(
-        cls,
-        *,
-        rho: float,
-        C_p: float,
-        C_w: float,
-        C_v: float,
-        kappa: float,
+        cls, *, rho: float, C_p: float, C_w: float, C_v: float, kappa: float,
         region: ConvexSet | Region | None = None,
     ) -> ObserverStability:
-        """Constants that the user states without proof.
-
-        Parameters
-        ----------
-        rho, C_p, C_w, C_v, kappa, region
-            As above.
-
-        Raises
-        ------
-        OptionError
-            If a constant is not positive, or rho not below 1.
-        SetError
-            If the region is no set.
-        """
+        """Constants that the user states without proof; see `Detectability.assumed`."""
         return cls(
             checked_rate("rho", rho), positive("C_p", C_p), positive("C_w", C_w),
             positive("C_v", C_v), positive("kappa", kappa), Evidence.ASSUMED, stated_region(region),
@@ -287,7 +232,7 @@ class ObserverStability:
         return _to_dict(self)
 
     def bound(self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike) -> Array:
-        """The right-hand side of (eq:RGES) along a run.
+        """The right-hand side of (eq:RGES) along a run, (T + 1, ...).
 
         Parameters
         ----------
@@ -295,19 +240,11 @@ class ObserverStability:
             The initial error.
         disturbances, noises : (T, ..., n) and (T, ..., p) array_like
             w and v at t = 0, ..., T - 1.
-
-        Returns
-        -------
-        (T + 1, ...) array
-            Bounds on the Euclidean norm of the error at t = 0, ..., T.
         """
-        x, w, v = (
-            np.linalg.norm(numbers(name, value), axis=-1)
-            for name, value in (
-                ("initial", initial), ("disturbances", disturbances), ("noises", noises)
-            )
+        return _bound(
+            self.rho, (self.C_p, self.C_w, self.C_v), initial=initial, disturbances=disturbances,
+            noises=noises,
         )
-        return _discounted(self.C_p * x, self.C_w * w, self.C_v * v, self.rho)
 
 
 Result = TypeVar("Result", "Detectability", "ObserverStability")

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import numbers
+from .._checks import Array, numbers
 from ..errors import ModelError, SetError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 
 __all__ = ["Region", "beyond", "bounded_region", "checked_system", "stated_region"]
-
-Array = NDArray[np.float64]
 
 # Of a polytope's vertices and corners, as starting points of searches; more add little.
 _MOST_CORNERS = 256
@@ -31,7 +29,6 @@ class Region:
     Parameters
     ----------
     states : ConvexSet
-        The set of states.
     inputs : Box or None
         Bounds on the inputs u; None for a system without.
     lower, upper : (n + m,) array
@@ -67,13 +64,7 @@ class Region:
         }
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Which states lie in the region.
-
-        Parameters
-        ----------
-        points : (..., n) array_like
-            States.
-        """
+        """Which of the states (..., n) lie in the region."""
         x = numbers("points", points, finite=False)
         inside = np.all((x >= self.states.lower) & (x <= self.states.upper), axis=-1)
         if not self.is_box:
@@ -85,13 +76,7 @@ class Region:
         return found
 
     def outside(self, lower: Array, upper: Array) -> NDArray[np.bool_]:
-        """Which cells certainly have no state of the region in them.
-
-        Parameters
-        ----------
-        lower, upper : (B, n + m) array
-            Corners of the cells.
-        """
+        """Which cells, given by corners (B, n + m), certainly have no state of the region."""
         away = np.zeros(lower.shape[0], dtype=np.bool_)
         if self.is_box:
             return away
@@ -107,19 +92,9 @@ class Region:
         return away
 
     def sample(self, count: int, generator: np.random.Generator) -> Array:
-        """Points of the region: its middle, corners of its box that belong to it, and others.
+        """About so many points (K, n + m) of the region, at least one: states and inputs.
 
-        Parameters
-        ----------
-        count : int
-            About how many.
-        generator : numpy.random.Generator
-            Where the others come from.
-
-        Returns
-        -------
-        (K, n + m) array
-            States and inputs, at least one.
+        The first is its middle; corners of its box that belong to it come next, then random ones.
         """
         sides = [
             (low,) if low == high else (low, high)
@@ -272,8 +247,7 @@ def _centre(states: ConvexSet, lower: Array, upper: Array) -> Array:
     )
     if answer.x is None:
         raise SetError(f"no point of {states!r} was found; is the set empty?")
-    point: Array = np.asarray(answer.x, np.float64)[:n]
-    return point
+    return np.asarray(answer.x, np.float64)[:n]
 
 
 def _shares(states: ConvexSet, centre: Array, points: Array) -> Array:

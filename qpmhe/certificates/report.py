@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..errors import InvalidInputError, QpmheError, SetError, ShapeError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
@@ -33,7 +33,6 @@ from .theorem import Sizes
 
 __all__ = ["LABELS", "Report", "certify_model", "error_and_bounds"]
 
-Array = NDArray[np.float64]
 Result = TypeVar("Result")
 
 #: Names of the kinds of bounds in figures and tables.
@@ -58,25 +57,19 @@ class Report:
 
     Parameters
     ----------
-    name : str
-        Name of the model.
-    example : Example
-        The model.
-    record : Record
-        The simulated record.
+    name, example, record
+        The model's name, the model, and its simulated record.
     audit : Audit
         The assumptions, one by one, on the region.
     certificate : Certificate or None
-        The certificate; None where the error could not be bounded.
+        None where the error could not be bounded.
     detectability, stability : Detectability and ObserverStability, or None
         Constants of the first horizon's bound, or those that could be certified alone.
     errors : dict of str to QpmheError
         What could not be certified, and why; empty with a certificate.
-    run, summary : Run and MonitorSummary, or None
-        The estimator on the record, with the largest horizon and two QPs a sample, and what
-        the monitor saw; None without a certificate.
-    estimator : MovingHorizonEstimator or None
-        The estimator after that run.
+    run, summary, estimator : Run, MonitorSummary and MovingHorizonEstimator, or None
+        With a certificate: the estimator's run on the record, with the largest horizon and two
+        QPs a sample, what the monitor saw, and the estimator after it.
     """
 
     name: str
@@ -127,21 +120,9 @@ class Report:
         }
 
     def draw(self, axes: Any = None) -> Any:
-        """Draw the error of the run and its bounds; see `error_and_bounds`.
+        """Draw the error of the run and its bounds into axes; see `error_and_bounds`.
 
-        Parameters
-        ----------
-        axes : matplotlib Axes, optional
-            Where to draw; a new figure if left out.
-
-        Returns
-        -------
-        Axes
-
-        Raises
-        ------
-        InvalidInputError
-            If there is no certificate, hence no run.
+        Without a certificate there is no run: an `InvalidInputError` is raised.
         """
         certificate, run = self.certificate, self.run
         if certificate is None or run is None:
@@ -166,22 +147,10 @@ class Report:
         )
 
     def save(self, path: str | Path) -> list[Path]:
-        """Write everything as JSON, and beside it the figure, if there is one.
+        """Write everything as JSON to a path, and return the paths of all files.
 
-        Parameters
-        ----------
-        path : path
-            The JSON file; the figure goes beside it, as ``.png`` and ``.svg``.
-
-        Returns
-        -------
-        list of Path
-            The files.
-
-        Raises
-        ------
-        InvalidInputError
-            If the file cannot be written.
+        The figure, if there is one, goes beside it as ``.png`` and ``.svg``. An
+        `InvalidInputError` is raised if the file cannot be written.
         """
         path = Path(path)
         written: list[Path] = []
@@ -196,14 +165,9 @@ class Report:
 
 
 def certify_model(
-    example: Example,
-    *,
-    horizon: int | list[int] | None = None,
-    region: ConvexSet | Region | None = None,
-    inputs: Box | None = None,
-    seed: int = 0,
-    seconds: float | Deadline = DEFAULT_SECONDS,
-    name: str = "",
+    example: Example, *, horizon: int | list[int] | None = None,
+    region: ConvexSet | Region | None = None, inputs: Box | None = None, seed: int = 0,
+    seconds: float | Deadline = DEFAULT_SECONDS, name: str = "",
 ) -> Report:
     """Certify a model as far as possible, and monitor its estimator on a simulated record.
 
@@ -228,10 +192,6 @@ def certify_model(
         How long the search may take, about; then the report has what was found so far.
     name : str
         Name of the model in the report; the scenario's title if left out.
-
-    Returns
-    -------
-    Report
 
     Raises
     ------
@@ -297,9 +257,7 @@ def _parts(
         system, region, seconds=deadline.part(0.5)))
     observed = attempt("the observer", lambda: certify_observer(
         system, observer, region, seconds=deadline.part(0.9)))
-    return Report(
-        name, example, record, findings, None, detected, observed, errors or {"": reason}
-    )
+    return Report(name, example, record, findings, None, detected, observed, errors or {"": reason})
 
 
 def _used(certificate: Certificate) -> tuple[Detectability, ObserverStability]:
@@ -345,22 +303,15 @@ def _sizes(example: Example) -> Sizes:
         _SIGMAS * float(np.sqrt(np.linalg.eigvalsh(matrix)[-1]))
         for matrix in (scenario.disturbance_covariance, scenario.noise_covariance)
     )
-    return Sizes(
-        float(np.linalg.norm(scenario.initial_state - scenario.initial_estimate)), w, v
-    )
+    return Sizes(float(np.linalg.norm(scenario.initial_state - scenario.initial_estimate)), w, v)
 
 
 def error_and_bounds(
-    times: Array,
-    error: Array | None,
-    bounds: Mapping[str, Array],
-    *,
-    diameter: float | None = None,
-    time_label: str = "time t",
-    error_label: str = "error",
+    times: Array, error: Array | None, bounds: Mapping[str, Array], *,
+    diameter: float | None = None, time_label: str = "time t", error_label: str = "error",
     axes: Any = None,
 ) -> Any:
-    """The error's length and its bounds over time, on a logarithmic axis.
+    """Draw the error's length and its bounds over time on a logarithmic axis; return the axes.
 
     Parameters
     ----------
@@ -369,23 +320,13 @@ def error_and_bounds(
     error : (T + 1,) array or None
         Length of the error; None for bounds alone.
     bounds : mapping of label to (T + 1,) array
-        At most six.
+        At most six; a `ShapeError` is raised if lengths differ.
     diameter : float, optional
         Diameter of the certified set, above which a bound says nothing.
     time_label, error_label : str
         Labels of the time axis, with its unit, and of the error.
     axes : matplotlib Axes, optional
-        Where to draw; a new figure if left out.
-
-    Returns
-    -------
-    Axes
-        Its figure is not shown yet; see `qpmhe.plots.save`.
-
-    Raises
-    ------
-    ShapeError
-        If lengths differ.
+        Where to draw; a new figure if left out, which `qpmhe.plots.save` can write.
     """
     from matplotlib import rc_context
 

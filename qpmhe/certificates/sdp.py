@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from .deadline import Deadline
 
 __all__ = ["Answer", "Kind", "Program", "Scales", "expected_seconds", "started"]
-
-Array = NDArray[np.float64]
 
 Kind = Literal["output weight", "output injection", "observer", "synthesis"]
 
@@ -82,11 +80,7 @@ class Program:
     """
 
     def __init__(
-        self,
-        kind: Kind,
-        jacobians: Array,
-        scales: Scales,
-        weights: tuple[float, float],
+        self, kind: Kind, jacobians: Array, scales: Scales, weights: tuple[float, float],
         gain: Array | None = None,
     ) -> None:
         cp: Any = importlib.import_module("cvxpy")

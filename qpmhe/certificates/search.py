@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import positive
+from .._checks import Array, positive
 from ..errors import ModelError, OptionError
 from ..model.system import System
 from .branch_and_bound import Cover, cover
@@ -20,8 +20,6 @@ from .regions import Region
 from .sdp import Answer, Kind, Program, Scales, expected_seconds
 
 __all__ = ["Found", "Search", "checked_weights"]
-
-Array = NDArray[np.float64]
 
 _SAMPLES = 400
 _ROUNDS = 8
@@ -63,13 +61,8 @@ class Search:
     """
 
     def __init__(
-        self,
-        system: System,
-        region: Region,
-        kind: Kind | None,
-        weights: tuple[float, float],
-        gain: Array | None = None,
-        seconds: float | Deadline = PART_SECONDS,
+        self, system: System, region: Region, kind: Kind | None, weights: tuple[float, float],
+        gain: Array | None = None, seconds: float | Deadline = PART_SECONDS,
     ) -> None:
         self._deadline = Deadline.of(seconds)
         self.system, self.region, self.gain, self._weights = system, region, gain, weights
@@ -105,9 +98,7 @@ class Search:
 
         Where the time is over before, the smallest one that was tried and is.
         """
-        return self._smallest_rate(self._deadline.part(_CHOICE))
-
-    def _smallest_rate(self, deadline: Deadline) -> float:
+        deadline = self._deadline.part(_CHOICE)
         low, high = 0.0, _LARGEST_RATE
         if self._feasible(high, deadline).P is None:
             return np.inf
@@ -123,12 +114,19 @@ class Search:
                 high = middle
         return high
 
+    def explaining_rate(self, error: NotCertifiedError) -> float | None:
+        """`smallest_rate`, where an error does not say enough; None where the time is over."""
+        if isinstance(error, (OutOfTimeError, JumpError)):
+            return None
+        try:
+            return self.smallest_rate()
+        except OutOfTimeError:
+            return None
+
     def _feasible(self, rate: float, deadline: Deadline) -> Answer:
         return self._solved(rate, _MARGINS[0] * min(1.0, rate * rate), deadline, thorough=False)
 
-    def _solved(
-        self, rate: float, margin: float, deadline: Deadline, *, thorough: bool
-    ) -> Answer:
+    def _solved(self, rate: float, margin: float, deadline: Deadline, *, thorough: bool) -> Answer:
         """What the program returns; an error if there is no time for it, or not enough."""
         if deadline.passed:
             raise self._out_of_time("it was over while matrices were sought and verified")
@@ -194,9 +192,7 @@ class Search:
         status = "no round was left"
         for turn in range(1, _ROUNDS + 1):
             try:
-                answer = self._solved(
-                    rate, _MARGINS[level] * size, self._deadline, thorough=True
-                )
+                answer = self._solved(rate, _MARGINS[level] * size, self._deadline, thorough=True)
             except OutOfTimeError:
                 if best is None:
                     raise
@@ -244,14 +240,12 @@ class Search:
     def _verified(self, form: Form) -> Found | Cover:
         """What was shown, or the cover with the states where the inequality fails."""
         if not definite(Matrices.exact(form.P[None]))[0].all():
-            return Cover(False, 0, 0.0, *(np.empty((0, 0)), np.empty((0, 0, 0))))
+            return Cover(False, 0, 0.0, np.empty((0, 0)), np.empty((0, 0, 0)))
         if self.model.reason:
             return self._sampled(
                 form, f"f and h cannot be run with intervals ({self.model.reason})"
             )
-        found = cover(
-            self.model, self.region, form, seconds=self._deadline.part(_VERIFICATION)
-        )
+        found = cover(self.model, self.region, form, seconds=self._deadline.part(_VERIFICATION))
         if found.proved:
             return Found(form, Evidence.PROVED, found.margin, found.cells, ())
         if found.violations.shape[0]:
@@ -265,9 +259,7 @@ class Search:
         shown, least = definite(form.matrices(Matrices.exact(self.jacobians)))
         if not shown.all():
             broken = ~shown
-            return Cover(
-                False, 0, float(least.min()), self.points[broken], self.jacobians[broken]
-            )
+            return Cover(False, 0, float(least.min()), self.points[broken], self.jacobians[broken])
         jump = self.jump(everywhere=True)
         if jump is not None:
             raise jump
@@ -313,9 +305,7 @@ def checked_weights(value: tuple[float, float]) -> tuple[float, float]:
     return positive("weights[0]", first), positive("weights[1]", second)
 
 
-def _check_derivatives(
-    model: SmoothModel, system: System, points: Array, jacobians: Array
-) -> None:
+def _check_derivatives(model: SmoothModel, system: System, points: Array, jacobians: Array) -> None:
     """Raise a ModelError where a given Jacobian is not the derivative, at states far apart."""
     n = system.n
     if "given" not in system.derivatives.values():

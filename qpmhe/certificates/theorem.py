@@ -9,16 +9,14 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import count
+from .._checks import Array, count
 from ..costs import CostConstants
 from ..errors import OptionError
 from .decay import DecayingSums, decaying_sums, lengths
 
 __all__ = ["Sizes", "TheoremConstants", "level", "theorem", "tighten"]
-
-Array = NDArray[np.float64]
 
 Triple = tuple[float, float, float]
 
@@ -109,9 +107,7 @@ class TheoremConstants:
             each[0] ** (-1.0 / self.cost.exponent)
             for each in (self.cost.prior, self.cost.disturbance, self.cost.noise)
         ]
-        return (
-            c_p * inverse[0], c_w * self.eta_bar * inverse[1], c_v * self.eta_bar * inverse[2]
-        )
+        return (c_p * inverse[0], c_w * self.eta_bar * inverse[1], c_v * self.eta_bar * inverse[2])
 
     def terms(self, *, full: bool = True) -> Array:
         """What C_i'(N) or C_i''(N) is the sum of."""
@@ -163,18 +159,12 @@ class TheoremConstants:
         a, rho = self.cost.exponent, self.observer.rate
         first: Array = self.rho_bar_1 * (C_p * start * rho ** np.arange(w.size + 1.0)) ** a
         second: Array = (C_w * decaying_sums(rho, w)) ** a + (C_v * decaying_sums(rho, v)) ** a
-        total: Array = self.c_bar * (first + self.rho_bar_2 * second)
-        return total
+        return self.c_bar * (first + self.rho_bar_2 * second)
 
 
 def theorem(
-    detectability: DecayingSums,
-    observer: DecayingSums,
-    cost: CostConstants,
-    *,
-    kappa: float,
-    lipschitz: float,
-    horizon: int,
+    detectability: DecayingSums, observer: DecayingSums, cost: CostConstants, *, kappa: float,
+    lipschitz: float, horizon: int,
 ) -> TheoremConstants:
     """Compute the theorem's constants from those of its assumptions.
 
@@ -193,10 +183,6 @@ def theorem(
         L_h, in units of the output per unit of the state.
     horizon : int
         N >= 1.
-
-    Returns
-    -------
-    TheoremConstants
 
     Raises
     ------
@@ -255,19 +241,9 @@ def _triple(values: Array | list[float]) -> Triple:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Errors and noises for which a bound is made tight.
+    """Largest |x_0 - z_0|, |w| and |v| for which a bound is made tight.
 
-    Parameters
-    ----------
-    initial : float
-        |x_0 - z_0|.
-    disturbance, noise : float
-        Largest |w| and |v|.
-
-    Raises
-    ------
-    OptionError
-        If one is negative or not finite, or all are zero.
+    An `OptionError` is raised if one is negative or not finite, or all are zero.
     """
 
     initial: float = 1.0
@@ -286,17 +262,11 @@ def level(bound: DecayingSums, sizes: Sizes) -> float:
 
 
 def tighten(
-    detectabilities: Iterable[DecayingSums],
-    observers: Iterable[DecayingSums],
-    cost: CostConstants,
-    *,
-    kappa: float,
-    lipschitz: float,
-    horizon: int,
-    sizes: Sizes | None = None,
+    detectabilities: Iterable[DecayingSums], observers: Iterable[DecayingSums], cost: CostConstants,
+    *, kappa: float, lipschitz: float, horizon: int, sizes: Sizes | None = None,
     searched: int = _SEARCHED,
 ) -> TheoremConstants:
-    r"""The theorem's constants for its best free choices.
+    r"""The theorem's constants with the smallest `level`; their fields hold the free choices.
 
     Free are
 
@@ -312,21 +282,16 @@ def tighten(
     detectabilities, observers : iterable of DecayingSums
         At least one each.
     cost, kappa, lipschitz, horizon
-        As of `theorem`.
+        As for `theorem`.
     sizes : Sizes, optional
         For which errors and noises the result is to be tight; all 1 if left out.
     searched : int
         In how many pairs of the two to search, the most promising ones first.
 
-    Returns
-    -------
-    TheoremConstants
-        The constants with the smallest `level`; its fields hold the choices.
-
     Raises
     ------
     OptionError
-        As of `theorem`, or if there is nothing to choose from.
+        As for `theorem`, or if there is nothing to choose from.
     """
     wanted = Sizes() if sizes is None else sizes
     best: TheoremConstants | None = None
@@ -357,10 +322,8 @@ def tighten(
 
 
 def _search(
-    tried: Callable[[DecayingSums, DecayingSums], float],
-    detectability: DecayingSums,
-    observer: DecayingSums,
-    lipschitz: float,
+    tried: Callable[[DecayingSums, DecayingSums], float], detectability: DecayingSums,
+    observer: DecayingSums, lipschitz: float,
 ) -> None:
     """Try rates and noise constants of the observer; `tried` keeps the best."""
 

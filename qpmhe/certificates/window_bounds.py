@@ -10,15 +10,13 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import count, numbers, positive, positive_definite
+from .._checks import Array, count, numbers, positive, positive_definite
 from ..costs import ObserverPrior, QuadraticCost
 from ..errors import OptionError, ShapeError
 from .decay import DecayingSums, checked_length, decaying_sums
 from .theorem import TheoremConstants
 
 __all__ = ["Parts", "SummedBound", "WeightedBound", "WindowBound", "fit_weight", "largest"]
-
-Array = NDArray[np.float64]
 
 # About as many numbers of windows are held at once.
 _ENTRIES = 4e6
@@ -57,14 +55,7 @@ class WindowBound(ABC):
     """
 
     def __init__(
-        self,
-        *,
-        horizon: int,
-        rho: float,
-        eta: float,
-        exponent: float,
-        slope: float,
-        entry: float,
+        self, *, horizon: int, rho: float, eta: float, exponent: float, slope: float, entry: float,
         scales: Array,
     ) -> None:
         self.horizon = count("horizon", horizon, 1)
@@ -94,11 +85,7 @@ class WindowBound(ABC):
         """The norms of an initial error, disturbances and noises."""
 
     def bound(
-        self,
-        initial: ArrayLike,
-        disturbances: ArrayLike,
-        noises: ArrayLike,
-        *,
+        self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike, *,
         costs: ArrayLike | None = None,
     ) -> Array:
         """The bound of |x(t) - x_hat(t)| at t = 0, ..., T."""
@@ -106,11 +93,7 @@ class WindowBound(ABC):
         return value
 
     def components(
-        self,
-        initial: ArrayLike,
-        disturbances: ArrayLike,
-        noises: ArrayLike,
-        *,
+        self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike, *,
         costs: ArrayLike | None = None,
     ) -> Array:
         """The bound of each component's error, (T + 1, n); arguments as of `bound`."""
@@ -157,8 +140,7 @@ class WindowBound(ABC):
             own = np.where(lengths == N - j, entry, own)
             own = self._advance(own, *padded[..., j : j + steps + 1])
         own[..., 0] = parts.window_start
-        total: Array = self.alphas[lengths] * roots + own
-        return total
+        return self.alphas[lengths] * roots + own
 
     def funnel(self, initial: float, disturbance: float, noise: float, steps: int) -> Array:
         """The bound at t = 0, ..., steps for all |w| <= disturbance and |v| <= noise."""
@@ -199,7 +181,6 @@ class WindowBound(ABC):
             second = max(second, _over_powers(of_w, lam, 1))
             third = max(third, _over_powers(of_v, lam, 1))
         return DecayingSums(lam, max(1.0, first), second, third)
-
 
     def _impulses(self, starts: NDArray[np.intp]) -> tuple[Array, Array]:
         """What unit impulses of w and of v at these times make of the N + 1 times after each."""
@@ -274,12 +255,9 @@ class SummedBound(WindowBound):
             (cost.disturbance[1] * constants.kappa**a + cost.noise[1]) ** (1.0 / a)
         )
         super().__init__(
-            horizon=constants.horizon,
-            rho=constants.observer.rate,
-            eta=constants.detectability.rate,
-            exponent=a,
-            slope=self.cost_root * constants.lipschitz,
-            entry=constants.detectability.initial,
+            horizon=constants.horizon, rho=constants.observer.rate,
+            eta=constants.detectability.rate, exponent=a,
+            slope=self.cost_root * constants.lipschitz, entry=constants.detectability.initial,
             scales=np.ones(1),
         )
 
@@ -332,16 +310,8 @@ class WeightedBound(WindowBound):
     """
 
     def __init__(
-        self,
-        cost: QuadraticCost,
-        *,
-        horizon: int,
-        P: ArrayLike,
-        eta: float,
-        noise_weight: ArrayLike,
-        observer_norm: ArrayLike,
-        rho: float,
-        gain: ArrayLike,
+        self, cost: QuadraticCost, *, horizon: int, P: ArrayLike, eta: float,
+        noise_weight: ArrayLike, observer_norm: ArrayLike, rho: float, gain: ArrayLike,
         slope: float,
     ) -> None:
         n, p = cost.n, cost.p
@@ -400,20 +370,16 @@ def fit_weight(cost: QuadraticCost, gain: ArrayLike) -> Array:
     K = numbers("gain", gain)
     if K.shape != (cost.n, cost.p):
         raise ShapeError(f"gain has shape {K.shape}; expected {(cost.n, cost.p)}.")
-    weight: Array = K.T @ cost.disturbance @ K + cost.noise
-    return weight
+    return K.T @ cost.disturbance @ K + cost.noise
 
 
 def norms(values: Array, weight: Array) -> Array:
     """|s|_W of each row, or what it is at most for vectors of these lengths."""
     if values.ndim == 1:
         top = float(np.linalg.eigvalsh(weight)[-1])
-        scaled: Array = math.sqrt(max(0.0, top)) * values
-        return scaled
+        return math.sqrt(max(0.0, top)) * values
     if values.shape[1] != weight.shape[0]:
-        raise ShapeError(
-            f"vectors have {values.shape[1]} components; expected {weight.shape[0]}."
-        )
+        raise ShapeError(f"vectors have {values.shape[1]} components; expected {weight.shape[0]}.")
     squares: Array = np.einsum("ti,ij,tj->t", values, weight, values)
     return np.sqrt(np.maximum(squares, 0.0))
 

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import Array
 from ..errors import OptionError
-from .prior import ObserverPrior
 
-__all__ = ["Cost", "CostConstants"]
+__all__ = ["Cost", "CostConstants", "ObserverPrior", "quadratic_form"]
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Weights for patterns of missing components are kept up to so many bytes, and a few in any case.
@@ -41,6 +42,41 @@ class CostConstants:
     noise: tuple[float, float]
 
 
+class ObserverPrior:
+    r"""Weigh the prior z(t-N) with the inverse of the observer's own covariance at t-N.
+
+    With a Kalman-type observer on a linear system, the estimator then equals the Kalman
+    filter for every horizon. The eigenvalues of the weight are clipped to stated bounds,
+    so that (eq:cond0) holds with :math:`\underline c_p` and :math:`\overline c_p` equal
+    to them.
+
+    Parameters
+    ----------
+    minimum, maximum : float
+        Bounds on the eigenvalues of the prior weight (inverse of squared state units); an
+        `OptionError` is raised unless 0 < minimum < maximum < infinity.
+    """
+
+    __slots__ = ("maximum", "minimum")
+
+    def __init__(self, minimum: float = 1e-12, maximum: float = 1e12) -> None:
+        if not _number(minimum) or not _number(maximum) or not 0 < minimum < maximum:
+            raise OptionError(
+                f"minimum is {minimum!r} and maximum {maximum!r}; "
+                "expected finite numbers with 0 < minimum < maximum."
+            )
+        self.minimum, self.maximum = float(minimum), float(maximum)
+
+    def weight(self, covariance: Array) -> Array:
+        """The clipped inverse of a covariance (n, n)."""
+        values, vectors = np.linalg.eigh(covariance)
+        with np.errstate(divide="ignore"):
+            inverse = np.where(values > 0.0, 1.0 / values, self.maximum)
+        clipped = np.clip(inverse, self.minimum, self.maximum)
+        weight: Array = (vectors * clipped) @ vectors.T
+        return weight
+
+
 class Cost(ABC):
     r"""A cost :math:`\gamma^K \Gamma(x_0 - \bar x) + \sum_{i<K} \gamma^{K-1-i} l(w_i, v_i)`.
 
@@ -50,10 +86,8 @@ class Cost(ABC):
 
     Parameters
     ----------
-    prior : (n, n) array or ObserverPrior
-        Weight of the initial error, or the rule for it.
-    disturbance, noise : (n, n) and (p, p) array
-        Weights of w and v.
+    prior, disturbance, noise : array
+        Weights of the initial error (n, n) or the `ObserverPrior` for it, of w and of v (p, p).
     discount : float
         gamma, 1 for none.
 
@@ -69,18 +103,9 @@ class Cost(ABC):
     quadratic: bool = False
 
     def __init__(
-        self,
-        prior: Array | ObserverPrior,
-        disturbance: Array,
-        noise: Array,
-        discount: float,
+        self, prior: Array | ObserverPrior, disturbance: Array, noise: Array, discount: float
     ) -> None:
-        kinds = (int, float, np.integer, np.floating)
-        if (
-            isinstance(discount, bool)
-            or not isinstance(discount, kinds)
-            or not 0.0 < discount <= 1.0
-        ):
+        if not _number(discount) or not 0.0 < discount <= 1.0:
             raise OptionError(f"discount is {discount!r}; expected a number in (0, 1].")
         self.discount = float(discount)
         self.prior, self.disturbance, self.noise = prior, disturbance, noise
@@ -103,93 +128,40 @@ class Cost(ABC):
 
     @abstractmethod
     def stage_costs(self, residuals: Array, weights: Array) -> Array:
-        """l(w, v) of each stage.
-
-        Parameters
-        ----------
-        residuals : (K, n + p) array
-            w and v.
-        weights : (n + p, n + p) or (K, n + p, n + p) array
-            Joint weight of all stages, or of each.
-        """
+        """l(w, v) of residuals (w, v), (K, n + p), for the weights of all stages or of each."""
 
     @abstractmethod
     def majorise(self, residuals: Array, weights: Array) -> Array:
         """Weights W of quadratic forms that touch the stage costs at the residuals r.
 
         ``r^T W s`` is half the derivative of l at r in direction s; for exponents up to 2
-        the form also lies above l, up to a constant.
-
-        Parameters
-        ----------
-        residuals, weights
-            As for `stage_costs`.
-
-        Returns
-        -------
-        (n + p, n + p) or (K, n + p, n + p) array
+        the form also lies above l, up to a constant. Residuals and weights are as for
+        `stage_costs`; W has the shape of the weights, or (K, n + p, n + p).
         """
 
     @abstractmethod
     def prior_cost(self, offset: Array, weight: Array) -> float:
-        """Gamma.
-
-        Parameters
-        ----------
-        offset : (n,) array
-            x_0 minus the prior.
-        weight : (n, n) array
-            The prior's weight.
-        """
+        """Gamma of an offset (n,), x_0 minus the prior, with the prior's weight (n, n)."""
 
     @abstractmethod
     def majorise_prior(self, offset: Array, weight: Array) -> Array:
-        """The prior's counterpart of `majorise`.
-
-        Parameters
-        ----------
-        offset, weight
-            As for `prior_cost`.
-        """
+        """The prior's counterpart of `majorise`, for offset and weight as of `prior_cost`."""
 
     def joint_weight(self, noise: Array | None) -> Array:
-        """The weight of (w, v) with this weight of v.
-
-        Parameters
-        ----------
-        noise : (p, p) array or None
-            Weight of the measurement noise; None for the usual one.
-        """
+        """The weight of (w, v) with this weight (p, p) of the noise v; None for the usual one."""
         joint = np.zeros((self.n + self.p, self.n + self.p))
         joint[: self.n, : self.n] = self.disturbance
         joint[self.n :, self.n :] = self.noise if noise is None else noise
         return joint
 
     def check_noise(self, noise: Array) -> None:  # noqa: B027 - most costs take any weight
-        """Insist that a weight of one sample's noise fits the cost.
-
-        Parameters
-        ----------
-        noise : (p, p) array
-            Symmetric positive definite.
-
-        Raises
-        ------
-        WeightError
-            If the cost cannot use it.
-        """
+        """Raise a `WeightError` unless the cost can use this noise weight (p, p) of one sample."""
 
     def partial_weight(self, observed: Mask, noise: Array | None = None) -> Array:
-        """The stage weight where only some components of y are there; zero on the others.
+        """The stage weight where only the observed components of y are there, (p,) bool.
 
-        Those there weigh the inverse of their block of the noise covariance.
-
-        Parameters
-        ----------
-        observed : (p,) bool array
-            Which components are there.
-        noise : (p, p) array, optional
-            A weight of this sample's noise, instead of the usual one.
+        It is zero on the others; those there weigh the inverse of their block of the covariance
+        of the noise, of which this sample may have a weight of its own.
         """
         if noise is not None:
             return self._reduced(observed, noise)
@@ -220,3 +192,8 @@ def quadratic_form(residuals: Array, weights: Array) -> Array:
     else:
         form = np.einsum("ki,kij,kj->k", residuals, weights, residuals)
     return form
+
+
+def _number(value: Any) -> bool:
+    kinds = (int, float, np.integer, np.floating)
+    return isinstance(value, kinds) and not isinstance(value, bool) and math.isfinite(value)

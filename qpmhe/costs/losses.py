@@ -5,15 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import positive, positive_definite
+from .._checks import Array, positive, positive_definite
 from ..errors import OptionError, WeightError
 from .base import quadratic_form
 
 __all__ = ["Huber", "Loss", "Power", "Quadratic"]
-
-Array = NDArray[np.float64]
 
 
 class Loss(ABC):
@@ -40,18 +38,7 @@ class Loss(ABC):
         self.check_weight(self.weight)
 
     def check_weight(self, weight: Array) -> None:
-        """Insist on a diagonal weight where the loss is per component.
-
-        Parameters
-        ----------
-        weight : (d, d) array
-            The weight.
-
-        Raises
-        ------
-        WeightError
-            If it is not diagonal where it must be.
-        """
+        """Raise a `WeightError` unless the weight is diagonal, where the loss is per component."""
         if self.per_component and (weight - np.diag(np.diag(weight))).any():
             raise WeightError(
                 f"weight is {weight.tolist()}; a loss per component needs a diagonal weight. "
@@ -70,15 +57,9 @@ class Loss(ABC):
         """rho'(q), the factor that turns W into the weight of the majorising form."""
 
     def cost(self, s: Array, weight: Array) -> Array:
-        """The loss of each row.
+        """The loss of each row of s, (K, d), for one weight of all or of each.
 
-        Parameters
-        ----------
-        s : (K, d) array
-            Residuals.
-        weight : (d, d) or (K, d, d) array
-            The weight in use, of all rows or of each: that of the loss, or what is left of
-            it where components are missing.
+        The weight is that of the loss, or what is left of it where components are missing.
         """
         if self.per_component:
             diagonal = np.diagonal(weight, axis1=-2, axis2=-1)
@@ -87,13 +68,7 @@ class Loss(ABC):
         return self._value(quadratic_form(s, weight))
 
     def majorise(self, s: Array, weight: Array) -> Array:
-        """Weights (K, d, d) of the quadratic forms that touch the loss at each row.
-
-        Parameters
-        ----------
-        s, weight
-            As for `cost`.
-        """
+        """Weights (K, d, d) of quadratic forms that touch the loss at each row s; see `cost`."""
         if self.per_component:
             diagonal = np.diagonal(weight, axis1=-2, axis2=-1)
             scaled = diagonal * self._slope(diagonal * s * s)
@@ -114,13 +89,7 @@ class Loss(ABC):
 
 
 class Quadratic(Loss):
-    r"""The quadratic loss :math:`|s|_W^2`, a = 2.
-
-    Parameters
-    ----------
-    weight : (d, d) array_like
-        W, symmetric positive definite.
-    """
+    """The quadratic loss :math:`|s|_W^2`, a = 2, with a symmetric positive definite weight W."""
 
     exponent = 2.0
 
@@ -146,12 +115,10 @@ class Huber(Loss):
 
     Parameters
     ----------
-    weight : (d, d) array_like
-        W, symmetric positive definite.
+    weight, per_component
+        As for `Loss`.
     threshold : float
         k, in standard deviations, > 0; 1.345 keeps 95 % efficiency on normal noise.
-    per_component : bool
-        Whether each component has its own outliers; needs a diagonal W.
 
     References
     ----------
@@ -180,12 +147,10 @@ class Power(Loss):
 
     Parameters
     ----------
-    weight : (d, d) array_like
-        W, symmetric positive definite.
+    weight, per_component
+        As for `Loss`.
     exponent : float
         a >= 1.
-    per_component : bool
-        Whether the powers of the components are added; needs a diagonal W.
 
     Notes
     -----
@@ -194,18 +159,14 @@ class Power(Loss):
     loss everywhere; the judgement by the true cost takes care of that.
     """
 
-    def __init__(
-        self, weight: ArrayLike, exponent: float, per_component: bool = False
-    ) -> None:
+    def __init__(self, weight: ArrayLike, exponent: float, per_component: bool = False) -> None:
         super().__init__(weight, per_component)
         self.exponent: float = positive("exponent", exponent)
         if self.exponent < 1.0:
             raise OptionError(f"exponent is {exponent!r}; expected a number >= 1: convexity.")
 
     def _value(self, q: Array) -> Array:
-        value: Array = q ** (0.5 * self.exponent)
-        return value
+        return q ** (0.5 * self.exponent)
 
     def _slope(self, q: Array) -> Array:
-        value: Array = 0.5 * self.exponent * np.maximum(q, 1e-8) ** (0.5 * self.exponent - 1.0)
-        return value
+        return 0.5 * self.exponent * np.maximum(q, 1e-8) ** (0.5 * self.exponent - 1.0)

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from qpmhe_solvers.errors import report_unknown_options
 
-from .._checks import positive_definite
-from .base import Cost, CostConstants, quadratic_form
-from .prior import ObserverPrior
+from .._checks import Array, positive_definite
+from .base import Cost, CostConstants, ObserverPrior, quadratic_form
 
 __all__ = ["QuadraticCost"]
-
-Array = NDArray[np.float64]
 
 
 @report_unknown_options
@@ -25,17 +22,16 @@ class QuadraticCost(Cost):
         l(\omega, \nu) = |\omega|_Q^2 + |\nu|_R^2
 
     as in (eq:costfunction) and the paper's example; P, Q, R are *weights*, that is
-    inverse covariances.
+    inverse covariances. Where components of y are missing, those that are there weigh the
+    inverse of their block of the covariance R^{-1}.
 
     Parameters
     ----------
     prior : (n, n) array_like or ObserverPrior
         Weight P of the prior, symmetric positive definite, or the rule to take it from a
         Kalman-type observer.
-    disturbance : (n, n) array_like
-        Weight Q of the disturbance w, symmetric positive definite.
-    noise : (p, p) array_like
-        Weight R of the measurement noise v, symmetric positive definite.
+    disturbance, noise : (n, n) and (p, p) array_like
+        Weights Q of the disturbance w and R of the noise v, symmetric positive definite.
     discount : float
         Factor in (0, 1] by which a stage's cost shrinks with each step of age, the prior's
         with the window's length; 1 is the paper's cost.
@@ -46,21 +42,12 @@ class QuadraticCost(Cost):
         If a weight is not square, symmetric and positive definite.
     OptionError
         If the discount is outside of (0, 1].
-
-    Notes
-    -----
-    Where components of y are missing, the noise enters with the weight of the components
-    that are there: the inverse of their block of the covariance R^{-1}.
     """
 
     quadratic = True
 
     def __init__(
-        self,
-        *,
-        prior: ArrayLike | ObserverPrior,
-        disturbance: ArrayLike,
-        noise: ArrayLike,
+        self, *, prior: ArrayLike | ObserverPrior, disturbance: ArrayLike, noise: ArrayLike,
         discount: float = 1.0,
     ) -> None:
         w = positive_definite("disturbance", disturbance)
@@ -73,27 +60,10 @@ class QuadraticCost(Cost):
 
     @classmethod
     def from_covariances(
-        cls,
-        *,
-        prior: ArrayLike | ObserverPrior,
-        disturbance: ArrayLike,
-        noise: ArrayLike,
+        cls, *, prior: ArrayLike | ObserverPrior, disturbance: ArrayLike, noise: ArrayLike,
         discount: float = 1.0,
     ) -> QuadraticCost:
-        """The same cost, given covariances instead of weights.
-
-        Parameters
-        ----------
-        prior, disturbance, noise : array_like
-            Covariances of the initial error, of w and of v, symmetric positive definite.
-        discount : float
-            As for `QuadraticCost`.
-
-        Raises
-        ------
-        WeightError, ShapeError
-            If a covariance is not square, symmetric and positive definite.
-        """
+        """The same cost, given the covariances of initial error, w and v; see `QuadraticCost`."""
         return cls(
             prior=(
                 prior if isinstance(prior, ObserverPrior) else _inverse("prior covariance", prior)

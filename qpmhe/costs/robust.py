@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from qpmhe_solvers.errors import report_unknown_options
 
-from .._checks import positive_definite
+from .._checks import Array, positive_definite
 from ..errors import InvalidInputError
-from .base import Cost, CostConstants
+from .base import Cost, CostConstants, ObserverPrior
 from .losses import Loss, Quadratic
-from .prior import ObserverPrior
 
 __all__ = ["RobustCost"]
-
-Array = NDArray[np.float64]
 
 
 @report_unknown_options
@@ -26,14 +23,15 @@ class RobustCost(Cost):
         \Gamma(\chi, \bar x) = \rho_p(\chi - \bar x), \qquad
         l(\omega, \nu) = \rho_w(\omega) + \rho_v(\nu)
 
+    Assumption ass:stagecosts asks for one exponent a in all three terms. `constants` is
+    None where the losses do not have that; the theorem does not apply then.
+
     Parameters
     ----------
     prior : Loss, (n, n) array_like or ObserverPrior
         Loss of the initial error; a matrix stands for `Quadratic`.
-    disturbance : Loss or (n, n) array_like
-        Loss of w, such as `Huber` or `Power`; a matrix stands for `Quadratic`.
-    noise : Loss or (p, p) array_like
-        Loss of v.
+    disturbance, noise : Loss or array_like
+        Losses of w and v, such as `Huber` or `Power`; a matrix stands for `Quadratic`.
     discount : float
         As for `QuadraticCost`.
 
@@ -42,20 +40,11 @@ class RobustCost(Cost):
     WeightError, ShapeError, OptionError
         If a weight is not symmetric positive definite, dimensions differ, or the discount
         is outside of (0, 1].
-
-    Notes
-    -----
-    Assumption ass:stagecosts asks for one exponent a in all three terms. `constants` is
-    None where the losses do not have that; the theorem does not apply then.
     """
 
     def __init__(
-        self,
-        *,
-        prior: Loss | ArrayLike | ObserverPrior,
-        disturbance: Loss | ArrayLike,
-        noise: Loss | ArrayLike,
-        discount: float = 1.0,
+        self, *, prior: Loss | ArrayLike | ObserverPrior, disturbance: Loss | ArrayLike,
+        noise: Loss | ArrayLike, discount: float = 1.0,
     ) -> None:
         self.disturbance_loss = _loss("disturbance", disturbance)
         self.noise_loss = _loss("noise", noise)
@@ -67,9 +56,7 @@ class RobustCost(Cost):
         else:
             self.prior_loss = _loss("prior", prior)
             weight = positive_definite("prior", self.prior_loss.weight, n)
-        super().__init__(
-            weight, self.disturbance_loss.weight, self.noise_loss.weight, discount
-        )
+        super().__init__(weight, self.disturbance_loss.weight, self.noise_loss.weight, discount)
 
     @property
     def constants(self) -> CostConstants | None:
@@ -102,7 +89,7 @@ class RobustCost(Cost):
         return joint
 
     def check_noise(self, noise: Array) -> None:
-        """Insist on a diagonal weight where the loss is per component; see `Cost`."""
+        """Check that the weight is diagonal where the loss is per component; see `Cost`."""
         self.noise_loss.check_weight(noise)
 
     def prior_cost(self, offset: Array, weight: Array) -> float:

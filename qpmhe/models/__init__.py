@@ -13,16 +13,6 @@ from .van_der_pol import van_der_pol
 from .vehicle import vehicle
 
 __all__ = [
-    "Example",
-    "Record",
-    "Scenario",
-    "batch_reactor",
-    "battery_cell",
-    "catalogue",
-    "chain_of_masses",
-    "cstr",
-    "pendulum",
-    "quadrotor",
-    "van_der_pol",
-    "vehicle",
+    "Example", "Record", "Scenario", "batch_reactor", "battery_cell", "catalogue",
+    "chain_of_masses", "cstr", "pendulum", "quadrotor", "van_der_pol", "vehicle",
 ]

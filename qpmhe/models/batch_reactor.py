@@ -82,16 +82,6 @@ def batch_reactor(method: str = "euler") -> Example:
     method : {"euler", "rk4"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     References
     ----------
     Schiller, Knuefer, Mueller (2021), doi 10.1016/j.ifacol.2021.08.549, (ex:eq:sys).
@@ -104,17 +94,9 @@ def batch_reactor(method: str = "euler") -> Example:
     )
     disturbance, noise = 0.1**2 * np.eye(2), 0.2**2 * np.eye(1)
     scenario = Scenario(
-        system=system,
-        initial_state=np.array([5.0, 2.0]),
-        initial_estimate=np.array([3.0, 0.0]),
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=10,
-        steps=150,
-        labels=("x1 (A)", "x2 (B)"),
-        settling_time=2.0,
-        title="Batch reactor, 2A <-> B",
+        system=system, initial_state=np.array([5.0, 2.0]), initial_estimate=np.array([3.0, 0.0]),
+        disturbance_covariance=disturbance, noise_covariance=noise, dt=_DT, horizon=10, steps=150,
+        labels=("x1 (A)", "x2 (B)"), settling_time=2.0, title="Batch reactor, 2A <-> B",
     )
     observer = Luenberger(_DT * np.array([[0.5], [0.5]]))
     cost = QuadraticCost.from_covariances(prior=np.eye(2), disturbance=disturbance, noise=noise)

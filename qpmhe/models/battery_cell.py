@@ -41,10 +41,7 @@ def _voltage(charge: Array) -> Array:
 
 
 def _voltage_slope(charge: Array) -> Array:
-    slope: Array = (
-        0.2156 + charge * (-0.2356 + 0.9603 * charge) + 36.085 * np.exp(-35.0 * charge)
-    )
-    return slope
+    return (0.2156 + charge * (-0.2356 + 0.9603 * charge) + 36.085 * np.exp(-35.0 * charge))
 
 
 def _rate(x: Array, u: Array) -> Array:
@@ -57,8 +54,7 @@ def _rate_jacobian(x: Array) -> Array:
 
 
 def _output(x: Array, u: Array) -> Array:
-    value: Array = _voltage(x[..., :1]) + x[..., 1:2] + x[..., 2:] + _R0 * u
-    return value
+    return _voltage(x[..., :1]) + x[..., 1:2] + x[..., 2:] + _R0 * u
 
 
 def _output_jacobian(x: Array) -> Array:
@@ -68,8 +64,7 @@ def _output_jacobian(x: Array) -> Array:
 
 
 def _current(t: int, x: Array) -> Array:  # noqa: ARG001
-    current: Array = _CAPACITY * _PROFILE[t // _HOLD % _PROFILE.size, None]
-    return current
+    return _CAPACITY * _PROFILE[t // _HOLD % _PROFILE.size, None]
 
 
 def battery_cell(method: str = "rk4") -> Example:
@@ -102,16 +97,6 @@ def battery_cell(method: str = "rk4") -> Example:
     method : {"rk4", "euler"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     References
     ----------
     Chen and Rincon-Mora, Accurate electrical battery model capable of predicting runtime and
@@ -127,17 +112,10 @@ def battery_cell(method: str = "rk4") -> Example:
     disturbance = np.diag([0.0002**2, 0.001**2, 0.0005**2])
     noise = np.diag([0.005**2])
     scenario = Scenario(
-        system=system,
-        initial_state=np.array([1.0, 0.0, 0.0]),
-        initial_estimate=np.array([0.5, 0.0, 0.0]),
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=60,
-        steps=400,
-        labels=("state of charge", "v1 (V)", "v2 (V)"),
-        inputs=_current,
-        settling_time=300.0,
+        system=system, initial_state=np.array([1.0, 0.0, 0.0]),
+        initial_estimate=np.array([0.5, 0.0, 0.0]), disturbance_covariance=disturbance,
+        noise_covariance=noise, dt=_DT, horizon=60, steps=400,
+        labels=("state of charge", "v1 (V)", "v2 (V)"), inputs=_current, settling_time=300.0,
         title="Battery cell, two RC elements",
     )
     cost = QuadraticCost.from_covariances(

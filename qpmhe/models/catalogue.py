@@ -18,13 +18,10 @@ __all__ = ["catalogue"]
 
 
 def catalogue() -> dict[str, Callable[..., Example]]:
-    """The models by name.
+    """The functions that make the models, by name.
 
-    Returns
-    -------
-    dict
-        From the name to the function that makes the model. Every function can be called
-        without arguments; some take keyword arguments, such as the number of masses.
+    Every function can be called without arguments; some take keyword arguments, such as the
+    number of masses.
 
     Examples
     --------
@@ -34,13 +31,7 @@ def catalogue() -> dict[str, Callable[..., Example]]:
     6
     """
     functions: tuple[Callable[..., Example], ...] = (
-        batch_reactor,
-        van_der_pol,
-        cstr,
-        pendulum,
-        vehicle,
-        quadrotor,
-        chain_of_masses,
+        batch_reactor, van_der_pol, cstr, pendulum, vehicle, quadrotor, chain_of_masses,
         battery_cell,
     )
     return {function.__name__: function for function in functions}

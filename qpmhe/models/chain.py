@@ -92,8 +92,7 @@ class _Chain:
 
     def output(self, x: Array) -> Array:
         """The positions, (..., n/2)."""
-        positions: Array = x[..., : self._half]
-        return positions
+        return x[..., : self._half]
 
     def output_jacobian(self, x: Array) -> Array:
         """The derivative of the output, (..., n/2, n)."""
@@ -202,7 +201,8 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
     The sampling time is 0.03 s, N = 30. Disturbances have standard deviations of 0.001 m and
     0.03 m/s a step, the noise 0.03 m. The chain starts displaced from rest by
     :math:`0.3 \sin(\pi i / (M+1))` m along every axis, the estimation from rest. The prior
-    weighs with 0.3 m and the velocity that goes with it, :math:`0.3 \sqrt{D/m}`.
+    weighs with 0.3 m and the velocity that goes with it, :math:`0.3 \sqrt{D/m}`. The observer's
+    constant gain is that of the stationary Kalman predictor about rest.
 
     Parameters
     ----------
@@ -212,17 +212,6 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
         Of space.
     method : {"rk4", "euler"}
         Discretisation of the model. Euler steps are stable here, too, but damp much less.
-
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-        The observer's constant gain is that of the stationary Kalman predictor about rest.
-
-    Raises
-    ------
-    OptionError
-        If there is no mass, or the dimension or method is unknown.
 
     Notes
     -----
@@ -261,17 +250,10 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
     axes = "xyz"[:dimension]
     names = [f"{axis}{i}" for i in range(1, masses + 1) for axis in axes]
     scenario = Scenario(
-        system=system,
-        initial_state=displaced,
-        initial_estimate=rest,
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=30,
-        steps=120,
+        system=system, initial_state=displaced, initial_estimate=rest,
+        disturbance_covariance=disturbance, noise_covariance=noise, dt=_DT, horizon=30, steps=120,
         labels=(*(f"{name} (m)" for name in names), *(f"v{name} (m/s)" for name in names)),
-        settling_time=1.5,
-        title=f"Chain of {masses} mass{'es' * (masses > 1)} in {dimension} D",
+        settling_time=1.5, title=f"Chain of {masses} mass{'es' * (masses > 1)} in {dimension} D",
     )
     swing = _DISPLACEMENT * (_STIFFNESS / _MASS) ** 0.5
     cost = QuadraticCost.from_covariances(

@@ -33,8 +33,7 @@ _GAIN, _COOLANT = 6.0, (270.0, 330.0)
 
 def _constant(temperature: Array) -> Array:
     """The rate constant k(T)."""
-    value: Array = _FREQUENCY * np.exp(-_ACTIVATION / temperature)
-    return value
+    return _FREQUENCY * np.exp(-_ACTIVATION / temperature)
 
 
 def _rate(x: Array, u: Array) -> Array:
@@ -60,8 +59,7 @@ def _rate_jacobian(x: Array) -> Array:
 
 
 def _output(x: Array) -> Array:
-    temperature: Array = x[..., 1:]
-    return temperature
+    return x[..., 1:]
 
 
 def _output_jacobian(x: Array) -> Array:
@@ -108,16 +106,6 @@ def cstr(method: str = "rk4") -> Example:
     method : {"rk4", "euler"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     References
     ----------
     Henson and Seborg, Nonlinear Process Control, Prentice Hall 1997. Seborg, Edgar,
@@ -130,18 +118,10 @@ def cstr(method: str = "rk4") -> Example:
     )
     disturbance, noise = np.diag([0.005**2, 0.3**2]), np.diag([0.5**2])
     scenario = Scenario(
-        system=system,
-        initial_state=np.array([0.5, 350.0]),
-        initial_estimate=np.array([0.65, 347.0]),
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=20,
-        steps=200,
-        labels=("c (mol/L)", "T (K)"),
-        time_unit="min",
-        inputs=_coolant,
-        settling_time=1.0,
+        system=system, initial_state=np.array([0.5, 350.0]),
+        initial_estimate=np.array([0.65, 347.0]), disturbance_covariance=disturbance,
+        noise_covariance=noise, dt=_DT, horizon=20, steps=200, labels=("c (mol/L)", "T (K)"),
+        time_unit="min", inputs=_coolant, settling_time=1.0,
         title="Continuous stirred tank reactor, exothermic A -> B",
     )
     cost = QuadraticCost.from_covariances(

@@ -13,18 +13,20 @@ __all__ = ["Example"]
 
 
 class Example(NamedTuple):
-    """A system with all that its estimation needs.
+    """A system with all that its estimation needs, as every function of `qpmhe.models` makes it.
+
+    It unpacks in this order. An `OptionError` is raised where an argument of the function, such
+    as the method of discretisation, is not among what it names.
 
     Parameters
     ----------
     system : System
-        The model.
     observer : Observer
         The auxiliary observer, stable in the scenario.
     cost : QuadraticCost
         Weights, the inverse covariances of the scenario and of the initial error.
     scenario : Scenario
-        How the system is simulated, and where the estimation starts.
+        How the system is simulated, ``scenario.simulate(seed)``, and where the estimation starts.
     """
 
     system: System

@@ -32,9 +32,7 @@ __all__ = [
 ]
 
 _FORM = re.compile(r"(?P<where>[^()]+)(?:\((?P<arguments>.*)\))?", re.DOTALL)
-_PARTS = (
-    (System, "system"), (Observer, "observer"), (Cost, "cost"), (Scenario, "scenario"),
-)
+_PARTS = ((System, "system"), (Observer, "observer"), (Cost, "cost"), (Scenario, "scenario"))
 _EXPECTED = (
     "expected a name of the catalogue, name(keyword=value), package.module:function or "
     "path/file.py:function"
@@ -57,8 +55,7 @@ class ModelSource:
     arguments : str
         Keyword arguments of the function, as ``key=value, key=value``.
     fingerprint : str
-        Digest of the file, and of the files that it imports from its own folder; empty for
-        the catalogue.
+        Digest of the file and of those it imports from its folder; empty for the catalogue.
     """
 
     name: str
@@ -88,14 +85,10 @@ def find(text: Any, folder: Path | None = None) -> ModelSource:
     ----------
     text : str
         ``name``, ``name(keyword=value)``, ``package.module:function`` or
-        ``path/file.py:function``.
+        ``path/file.py:function``. A `ModelError` is raised if it has another form, or there is
+        no such model or file.
     folder : Path, optional
         What a file's path is relative to; the working directory if left out.
-
-    Raises
-    ------
-    ModelError
-        If the text has another form, or there is no such model or file.
     """
     match = _FORM.fullmatch(text.strip()) if isinstance(text, str) else None
     if match is None:
@@ -130,20 +123,11 @@ def find(text: Any, folder: Path | None = None) -> ModelSource:
 
 
 def build(source: ModelSource) -> Any:
-    """Call the model's function, and return whatever it returns.
+    """Call the function of a source that `find` found, and return whatever it returns.
 
-    A file can import the files beside it, as it can when Python runs it.
-
-    Parameters
-    ----------
-    source : ModelSource
-        From `find`.
-
-    Raises
-    ------
-    ModelError
-        If the file cannot be imported, has changed since it was found, or lacks the function,
-        or if the function raises; the text names the line in the user's file.
+    A file can import the files beside it, as it can when Python runs it. A `ModelError` is
+    raised if the file cannot be imported, has changed since it was found, or lacks the function,
+    or if the function raises; the text names the line in the user's file.
     """
     with _neighbours(source):
         function = _function(source)
@@ -334,13 +318,8 @@ def _forget(files: set[Path]) -> None:
 
 
 @contextlib.contextmanager
-def _neighbours(source: ModelSource) -> Iterator[None]:
-    """Let a file import those beside it."""
-    if not source.is_file:
-        yield
-        return
-    folder = str(Path(source.where.rpartition(":")[0]).parent)
-    sys.path.insert(0, folder)
+def _in_path(folder: str, position: int) -> Iterator[None]:
+    sys.path.insert(position, folder)
     try:
         yield
     finally:
@@ -348,18 +327,19 @@ def _neighbours(source: ModelSource) -> Iterator[None]:
             sys.path.remove(folder)
 
 
-@contextlib.contextmanager
-def _working_directory() -> Iterator[None]:
+def _neighbours(source: ModelSource) -> contextlib.AbstractContextManager[None]:
+    """Let a file import those beside it."""
+    if not source.is_file:
+        return contextlib.nullcontext()
+    return _in_path(str(Path(source.where.rpartition(":")[0]).parent), 0)
+
+
+def _working_directory() -> contextlib.AbstractContextManager[None]:
     """A console script has its own folder in the path, not the one it is called from."""
     here = str(Path.cwd())
     if "" in sys.path or here in sys.path:
-        yield
-        return
-    sys.path.append(here)
-    try:
-        yield
-    finally:
-        sys.path.remove(here)
+        return contextlib.nullcontext()
+    return _in_path(here, len(sys.path))
 
 
 def _import_file(path: Path) -> ModuleType:

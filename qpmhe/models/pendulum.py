@@ -40,8 +40,7 @@ def _rate_jacobian(x: Array) -> Array:
 
 
 def _output(x: Array) -> Array:
-    angle: Array = x[..., :1]
-    return angle
+    return x[..., :1]
 
 
 def _output_jacobian(x: Array) -> Array:
@@ -71,16 +70,6 @@ def pendulum(method: str = "rk4") -> Example:
     method : {"rk4", "euler"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     References
     ----------
     Khalil, Nonlinear Systems, 3rd edition, 2002, section 1.2.1.
@@ -91,18 +80,10 @@ def pendulum(method: str = "rk4") -> Example:
     )
     disturbance, noise = np.diag([0.001**2, 0.02**2]), np.diag([_COUNT**2 / 12.0])
     scenario = Scenario(
-        system=system,
-        initial_state=np.array([2.5, 0.0]),
-        initial_estimate=np.zeros(2),
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=30,
-        steps=300,
-        labels=("angle (rad)", "speed (rad/s)"),
-        settling_time=1.0,
-        title="Damped pendulum with encoder",
-        resolution=np.array([_COUNT]),
+        system=system, initial_state=np.array([2.5, 0.0]), initial_estimate=np.zeros(2),
+        disturbance_covariance=disturbance, noise_covariance=noise, dt=_DT, horizon=30, steps=300,
+        labels=("angle (rad)", "speed (rad/s)"), settling_time=1.0,
+        title="Damped pendulum with encoder", resolution=np.array([_COUNT]),
     )
     cost = QuadraticCost.from_covariances(
         prior=np.diag([1.0**2, 5.0**2]), disturbance=disturbance, noise=noise

@@ -88,8 +88,7 @@ def _rate_jacobian(x: Array, u: Array) -> Array:
 
 
 def _output(x: Array) -> Array:
-    measured: Array = x[..., _MEASURED]
-    return measured
+    return x[..., _MEASURED]
 
 
 def _output_jacobian(x: Array) -> Array:
@@ -147,17 +146,6 @@ def quadrotor(method: str = "rk4") -> Example:
     method : {"rk4", "euler"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record
-        with the inputs.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     Notes
     -----
     The angles are singular at a pitch of 90 degrees; the controller tilts by 29 at most.
@@ -179,21 +167,13 @@ def quadrotor(method: str = "rk4") -> Example:
     estimate = np.zeros(12)
     estimate[:3] = 1.0, 0.5, 1.5
     scenario = Scenario(
-        system=system,
-        initial_state=start,
-        initial_estimate=estimate,
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=20,
-        steps=200,
+        system=system, initial_state=start, initial_estimate=estimate,
+        disturbance_covariance=disturbance, noise_covariance=noise, dt=_DT, horizon=20, steps=200,
         labels=(
             "x (m)", "y (m)", "z (m)", "vx (m/s)", "vy (m/s)", "vz (m/s)",
             "roll (rad)", "pitch (rad)", "yaw (rad)", "p (rad/s)", "q (rad/s)", "r (rad/s)",
         ),
-        inputs=_fly,
-        settling_time=2.0,
-        title="Quadrotor",
+        inputs=_fly, settling_time=2.0, title="Quadrotor",
     )
     cost = QuadraticCost.from_covariances(
         prior=_diagonal(0.5, 1.0, 0.2, 0.5), disturbance=disturbance, noise=noise

@@ -8,16 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .._checks import count, positive, positive_definite, vector
+from .._checks import Array, count, positive, positive_definite, vector
 from ..errors import InvalidInputError, ModelError, OptionError
 from ..model.sets import ConvexSet
 from ..model.system import System
 
 __all__ = ["Record", "Scenario"]
-
-Array = NDArray[np.float64]
 
 # Draws for one sample until it lies in the sets: more would mean that hardly any does.
 _DRAWS = 1000
@@ -59,23 +56,18 @@ class Scenario:
     Parameters
     ----------
     system : System
-        The system.
-    initial_state : (n,) array
-        x(0) of the simulation.
-    initial_estimate : (n,) array
-        Where the estimation starts.
+    initial_state, initial_estimate : (n,) array
+        Where the simulation starts, and the estimation.
     disturbance_covariance, noise_covariance : array
         Covariances of w (n, n) and v (p, p), before any truncation.
-    dt : float
-        Sampling time.
+    dt, time_unit : float and str
+        Sampling time and its unit.
     horizon : int
         N of the published or recommended setting.
     steps : int
         Samples of a usual record.
     labels : tuple of str
         Names of the states with units, for figures.
-    time_unit : str
-        Unit of dt.
     inputs : callable, optional
         inputs(t, x) -> u(t) (m,), from the sample's index t = 0, 1, ... and the true state
         x(t): known inputs ignore the state, a feedback controller does not. Needed exactly
@@ -114,7 +106,7 @@ class Scenario:
         n, p = self.system.n, self.system.p
         for name in ("initial_state", "initial_estimate"):
             state = vector(name, getattr(self, name), n)
-            _insist_on_member(name, state, self.system.states)
+            _check_member(name, state, self.system.states)
             object.__setattr__(self, name, state)
         for name, size in (("disturbance_covariance", n), ("noise_covariance", p)):
             matrix = positive_definite(name.replace("_", " "), getattr(self, name), size)
@@ -149,18 +141,12 @@ class Scenario:
         steps : int, optional
             Number T of measurements; ``self.steps`` if left out.
 
-        Returns
-        -------
-        Record
-            States (T + 1, n), measurements (T, p) and inputs (T, m), if there are any.
-
         Raises
         ------
         OptionError
             If the seed or the number of steps is not an integer >= 0.
         ModelError
-            If the state cannot be kept in its set by any disturbance that is drawn, or is
-            not finite.
+            If no disturbance that is drawn keeps the state in its set, or it is not finite.
         """
         generator = np.random.default_rng(count("seed", seed, 0))
         total = self.steps if steps is None else count("steps", steps, 0)
@@ -204,7 +190,7 @@ def _factor(covariance: Array) -> Array:
     return np.asarray(np.linalg.cholesky(covariance).T, np.float64)
 
 
-def _insist_on_member(name: str, state: Array, states: ConvexSet | None) -> None:
+def _check_member(name: str, state: Array, states: ConvexSet | None) -> None:
     if states is not None and states.violation(state) > 0.0:
         raise InvalidInputError(
             f"{name} is {state.tolist()}, which is outside of the state set {states!r}."
@@ -212,9 +198,7 @@ def _insist_on_member(name: str, state: Array, states: ConvexSet | None) -> None
 
 
 def _inside(
-    drawn: Array,
-    spread: Array,
-    generator: np.random.Generator,
+    drawn: Array, spread: Array, generator: np.random.Generator,
     *sets: tuple[ConvexSet | None, Any],
 ) -> Array | None:
     """What was drawn, or drawn again until what each set bounds, s + offset, lies in it."""

@@ -39,8 +39,7 @@ def _rate_jacobian(x: Array) -> Array:
 
 
 def _output(x: Array) -> Array:
-    first: Array = x[..., :1]
-    return first
+    return x[..., :1]
 
 
 def _output_jacobian(x: Array) -> Array:
@@ -66,16 +65,6 @@ def van_der_pol(method: str = "rk4") -> Example:
     method : {"rk4", "euler"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     References
     ----------
     Khalil, Nonlinear Systems, 3rd edition, 2002, section 2.4.
@@ -86,17 +75,9 @@ def van_der_pol(method: str = "rk4") -> Example:
     )
     disturbance, noise = np.diag([0.02**2, 0.05**2]), np.diag([0.1**2])
     scenario = Scenario(
-        system=system,
-        initial_state=np.array([2.0, 0.0]),
-        initial_estimate=np.zeros(2),
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=20,
-        steps=200,
-        labels=("x1", "x2"),
-        settling_time=3.0,
-        title="Van der Pol oscillator",
+        system=system, initial_state=np.array([2.0, 0.0]), initial_estimate=np.zeros(2),
+        disturbance_covariance=disturbance, noise_covariance=noise, dt=_DT, horizon=20, steps=200,
+        labels=("x1", "x2"), settling_time=3.0, title="Van der Pol oscillator",
     )
     cost = QuadraticCost.from_covariances(prior=np.eye(2), disturbance=disturbance, noise=noise)
     return Example(system, HighGain(2, epsilon=0.4, dt=_DT), cost, scenario)

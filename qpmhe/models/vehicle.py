@@ -44,8 +44,7 @@ def _rate_jacobian(x: Array, u: Array) -> Array:
 
 def _offsets(x: Array) -> Array:
     """From the vehicle to each beacon, (..., 2 beacons, 2 axes)."""
-    offsets: Array = _BEACONS - x[..., None, :2]
-    return offsets
+    return _BEACONS - x[..., None, :2]
 
 
 def _output(x: Array) -> Array:
@@ -110,16 +109,6 @@ def vehicle(method: str = "rk4") -> Example:
     method : {"rk4", "euler"}
         Discretisation of the model.
 
-    Returns
-    -------
-    system, observer, cost, scenario
-        Ready for `qpmhe.MovingHorizonEstimator`; ``scenario.simulate(seed)`` gives a record.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-
     References
     ----------
     Thrun, Burgard and Fox, Probabilistic Robotics, 2005, sections 5.3 and 6.6.
@@ -131,17 +120,10 @@ def vehicle(method: str = "rk4") -> Example:
     disturbance = np.diag([0.02**2, 0.02**2, 0.02**2])
     noise = np.diag(_ROOT_WEIGHTS**-2.0)
     scenario = Scenario(
-        system=system,
-        initial_state=np.array([0.0, 0.0, 0.8]),
-        initial_estimate=np.array([-1.0, 1.1, 0.3]),
-        disturbance_covariance=disturbance,
-        noise_covariance=noise,
-        dt=_DT,
-        horizon=20,
-        steps=250,
-        labels=("x (m)", "y (m)", "heading (rad)"),
-        inputs=_drive,
-        settling_time=5.0,
+        system=system, initial_state=np.array([0.0, 0.0, 0.8]),
+        initial_estimate=np.array([-1.0, 1.1, 0.3]), disturbance_covariance=disturbance,
+        noise_covariance=noise, dt=_DT, horizon=20, steps=250,
+        labels=("x (m)", "y (m)", "heading (rad)"), inputs=_drive, settling_time=5.0,
         title="Vehicle with ranges and bearings of two beacons",
     )
     cost = QuadraticCost.from_covariances(

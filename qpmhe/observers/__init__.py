@@ -10,13 +10,6 @@ from .steady_kalman import SteadyStateKalman
 from .unscented import UnscentedKalman
 
 __all__ = [
-    "ExtendedKalman",
-    "HighGain",
-    "Luenberger",
-    "Observer",
-    "OutputInjection",
-    "Sample",
-    "SteadyStateKalman",
-    "UnscentedKalman",
-    "design_luenberger",
+    "ExtendedKalman", "HighGain", "Luenberger", "Observer", "OutputInjection", "Sample",
+    "SteadyStateKalman", "UnscentedKalman", "design_luenberger",
 ]

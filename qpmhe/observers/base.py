@@ -6,13 +6,13 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from .._checks import Array, positive_definite
+from ..errors import ShapeError
 from ..model.system import System
 
-__all__ = ["Observer", "Sample"]
-
-Array = NDArray[np.float64]
+__all__ = ["KalmanType", "Observer", "Sample"]
 
 
 @dataclass(slots=True)
@@ -21,16 +21,12 @@ class Sample:
 
     Parameters
     ----------
-    system : System
-        The model that holds at this stage.
-    u : (m,) array
-        The input.
+    system, u : System and (m,) array
+        The model that holds at this stage, and the input.
     f_jacobian, h_jacobian : (n, n) and (p, n) array or None
         Jacobians at z, if `Observer.needs_jacobians`.
-    observed : (p,) bool array or None
-        Which components of y are there; None if all are.
-    noise_weight : (p, p) array or None
-        Weight of this sample's noise, if it is not the usual one.
+    observed, noise_weight : (p,) bool and (p, p) array or None
+        Which components of y are there, and the weight of its noise; None as usual.
     covariance : (n, n) array or None
         Covariance of x(t) - z(t), if the observer has one.
     """
@@ -56,20 +52,7 @@ class Observer(ABC):
 
     @abstractmethod
     def check(self, system: System, initial_state: Array) -> None:
-        """Insist that the observer fits the system.
-
-        Parameters
-        ----------
-        system : System
-            The system that is to be observed.
-        initial_state : (n,) array
-            z(0).
-
-        Raises
-        ------
-        InvalidInputError
-            If it does not fit.
-        """
+        """Raise an `InvalidInputError` unless it fits the system and initial_state, z(0)."""
 
     @property
     def constant_gain(self) -> Array | None:
@@ -86,10 +69,39 @@ class Observer(ABC):
 
         Parameters
         ----------
-        z : (n,) array
-            Observer state z(t).
-        v : (p,) array
-            Fitting error y(t) - h(z(t)), with zeros where y is missing.
+        z, v : (n,) and (p,) array
+            Observer state z(t), and fitting error y(t) - h(z(t)), with zeros where y is missing.
         sample : Sample
             What else is known of the stage; overwritten at the next one.
         """
+
+
+class KalmanType(Observer):
+    """An observer with covariances of initial error (n, n), disturbance and noise (p, p)."""
+
+    def __init__(self, *, prior: ArrayLike, disturbance: ArrayLike, noise: ArrayLike) -> None:
+        self._prior = positive_definite("prior covariance", prior)
+        self._disturbance = positive_definite("disturbance covariance", disturbance)
+        self._noise = positive_definite("noise covariance", noise)
+
+    def check(self, system: System, initial_state: Array) -> None:
+        """Check the covariances' dimensions; see `Observer.check`."""
+        for name, matrix, size in (
+            ("prior", self._prior, system.n),
+            ("disturbance", self._disturbance, system.n),
+            ("noise", self._noise, system.p),
+        ):
+            if matrix.shape[0] != size:
+                raise ShapeError(
+                    f"{name} covariance has shape {matrix.shape}; expected ({size}, {size})."
+                )
+
+    def initial_covariance(self) -> Array:
+        """P(0)."""
+        return self._prior
+
+    def _noise_of(self, sample: Sample) -> Array:
+        """The covariance of this sample's noise."""
+        if sample.noise_weight is None:
+            return self._noise
+        return np.asarray(np.linalg.inv(sample.noise_weight), np.float64)

@@ -8,14 +8,13 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import positive_definite, vector
+from .._checks import Array, positive_definite, vector
 from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
 from ..model.system import System
 from .luenberger import Luenberger
 
 __all__ = ["design_luenberger"]
 
-Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 # Below this a direction counts as unseen. Matrices are scaled to norm one before, and the
@@ -24,13 +23,8 @@ _UNSEEN = float(np.sqrt(np.finfo(np.float64).eps))
 
 
 def design_luenberger(
-    system: System,
-    at: ArrayLike,
-    u: ArrayLike | None = None,
-    *,
-    poles: ArrayLike | None = None,
-    disturbance: ArrayLike | None = None,
-    noise: ArrayLike | None = None,
+    system: System, at: ArrayLike, u: ArrayLike | None = None, *, poles: ArrayLike | None = None,
+    disturbance: ArrayLike | None = None, noise: ArrayLike | None = None,
 ) -> Luenberger:
     r"""A Luenberger observer for the linearisation of a system about a point.
 
@@ -42,8 +36,8 @@ def design_luenberger(
         K = A P C^\top S^{-1}, \quad S = C P C^\top + R, \quad
         P = A P A^\top + Q - K S K^\top
 
-    The observer is stable where the linearisation is a good one. How far that is, nothing
-    here tells: the point should be typical, most often a steady state.
+    The observer is stable where the linearisation is a good one. How far that is remains open:
+    the point should be typical, most often a steady state.
 
     Parameters
     ----------
@@ -57,11 +51,9 @@ def design_luenberger(
         Eigenvalues of A - K C, inside the unit circle, complex ones in conjugate pairs.
         With several outputs, none more often than the rank of C. For a continuous-time
         pole s and a sampling time dt, give exp(s dt).
-    disturbance : (n, n) array_like, optional
-        Covariance Q of w (squared state units), symmetric positive definite. Instead of
-        poles, together with the noise.
-    noise : (p, p) array_like, optional
-        Covariance R of v (squared output units), symmetric positive definite.
+    disturbance, noise : (n, n) and (p, p) array_like, optional
+        Instead of poles: covariances Q of w and R of v (squared units), symmetric positive
+        definite.
 
     Returns
     -------
@@ -300,8 +292,7 @@ def _shift_and_scale(a: Array) -> tuple[float, float]:
 
 def _kernel(matrix: Array) -> Array:
     _, values, rows = np.linalg.svd(matrix)
-    kernel: Array = rows[int(np.count_nonzero(values > _UNSEEN)) :].T
-    return kernel
+    return rows[int(np.count_nonzero(values > _UNSEEN)) :].T
 
 
 def _text(values: ComplexArray) -> str:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .base import Sample
-from .kalman_type import KalmanType
+from .._checks import Array
+from .base import KalmanType, Sample
 
 __all__ = ["ExtendedKalman"]
-
-Array = NDArray[np.float64]
 
 
 class ExtendedKalman(KalmanType):
@@ -29,12 +26,8 @@ class ExtendedKalman(KalmanType):
 
     Parameters
     ----------
-    prior : (n, n) array_like
-        Covariance P(0) of the initial error x(0) - z(0).
-    disturbance : (n, n) array_like
-        Covariance Q of w.
-    noise : (p, p) array_like
-        Covariance R of v.
+    prior, disturbance, noise : (n, n), (n, n) and (p, p) array_like
+        Covariances P(0) of the initial error x(0) - z(0), Q of w and R of v.
 
     Raises
     ------

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import count, positive, vector
+from .._checks import Array, count, positive, vector
 from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
 from ..model.system import System
 from .design import ackermann, linearize, spectral_radius
@@ -16,7 +16,6 @@ from .luenberger import Luenberger
 
 __all__ = ["HighGain"]
 
-Array = NDArray[np.float64]
 Sampling = Literal["exact", "euler"]
 
 
@@ -74,17 +73,13 @@ class HighGain(Luenberger):
 
     Raises
     ------
-    OptionError
-        If epsilon or dt is not positive, a root not in the left half plane, or the sampling
-        unknown.
-    ShapeError
-        If there are not n coefficients. Where the observer meets the system: if that has
-        another number of states, or not one output.
-    ModelError
-        Where the observer meets the system: if A - K C, with the Jacobians at the initial
-        state (and zero input), is not stable. The text names its spectral radius.
-    InvalidInputError
-        Where the observer meets the system: if its sampling time is not dt.
+    OptionError, ShapeError
+        If epsilon or dt is not positive, there are not n coefficients, a root is not in the left
+        half plane, or the sampling is unknown.
+    ShapeError, InvalidInputError, ModelError
+        Where the observer meets the system: if that has another number of states, another
+        sampling time, or not one output, or if A - K C, with the Jacobians at the initial state
+        (and zero input), is not stable. The text names its spectral radius.
 
     References
     ----------
@@ -102,12 +97,7 @@ class HighGain(Luenberger):
     """
 
     def __init__(
-        self,
-        n: int,
-        *,
-        epsilon: float,
-        dt: float,
-        coefficients: ArrayLike | None = None,
+        self, n: int, *, epsilon: float, dt: float, coefficients: ArrayLike | None = None,
         sampling: Sampling = "exact",
     ) -> None:
         n = count("n", n, 1)
@@ -130,7 +120,7 @@ class HighGain(Luenberger):
         super().__init__(gain / self.dt ** np.arange(n))
 
     def check(self, system: System, initial_state: Array) -> None:
-        """Insist on one output, and on stability at z(0); see `Observer.check`."""
+        """Check that there is one output, and stability at z(0); see `Observer.check`."""
         n = self.gain.shape[0]
         if system.p != 1:
             raise ShapeError(

@@ -6,15 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..errors import ModelError
 from ..model.system import System
 from .base import Observer, Sample
 
 __all__ = ["OutputInjection"]
-
-Array = NDArray[np.float64]
 
 
 class OutputInjection(Observer):
@@ -23,13 +21,9 @@ class OutputInjection(Observer):
     Parameters
     ----------
     correction : callable
-        correction(z, v): z (n,) and the fitting error v (p,) to (n,).
-
-    Raises
-    ------
-    ModelError
-        Where it meets the system: if its value has the wrong shape or is not finite, or if
-        it does not vanish for v = 0.
+        correction(z, v): z (n,) and the fitting error v (p,) to (n,). Where it meets the
+        system, a `ModelError` is raised if its value has the wrong shape, is not finite, or
+        does not vanish for v = 0.
     """
 
     def __init__(self, correction: Callable[[Array, Array], Any]) -> None:
@@ -38,7 +32,7 @@ class OutputInjection(Observer):
         self._correction = correction
 
     def check(self, system: System, initial_state: Array) -> None:
-        """Insist on values of shape (n,), and on L(z, 0) = 0; see `Observer.check`."""
+        """Check that values have shape (n,), and that L(z, 0) = 0; see `Observer.check`."""
         self._check_at(initial_state, system.p)
         generator = np.random.default_rng(20210829)
         for _ in range(3):
@@ -54,9 +48,7 @@ class OutputInjection(Observer):
                 f"correction raised {type(error).__name__}: {error} at z = {z.tolist()}, v = 0."
             ) from error
         if value.shape != z.shape:
-            raise ModelError(
-                f"correction returned shape {value.shape}; expected (n,) = {z.shape}."
-            )
+            raise ModelError(f"correction returned shape {value.shape}; expected (n,) = {z.shape}.")
         state, misfit = z.copy(), np.full(outputs, 0.1)
         try:
             with np.errstate(all="ignore"):

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import numbers
+from .._checks import Array, numbers
 from ..errors import ShapeError
 from ..model.system import System
 from .base import Observer, Sample
 
 __all__ = ["Luenberger"]
-
-Array = NDArray[np.float64]
 
 
 class Luenberger(Observer):
@@ -24,12 +22,9 @@ class Luenberger(Observer):
     Parameters
     ----------
     gain : (n, p) array_like
-        K, of the discrete-time observer; a vector (n,) will do where p is 1.
-
-    Raises
-    ------
-    InvalidInputError
-        If the gain is not finite; its shape is checked where it meets the system.
+        K, of the discrete-time observer; a vector (n,) will do where p is 1. An
+        `InvalidInputError` is raised if it is not finite; its shape is checked where it meets
+        the system.
     """
 
     def __init__(self, gain: ArrayLike) -> None:
@@ -37,7 +32,7 @@ class Luenberger(Observer):
         self.gain: Array = given.reshape(-1, 1) if given.ndim < 2 else given
 
     def check(self, system: System, initial_state: Array) -> None:
-        """Insist on a gain of shape (n, p); see `Observer.check`."""
+        """Check that the gain has shape (n, p); see `Observer.check`."""
         shape = (system.n, system.p)
         if self.gain.shape != shape:
             raise ShapeError(

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import positive_definite
+from .._checks import Array, positive_definite
 from ..errors import ShapeError
 from ..model.system import System
 from .base import Observer, Sample
 from .design import linearize, stationary
 
 __all__ = ["SteadyStateKalman"]
-
-Array = NDArray[np.float64]
 
 
 class SteadyStateKalman(Observer):
@@ -45,20 +43,16 @@ class SteadyStateKalman(Observer):
         The state about which to linearise; it should be typical of the operation.
     u : (m,) array_like, optional
         The input there; needed exactly if the system has inputs.
-    disturbance : (n, n) array_like
-        Covariance Q of w (squared state units), symmetric positive definite.
-    noise : (p, p) array_like
-        Covariance R of v (squared output units), symmetric positive definite.
+    disturbance, noise : (n, n) and (p, p) array_like
+        Covariances Q of w and R of v (squared units), symmetric positive definite.
     prior : (n, n) array_like, optional
         Covariance P(0) of the initial error x(0) - z(0); the stationary one if left out,
         which suits an observer that has run for long and is too sure of itself otherwise.
 
     Attributes
     ----------
-    gain : (n, p) array
-        K, in units of the state per unit of the output.
-    covariance : (n, n) array
-        The stationary P.
+    gain, covariance : (n, p) and (n, n) array
+        K, in units of the state per unit of the output, and the stationary P.
 
     Raises
     ------
@@ -83,14 +77,8 @@ class SteadyStateKalman(Observer):
     """
 
     def __init__(
-        self,
-        system: System,
-        at: ArrayLike,
-        u: ArrayLike | None = None,
-        *,
-        disturbance: ArrayLike,
-        noise: ArrayLike,
-        prior: ArrayLike | None = None,
+        self, system: System, at: ArrayLike, u: ArrayLike | None = None, *, disturbance: ArrayLike,
+        noise: ArrayLike, prior: ArrayLike | None = None,
     ) -> None:
         self._a, self._c, point = linearize(system, at, u)
         self._disturbance = positive_definite("disturbance covariance", disturbance, system.n)
@@ -105,7 +93,7 @@ class SteadyStateKalman(Observer):
         self._entering = self._disturbance + self.gain @ self._noise @ self.gain.T
 
     def check(self, system: System, initial_state: Array) -> None:
-        """Insist on a system of the dimensions that the gain is for; see `Observer.check`."""
+        """Check that the gain is for the system's dimensions; see `Observer.check`."""
         n, p = self.gain.shape
         if (system.n, system.p) != (n, p):
             raise ShapeError(

@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import positive
-from .base import Sample
-from .kalman_type import KalmanType
+from .._checks import Array, positive
+from .base import KalmanType, Sample
 
 __all__ = ["UnscentedKalman"]
-
-Array = NDArray[np.float64]
 
 # A sigma point is drawn back into the state set, but not closer to z than this share.
 _CLOSEST = 1e-3
@@ -54,12 +51,8 @@ class UnscentedKalman(KalmanType):
 
     Parameters
     ----------
-    prior : (n, n) array_like
-        Covariance P(0) of the initial error x(0) - z(0), in squared state units.
-    disturbance : (n, n) array_like
-        Covariance Q of w, in squared state units.
-    noise : (p, p) array_like
-        Covariance R of v, in squared output units.
+    prior, disturbance, noise : (n, n), (n, n) and (p, p) array_like
+        Covariances P(0) of the initial error x(0) - z(0), Q of w and R of v, in squared units.
     spread : float
         c, the distance of the sigma points from z in standard deviations, above 0:
         :math:`\sqrt{n + \lambda}` or :math:`\alpha \sqrt{n + \kappa}` of the textbooks.
@@ -79,11 +72,7 @@ class UnscentedKalman(KalmanType):
     """
 
     def __init__(
-        self,
-        *,
-        prior: ArrayLike,
-        disturbance: ArrayLike,
-        noise: ArrayLike,
+        self, *, prior: ArrayLike, disturbance: ArrayLike, noise: ArrayLike,
         spread: float = math.sqrt(3.0),
     ) -> None:
         super().__init__(prior=prior, disturbance=disturbance, noise=noise)

@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import numbers
+from .._checks import Array, numbers
 from ..errors import InvalidInputError, ShapeError
 from ..estimation.estimate import Estimate
 from ..estimation.run import Run
 
 __all__ = ["check_estimate", "check_run", "curve", "label_list", "named_curves", "sample_times"]
-
-Array = NDArray[np.float64]
 
 
 def check_run(run: Any) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._checks import positive
 from ..estimation.estimate import Status
@@ -16,8 +15,6 @@ if TYPE_CHECKING:
     from ..estimation.run import Run
 
 __all__ = ["costs", "outcomes", "step_times"]
-
-Array = NDArray[np.float64]
 
 # Below this many times the largest, a cost is drawn as this: a logarithm ends somewhere.
 _FLOOR = 1e-12
@@ -35,30 +32,15 @@ def costs(
 ) -> Any:
     """True cost J of estimates and candidates, on a logarithmic axis; kept steps are marked.
 
+    Errors are those of `states`.
+
     Parameters
     ----------
     run : Run
-        The run.
-    dt : float
-        Time between samples, in the unit of ``time_label``.
-    time_label : str
-        Label of the time axis, with its unit.
+    dt, time_label
+        As for `states`.
     axes : matplotlib Axes, optional
         Where to draw; a figure is made if left out.
-
-    Returns
-    -------
-    Axes
-        The axes.
-
-    Raises
-    ------
-    InvalidInputError
-        If run is no `Run`, or axes are no axes.
-    ShapeError
-        If axes are more than one.
-    OptionError
-        If dt is not above zero.
     """
     check_run(run)
     dt = positive("dt", dt)
@@ -85,32 +67,12 @@ def costs(
 def outcomes(
     run: Run, *, dt: float = 1.0, time_label: str = "time t (samples)", axes: Any = None
 ) -> Any:
-    """Marks of what happened at each step: improved, kept, and why.
+    """Marks of what happened at each step, a row for each kind of event: improved, kept, and why.
 
     Parameters
     ----------
-    run : Run
-        The run.
-    dt : float
-        Time between samples, in the unit of ``time_label``.
-    time_label : str
-        Label of the time axis, with its unit.
-    axes : matplotlib Axes, optional
-        Where to draw; a figure is made if left out.
-
-    Returns
-    -------
-    Axes
-        The axes; a row for each kind of event that occurred.
-
-    Raises
-    ------
-    InvalidInputError
-        If run is no `Run`, or axes are no axes.
-    ShapeError
-        If axes are more than one.
-    OptionError
-        If dt is not above zero.
+    run, dt, time_label, axes
+        As for `costs`, errors too.
     """
     check_run(run)
     dt = positive("dt", dt)
@@ -138,26 +100,10 @@ def step_times(run: Run, *, deadline: float | None = None, axes: Any = None) -> 
 
     Parameters
     ----------
-    run : Run
-        The run.
+    run, axes
+        As for `costs`, errors too.
     deadline : float, optional
         Seconds, drawn as a line.
-    axes : matplotlib Axes, optional
-        Where to draw; a figure is made if left out.
-
-    Returns
-    -------
-    Axes
-        The axes, both logarithmic.
-
-    Raises
-    ------
-    InvalidInputError
-        If run is no `Run`, or axes are no axes.
-    ShapeError
-        If axes are more than one.
-    OptionError
-        If the deadline is not above zero.
     """
     check_run(run)
     if deadline is not None:

@@ -70,7 +70,7 @@ def panels(count: int, axes: Any, height: float = 2.1) -> list[Any]:
 
 
 def save(figure: Figure, stem: str | PathLike[str]) -> list[Path]:
-    """Write a figure as PNG and SVG.
+    """Write a figure as PNG and SVG, and return the paths of the files.
 
     Parameters
     ----------
@@ -79,11 +79,6 @@ def save(figure: Figure, stem: str | PathLike[str]) -> list[Path]:
     stem : str or Path
         Path without suffix; its folder is made. ``.png`` or ``.svg`` at its end is taken off,
         any other dot belongs to the name: of ``run_0.5`` comes ``run_0.5.png``.
-
-    Returns
-    -------
-    list of Path
-        The files.
 
     Raises
     ------

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .._checks import positive
+from .._checks import Array, positive
 from .checks import check_estimate, check_run, curve, label_list, named_curves, sample_times
 from .style import REAL, STYLES, panels
 
@@ -18,16 +17,10 @@ if TYPE_CHECKING:
 
 __all__ = ["states", "trajectories", "window"]
 
-Array = NDArray[np.float64]
-
 
 def trajectories(
-    times: Array,
-    truth: Array | None,
-    estimates: Mapping[str, Array],
-    labels: Sequence[str],
-    time_label: str,
-    axes: Any = None,
+    times: Array, truth: Array | None, estimates: Mapping[str, Array], labels: Sequence[str],
+    time_label: str, axes: Any = None,
 ) -> list[Any]:
     """True states and estimates over time, one panel a state, as in the paper's figure.
 
@@ -44,12 +37,7 @@ def trajectories(
     time_label : str
         Label of the time axis, with its unit.
     axes : sequence of n matplotlib Axes, optional
-        Where to draw; a figure is made if left out.
-
-    Returns
-    -------
-    list of Axes
-        One a state; ``axes[0].figure`` is the figure, see `save`.
+        Where to draw; a figure is made if left out: ``axes[0].figure`` of the axes returned.
 
     Raises
     ------
@@ -76,13 +64,8 @@ def trajectories(
 
 
 def states(
-    run: Run,
-    *,
-    dt: float = 1.0,
-    labels: Sequence[str] | None = None,
-    time_label: str = "time t (samples)",
-    truth: Array | None = None,
-    sigmas: float = 2.0,
+    run: Run, *, dt: float = 1.0, labels: Sequence[str] | None = None,
+    time_label: str = "time t (samples)", truth: Array | None = None, sigmas: float = 2.0,
     axes: Any = None,
 ) -> list[Any]:
     """The estimates of a run, with bands of their covariances where it has them.
@@ -93,21 +76,10 @@ def states(
         Of `MovingHorizonEstimator.run`, with ``covariances=True`` for the bands.
     dt : float
         Time between samples, in the unit of ``time_label``.
-    labels : sequence of str, optional
-        Axis labels of the states, with units.
-    time_label : str
-        Label of the time axis, with its unit.
-    truth : (T + 1, n) array, optional
-        The real states.
+    labels, time_label, truth, axes
+        As for `trajectories`.
     sigmas : float
         Half the width of a band, in standard deviations.
-    axes : sequence of n matplotlib Axes, optional
-        Where to draw; a figure is made if left out.
-
-    Returns
-    -------
-    list of Axes
-        One a state.
 
     Raises
     ------
@@ -116,7 +88,7 @@ def states(
     ShapeError
         If labels, truth or axes are not of the run's states and times.
     OptionError
-        If dt or sigmas is not above zero.
+        If a number is not above zero.
     """
     check_run(run)
     count, n = run.states.shape
@@ -138,12 +110,8 @@ def states(
 
 
 def window(
-    estimate: Estimate,
-    *,
-    dt: float = 1.0,
-    labels: Sequence[str] | None = None,
-    time_label: str = "time t (samples)",
-    axes: Any = None,
+    estimate: Estimate, *, dt: float = 1.0, labels: Sequence[str] | None = None,
+    time_label: str = "time t (samples)", axes: Any = None,
 ) -> list[Any]:
     """The window of one estimate: the observer's candidate, and what became of it.
 
@@ -151,28 +119,13 @@ def window(
     ----------
     estimate : Estimate
         Of `MovingHorizonEstimator.update`.
-    dt : float
-        Time between samples, in the unit of ``time_label``.
-    labels : sequence of str, optional
-        Axis labels of the states, with units.
-    time_label : str
-        Label of the time axis, with its unit.
-    axes : sequence of n matplotlib Axes, optional
-        Where to draw; a figure is made if left out.
-
-    Returns
-    -------
-    list of Axes
-        One a state.
+    dt, labels, time_label, axes
+        As for `states`.
 
     Raises
     ------
-    InvalidInputError
-        If estimate is no `Estimate`, labels are no strings or axes no axes.
-    ShapeError
-        If labels or axes are not as many as states.
-    OptionError
-        If dt is not above zero.
+    InvalidInputError, ShapeError, OptionError
+        As for `states`, with an `Estimate` in place of the run.
     """
     check_estimate(estimate)
     count, n = estimate.trajectory.shape
