@@ -577,6 +577,5 @@ def test_one_state_one_output_one_input_without_brackets():
 def test_what_is_shown():
     batch = estimator()
     assert "members=3" in repr(batch)
-    assert batch.mode_reason == ""
     assert batch.horizon == 3
     assert "improved=3" in repr(batch.update([1.0, 2.0, 3.0]))
