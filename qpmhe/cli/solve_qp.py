@@ -45,13 +45,8 @@ class Replay(NamedTuple):
 
 
 def run(
-    console: Console,
-    paths: Sequence[Path],
-    backends: Sequence[str] = (),
-    *,
-    max_iterations: int | None = None,
-    tolerance: float | None = None,
-    every: bool = False,
+    console: Console, paths: Sequence[Path], backends: Sequence[str] = (), *,
+    max_iterations: int | None = None, tolerance: float | None = None, every: bool = False,
 ) -> bool:
     """Solve each QP of the files with each backend, and print a table for each file."""
     changes: dict[str, int | float] = {}
@@ -67,8 +62,8 @@ def run(
     tables: list[list[Replay]] = []
     for one, asked in zip(stored, options, strict=True):
         rows: list[Replay] = []
-        for name in wanted or [_default(one)]:
-            # A solver can crash the process: then the last thing on screen tells which one.
+        for name in wanted or [one.backend if one.backend in available() else "auto"]:
+            # A solver can crash the process: then the last line on screen names it.
             with console.status(f"{escape(str(one.path))}: {escape(name)}"):
                 rows.append(replay(one, name, asked))
         console.print(_table(one, asked, rows), highlight=False)
@@ -107,10 +102,6 @@ def _judged(name: str, qp: QP, solution: Solution, seconds: float = np.nan) -> R
     with np.errstate(all="ignore"):
         residuals = Residuals.of(qp, d, bound_duals, row_duals)
         return Replay(name, solution, residuals, qp.objective(d), seconds)
-
-
-def _default(stored: StoredQP) -> str:
-    return stored.backend if stored.backend in available() else "auto"
 
 
 def _solved(row: Replay) -> bool:

@@ -1,7 +1,7 @@
 """Compiled code compared with CasADi's interpreter, before it is used.
 
-A compiler's mistake changes numbers without any sign. Rounding is told apart from it by what
-the interpreter itself makes of arguments that differ in their last digits.
+A compiler's mistake changes numbers without any sign. What the interpreter itself computes from
+arguments that differ in their last digits shows how far rounding alone can go.
 """
 
 from __future__ import annotations
@@ -194,8 +194,7 @@ def _allowed(name: str, xs: Array, found: dict[str, Array]) -> Array:
 
 
 def model_fault(
-    interpreter: Interpreter,
-    maker: Callable[[bool, int, tuple[str, ...]], Buffers],
+    interpreter: Interpreter, maker: Callable[[bool, int, tuple[str, ...]], Buffers],
     batches: Sequence[Batch],
 ) -> str:
     """Where a model's machine code differs from the interpreter; empty where it does not."""
@@ -219,7 +218,7 @@ def model_fault(
                     whole = np.isfinite(true).all(axis=(1, 2))
                     got, true, allowed = got[whole], true[whole], allowed[whole]
                 if differs(got, true, allowed):
-                    return f"{name} of {count} states at once is not that of CasADi's interpreter"
+                    return f"{name} of {count} states at once differs from CasADi's interpreter"
         fault = _residual_fault(maker, timed, xs, given, found)
         if fault:
             return fault
@@ -442,8 +441,7 @@ class _Judged:
 
     def __init__(
         self, xs: Array, found: dict[str, Array], ys: Array, weights: Array, gain: Array,
-        disturbance: Array, prior_weight: Array, prior: Array, discount: float,
-        is_candidate: bool,
+        disturbance: Array, prior_weight: Array, prior: Array, discount: float, is_candidate: bool,
     ) -> None:
         self.xs, self._f, self.observed = xs, found["f"], np.isfinite(ys)
         count = len(ys)

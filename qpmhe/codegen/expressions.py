@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from .._checks import count, positive
+from .._checks import count, need, positive
 from ..errors import InvalidInputError, ModelError, OptionError
 from ..model.discretize import METHODS
 from ..model.functions import check_inputs, takes_input
@@ -15,36 +15,16 @@ __all__ = ["CasadiModel", "casadi_model", "import_casadi"]
 
 
 def import_casadi() -> Any:
-    """The casadi package, which is imported late.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is not installed.
-    """
-    try:
-        import casadi
-    except ImportError as error:
-        raise InvalidInputError(
-            "the model needs CasADi, which is not installed; pip install 'qpmhe[casadi]'."
-        ) from error
-    return casadi
+    """The casadi package, imported late; InvalidInputError if it is not installed."""
+    return need("casadi", "the model", "casadi")
 
 
 @dataclass(frozen=True)
 class CasadiModel:
-    """f and h, or the rate of an ODE and h, as functions of (x, u).
+    """f and h as functions of (x, u) to a dense column, with n, p, m states, outputs and inputs.
 
-    Parameters
-    ----------
-    f, h : casadi.Function
-        (x, u) to a dense column; u has no rows where there are no inputs.
-    n, p, m : int
-        Numbers of states, outputs and inputs.
-    dt : float or None
-        Sampling time of an ODE; None where f is the discrete-time map itself.
-    method : str or None
-        Its discretisation.
+    f is the rate of an ODE with sampling time ``dt`` and discretisation ``method``, or the
+    discrete-time map itself, where these are None. u has no rows where there are no inputs.
     """
 
     f: Any
@@ -56,19 +36,9 @@ class CasadiModel:
     method: str | None = None
 
     def with_jacobian(self, which: str) -> tuple[Any, list[int]]:
-        """A function of (x, u) to the value and the nonzeros of its Jacobian by x.
+        """A function of (x, u) to f or h and the nonzeros of its Jacobian by x.
 
-        Parameters
-        ----------
-        which : {"f", "h"}
-            The function.
-
-        Returns
-        -------
-        function : casadi.Function
-            (x, u) to the value and a column of nonzeros.
-        places : list of int
-            Where each nonzero is in the dense Jacobian, counted by rows.
+        Also where each nonzero is in the dense Jacobian, counted by rows.
         """
         ca, function = import_casadi(), getattr(self, which)
         x, u = _symbols(ca, function, self.n, self.m)
@@ -107,20 +77,7 @@ def casadi_model(
     dt: float | None = None,
     method: str = "rk4",
 ) -> CasadiModel:
-    """Check a model given to CasADi and bring it to the common form.
-
-    Parameters
-    ----------
-    f, h : casadi.Function or callable
-        As for `qpmhe.from_casadi`.
-    n, p, m, dt, method
-        As there.
-
-    Raises
-    ------
-    InvalidInputError
-        If CasADi is missing, or an argument does not fit; subclasses tell what.
-    """
+    """Check the arguments of `qpmhe.from_casadi`, and bring the model to the common form."""
     ca = import_casadi()
     if method not in METHODS:
         raise OptionError(f"method is {method!r}; expected one of {', '.join(METHODS)}.")
@@ -182,7 +139,7 @@ def _canonical(ca: Any, name: str, given: Any, n: int, m: int) -> Any:
             )
         call = given if given.n_in() > 1 else _without_input(given)
     elif callable(given):
-        call = _with_inputs(name, given, m)
+        call = given if takes_input(name, given, m) else _without_input(given)
     else:
         raise ModelError(f"{name} is {given!r}; expected a casadi.Function or a callable.")
     error: Exception | None = None
@@ -218,7 +175,7 @@ def _asserts(ca: Any, call: Callable[[Any, Any], Any], n: int, m: int) -> bool:
         if isinstance(value, (list, tuple)):
             value = ca.vertcat(*value)
         function = ca.Function("tried", [x, u], [ca.MX(value)])
-    except Exception:  # of scalar operations alone, then; or what is told when it is used
+    except Exception:  # of scalar operations alone, or reported when it is used
         return False
     found, waiting = set(), [function]
     while waiting:
@@ -236,12 +193,5 @@ def _asserts(ca: Any, call: Callable[[Any, Any], Any], n: int, m: int) -> bool:
     return False
 
 
-def _with_inputs(name: str, function: Callable[..., Any], m: int) -> Callable[[Any, Any], Any]:
-    return function if takes_input(name, function, m) else _without_input(function)
-
-
 def _without_input(function: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
-    def call(x: Any, _: Any) -> Any:
-        return function(x)
-
-    return call
+    return lambda x, _: function(x)

@@ -93,7 +93,7 @@ def _is_flat(one: ConvexSet) -> bool:
 
 
 def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:
-    """Zeros, or an error that tells how many bytes there are not."""
+    """Zeros, or an error that says how many bytes are missing."""
     try:
         return np.zeros(count, kind)
     except (MemoryError, ValueError) as error:  # the latter of more than can be addressed
@@ -104,11 +104,7 @@ def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:
 
 
 def generated(
-    system: System,
-    observer: Observer,
-    cost: Cost,
-    settings: Settings,
-    name: str = "mhe",
+    system: System, observer: Observer, cost: Cost, settings: Settings, name: str = "mhe",
     real: str = "double",
 ) -> tuple[dict[str, str], str, Layout, NDArray[Any]]:
     """Source of an estimator, its structure, its layout and its settings."""
@@ -126,14 +122,9 @@ def generated(
 class EstimatorLibrary:
     """Functions and structures of one compiled estimator.
 
-    Attributes
-    ----------
-    layout : Layout
-        Its sizes.
-    settings : structured array
-        The ``mhe_settings`` in use; must outlive all estimators that point to it.
-    update, update_members, amend, reset, run : ctypes functions
-        The C functions of these names; `update` is ``mhe_update_undoable``.
+    ``settings``, the ``mhe_settings`` in use, must outlive all estimators that point to it.
+    ``update``, ``update_members``, ``amend``, ``reset`` and ``run`` are the C functions of these
+    names; `update` is ``mhe_update_undoable``.
     """
 
     def __init__(
@@ -172,7 +163,7 @@ class EstimatorLibrary:
         self.run.argtypes = [pointer, integer, pointer, integer, pointer, pointer, pointer]
 
     def _check_sizes(self, library: ctypes.PyDLL) -> int:
-        """Insist that C and NumPy lay the structures out alike; the workspace's size."""
+        """Refuse structures that C and NumPy lay out differently; the workspace's size."""
         sizes = np.zeros(4, np.int64)
         library.mhe_sizes.restype = None
         library.mhe_sizes(ctypes.c_void_p(sizes.ctypes.data))

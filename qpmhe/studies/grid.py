@@ -1,15 +1,8 @@
 """What a study compares: models, backends, caps, horizons and seeds; in Python or in a TOML file.
 
 In a TOML file the keys are the parameters of `Study`. TOML has no None: ``"converged"`` stands for
-it in ``qps``, ``"none"`` in ``solver_iterations``, ``"default"`` in ``horizons``::
-
-    models = ["batch_reactor", "chain_of_masses(masses=2)", "my_model.py:make"]
-    backends = ["daqp", "osqp"]
-    qps = [0, 1, 2, "converged"]
-    solver_iterations = [1, 5, "none"]
-    seeds = 20
-
-Paths of models are relative to the file.
+it in ``qps``, ``"none"`` in ``solver_iterations``, ``"default"`` in ``horizons``. Paths of models
+are relative to the file.
 """
 
 from __future__ import annotations
@@ -46,41 +39,37 @@ WORDS = {"qps": "converged", "solver_iterations": "none", "horizons": "default"}
 class Study:
     """A grid of estimators, each run on records of many seeds.
 
-    Cells that would be the same are one: with ``qps=0`` no QP is solved, so that there is one
-    cell, whose backend is called ``observer``; a backend without a cap has one cell for all
+    Cells that would be the same are one: with ``qps=0`` no QP is solved, so there is one cell,
+    whose backend is called ``observer``; a backend without a cap has one cell for all
     ``solver_iterations``.
 
     Parameters
     ----------
     models : sequence of str
-        Names of the catalogue, with keyword arguments where wanted
-        (``chain_of_masses(masses=2)``), or functions that return system, observer, cost and
-        scenario: ``package.module:function`` or ``path/file.py:function``.
+        Names of the catalogue, with arguments where wanted (``chain_of_masses(masses=2)``), or
+        functions that return system, observer, cost and scenario: ``package.module:function`` or
+        ``path/file.py:function``.
     backends : sequence of str, optional
-        QP backends; if left out, all that are installed, without the generic forms
-        (``qpsolvers:...``) of those that have one of their own.
-    qps : sequence of int or None
-        QPs per sample, the paper's i; None iterates to convergence, 0 is the observer.
-    solver_iterations : sequence of int or None
-        Caps on the solver's own iterations in each QP; None leaves the solver's default.
-    horizons : sequence of int or None
-        N; None takes the scenario's.
+        QP backends; by default all that are installed, without the forms ``qpsolvers:...``.
+    qps, solver_iterations, horizons : sequence of int or None
+        QPs per sample, the paper's i (0 is the observer; None iterates to convergence); caps on
+        the solver's iterations in each QP (None: its default); N (None: the scenario's).
     starts : sequence of {"candidate", "best"}
         Where the sequences of QPs start.
     seeds : int or sequence of int
         Seeds of the records; a number k stands for 0, ..., k-1.
     steps : int, optional
-        Samples of a record; the scenario's if left out.
+        Samples of a record; the scenario's by default.
     measure : {"both", "accuracy", "time"}
-        What is recorded. With "time" one cell runs at a time, unless more jobs are asked for.
+        What is recorded. With "time" one cell runs at a time, unless you ask for more jobs.
     deadline : float, optional
         Seconds; the results report the share of steps that take longer.
     covariances : bool
-        Whether covariances are computed, and errors judged by them (NEES).
+        Whether to compute covariances, and judge errors by them (NEES).
     cell_timeout : float
         Seconds for one cell.
     folder : str or Path, optional
-        What the paths of models are relative to; the working directory if left out.
+        The paths of models are relative to it; by default to the working directory.
 
     Raises
     ------
@@ -122,18 +111,10 @@ class Study:
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Study:
-        """Read a study from a file, and check it before anything runs.
+        """Read a study from the TOML file ``path``, and check it before anything runs.
 
-        Parameters
-        ----------
-        path : str or Path
-            A TOML file whose keys are the parameters of this class, without ``folder``.
-
-        Raises
-        ------
-        StudyError
-            If it cannot be read, is empty, has an unknown key or a value that does not fit;
-            the text has the file and the line.
+        Its keys are the parameters of this class, without ``folder``. A `StudyError` names the file
+        and the line of what does not fit.
         """
         path = Path(path)
         text = _read(path)
@@ -165,11 +146,8 @@ class Study:
 
     def settings(self) -> dict[str, Any]:
         """The grid as plain lists and numbers; what the store keeps of it."""
-        found = {name: getattr(self, name) for name in _CHECKS}
-        return {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in found.items()
-        }
+        found = ((name, getattr(self, name)) for name in _CHECKS)
+        return {key: list(one) if isinstance(one, tuple) else one for key, one in found}
 
     def cells(self) -> tuple[Cell, ...]:
         """All cells, each once, seed by seed, so that the first results cover the whole grid."""
@@ -260,10 +238,6 @@ def _several(name: str, value: Any, known: str) -> list[Any]:
     return found
 
 
-def _models(value: Any) -> tuple[str, ...]:
-    return _distinct(_several("models", value, "name at least one model"))
-
-
 def _backends(value: Any) -> tuple[str, ...]:
     if value is None:
         return tuple(name for name in available() if ":" not in name)
@@ -318,7 +292,7 @@ def _switch(value: Any) -> bool:
 
 # The check of each option, in order; each returns the value in its standard form.
 _CHECKS: dict[str, Callable[[Any], Any]] = {
-    "models": _models,
+    "models": lambda value: _distinct(_several("models", value, "name at least one model")),
     "backends": _backends,
     "qps": _numbers("qps", 0, " None stands for convergence."),
     "solver_iterations": _numbers("solver_iterations", 1, " None leaves the solver's default."),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import need
 from ..costs import QuadraticCost
 from ..errors import InvalidInputError
 from ..estimation.estimate import Estimate, Status
@@ -26,37 +27,21 @@ Array = NDArray[np.float64]
 class IpoptEstimator:
     """The estimator of Definition def:estimator with Ipopt on the nonlinear program.
 
-    The program is (eq:optiMHE) in the state trajectory, as in `Problem`: with disturbances
-    as variables of their own and the dynamics as constraints, Ipopt took a quarter longer.
-    It is built once for each window length and started at the candidate. An iterate is
-    judged as everywhere else in this package: by its state trajectory, the true cost and
-    the true constraints, against the candidate.
+    The program is (eq:optiMHE) in the state trajectory, as in `Problem`: with disturbances as
+    variables, too, Ipopt took a quarter longer. It is built once for each window length and
+    starts at the candidate. The true cost and the true constraints judge its iterate.
     """
 
     def __init__(
-        self,
-        system: System,
-        observer: Observer,
-        cost: QuadraticCost,
-        *,
-        f: Callable[[Any], Any],
-        h: Callable[[Any], Any],
-        horizon: int,
-        initial_state: Array,
-        max_iterations: int | None = None,
-        tolerance: float = 1e-8,
+        self, system: System, observer: Observer, cost: QuadraticCost, *, f: Callable[[Any], Any],
+        h: Callable[[Any], Any], horizon: int, initial_state: Array,
+        max_iterations: int | None = None, tolerance: float = 1e-8,
     ) -> None:
-        try:
-            import casadi
-        except ImportError as error:
-            raise InvalidInputError(
-                "Ipopt comes with CasADi, which is not installed; pip install 'qpmhe[casadi]'."
-            ) from error
+        self._casadi = need("casadi", "Ipopt, which is part of CasADi,", "casadi")
         if system.m or cost.observer_prior is not None:
             raise InvalidInputError(
                 "the comparison with Ipopt takes systems without inputs and constant prior weights."
             )
-        self._casadi = casadi
         self._system, self._cost, self._f, self._h = system, cost, f, h
         self._prior = cost.prior
         self._window = Window(system, observer, cost, horizon, initial_state, False)
@@ -91,17 +76,10 @@ class IpoptEstimator:
         improved = math.isfinite(trial.cost) and trial.cost < candidate.cost * (1 - 1e-12)
         best = trial if improved else candidate
         estimate = Estimate(
-            window.time - 1,
-            best.trajectory.copy(),
-            best.residuals.copy(),
-            best.cost,
-            window.candidate.copy(),
-            candidate.cost,
-            Status.IMPROVED if improved else Status.CANDIDATE,
-            str(solve.stats()["return_status"]),
-            0,
-            int(solve.stats()["iter_count"]),
-            solve_time,
+            window.time - 1, best.trajectory.copy(), best.residuals.copy(), best.cost,
+            window.candidate.copy(), candidate.cost,
+            Status.IMPROVED if improved else Status.CANDIDATE, str(solve.stats()["return_status"]),
+            0, int(solve.stats()["iter_count"]), solve_time,
         )
         estimate.step_time = perf_counter() - began
         return estimate

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers import available, backend, create
 
-from ..errors import InvalidInputError
+from .._checks import make_folder
 from ..estimation.estimate import Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
@@ -24,6 +24,7 @@ from ..models.batch_reactor import batch_reactor, casadi_output, casadi_rate
 from ..models.scenario import Record
 from ..plots import save, trajectories
 from .ipopt import IpoptEstimator
+from .metrics import accuracy, timing
 
 __all__ = ["SETTLED", "PaperStudy", "Reproduction", "Row", "reproduce"]
 
@@ -41,17 +42,7 @@ SETTLED = 2.0
 
 @dataclass(frozen=True)
 class PaperStudy:
-    """One record of the example, and estimators on it.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the noise.
-    steps : int
-        Number of measurements.
-    method : str
-        Discretisation, ``euler`` or ``rk4``.
-    """
+    """One record of the example, by ``seed``, ``steps`` and ``method``: ``euler`` or ``rk4``."""
 
     seed: int = 0
     steps: int = 150
@@ -92,24 +83,8 @@ class PaperStudy:
 class Row:
     """Accuracy, time and outcome of one run.
 
-    Attributes
-    ----------
-    label : str
-        What was run.
-    cap : int or None
-        Cap on the iterations inside each QP.
-    states : (T + 1, n) array
-        The estimates.
-    rmse, rmse_settled : float
-        Root mean square of |x(t) - estimate(t)| over all t, and from `SETTLED` on.
-    median_time, high_time : float
-        Median and 95th percentile of the seconds per update.
-    improved : float
-        Share of steps whose estimate is better than the candidate.
-    mean_cost : float
-        Mean of J over all steps.
-    stopped : str
-        What ended the steps, with shares.
+    The RMSEs are over all t and from `SETTLED` on, the times the median and the 95th percentile
+    of the seconds per update, ``mean_cost`` the mean of J, and ``stopped`` what ended the steps.
     """
 
     label: str
@@ -130,12 +105,10 @@ class Reproduction:
 
     Attributes
     ----------
-    study : PaperStudy
-        The record.
-    backend : str
-        Backend of ``rows``.
+    study, backend : PaperStudy, str
+        The record, and the backend of ``rows``.
     rows : list of Row
-        i = 0, 1, 2, 5 and converged; then Ipopt's, where it was asked for.
+        i = 0, 1, 2, 5 and converged; then Ipopt's, where asked for.
     backends : list of Row
         Every installed backend at each cap, with i = 2.
     files : list of Path
@@ -149,7 +122,7 @@ class Reproduction:
     files: list[Path]
 
     def excess(self, row: Row) -> float:
-        """Mean cost of a row above that of the converged one, relative."""
+        """How far a row's mean cost is above the converged one, relative."""
         converged = next(one for one in self.rows if one.label == "converged")
         return row.mean_cost / converged.mean_cost - 1.0
 
@@ -169,16 +142,15 @@ def reproduce(
     Parameters
     ----------
     out : path, optional
-        Folder for the figure (PNG, SVG) and tables (CSV); it is made. Nothing is written if
-        left out.
+        Folder for the figure (PNG, SVG) and tables (CSV); without it nothing is written.
     seed, steps, method
         As of `PaperStudy`.
     backend_name : str
         QP backend of the paper's rows.
     ipopt : bool
-        Whether CasADi with Ipopt, the paper's tool, runs beside.
+        Whether to run CasADi with Ipopt, the paper's tool, as well.
     progress : callable, optional
-        Is given the number of steps that are done and of all steps.
+        Called with the numbers of finished and of all steps.
 
     Returns
     -------
@@ -187,20 +159,11 @@ def reproduce(
 
     Raises
     ------
-    BackendError
-        If the backend is unknown or not installed.
-    InvalidInputError
-        If the folder cannot be made, or CasADi is missing though asked for.
+    BackendError, InvalidInputError
+        If the backend or CasADi is missing, or the folder cannot be made.
     """
     create(backend_name)  # before any work: a wrong name must not cost a minute
-    folder = None if out is None else Path(out)
-    if folder is not None:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InvalidInputError(
-                f"cannot make the folder {folder}: {error.strerror}."
-            ) from error
+    folder = None if out is None else make_folder(out)
     study = PaperStudy(seed, steps, method)
     runs: list[tuple[str, int | None, Callable[[], Any]]] = [
         ("converged" if i is None else f"i = {i}", None, partial(study.estimator, i, backend_name))
@@ -235,18 +198,11 @@ def reproduce(
 
 
 def _row(label: str, cap: int | None, run: Run, record: Record, dt: float) -> Row:
-    squares = np.sum((run.states - record.states) ** 2, axis=1)
-    late = squares[round(SETTLED / dt) :]
+    errors, times = accuracy(run.states, record.states, round(SETTLED / dt)), timing(run.times)
     return Row(
-        label=label,
-        cap=cap,
-        states=run.states,
-        rmse=float(np.sqrt(squares.mean())),
-        rmse_settled=float(np.sqrt(late.mean())) if late.size else float("nan"),
-        median_time=float(np.median(run.times)),
-        high_time=float(np.percentile(run.times, 95)),
-        improved=run.share(Status.IMPROVED),
-        mean_cost=float(run.costs.mean()),
+        label, cap, run.states, rmse=errors["rmse"], rmse_settled=errors["rmse_settled"],
+        median_time=times["time_median"], high_time=times["time_p95"],
+        improved=run.share(Status.IMPROVED), mean_cost=float(run.costs.mean()),
         stopped=_stopped(run),
     )
 

@@ -20,7 +20,7 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from qpmhe_solvers import backend
 
@@ -52,32 +52,27 @@ _SIGNALS = re.compile(r"exit codes of the workers are \{(.*?)\}")
 
 
 def run(
-    study: Study,
-    store: Store | str | Path,
-    *,
-    jobs: int | None = None,
-    scheduler: str | None = None,
-    progress: bool | Console = True,
-    retry_failed: bool = False,
+    study: Study, store: Store | str | Path, *, jobs: int | None = None,
+    scheduler: str | None = None, progress: bool | Console = True, retry_failed: bool = False,
 ) -> Store:
     """Run the cells of a study that the store does not have, and store each as it ends.
 
     A study that is stopped or killed loses no finished cell; the same call resumes it. A cell
     that fails is a row with its reason. Where a cell kills its worker process, it runs once
-    more alone, then with the solver in a process of its own; no other cell is lost.
+    more alone, then with the solver in another process; no other cell is lost.
 
     Parameters
     ----------
     study : Study
         What to run.
     store : Store, str or Path
-        Where results go. Cells of other studies may be in it.
+        Where results go. It may hold cells of other studies.
     jobs : int, optional
-        Cells at a time on this machine; as many as there are cores if left out, one if only
-        times are measured.
+        Cells at a time on this machine; by default the number of cores, or one if only times are
+        measured.
     scheduler : str, optional
-        Address of a Dask scheduler, such as ``tcp://10.0.0.1:8786``, whose workers run the
-        cells in place of this machine; best with one thread each.
+        Address of a Dask scheduler, such as ``tcp://10.0.0.1:8786``, whose workers run the cells
+        instead; best with one thread each.
     progress : bool or rich.console.Console
         Whether (and where) to show a progress bar; on the standard error stream by default.
     retry_failed : bool
@@ -90,10 +85,8 @@ def run(
 
     Raises
     ------
-    StoreError
-        If the store cannot be used, or no longer.
-    StudyError
-        If the cluster cannot be reached, or no longer.
+    StoreError, StudyError
+        If the store, or the cluster, cannot be used, or no longer.
     InvalidInputError
         If an argument does not fit, or a package is missing.
     """
@@ -104,7 +97,12 @@ def run(
         if scheduler is not None:
             raise OptionError("jobs is for this machine; with a scheduler, leave it out.")
     target = store if isinstance(store, Store) else Store(store)
-    with closing(_workers(study, jobs, scheduler)) as workers, target.writing() as writer:
+    alone = study.measure == "time"  # other cells would share the cores
+    made = (
+        _Processes(jobs or (1 if alone else environment()["cores"])) if scheduler is None
+        else _Cluster(scheduler)
+    )
+    with closing(made) as workers, target.writing() as writer:
         writer.begin(
             {**study.settings(), "jobs": workers.jobs, "scheduler": scheduler},
             {source.name: source.fingerprint for source in study.sources},
@@ -117,28 +115,6 @@ def run(
                 writer.put(result)
                 advance(result["outcome"] == "failed")
     return target
-
-
-class Workers(Protocol):
-    """Where cells run."""
-
-    jobs: int
-
-    def submit(self, task: Task) -> Future[Result]:
-        """Send a task."""
-        ...
-
-    def ready(self) -> bool:
-        """Whether there are workers at all."""
-        ...
-
-    def restart(self) -> None:
-        """Replace workers that may have died."""
-        ...
-
-    def close(self) -> None:
-        """Leave nothing running."""
-        ...
 
 
 class _Processes:
@@ -162,6 +138,7 @@ class _Processes:
         return True
 
     def restart(self) -> None:
+        """Replace workers that may have died."""
         if self._executor is not None:
             self._executor.shutdown(wait=True, kill_workers=True)
             self._executor = None
@@ -241,13 +218,7 @@ def _identity(distributed: Any, address: str, seconds: float) -> dict[str, Any]:
     return answer if isinstance(answer, dict) else {}
 
 
-def _workers(study: Study, jobs: int | None, scheduler: str | None) -> Workers:
-    if scheduler is not None:
-        return _Cluster(scheduler)
-    return _Processes(jobs or (1 if study.measure == "time" else environment()["cores"]))
-
-
-def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
+def _results(workers: _Processes | _Cluster, tasks: Iterable[Task]) -> Iterator[Result]:
     """The row of each task, in the order in which they end."""
     waiting, suspects = deque(tasks), deque[Task]()
     sent: dict[Future[Result], Task] = {}
@@ -289,7 +260,7 @@ def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
 
 
 def _answer(
-    workers: Workers, task: Task, future: Future[Result], start: float | None
+    workers: _Processes | _Cluster, task: Task, future: Future[Result], start: float | None
 ) -> Result | Exception:
     """The row of a task that ended, or the error where the process died that may have run it."""
     try:
@@ -306,7 +277,7 @@ def _answer(
         return error
 
 
-def _again(workers: Workers, task: Task) -> Result:
+def _again(workers: _Processes | _Cluster, task: Task) -> Result:
     """Run a cell alone at which a process may have died, at last with its solver isolated."""
     words = ""
     for isolated in (False, True) if task.cell.backend != OBSERVER else (False,):

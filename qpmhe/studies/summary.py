@@ -14,7 +14,9 @@ from ..errors import InvalidInputError, ShapeError
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
-__all__ = ["CONFIGURATION", "METRICS", "PROBLEM", "TOLERANCE", "pareto_front", "summarise"]
+__all__ = [
+    "CONFIGURATION", "METRICS", "PROBLEM", "TOLERANCE", "cells_of", "pareto_front", "summarise",
+]
 
 #: What distinguishes configurations.
 CONFIGURATION = (
@@ -53,8 +55,7 @@ def summarise(frame: DataFrame) -> DataFrame:
     Parameters
     ----------
     frame : pandas.DataFrame
-        One row a cell, with the columns of the store: `CONFIGURATION`, ``seed``, ``steps``,
-        ``outcome``, ``reasons``, ``shared``, and the metrics.
+        One row a cell, with the columns of the store.
 
     Returns
     -------
@@ -64,15 +65,15 @@ def summarise(frame: DataFrame) -> DataFrame:
         - of `CONFIGURATION`; ``seeds`` (cells), ``failures`` (cells that failed), ``shared``
           (whether any time was taken on shared cores);
         - of `METRICS`: the mean over finished cells, with ``_low`` and ``_high``. Times in
-          seconds per step. ``failed_steps`` is the share of steps where solver or model
-          failed. ``rmse_excess`` is ``rmse`` relative to that of the most accurate
-          configuration of the same problem (`PROBLEM`), minus 1, taken seed by seed, so that
-          what the seeds have in common cancels;
+          seconds per step. ``failed_steps`` is the share of steps where solver or model failed.
+          ``rmse_excess`` is ``rmse`` relative to the most accurate configuration of the same
+          problem (`PROBLEM`), minus 1, seed by seed, so that what the seeds have in common
+          cancels;
         - ``rmse_states`` and ``rmse_settled_states``: lists, a value a state;
         - ``reasons``: dict, share of the steps with each flag of `qpmhe.Status`;
-        - ``pareto``: whether no configuration of the same problem is faster
-          (``time_median``) and more accurate (``rmse``, where a difference below `TOLERANCE`
-          is none). Only configurations without failed cells take part.
+        - ``pareto``: whether no configuration of the same problem is faster (``time_median``)
+          and more accurate (``rmse``, by more than `TOLERANCE`). Only configurations without
+          failed cells take part.
 
     Raises
     ------
@@ -155,7 +156,7 @@ def _add_means(summary: DataFrame, done: DataFrame, names: list[str]) -> None:
 
 
 def _excess(done: DataFrame, summary: DataFrame) -> Series:
-    """RMSE of each cell above that of the best configuration on the same seed, relative."""
+    """How far each cell's RMSE is above the best configuration's on the same seed, relative."""
     import pandas as pd
 
     excess = pd.Series(np.nan, index=done.index, dtype=float)
@@ -164,13 +165,14 @@ def _excess(done: DataFrame, summary: DataFrame) -> Series:
         ranked = rows.sort_values(["failures", "rmse"])
         if ranked.empty or not np.isfinite(ranked["rmse"].iloc[0]):
             continue
-        best = _cells_of(done, ranked.iloc[0], CONFIGURATION).groupby("seed")["rmse"].mean()
-        mine = _cells_of(done, ranked.iloc[0], PROBLEM)
+        best = cells_of(done, ranked.iloc[0], CONFIGURATION).groupby("seed")["rmse"].mean()
+        mine = cells_of(done, ranked.iloc[0], PROBLEM)
         excess[mine.index] = mine["rmse"] / mine["seed"].map(best).astype(float) - 1.0
     return excess
 
 
-def _cells_of(cells: DataFrame, row: Any, keys: tuple[str, ...]) -> DataFrame:
+def cells_of(cells: DataFrame, row: Any, keys: tuple[str, ...]) -> DataFrame:
+    """The cells that have the same values as a row of the summary."""
     import pandas as pd
 
     chosen = np.ones(len(cells), dtype=bool)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -32,8 +33,7 @@ class Answer:
 class Case:
     """The configurations that can be compared: those of one model, horizon and record length.
 
-    ``key`` names files and links, ``title`` is for reading, and ``summary`` has their rows of
-    `qpmhe.studies.summarise`.
+    ``key`` names files and links.
     """
 
     key: str
@@ -149,20 +149,17 @@ def cases(summary: DataFrame) -> list[Case]:
         title = f"{model}, " + ("usual N" if missing(horizon) else f"N = {int(horizon)}")
         if several["steps"]:
             title += f", T = {int(steps)}"
-        safe = "".join(c if c.isalnum() else "-" for c in title).strip("-")
-        while "--" in safe:
-            safe = safe.replace("--", "-")
+        safe = re.sub(r"[\W_]+", "-", title).strip("-")
         key = safe if safe not in {case.key for case in found} else f"{safe}-{place}"
         found.append(Case(key, title, rows))
     return found
 
 
 def chosen(summary: DataFrame) -> tuple[Any | None, Any] | None:
-    """The fastest configuration near the best RMSE, and the most accurate one.
+    """The fastest configuration near the best RMSE, and the most accurate, of equals the fastest.
 
-    Where several have the best RMSE within `qpmhe.studies.summary.TOLERANCE`, the fastest of
-    these is taken. The first is None where there are no times; all is None where no
-    configuration finished all its runs.
+    The first is None where there are no times; all is None where no configuration finished all
+    its runs.
     """
     rows = summary[(summary["failures"] == 0) & np.isfinite(summary["rmse"].astype(float))]
     if rows.empty:

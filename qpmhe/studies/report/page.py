@@ -8,14 +8,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..._checks import make_folder
 from ...errors import InvalidInputError
 from ...plots import save, trajectories
 from ..store import Store
-from ..summary import TOLERANCE, pareto_front, summarise
+from ..summary import PROBLEM, TOLERANCE, cells_of, pareto_front, summarise
 from . import figures
 from .answers import Case, cases, chosen, failures, limitations
 from .drawing import Axis, Drawing, Mark, Panel, Style, interactive, static, styles
@@ -25,7 +26,6 @@ from .words import (
     cap_words,
     configuration_words,
     listed,
-    missing,
     percent,
     qps_heading,
     qps_words,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-__all__ = ["Source", "write_report"]
+__all__ = ["write_report"]
 
 #: States that the page draws, and a file.
 MOST_STATES, _MOST_STATIC = 12, 6
@@ -63,30 +63,14 @@ _ROLES = {
 }
 
 
-class Source(Protocol):
-    """What a report is made of; `qpmhe.studies.Store` is one."""
-
-    def frame(self) -> DataFrame:
-        """One row a cell."""
-        ...
-
-    def meta(self) -> Mapping[str, Any]:
-        """``study`` (settings), ``environments`` (list of mappings)."""
-        ...
-
-    def trajectory(self, key: str) -> Mapping[str, Any] | None:
-        """Times, states, estimates, labels, title and time_unit of a cell; None if not kept."""
-        ...
-
-
 def write_report(
-    source: Source | str | Path | tuple[DataFrame, Mapping[str, Any]], out: str | Path
+    source: Store | str | Path | tuple[DataFrame, Mapping[str, Any]], out: str | Path
 ) -> Path:
     """Write ``index.html``, figures as PNG and SVG, and ``summary.csv`` into a folder.
 
     Parameters
     ----------
-    source : Source, path or (frame, meta)
+    source : Store, path or (frame, meta)
         A store or its file; or its frame and meta alone, then without trajectories.
     out : path
         The folder; it is made.
@@ -94,14 +78,13 @@ def write_report(
     Returns
     -------
     Path
-        The HTML file. It holds all that it shows and asks for nothing over the network.
+        The HTML file, which needs nothing from the network.
 
     Raises
     ------
-    StoreError
-        If the store cannot be read.
-    InvalidInputError
-        If there is no finished cell, the folder cannot be made, or a library is missing.
+    StoreError, InvalidInputError
+        If the store cannot be read or has no finished cell, the folder cannot be made, or a
+        library is missing.
     """
     absent = [name for name in ("pandas", "plotly", "itables", "jinja2") if not find_spec(name)]
     if absent:
@@ -115,14 +98,11 @@ def write_report(
         raise InvalidInputError(
             "the study has no finished cell, so that there is nothing to report; run it first."
         )
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidInputError(f"cannot make the folder {folder}: {error.strerror}.") from error
+    folder = make_folder(out)
     summary = summarise(frame)
+    deadline = (meta.get("study") or {}).get("deadline")
     found = [
-        Part(case, _cells(frame, case), (meta.get("study") or {}).get("deadline"))
+        Part(case, cells_of(frame, case.summary.iloc[0], PROBLEM), deadline)
         for case in cases(summary)
     ]
     if not isinstance(source, tuple):
@@ -159,7 +139,7 @@ class Part:
     runs: Runs = field(default_factory=Runs)
 
 
-def choose_runs(source: Source, cells: DataFrame, case: Case, most: int) -> Runs:
+def choose_runs(source: Store, cells: DataFrame, case: Case, most: int) -> Runs:
     """The runs of one case: the best configurations' first, up to this many bytes."""
     runs = Runs()
     seed = cells["seed"].min()
@@ -214,6 +194,7 @@ def _run_figure(first: Mapping[str, Any]) -> dict[str, Any]:
         for j in range(n)
     ], 90 + (170 if n <= 4 else 115) * n, gap=0.12)
     figure = interactive(drawing, _ROLES)
+    assert figure is not None
     for trace in figure["data"]:
         role, j = trace["meta"]["role"], trace["meta"]["state"]
         trace |= {"x": times, "name": role, "legendgroup": role, "showlegend": j == 0}
@@ -294,21 +275,8 @@ def _run_file(runs: Runs) -> Figure:
     return figure
 
 
-def _cells(frame: DataFrame, case: Case) -> DataFrame:
-    first = case.summary.iloc[0]
-    same = frame["model"] == first["model"]
-    for name in ("horizon", "steps"):
-        column, value = frame[name], first[name]
-        equal = column.isna() if missing(value) else (column == value).fillna(False)
-        same &= equal.astype(bool)
-    return frame[same]
-
-
 def _page(
-    frame: DataFrame,
-    meta: Mapping[str, Any],
-    parts: list[Part],
-    drawn: Mapping[str, Style],
+    frame: DataFrame, meta: Mapping[str, Any], parts: list[Part], drawn: Mapping[str, Style],
     profile: list[Profile],
 ) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -368,7 +336,7 @@ def _figures(part: Part, drawn: Mapping[str, Style], overall: Drawing | None) ->
             summary["time_median"].where(whole), summary[by].where(whole), TOLERANCE
         )
         rows = _in_percent(summary) if metric == "rmse_excess" else summary
-        measures[metric] = _interactive(figures.accuracy(rows, metric, label, front), drawn)
+        measures[metric] = interactive(figures.accuracy(rows, metric, label, front), drawn)
     rest = summary[summary["backend"] != "observer"]
     qps = [(word, word) for word in ranked(map(qps_words, rest["qps"]))]
     caps = [(word, word) for word in ranked(map(cap_words, rest["solver_iterations"]))]
@@ -376,9 +344,9 @@ def _figures(part: Part, drawn: Mapping[str, Style], overall: Drawing | None) ->
     numbers = [word for word, _ in qps if word.isdigit()]
     return {
         "accuracy": measures,
-        "anytime": _interactive(figures.anytime(summary), drawn),
-        "times": _interactive(figures.times(figures.spreads(part.cells), part.deadline), drawn),
-        "profile": _interactive(overall, drawn),
+        "anytime": interactive(figures.anytime(summary), drawn),
+        "times": interactive(figures.times(figures.spreads(part.cells), part.deadline), drawn),
+        "profile": interactive(overall, drawn),
         "trajectories": None if runs.first is None else _run_figure(runs.first),
         "runs": {"observer": runs.observer, "all": runs.all},
         "menus": {
@@ -393,10 +361,6 @@ def _figures(part: Part, drawn: Mapping[str, Style], overall: Drawing | None) ->
             "run": runs.entries[0][0] if runs.entries else None,
         },
     }
-
-
-def _interactive(drawing: Drawing | None, drawn: Mapping[str, Style]) -> dict[str, Any] | None:
-    return None if drawing is None else interactive(drawing, drawn)
 
 
 def _in_percent(summary: DataFrame) -> DataFrame:
