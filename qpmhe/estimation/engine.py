@@ -24,7 +24,7 @@ from .estimate import Estimate, Status
 from .optimizer import Optimizer
 from .problem import Problem
 from .settings import Settings
-from .snapshot import SET_NAMES, check_description, described, reading, taken
+from .snapshot import SET_NAMES, check_description, checked_array, described, reading
 from .stages import Mark
 from .subproblem import Subproblem
 from .window import Window
@@ -315,7 +315,7 @@ class PythonEngine:
         loaded, recomputed = (self._fresh_window(np.zeros(n)) for _ in range(2))
         for one in (loaded, recomputed):
             one.load_state_dict(state["window"], self._system.make_timed is not None)
-        history = [taken("history", one, (n,)) for one in state["history"]]
+        history = [checked_array("history", one, (n,)) for one in state["history"]]
         count = min(loaded.length + 1, self._history.maxlen or 1)
         if len(history) != count:
             raise ValueError(f"history has {len(history)} states; expected {count}")
@@ -323,7 +323,7 @@ class PythonEngine:
         if (trajectory is None) != (loaded.time == 0):
             raise TypeError("trajectory is there exactly if there was a measurement")
         if trajectory is not None:
-            trajectory = taken("trajectory", trajectory, (loaded.length + 1, n))
+            trajectory = checked_array("trajectory", trajectory, (loaded.length + 1, n))
             if not np.array_equal(trajectory[-1], history[-1]):
                 raise ValueError("history does not end where the trajectory does")
         dropped = state["dropped"]

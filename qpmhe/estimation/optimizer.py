@@ -37,16 +37,8 @@ class Outcome:
         Whether it is better than the reference.
     events : Status
         Why the sequence stopped, and what happened.
-    message : str
-        Message of a solver that failed.
-    qps, corrections : int
-        QPs solved, and second-order corrections among the solves beside them.
-    solver_iterations : int or None
-        Sum of the solver's own counts, None where it reports none.
-    solve_time : float
-        Seconds in the solver.
-    dropped : tuple of str
-        Names of the sets that were left out.
+    message, qps, corrections, solver_iterations, solve_time, dropped
+        As in `Estimate`.
     """
 
     # Class attributes as defaults: few of them change in most steps.

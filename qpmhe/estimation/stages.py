@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .._checks import positive_definite
 from .linearization import Span, Stage, StageTerms
-from .snapshot import check_size, other, taken
+from .snapshot import check_size, checked_array, mismatch
 
 __all__ = ["Mark", "StageView", "Stages", "Views", "WindowView", "read_only"]
 
@@ -254,15 +254,15 @@ class Stages:
             ("covariance", self._covariances, state["covariance"]),
         ):
             if (mine is None) != (saved is None):
-                raise other("observer")
+                raise mismatch("observer")
             if mine is not None:
-                mine[: length + 1] = taken(name, saved, (length + 1, *mine.shape[1:]))
-        self._earlier_state = taken("earlier", state["earlier"], self._earlier_state.shape)
+                mine[: length + 1] = checked_array(name, saved, (length + 1, *mine.shape[1:]))
+        self._earlier_state = checked_array("earlier", state["earlier"], self._earlier_state.shape)
         if self._covariances is not None:
             saved, shape = state["earlier_covariance"], self._covariances.shape[1:]
-            self._earlier_covariance = taken("earlier_covariance", saved, shape)
+            self._earlier_covariance = checked_array("earlier_covariance", saved, shape)
         if len(state["stages"]) != len(self._stage_arrays()):
-            raise other("cost")
+            raise mismatch("cost")
         for arrays, part, may_be_infinite in (
             # Inputs, and costs and terms where the model fails.
             (self._stage_arrays(), state["stages"], (self._u, self._stage_costs)),
@@ -270,7 +270,7 @@ class Stages:
         ):
             for array, saved in zip(arrays, part, strict=True):
                 finite = not any(array is one for one in may_be_infinite)
-                array[:length] = taken(
+                array[:length] = checked_array(
                     "a stage", saved, (length, *array.shape[1:]), array.dtype, finite
                 )
         if not (self._stage_costs[:length] >= 0.0).all():
@@ -284,7 +284,7 @@ class Stages:
         for when, weight in state["own_noise"].items():
             when = check_size("a sample's time", when, lambda t: time - length <= t < time)
             self._own_noise[when] = positive_definite(
-                "noise_weight", taken("noise_weight", weight, (p, p))
+                "noise_weight", checked_array("noise_weight", weight, (p, p))
             )
         latest = [  # the times of the last special and irregular stages that are loaded
             time - length + int(np.flatnonzero(flags[:length])[-1]) if flags[:length].any()

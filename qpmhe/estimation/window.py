@@ -13,7 +13,7 @@ from ..model.system import Function, System
 from ..observers import Observer, Sample
 from .limits import LARGEST
 from .linearization import Stage, StageTerms
-from .snapshot import near, other
+from .snapshot import mismatch, near
 from .stages import Stages, WindowView
 
 __all__ = ["Window"]
@@ -319,11 +319,11 @@ class Window(Stages):
                 self._compute_stage(k, first + k)
                 succeeded = math.isfinite(loaded._stage_costs[k])
                 if succeeded != math.isfinite(self._stage_costs[k]):
-                    raise other("model")
+                    raise mismatch("model")
                 if succeeded:
                     self._check_stage(k, loaded, terms)
                 elif loaded.terms.residuals[k, :n].any():  # no correction at a failed stage
-                    raise other("model")
+                    raise mismatch("model")
                 # A restart sets it after a failed stage; elsewhere it has been compared.
                 self._z[k + 1] = loaded._z[k + 1]
                 if self._covariances is not None and loaded._covariances is not None:
@@ -337,36 +337,36 @@ class Window(Stages):
             and np.array_equal(self._observed[k], loaded._observed[k])
             and near(loaded._weights[k], self._weights[k], np.abs(self._weights[k]).max())
         ):
-            raise other("weight of the stages' cost")
+            raise mismatch("weight of the stages' cost")
         y, fitting_error = np.abs(self._y[k]), mine.residuals[k, n:]
         if not near(saved.residuals[k, n:], fitting_error, y + np.abs(fitting_error)):
-            raise other("model (h)")
+            raise mismatch("model (h)")
         sizes = np.abs(loaded._z[: self.end + 1]).max(axis=0)
         correction = mine.residuals[k, :n]
         reached = np.maximum(sizes, np.abs(correction))
         if not near(saved.residuals[k, :n], correction, reached):
-            raise other("observer")
+            raise mismatch("observer")
         if not near(loaded._z[k + 1], self._z[k + 1], reached):
-            raise other("model (f)")
+            raise mismatch("model (f)")
         if self._covariances is not None and loaded._covariances is not None:
             found, expected = loaded._covariances[k + 1], self._covariances[k + 1]
             spread = np.sqrt(np.abs(expected.diagonal()))
             if not near(found, expected, np.outer(spread, spread)):
-                raise other("observer")
+                raise mismatch("observer")
         r, weight = saved.residuals[k], loaded._weights[k]
         cost = float(self._evaluate_costs(r[None], weight)[0])
         size = np.abs(r).dot(np.abs(weight)).dot(np.abs(r)) if self._quadratic else cost
         if not near(loaded._stage_costs[k], cost, size):
-            raise other("cost")
+            raise mismatch("cost")
         if not (terms and (self._with_terms or self._quadratic)):
             return
         jacobian = mine.linear[k, :, 1:]
         sizes = np.nan_to_num(np.abs(jacobian)).max(axis=1, keepdims=True)
         if not near(saved.linear[k, :, 1:], jacobian, sizes):
-            raise other("model (its Jacobians)")
+            raise mismatch("model (its Jacobians)")
         majorising = self._majorising_weights[k]
         if not near(loaded._majorising_weights[k], majorising, np.abs(majorising).max()):
-            raise other("cost")
+            raise mismatch("cost")
         exact, bound = StageTerms(1, n, r.size - n), StageTerms(1, n, r.size - n)
         exact.linear[0], weight = saved.linear[k], loaded._majorising_weights[k]
         bound.linear[0] = np.abs(exact.linear[0])
@@ -376,4 +376,4 @@ class Window(Stages):
             saved.arrays(), exact.arrays(), bound.arrays(), strict=True
         ):
             if not near(found[k], expected[0], size[0]):
-                raise other("weight of the stages' cost")
+                raise mismatch("weight of the stages' cost")
