@@ -22,11 +22,11 @@ from ..estimation.settings import Settings
 from ..estimation.snapshot import (
     SET_NAMES,
     check_description,
+    checked_array,
     described,
+    mismatch,
     near,
-    other,
     reading,
-    taken,
 )
 from ..model.system import System
 from ..observers import Observer
@@ -231,7 +231,8 @@ class CompiledEngine:
         with reading():
             check_description(state["estimator"], self._description())
             size, linearized = self._memory.itemsize, state["linearized"]
-            memory = taken("memory", state["memory"], (size,), np.uint8).view(self._memory.dtype)
+            memory = checked_array("memory", state["memory"], (size,), np.uint8)
+            memory = memory.view(self._memory.dtype)
             if not isinstance(linearized, bool):
                 raise TypeError(f"linearized is {linearized!r}")
             with np.errstate(all="ignore"):
@@ -291,7 +292,7 @@ class CompiledEngine:
         if not flags[2]:
             weight = self._cost.partial_weight(observed != 0, weight)[-p:, -p:]
         if not near(stage["noise_weight"].reshape(p, p), weight, np.abs(weight).max()):
-            raise other("weight of the stages' cost")
+            raise mismatch("weight of the stages' cost")
 
     def _check_stage(self, stage: Any, following: Array, sizes: Array) -> tuple[Array, Array]:
         """Compare a stage with what the model makes of it; its Jacobians."""
@@ -319,7 +320,7 @@ class CompiledEngine:
         )
         held = not np.isfinite(stage["cost"])
         if held != (not np.isfinite([reached.dot(reached), cost]).all()):
-            raise other("model")
+            raise mismatch("model")
         if held:
             if stage["w"].any() or stage["v"].any():
                 raise ValueError("a failed stage has residuals")
@@ -328,15 +329,15 @@ class CompiledEngine:
         error_size = np.abs(stage["y"]) + np.abs(error)
         sizes = np.maximum(sizes, np.abs(correction))
         if not near(stage["v"], error, error_size):
-            raise other("model (h)")
+            raise mismatch("model (h)")
         if not near(stage["w"], correction, sizes):
-            raise other("observer")
+            raise mismatch("observer")
         if not near(following, reached, sizes):
-            raise other("model (f)")
+            raise mismatch("model (f)")
         w, v = stage["w"], stage["v"]
         kept = w.dot(weights[0]).dot(w) + v.dot(weights[1]).dot(v)
         if not near(stage["cost"], kept, size):
-            raise other("cost")
+            raise mismatch("cost")
         finite = np.isfinite(a).all() and np.isfinite(c).all()
         return (a, c) if finite else (np.eye(n), np.zeros((p, n)))
 
@@ -345,13 +346,13 @@ class CompiledEngine:
         for name in ("f_jacobian", "h_jacobian"):
             steepest = np.abs(terms[name]).max(axis=1, keepdims=True)
             if not near(found[name].reshape(terms[name].shape), terms[name], steepest):
-                raise other("model (its Jacobians)")
+                raise mismatch("model (its Jacobians)")
         a, c = (found[name].reshape(terms[name].shape) for name in ("f_jacobian", "h_jacobian"))
         exact = _terms(self._cost, stage, a, c)
         bound = _terms(self._cost, stage, a, c, np.abs)
         for name in ("hessian", "coupling", "own", "following"):
             if not near(found[name], exact[name], np.abs(bound[name])):
-                raise other("weight of the stages' cost")
+                raise mismatch("weight of the stages' cost")
 
 
 def _terms(

@@ -1,4 +1,4 @@
-"""One step of the estimator in Python, and all that it remembers from step to step."""
+"""One step of the estimator in Python, and its memory between steps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .estimate import Estimate, Status
 from .optimizer import Optimizer
 from .problem import Problem
 from .settings import Settings
-from .snapshot import SET_NAMES, check_description, described, reading, taken
+from .snapshot import SET_NAMES, check_description, checked_array, described, reading
 from .stages import Mark
 from .subproblem import Subproblem
 from .window import Window
@@ -35,10 +35,10 @@ Array = NDArray[np.float64]
 
 
 class PythonEngine:
-    """The loop body: sample in, observer, candidate, QPs, verdict, estimate out.
+    """The step in Python: window, problem, optimizer, estimate.
 
-    Everything it is given was checked by `MovingHorizonEstimator`, whose methods of the
-    same names document these.
+    `MovingHorizonEstimator` validates all arguments; its methods of the same names document
+    those here.
     """
 
     name = "python"
@@ -65,49 +65,23 @@ class PythonEngine:
         self._problem = Problem(system, cost)
         self._subproblem = Subproblem(system, cost, settings.horizon)
         self._optimizer = Optimizer(self._subproblem, solver, settings)
-        self._linearized = settings.qp_limit > 0
+        self._with_terms = settings.qp_limit > 0
         self._window = self._fresh_window(initial_state)
-        self._made = system.call_modes()  # how the model is called, as found at construction
-        self._before: tuple[Mark, Array | None, tuple[str, ...], tuple[Array, ...]]
-        self._trajectory: Array | None = None  # the last estimate's
-        self._dropped: tuple[str, ...] = ()
-        # Estimates of x(t-N), ..., x(t), each made at its own time; or the last where it suffices.
-        again = settings.candidate == "reinitialized"
+        self._known_modes = system.call_modes()  # as found at construction
+        self._undo_point: tuple[Mark, Array | None, tuple[str, ...], tuple[Array, ...]]
+        self._trajectory: Array | None = None  # of the last estimate
+        self._dropped: tuple[str, ...] = ()  # the sets that it leaves out
+        # Estimates of x(t-N), ..., x(t), each made at its own time; otherwise of x(t) only.
+        self._reinitialized = settings.candidate == "reinitialized"
         self._history: deque[Array] = deque(
-            [initial_state.copy()], maxlen=settings.horizon + 1 if again else 1
+            [initial_state.copy()], maxlen=settings.horizon + 1 if self._reinitialized else 1
         )
-
-    def run(self, ys: Array, us: Array | None) -> None:
-        """Take only sample by sample."""
-
-    def reset(self, initial_state: Array) -> None:
-        """Forget all measurements and start at this state."""
-        self._solver.forget()
-        self.replace(self._fresh_window(initial_state), None, (), [initial_state.copy()])
-
-    @property
-    def memory(self) -> tuple[Window, Array | None, tuple[str, ...], deque[Array]]:
-        """What `replace` takes."""
-        return self._window, self._trajectory, self._dropped, self._history
-
-    def replace(
-        self, window: Window, trajectory: Array | None, dropped: tuple[str, ...],
-        history: Iterable[Array],
-    ) -> None:
-        """Remember this in place of all that was; whole or, if interrupted, not at all."""
-        before = self.memory
-        try:
-            self._window, self._trajectory, self._dropped = window, trajectory, dropped
-            self._history = deque(history, maxlen=self._history.maxlen)
-        except BaseException:
-            self._window, self._trajectory, self._dropped, self._history = before
-            raise
 
     def _fresh_window(self, initial_state: Array) -> Window:
         settings = self._settings
         return Window(
             self._system, self._observer, self._cost, settings.horizon, initial_state,
-            self._linearized,
+            self._with_terms,
         )
 
     @property
@@ -128,75 +102,33 @@ class PythonEngine:
     def step(
         self, y: Array, u: Array, dt: float | None, noise_weight: Array | None, began: float
     ) -> Estimate:
-        """Take a sample in, and estimate."""
-        window, again = self._window, self._settings.candidate == "reinitialized"
+        """Take the sample y(t), u(t), and estimate x(t+1)."""
+        window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
-            window.make_room()
-        self._mark(again)
+            window.make_room()  # `undo` cannot cross it
+        self._set_undo_point(reinitialized)
         try:
             with np.errstate(all="ignore"):
                 if window.length == self._settings.horizon:
                     self._solver.shift()
                 missing, model_failed, jacobian_failed = window.push(y, u, dt, noise_weight)
-                if again:
-                    # The history reaches back to the estimate of the window's first state.
+                if reinitialized:
                     first = self._history[len(self._history) - window.length]
                     missing, model_failed, jacobian_failed = window.replay(window.length, first)
                 estimate = self._estimate(missing, model_failed, jacobian_failed, began)
             assert self._trajectory is not None
-            newest = self._trajectory[-1]
-            # Of many states, views would keep as many trajectories.
-            self._history.append(newest.copy() if again else newest)
+            state = self._trajectory[-1]
+            # A view keeps its whole trajectory in memory: one may, N may not.
+            self._history.append(state.copy() if reinitialized else state)
             return estimate
         except BaseException:  # an interrupt: the sample is not taken
             self.undo()
             raise
 
-    def amend(self, time: int, y: Array) -> Estimate:
-        """Put a late measurement in its place, and estimate again."""
-        began = perf_counter()
-        self._mark(True)
-        try:
-            with np.errstate(all="ignore"):
-                self._window.amend(time, y)
-                self._trajectory = None  # it does not belong to the window before this one
-                missing = not self._window.observed[-1].all()
-                model_failed = self._window.newest_failed
-                estimate = self._estimate(missing, model_failed, False, began)
-            self._history[-1] = estimate.state.copy()
-            return estimate
-        except BaseException:
-            self.undo()
-            raise
-
-    def _mark(self, whole: bool) -> None:
-        """Note what `undo` needs; whole where stages of the window are to be rewritten."""
-        window = self._window.mark(whole)
-        self._before = window, self._trajectory, self._dropped, tuple(self._history)
-
-    def undo(self) -> None:
-        """Take the last step back, as far as this is in our hands: solvers start afresh."""
-        window, self._trajectory, self._dropped, history = self._before
-        self._window.roll_back(window)
-        self._history.clear()
-        self._history.extend(history)
-        self._subproblem.forget()
-        self._solver.forget()
-
-    def covariances(self) -> Array:
-        """Covariances along the last estimate."""
-        if self._trajectory is None:
-            raise InvalidInputError("there is no estimate yet; update first.")
-        problem = self._problem
-        with np.errstate(all="ignore"):
-            problem.bind(self._window)
-            problem.leave_out(self._dropped)
-            return window_covariances(problem, self._trajectory.copy())
-
     def _estimate(
         self, missing: bool, model_failed: bool, jacobian_failed: bool, began: float
     ) -> Estimate:
-        """Solve the window's problem as it stands."""
+        """Solve the present window's problem."""
         window, problem, settings = self._window, self._problem, self._settings
         problem.bind(window)
         start = self._shifted() if settings.warm_start else None
@@ -214,9 +146,9 @@ class PythonEngine:
         elif not math.isfinite(reference.cost):
             status |= Status.FAILED_STAGE
         if not math.isfinite(reference.cost):
-            status &= ~Status.NO_DECREASE  # no solver is to blame where nothing can be judged
+            status &= ~Status.NO_DECREASE  # the model failed, not the solver
         if not outcome.improved:
-            trajectory = trajectory.copy()  # of the window, which moves on
+            trajectory = trajectory.copy()  # it is a view of the window
         if problem.observed is not None or not outcome.improved:
             residuals = residuals.copy()
             if problem.observed is not None:
@@ -245,32 +177,99 @@ class PythonEngine:
         return estimate
 
     def _shifted(self) -> Array | None:
-        """The previous estimate, moved on by one step of the model to the present window."""
-        window, before = self._window, self._trajectory
-        if before is None:
+        """The previous estimate, shifted by one step of the model to the present window."""
+        window, previous = self._window, self._trajectory
+        if previous is None:
             return None
-        shifted = np.empty((before.shape[0] + 1, before.shape[1]))
-        shifted[:-1] = before
+        shifted = np.empty((previous.shape[0] + 1, previous.shape[1]))
+        shifted[:-1] = previous
         try:
-            shifted[-1] = window.model.f(before[-1], window.inputs[-1])
-        except Exception:  # the model is not defined there: no start, then
+            shifted[-1] = window.model.f(previous[-1], window.inputs[-1])
+        except Exception:  # the model is not defined there: no warm start
             return None
         return shifted[shifted.shape[0] - 1 - window.length :]
 
+    def amend(self, time: int, y: Array) -> Estimate:
+        """Insert a late measurement, and estimate again."""
+        began = perf_counter()
+        self._set_undo_point(True)
+        try:
+            with np.errstate(all="ignore"):
+                self._window.amend(time, y)
+                self._trajectory = None  # of this window already: no warm start from it
+                missing = not self._window.observed[-1].all()
+                model_failed = self._window.newest_failed
+                estimate = self._estimate(missing, model_failed, False, began)
+            self._history[-1] = estimate.state.copy()
+            return estimate
+        except BaseException:
+            self.undo()
+            raise
+
+    def _set_undo_point(self, whole: bool) -> None:
+        """Save what `undo` needs; all stages where some will be rewritten."""
+        mark = self._window.mark(whole)
+        self._undo_point = mark, self._trajectory, self._dropped, tuple(self._history)
+
+    def undo(self) -> None:
+        """Undo the last step; the solver loses its warm start."""
+        mark, self._trajectory, self._dropped, history = self._undo_point
+        self._window.roll_back(mark)
+        self._history.clear()
+        self._history.extend(history)
+        self._subproblem.forget()
+        self._solver.forget()
+
+    def reset(self, initial_state: Array) -> None:
+        """Forget all measurements and start at this state."""
+        self._solver.forget()
+        self.replace(self._fresh_window(initial_state), None, (), [initial_state.copy()])
+
+    @property
+    def memory(self) -> tuple[Window, Array | None, tuple[str, ...], deque[Array]]:
+        """The arguments of `replace`."""
+        return self._window, self._trajectory, self._dropped, self._history
+
+    def replace(
+        self, window: Window, trajectory: Array | None, dropped: tuple[str, ...],
+        history: Iterable[Array],
+    ) -> None:
+        """Replace the memory: all of it or, if interrupted, nothing."""
+        before = self.memory
+        try:
+            self._window, self._trajectory, self._dropped = window, trajectory, dropped
+            self._history = deque(history, maxlen=self._history.maxlen)
+        except BaseException:
+            self._window, self._trajectory, self._dropped, self._history = before
+            raise
+
+    def run(self, ys: Array, us: Array | None) -> None:
+        """None: samples are taken one at a time only."""
+
+    def covariances(self) -> Array:
+        """Covariances along the last estimate."""
+        if self._trajectory is None:
+            raise InvalidInputError("there is no estimate yet; update first.")
+        problem = self._problem
+        with np.errstate(all="ignore"):
+            problem.bind(self._window)
+            problem.leave_out(self._dropped)
+            return window_covariances(problem, self._trajectory.copy())
+
     def state_dict(self) -> dict[str, Any]:
-        """All that was learnt from measurements so far, as plain arrays and numbers."""
-        # What a solver keeps is not written down: this estimator goes on without it, too.
+        """The memory as plain arrays and numbers."""
+        # The solver's warm start is not saved: so this estimator continues without it, too.
         self._solver.forget()
         modes, methods = self._system.call_modes()
         return {
             "problem": self._size(),
             "estimator": self._description(),
-            "linearized": self._linearized,
+            "linearized": self._with_terms,
             "window": self._window.state_dict(),
             "history": [state.copy() for state in self._history],
             "trajectory": None if self._trajectory is None else self._trajectory.copy(),
             "dropped": self._dropped,
-            # How the model is called: another way of calling would round differently.
+            # How the model is called: another way would round differently.
             "modes": list(modes),
             "methods": list(methods),
         }
@@ -283,45 +282,45 @@ class PythonEngine:
         return system.n, system.p, system.m, self._settings.horizon
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where another estimator stopped."""
+        """Continue where another estimator stopped."""
         check_problem(state, self._size())
         if str(state.get("engine", "python")) != "python":
             raise InvalidInputError(
-                f"the state is of an estimator with engine={state['engine']!r}, which is not at "
-                "work here; install a C compiler, or snapshot with engine='python'."
+                f"the state is of an estimator with engine={state['engine']!r}, which does not "
+                "run here; install a C compiler, or snapshot with engine='python'."
             )
         before = self._system.call_modes()
         try:
             with reading():
                 check_description(state["estimator"], self._description())
-                modes = self._checked_calling(state["modes"], state["methods"])
+                modes = self._checked_modes(state["modes"], state["methods"])
                 self._system.use_call_modes(modes)
-                found = self._read(state)
+                memory = self._checked_memory(state)
                 self._solver.forget()
-            self.replace(*found)
+            self.replace(*memory)
         except BaseException:
             self._system.use_call_modes(before)
             raise
 
-    def _read(
+    def _checked_memory(
         self, state: dict[str, Any]
     ) -> tuple[Window, Array | None, tuple[str, ...], list[Array]]:
-        """What a state's estimator remembered, checked."""
-        n, linearized = self._system.n, state["linearized"]
-        if not isinstance(linearized, bool):
-            raise TypeError(f"linearized is {linearized!r}")
-        window, again = (self._fresh_window(np.zeros(n)) for _ in range(2))
-        for one in (window, again):
+        """The memory in a state, as `replace` takes it."""
+        n, with_terms = self._system.n, state["linearized"]
+        if not isinstance(with_terms, bool):
+            raise TypeError(f"linearized is {with_terms!r}")
+        loaded, recomputed = (self._fresh_window(np.zeros(n)) for _ in range(2))
+        for one in (loaded, recomputed):
             one.load_state_dict(state["window"], self._system.make_timed is not None)
-        history = [taken("history", one, (n,)) for one in state["history"]]
-        count = min(window.length + 1, self._history.maxlen or 1)
+        history = [checked_array("history", one, (n,)) for one in state["history"]]
+        count = min(loaded.length + 1, self._history.maxlen or 1)
         if len(history) != count:
             raise ValueError(f"history has {len(history)} states; expected {count}")
         trajectory = state["trajectory"]
-        if (trajectory is None) != (window.time == 0):
+        if (trajectory is None) != (loaded.time == 0):
             raise TypeError("trajectory is there exactly if there was a measurement")
         if trajectory is not None:
-            trajectory = taken("trajectory", trajectory, (window.length + 1, n))
+            trajectory = checked_array("trajectory", trajectory, (loaded.length + 1, n))
             if not np.array_equal(trajectory[-1], history[-1]):
                 raise ValueError("history does not end where the trajectory does")
         dropped = state["dropped"]
@@ -330,23 +329,23 @@ class PythonEngine:
             and name in SET_NAMES for name in dropped
         ):
             raise ValueError(f"dropped is {dropped!r}")
-        alike = linearized == self._linearized
-        again.check_stages(window, alike)
-        return window if alike else again, trajectory, dropped, history
+        same_terms = with_terms == self._with_terms
+        recomputed.check_stages(loaded, same_terms)
+        return loaded if same_terms else recomputed, trajectory, dropped, history
 
-    def _checked_calling(
+    def _checked_modes(
         self, modes: Any, methods: Any
     ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """How a state's estimator called the model, if that is how it can be called here."""
-        made = self._made
+        """How a state's estimator called the model; raises if it cannot be called so here."""
+        known_modes, known_methods = self._known_modes
         if len(modes) == 4:
             if self._system.make_timed is None:
                 raise ValueError("the system has no steps of other lengths")
             timed = self._system.make_timed().call_modes()
-            made = made[0] + timed[0], made[1] + timed[1]
+            known_modes, known_methods = known_modes + timed[0], known_methods + timed[1]
         for name, found, known, slowest in (
-            ("modes", modes, made[0], "looped"),
-            ("methods", methods, made[1], "finite differences"),
+            ("modes", modes, known_modes, "looped"),
+            ("methods", methods, known_methods, "finite differences"),
         ):
             if not isinstance(found, (list, tuple)) or len(found) != len(known):
                 raise ValueError(f"{name} is {found!r}; expected {len(known)} of them")

@@ -1,4 +1,4 @@
-"""The engines that can run the step, and the door through which they register."""
+"""The interface of an engine, which runs the step, and the registry of engines."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 class Engine(Protocol):
-    """The loop body with its memory; `MovingHorizonEstimator` has checked what it is given."""
+    """The step and its memory; `MovingHorizonEstimator` validates all arguments."""
 
     name: str
 
@@ -46,22 +46,22 @@ class Engine(Protocol):
     def step(
         self, y: Array, u: Array, dt: float | None, noise_weight: Array | None, began: float
     ) -> Estimate:
-        """Take a sample in, and estimate."""
+        """Take the sample y(t), u(t), and estimate x(t+1)."""
 
     def amend(self, time: int, y: Array) -> Estimate:
-        """Put a late measurement in its place, and estimate again."""
+        """Insert a late measurement, and estimate again."""
 
     def run(self, ys: Array, us: Array | None) -> Run | None:
-        """Take a whole record in; None where it takes only sample by sample."""
+        """Take a whole record; None if the engine takes samples one at a time only."""
 
     def covariances(self) -> Array:
         """Covariances along the last estimate."""
 
     def state_dict(self) -> dict[str, Any]:
-        """All that was learnt from measurements so far, as plain arrays and numbers."""
+        """The memory as plain arrays and numbers."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where another estimator stopped."""
+        """Continue where another estimator stopped."""
 
 
 _ENGINES: dict[str, Callable[[System, Observer, Cost, Settings, Array], Engine]] = {

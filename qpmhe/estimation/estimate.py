@@ -1,4 +1,4 @@
-"""What one step of the estimator tells."""
+"""The result of one step of the estimator."""
 
 from __future__ import annotations
 
@@ -13,40 +13,26 @@ Array = NDArray[np.float64]
 
 
 class Status(enum.Flag):
-    """Outcome of a step, and everything that happened on the way.
+    """Outcome of a step, and everything that happened in it.
 
     Exactly one of IMPROVED and CANDIDATE is always set; the others are added where they
     apply, so that ``Status.IMPROVED in estimate.status`` asks for the outcome.
-    `explain` puts it into words.
+    `explain` says what each one means and what to do about it.
     """
 
-    #: The estimate's true cost is below the candidate's.
     IMPROVED = enum.auto()
-    #: The observer's candidate is the estimate.
     CANDIDATE = enum.auto()
-    #: No QP was asked for: max_qps is 0.
     NO_QPS = enum.auto()
-    #: The sequence of QPs stopped because it had converged.
     CONVERGED = enum.auto()
-    #: The sequence stopped at an iterate that no step length turned into a lower true cost.
     NO_DECREASE = enum.auto()
-    #: A QP solver brought back no usable iterate.
     SOLVER_FAILED = enum.auto()
-    #: A QP solver stopped at its cap, or its claim was not confirmed; its iterate was judged.
     SOLVER_STOPPED = enum.auto()
-    #: A model function raised or was not finite.
     MODEL_FAILED = enum.auto()
-    #: The model failed at an earlier stage of the window: the candidate has no finite cost.
     FAILED_STAGE = enum.auto()
-    #: Components of the newest measurement are missing or not finite; they were left out.
     MISSING = enum.auto()
-    #: The candidate is outside of sets; these were left out in this step.
     SETS_DROPPED = enum.auto()
-    #: The candidate is outside of sets; the nearest trajectory inside took its view.
     PROJECTED = enum.auto()
-    #: The candidate is outside of sets, and is the estimate as the policy "keep" demands.
     CANDIDATE_OUTSIDE = enum.auto()
-    #: The time budget was spent; the best so far is the estimate.
     TIME_UP = enum.auto()
 
     def explain(self) -> str:
@@ -76,7 +62,7 @@ _TEXTS = {
     ),
     Status.FAILED_STAGE: (
         "The model failed at an earlier stage, which is still in the window: the candidate has "
-        "no finite cost, and any trajectory that has one is taken."
+        "no finite cost, and any trajectory with a finite one is accepted."
     ),
     Status.MISSING: (
         "The measurement is missing in part or whole (not finite); its noise term was left "
@@ -104,9 +90,8 @@ class Estimate:
     With N_t = min(t + 1, N) stages in the window, the trajectory holds the estimates of
     x(t+1-N_t), ..., x(t+1), made from the measurements y(t+1-N_t), ..., y(t).
 
-    The arrays are the caller's: no estimator reads them again. ``state``, ``filtered`` and
-    ``delayed`` are rows of ``trajectory``; copy them to change one without the other, or to
-    keep a state without its window.
+    The arrays belong to the caller: no estimator reads them again. ``state``, ``filtered`` and
+    ``delayed`` are views of ``trajectory``: copy a state to change or keep it on its own.
 
     Attributes
     ----------
@@ -134,32 +119,19 @@ class Estimate:
     status : Status
         Outcome and events.
     message : str
-        Words of the QP solver where it failed.
+        Message of the QP solver if it failed.
     qps, corrections : int
         QPs solved, and second-order corrections solved beside them.
     solver_iterations : int or None
-        Sum of the solver's own iterations; None where it does not tell.
+        Sum of the solver's own iterations; None where it reports none.
     step_time, solve_time : float
         Seconds for the whole update, and for the QP solver in it.
     """
 
     __slots__ = (
-        "_residuals",
-        "candidate",
-        "candidate_cost",
-        "corrections",
-        "cost",
-        "delayed",
-        "dropped",
-        "message",
-        "qps",
-        "solve_time",
-        "solver_iterations",
-        "state",
-        "status",
-        "step_time",
-        "time",
-        "trajectory",
+        "_residuals", "candidate", "candidate_cost", "corrections", "cost", "delayed", "dropped",
+        "message", "qps", "solve_time", "solver_iterations", "state", "status", "step_time",
+        "time", "trajectory",
     )
 
     def __init__(

@@ -32,7 +32,7 @@ class MovingHorizonEstimator:
 
     At each measurement the auxiliary observer is advanced; its last N steps are a feasible
     candidate for the estimation problem (eq:optiMHE) and its state z(t-N) is the prior. A
-    sequence of convex QPs then improves the candidate. An iterate is taken only if it
+    sequence of convex QPs then improves the candidate. An iterate is accepted only if it
     satisfies the constraints and its true cost J is no greater than the candidate's
     (eq:estimator); otherwise the candidate is the estimate. Under the assumptions of the
     paper's theorem this is robustly exponentially stable for every horizon, solver and cap.
@@ -46,18 +46,23 @@ class MovingHorizonEstimator:
     cost : Cost
         `QuadraticCost` or `RobustCost`.
     horizon : int
-        N >= 1. Until N samples are there, all of them are used (Remark rem:emtpyN).
+        N >= 1. Before N samples have come, all are used (Remark rem:emtpyN).
     initial_state : (n,) array_like
+<<<<<<< HEAD
         Initial estimate, at the time of the first measurement; within the state set.
     backend : str or Solver
+=======
+        Estimate of x(0), the state at the first measurement; within the state set.
+    backend : str
+>>>>>>> wt-reader
         QP solver, one of ``qpmhe.solvers.available()``. ``auto`` uses a banded Cholesky
         factorisation and another solver only where inequalities bind; a named backend is
         always really used. Or a solver made by ``qpmhe.solvers.create``, which brings its own
         cap and tolerances. It may serve several estimators of one thread, and starts afresh
         whenever it passes from one to another.
     max_qps : int or None
-        QPs per sample, the paper's i; 0 gives the observer. None goes on to convergence,
-        at most 100.
+        QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence,
+        with at most 100.
     max_solver_iterations : int or None
         Cap on the solver's own iterations in each QP; None leaves the solver's default, or the
         cap of the solver given as ``backend``.
@@ -68,11 +73,10 @@ class MovingHorizonEstimator:
         The sequence of QPs has converged when a QP that was solved lowers J by less than
         this share of it.
     engine : {"python", "compiled"}
-        How the step is carried out. ``compiled`` generates C code for the whole step from a
-        system made by `qpmhe.from_casadi`, a quadratic cost and an observer with constant
-        gain, compiles it once and keeps it in a cache on disk; QPs with active inequalities
-        are solved by an interior-point method in it. Without a C compiler, a warning tells
-        so and the Python step is taken.
+        What runs the step. ``compiled`` generates C code for the whole step from a system
+        made by `qpmhe.from_casadi`, a quadratic cost and an observer with constant gain,
+        compiles it once and keeps it in a cache on disk; an interior-point method in it solves
+        QPs with active inequalities. Without a C compiler it warns and runs the Python step.
     outside : {"drop", "project", "keep"}
         What to do where the candidate is outside of the sets: ``drop`` leaves the violated
         sets out in this step, the paper's remedy after Assumption ass:observer; ``project``
@@ -82,9 +86,9 @@ class MovingHorizonEstimator:
         Whether the sequence starts at the shifted previous estimate where its true J is lower
         than the candidate's. What beats the candidate is accepted in either case.
     candidate : {"observer", "reinitialized"}
-        The paper's candidate, or that of an observer which at each sample starts again
-        from the estimate of x(t-N) made at that time; the paper's outlook, outside of the
-        theorem as proved there.
+        The paper's candidate, or the trajectory of an observer that at each sample starts
+        anew from the estimate of x(t-N) made at time t-N: the paper's outlook, which its
+        theorem does not cover.
     time_budget : float or None
         Seconds for one update: no QP is begun later, and backends with a clock stop.
     delay : int
@@ -98,7 +102,7 @@ class MovingHorizonEstimator:
     Raises
     ------
     InvalidInputError
-        If anything does not fit; subclasses tell what (see `qpmhe.errors`).
+        If an argument does not fit; the subclass says which (see `qpmhe.errors`).
 
     Examples
     --------
@@ -138,9 +142,9 @@ class MovingHorizonEstimator:
             engine, outside, warm_start, candidate, time_budget, delay, isolated,
         )
         self.system, self.observer, self.cost = system, observer, cost
-        _is(system, System, "system", "qpmhe.System")
-        _is(observer, Observer, "observer", "qpmhe.Luenberger or another observer")
-        _is(cost, Cost, "cost", "qpmhe.QuadraticCost or qpmhe.RobustCost")
+        _require(system, System, "system", "qpmhe.System")
+        _require(observer, Observer, "observer", "qpmhe.Luenberger or another observer")
+        _require(cost, Cost, "cost", "qpmhe.QuadraticCost or qpmhe.RobustCost")
         if (cost.n, cost.p) != (system.n, system.p):
             raise ShapeError(
                 f"the cost is for {cost.n} states and {cost.p} outputs; expected {system.n} "
@@ -152,13 +156,13 @@ class MovingHorizonEstimator:
                 "has no covariance; take a Kalman-type observer, such as qpmhe.ExtendedKalman, "
                 "or give a constant weight."
             )
-        #: For this estimator alone, which may change how the model is called.
-        self._own = system.copy()
+        # A copy, because this estimator may change how the model is called.
+        self._own_system = system.copy()
         self._initial_state: Array = self._checked_start(initial_state)
         self._no_input = np.zeros(system.m)
         try:
             self._engine = engine_for(
-                self._own, observer, cost, self.settings, self._initial_state
+                self._own_system, observer, cost, self.settings, self._initial_state
             )
         except MemoryError as error:
             raise OptionError(
@@ -168,7 +172,7 @@ class MovingHorizonEstimator:
 
     def _checked_start(self, initial_state: ArrayLike) -> Array:
         state = vector("initial_state", initial_state, self.system.n)
-        check_start(self._own, self.observer, state)
+        check_start(self._own_system, self.observer, state)
         return state
 
     def reset(self, initial_state: ArrayLike | None = None) -> None:
@@ -184,14 +188,14 @@ class MovingHorizonEstimator:
         InvalidInputError
             If the state does not fit; the estimator is left as it was.
         """
-        before = self._initial_state, self._own.call_modes()
+        before = self._initial_state, self._own_system.call_modes()
         try:
             if initial_state is not None:
                 self._initial_state = self._checked_start(initial_state)
             self._engine.reset(self._initial_state)
         except BaseException:
             self._initial_state, calling = before
-            self._own.use_call_modes(calling)
+            self._own_system.use_call_modes(calling)
             raise
 
     @property
@@ -206,7 +210,7 @@ class MovingHorizonEstimator:
 
     @property
     def engine(self) -> str:
-        """How the step is carried out: ``python`` or ``compiled``."""
+        """What runs the step: ``python`` or ``compiled``."""
         return self._engine.name
 
     @property
@@ -227,31 +231,31 @@ class MovingHorizonEstimator:
         dt: float | None = None,
         noise_weight: ArrayLike | None = None,
     ) -> Estimate:
-        """Take the measurement y(t) and the input u(t) in, and estimate x(t+1).
+        """Take the measurement y(t) and the input u(t), and estimate x(t+1).
 
         Solver failures, a model that cannot be evaluated and missing measurements do not
-        raise: the step falls back to the candidate, and the estimate's status tells why. An
-        update that is interrupted (Ctrl+C) has not taken the sample; a QP solver that
-        warm-starts then starts afresh.
+        raise: the step falls back to the candidate, and the estimate's status says why. An
+        interrupted update (Ctrl+C) leaves the estimator as it was before the sample, except
+        that a QP solver that warm-starts loses its start.
 
         Parameters
         ----------
         y : (p,) array_like
             y(t); components that are not finite (or so large that their square is not), None or
-            masked are missing. A scalar will do where p is 1.
+            masked are missing. A scalar if p is 1.
         u : (m,) array_like, optional
-            u(t), the input that acts from t to t+1 (and on y(t), if h depends on it), and
-            whatever else is known of this time. Needed exactly if the system has inputs.
+            u(t), the input that acts from t to t+1 (and on y(t), if h depends on it), and any
+            known parameters of that time. Required exactly if the system has inputs.
         dt : float, optional
-            Length of the step from t to t+1, for a system made by `System.from_ode`, where
-            it is not the usual one.
+            Length of the step from t to t+1 if not the sampling time; for a system made by
+            `System.from_ode`.
         noise_weight : (p, p) array_like, optional
-            Weight of this sample's noise, where it is not that of the cost.
+            Weight of this sample's noise, in place of the cost's.
 
         Returns
         -------
         Estimate
-            The estimate with everything known about it.
+            Trajectory, cost, status and times.
 
         Raises
         ------
@@ -264,18 +268,11 @@ class MovingHorizonEstimator:
         u_array = self._no_input if u is None and system.m == 0 else self._input(u)
         if dt is not None:
             dt = positive("dt", dt)
-            self._check_timed(dt)
+            self._check_step_length(dt)
         if noise_weight is not None:
             noise_weight = positive_definite("noise_weight", noise_weight, system.p)
             self.cost.check_noise(noise_weight)
         return self._engine.step(y_array, u_array, dt, noise_weight, began)
-
-    def _check_timed(self, dt: float) -> None:
-        """Insist, before the sample is taken, that there is a model with this step."""
-        if "timed" not in self._own.__dict__:
-            timed = self.system.timed.copy()
-            timed.check(self._initial_state, np.append(self._no_input, dt))
-            self._own.__dict__["timed"] = timed
 
     def _measurement(self, y: ArrayLike | None) -> Array:
         p = self.system.p
@@ -287,20 +284,35 @@ class MovingHorizonEstimator:
             y = [np.nan if item is None else item for item in y]
         return vector("y", y, p, finite=False)
 
+    def _input(self, u: ArrayLike | None) -> Array:
+        m = self.system.m
+        if u is None:
+            raise InvalidInputError(f"u is missing; the system has {m} inputs: update(y, u).")
+        if m == 0:
+            raise InvalidInputError("u was given, but the system has no inputs; leave it out.")
+        return vector("u", u, m, finite=False)
+
+    def _check_step_length(self, dt: float) -> None:
+        """Check once, before a sample is taken, that the model takes step lengths."""
+        if "timed" not in self._own_system.__dict__:
+            timed = self.system.timed.copy()
+            timed.check(self._initial_state, np.append(self._no_input, dt))
+            self._own_system.__dict__["timed"] = timed
+
     def amend(self, time: int, y: ArrayLike) -> Estimate:
-        """Put a late measurement in its place, redo the observer from there, and estimate.
+        """Insert a late measurement, run the observer again from there, and estimate.
 
         Parameters
         ----------
         time : int
-            Index of the sample that it belongs to, at most N samples old.
+            Index of the sample that it belongs to, one of the last N.
         y : (p,) array_like
-            The measurement; components that are not finite leave those of the sample alone.
+            The measurement; its finite components replace the sample's.
 
         Returns
         -------
         Estimate
-            The estimate of the same state as before, with what is known now.
+            The estimate of the same state as before, with this measurement.
 
         Raises
         ------
@@ -320,6 +332,7 @@ class MovingHorizonEstimator:
             )
         return self._engine.amend(int(time), self._measurement(y))
 
+<<<<<<< HEAD
     def covariances(self) -> Array:
         """Covariances of the last estimate's trajectory, by linearisation along it.
 
@@ -408,6 +421,8 @@ class MovingHorizonEstimator:
             raise InvalidInputError("u was given, but the system has no inputs; leave it out.")
         return vector("u", u, m, finite=False)
 
+=======
+>>>>>>> wt-reader
     def run(
         self,
         measurements: ArrayLike,
@@ -415,12 +430,12 @@ class MovingHorizonEstimator:
         *,
         covariances: bool = False,
     ) -> Run:
-        """Take a whole record, sample by sample, going on from the present state.
+        """Update with each sample of a record, starting at the present state.
 
         Parameters
         ----------
         measurements : (T, p) array_like
-            y(t), ..., y(t+T-1); (T,) will do where p is 1.
+            y(t), ..., y(t+T-1); (T,) if p is 1.
         inputs : (T, m) array_like, optional
             The inputs of the same times.
         covariances : bool
@@ -435,7 +450,7 @@ class MovingHorizonEstimator:
         Raises
         ------
         ShapeError, InvalidInputError
-            If a shape is wrong; no sample has been taken then.
+            If a shape is wrong; the estimator is left as it was.
         """
         ys = record("measurements", measurements, self.system.p)
         us = None
@@ -447,9 +462,9 @@ class MovingHorizonEstimator:
                 )
         elif self.system.m:
             self._input(None)
-        found = None if covariances else self._engine.run(ys, us)
-        if found is not None:
-            return found
+        whole = None if covariances else self._engine.run(ys, us)
+        if whole is not None:
+            return whole
         start, estimates, collected = self.state.copy(), [], []
         for y, u in zip(ys, [None] * len(ys) if us is None else us, strict=True):
             estimates.append(self.update(y, u))
@@ -459,6 +474,26 @@ class MovingHorizonEstimator:
         blocks = np.array(collected).reshape(-1, n, n) if covariances else None
         return Run.of(start, estimates, blocks)
 
+    def covariances(self) -> Array:
+        """Covariances of the last estimate's trajectory, by linearisation along it.
+
+        The inverse of the Gauss-Newton Hessian's diagonal blocks, computed in O(N n^3):
+        with inverse covariances as weights, the covariance of the error of each state given
+        the window's measurements and the prior. Inequalities do not enter; noise-free
+        components do.
+
+        Returns
+        -------
+        (N_t + 1, n, n) array
+            The last belongs to ``estimate.state``, the one before to ``estimate.filtered``.
+
+        Raises
+        ------
+        InvalidInputError
+            Before the first measurement, or if the model cannot be linearised there.
+        """
+        return self._engine.covariances()
+
     def _newest_covariance(self) -> Array:
         try:
             value: Array = self.covariances()[-1]
@@ -466,8 +501,57 @@ class MovingHorizonEstimator:
             value = np.full((self.system.n, self.system.n), np.nan)
         return value
 
+    def state_dict(self) -> dict[str, Any]:
+        """A snapshot of the estimator's memory, as plain arrays and numbers.
 
-def _is(value: object, kind: type, name: str, expected: str) -> None:
+        An estimator made with the same arguments continues bit for bit after
+        `load_state_dict`, in the same process or another.
+
+        Returns
+        -------
+        dict
+            Copies; safe to keep, to pickle, or to write down.
+        """
+        return self._engine.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue where another estimator stopped.
+
+        Parameters
+        ----------
+        state : dict
+            What `state_dict` of an estimator with the same arguments returned.
+
+        Raises
+        ------
+        InvalidInputError
+            If it is not such a state: damaged, or of an estimator with another model,
+            observer, cost, sets or candidate. The estimator is left as it was. QP caps,
+            backend, tolerances and policies may differ.
+
+        Notes
+        -----
+        Every stored stage is computed again and compared.
+        """
+        self._engine.load_state_dict(state)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {
+            "arguments": (self.system, self.observer, self.cost),
+            "settings": self.settings,
+            "initial_state": self.initial_state,
+            "state": self.state_dict(),
+        }
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        # Construction checks everything again: a snapshot is input like any other.
+        self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
+            *saved["arguments"], initial_state=saved["initial_state"], **vars(saved["settings"])
+        )
+        self.load_state_dict(saved["state"])
+
+
+def _require(value: object, kind: type, name: str, expected: str) -> None:
     if not isinstance(value, kind):
         raise InvalidInputError(f"{name} is {value!r}; expected a {expected}.")
 

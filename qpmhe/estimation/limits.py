@@ -1,8 +1,4 @@
-"""Step lengths, tolerances and thresholds that both steps share.
-
-Python's step imports them. The C header of a generated estimator is written from them, in
-double or in single precision.
-"""
+"""Step lengths, tolerances and thresholds that the steps in Python and in C share."""
 
 from __future__ import annotations
 
@@ -11,37 +7,37 @@ __all__ = [
     "c_definitions",
 ]
 
-#: Tried in turn where the full step fails: the first where it misses a set by the solver's
-#: accuracy, the last short enough for any descent direction that is worth taking.
+#: Step lengths, tried in turn after the full step: the first for a step that leaves a set by
+#: the solver's tolerance, the last short enough for any useful direction of descent.
 LENGTHS = (0.9999, 0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)
 
-#: A decrease of J by less than this share is rounding, and no improvement.
+#: A decrease of J by less than this share of it is rounding, and no improvement.
 ROUNDING = 1e-12
 
-#: A set missed by less than this is for the first of the lengths, not for a correction.
+#: A step that violates a set by less than this is shortened before it is corrected.
 NEARLY = 1e-6
 
-#: On curved sets J can only be lowered as far as feasibility can be seen: where no length helps
-#: and no more than this many times the tolerance was promised, that is convergence.
+#: On curved sets, FEASIBLE limits how far J can be lowered. If no step length lowers it, the
+#: sequence has converged if the QP predicted less than this many times the tolerance.
 STALLED = 1e3
 
-#: Second-order corrections of a trial that misses a curved set.
+#: Most second-order corrections of a step that leaves a curved set.
 CORRECTIONS = 2
 
-#: A second-order correction goes this share of itself further, to land inside.
+#: A second-order correction is lengthened by this share of itself, to end inside the set.
 BEYOND = 0.1
 
-#: A trial lies on the boundary of its sets up to what QP solvers leave.
+#: Largest violation of a feasible trial: QP solvers end on the boundary up to their tolerance.
 FEASIBLE = 5e-9
 
-#: A measurement beyond this has no finite square: it is as good as missing.
+#: A larger measurement counts as missing: its square would not be finite.
 LARGEST = 1e150
 
 _SINGLE = {"ROUNDING": 1e-6, "NEARLY": 1e-3, "FEASIBLE": 1e-5, "LARGEST": 1e15}
 
 
 def c_definitions(prefix: str, real: str) -> str:
-    """The table as C, for reals of type "double" or "float"."""
+    """The same as C macros, for reals of type "double" or "float"."""
     values = {
         "ROUNDING": ROUNDING, "NEARLY": NEARLY, "STALLED": STALLED, "BEYOND": BEYOND,
         "FEASIBLE": FEASIBLE, "LARGEST": LARGEST,

@@ -21,22 +21,15 @@ class Stage:
         :math:`[r, -G]` (n + p, 1 + n), and its transpose.
     disturbance, noise : array
         The parts w (n,) and v (p,) of r.
-    minus_f, minus_h : array
+    minus_a, minus_c : array
         The parts -A (n, n) and -C (p, n) of -G.
-    panel, current, next : array
+    panel, gradient, next_gradient : array
         The stage's terms.
     """
 
     __slots__ = (
-        "current",
-        "disturbance",
-        "linear",
-        "minus_f",
-        "minus_h",
-        "next",
-        "noise",
-        "panel",
-        "transposed",
+        "disturbance", "gradient", "linear", "minus_a", "minus_c", "next_gradient", "noise",
+        "panel", "transposed",
     )
 
     def __init__(self, terms: StageTerms, k: int) -> None:
@@ -44,12 +37,13 @@ class Stage:
         self.transposed = linear.T
         n = linear.shape[1] - 1
         self.disturbance, self.noise = linear[:n, 0], linear[n:, 0]
-        self.minus_f, self.minus_h = linear[:n, 1:], linear[n:, 1:]
-        self.panel, self.current, self.next = terms.panel[k], terms.current[k], terms.next[k]
+        self.minus_a, self.minus_c = linear[:n, 1:], linear[n:, 1:]
+        self.panel, self.gradient = terms.panel[k], terms.gradient[k]
+        self.next_gradient = terms.next_gradient[k]
 
 
 class Span:
-    """Views of some successive stages of `StageTerms`, as a QP takes them in.
+    """Views of successive stages of `StageTerms`, in the parts that a QP sums up.
 
     Attributes
     ----------
@@ -57,44 +51,40 @@ class Span:
         The :math:`-G_i`.
     panel : (count, n, 2n) array
         The panels.
-    current_first, current_rest : array
-        ``current`` of the first stage, and of all behind it.
-    next_rest, next_last : array
-        ``next`` of all stages but the last, and of the last.
+    gradient_first, gradient_rest : array
+        ``gradient`` of the first stage, and of all after it.
+    next_gradient_rest, next_gradient_last : array
+        ``next_gradient`` of all stages but the last, and of the last.
     """
 
     __slots__ = (
-        "current_first",
-        "current_rest",
-        "minus_jacobian",
-        "next_last",
-        "next_rest",
-        "panel",
+        "gradient_first", "gradient_rest", "minus_jacobian", "next_gradient_last",
+        "next_gradient_rest", "panel",
     )
 
     def __init__(self, terms: StageTerms, first: int, count: int) -> None:
         last = first + count
         self.minus_jacobian = terms.linear[first:last, :, 1:]
         self.panel = terms.panel[first:last]
-        self.current_first = terms.current[first]
-        self.current_rest = terms.current[first + 1 : last]
-        self.next_rest = terms.next[first : last - 1]
-        self.next_last = terms.next[last - 1]
+        self.gradient_first = terms.gradient[first]
+        self.gradient_rest = terms.gradient[first + 1 : last]
+        self.next_gradient_rest = terms.next_gradient[first : last - 1]
+        self.next_gradient_last = terms.next_gradient[last - 1]
 
 
 class StageTerms:
-    r"""Terms of a run of stages in the increments d of the trajectory.
+    r"""What each stage adds to a QP in the increments d of the trajectory.
 
     The joint residual of stage i is :math:`r_i = (w_i, v_i)`, with
     :math:`w_i = x_{i+1} - f(x_i)` and :math:`v_i = y_i - h(x_i)`. Linearised,
     :math:`r_i + E d_{i+1} - G_i d_i` with :math:`G_i = [A_i; C_i]` and :math:`E = [I; 0]`:
-    the map ``linear[i]`` :math:`= [r_i, -G_i]` is all that is known of a stage. Half the
-    weighted square :math:`\tfrac12 |r_i|_{W_i}^2` adds
+    ``linear[i]`` :math:`= [r_i, -G_i]` and the weight :math:`W_i`, with its block :math:`Q_i`
+    for w, define the stage. Half the weighted square :math:`\tfrac12 |r_i|_{W_i}^2` adds
 
     - ``panel[i]``: the band of :math:`G_i^\top W_i G_i` and of the coupling block
       :math:`-Q_i A_i` below it, without :math:`Q_{i-1}` of the stage before;
-    - ``current[i]``: :math:`-G_i^\top W_i r_i`, the gradient with respect to :math:`d_i`;
-    - ``next[i]``: :math:`Q_i w_i`, the gradient with respect to :math:`d_{i+1}`.
+    - ``gradient[i]``: :math:`-G_i^\top W_i r_i`, with respect to :math:`d_i`;
+    - ``next_gradient[i]``: :math:`Q_i w_i`, with respect to :math:`d_{i+1}`.
 
     Attributes
     ----------
@@ -102,23 +92,13 @@ class StageTerms:
         :math:`[r_i, -G_i]`.
     residuals : (stages, n + p) array
         The :math:`r_i` in it, a view.
-    panel, current, next : array
+    panel, gradient, next_gradient : array
         (stages, n, 2n), (stages, n), (stages, n).
     """
 
     __slots__ = (
-        "_first",
-        "_flat",
-        "_index",
-        "_own",
-        "_square",
-        "_weighted",
-        "_zeros",
-        "current",
-        "linear",
-        "next",
-        "panel",
-        "residuals",
+        "_flat", "_gradient_column", "_next_column", "_panel_index", "_square", "_weighted",
+        "_zeros", "gradient", "linear", "next_gradient", "panel", "residuals",
     )
 
     def __init__(self, stages: int, n: int, p: int) -> None:
@@ -126,61 +106,56 @@ class StageTerms:
         self.linear: Array = np.zeros((stages, q, 1 + n))
         self.residuals: Array = self.linear[:, :, 0]
         self.panel: Array = np.zeros((stages, n, 2 * n))
-        self.current: Array = np.zeros((stages, n))
-        self.next: Array = np.zeros((stages, n))
-        # Of one stage, with M = [r, -G]: M^T W M, behind it W M, and a number that stays 0.
+        self.gradient: Array = np.zeros((stages, n))
+        self.next_gradient: Array = np.zeros((stages, n))
+        # Workspace for one stage, with M = [r, -G]: M^T W M, then W M, then a number that stays 0.
         self._flat = np.zeros((1 + n) ** 2 + q * (1 + n) + 1)
         self._square = self._flat[: (1 + n) ** 2].reshape(1 + n, 1 + n)
         self._weighted = self._flat[(1 + n) ** 2 : -1].reshape(q, 1 + n)
         self._zeros = np.zeros(self._flat.size)
-        # -G^T W r, and W r of the disturbances, W M's first column.
-        self._own, self._first = self._square[1:, 0], self._weighted[:n, 0]
-        self._index = _places(n, p)
-
-    @property
-    def jacobian(self) -> Array:
-        """The Jacobians G_i (stages, n + p, n), a copy."""
-        return -self.linear[:, :, 1:]
+        # -G^T W r is the first column of M^T W M below its corner; Q w starts that of W M.
+        self._gradient_column, self._next_column = self._square[1:, 0], self._weighted[:n, 0]
+        self._panel_index = _panel_index(n, p)
 
     def set_stage(self, stage: Stage, weight: Array) -> float:
-        """Compute the terms of a stage from its linear map, which is in place already."""
+        """Compute a stage's terms from its ``linear``; return its cost, NaN if they overflow."""
         flat, weighted = self._flat, self._weighted
         weight.dot(stage.linear, weighted)
         stage.transposed.dot(weighted, self._square)
-        flat.take(self._index, None, stage.panel, "clip")
-        stage.current[...] = self._own
-        stage.next[...] = self._first
-        # 0 times what is not finite is NaN, and no square overflows on the way.
+        flat.take(self._panel_index, None, stage.panel, "clip")
+        stage.gradient[...] = self._gradient_column
+        stage.next_gradient[...] = self._next_column
+        # 0 times anything that is not finite is NaN, so one product checks all entries.
         return float(flat[0] + flat.dot(self._zeros))
 
     def set_all(self, count: int, weight: Array) -> None:
-        """Compute the terms of the first stages, their linear maps in view."""
+        """Compute the terms of the first stages from their ``linear``."""
         linear = self.linear[:count]
         weighted = np.matmul(weight, linear)
         square = np.matmul(linear.transpose(0, 2, 1), weighted)
         flat = np.concatenate(
             (square.reshape(count, -1), weighted.reshape(count, -1), np.zeros((count, 1))), axis=1
         )
-        flat.take(self._index, axis=1, out=self.panel[:count], mode="clip")
-        self.current[:count] = square[:, 1:, 0]
-        self.next[:count] = weighted[:, : self.current.shape[1], 0]
+        flat.take(self._panel_index, axis=1, out=self.panel[:count], mode="clip")
+        self.gradient[:count] = square[:, 1:, 0]
+        self.next_gradient[:count] = weighted[:, : self.gradient.shape[1], 0]
 
     def copy_scaled(self, terms: StageTerms, first: int, factors: Array) -> None:
-        """Take over the stages of other terms from ``first`` on, each times its factor."""
+        """Copy the stages of ``terms`` from ``first`` on, each with its cost times a factor."""
         count = factors.size
         stages = slice(first, first + count)
         self.linear[:count] = terms.linear[stages]
         np.multiply(terms.panel[stages], factors[:, None, None], out=self.panel[:count])
-        np.multiply(terms.current[stages], factors[:, None], out=self.current[:count])
-        np.multiply(terms.next[stages], factors[:, None], out=self.next[:count])
+        np.multiply(terms.gradient[stages], factors[:, None], out=self.gradient[:count])
+        np.multiply(terms.next_gradient[stages], factors[:, None], out=self.next_gradient[:count])
 
     def arrays(self) -> tuple[Array, ...]:
         """The arrays, each with one entry a stage."""
-        return self.linear, self.panel, self.current, self.next
+        return self.linear, self.panel, self.gradient, self.next_gradient
 
 
-def _places(n: int, p: int) -> NDArray[np.intp]:
-    """Where the panel of a stage stands in [M^T W M, W M, 0], flat."""
+def _panel_index(n: int, p: int) -> NDArray[np.intp]:
+    """Indices of a stage's panel in the flat workspace [M^T W M, W M, 0]."""
     wide = 1 + n
     square = np.arange(wide * wide).reshape(wide, wide)
     weighted = wide * wide + np.arange((n + p) * wide).reshape(n + p, wide)

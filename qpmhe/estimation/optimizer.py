@@ -1,4 +1,4 @@
-"""The sequence of QPs, which accepts only what the true cost approves (eq:estimator)."""
+"""The sequence of QPs, which accepts an iterate only by its true cost (eq:estimator)."""
 
 from __future__ import annotations
 
@@ -23,37 +23,27 @@ __all__ = ["Optimizer", "Outcome"]
 
 Array = NDArray[np.float64]
 
-_NONE = Status(0)
-
 
 class Outcome:
-    """What the sequence of QPs came to.
+    """The result of the sequence of QPs, updated while it runs.
 
     Attributes
     ----------
     reference : Trial
         The candidate, or its projection onto the sets.
     trial : Trial
-        The best trajectory, the reference itself if nothing was better.
+        The best trajectory so far, at first the reference.
     improved : bool
-        Whether it is not the reference.
+        Whether it is better than the reference.
     events : Status
         Why the sequence stopped, and what happened.
-    message : str
-        Words of a solver that failed.
-    qps, corrections : int
-        QPs solved, and second-order corrections among the solves beside them.
-    solver_iterations : int or None
-        Sum of the solver's own counts, None where it does not tell.
-    solve_time : float
-        Seconds in the solver.
-    dropped : tuple of str
-        Names of the sets that were left out.
+    message, qps, corrections, solver_iterations, solve_time, dropped
+        As in `Estimate`.
     """
 
-    # Of the class until they change, which in most steps few of them do.
+    # Class attributes as defaults: few of them change in most steps.
     improved: bool = False
-    events: Status = _NONE
+    events: Status = Status(0)
     message: str = ""
     qps: int = 0
     corrections: int = 0
@@ -65,15 +55,15 @@ class Outcome:
         self.reference = self.trial = candidate
         self.deadline = deadline
 
-    def late(self) -> bool:
-        """Whether the time is up, which is noted then."""
+    def time_is_up(self) -> bool:
+        """Whether the deadline has passed; adds it to the events."""
         late = self.deadline < math.inf and perf_counter() > self.deadline
         if late:
             self.events |= Status.TIME_UP
         return late
 
     def remaining(self, now: float) -> float | None:
-        """Seconds left at a reading of the clock, noted if there are none; None for no limit."""
+        """Seconds left, None without a deadline; adds to the events if there are none."""
         if self.deadline == math.inf:
             return None
         left = self.deadline - now
@@ -93,9 +83,9 @@ class Outcome:
 class Optimizer:
     """Gauss-Newton steps from the candidate, each judged by the true problem.
 
-    A trial that does not lower J over the best trajectory so far is shortened towards it,
-    and dropped if no length helps. So J of the result is never above the candidate's, and
-    the result satisfies the constraints, whatever the solver returns.
+    A step that does not lower J below that of the best trajectory so far is shortened, and
+    dropped if no length helps. So J of the result is never above the candidate's, and the
+    result satisfies the constraints, whatever the solver returns.
     """
 
     def __init__(
@@ -115,10 +105,10 @@ class Optimizer:
         start: Array | None = None,
         deadline: float = math.inf,
     ) -> Outcome:
-        """Run the sequence on a bound problem; never raises on account of solver or model."""
+        """Run the sequence on a bound problem; never raises, whatever solver and model do."""
         candidate = problem.candidate(window)
         outcome = Outcome(candidate, deadline)
-        if problem.constrained and not self._reconcile(problem, window, outcome):
+        if problem.constrained and not self._treat_violated_sets(problem, window, outcome):
             return outcome
         if self._limit == 0:
             outcome.events |= Status.NO_QPS
@@ -129,7 +119,7 @@ class Optimizer:
             if trial.cost < _target(outcome.trial):
                 outcome.trial, outcome.improved = trial, True
         for _ in range(self._limit):
-            if outcome.late():
+            if outcome.time_is_up():
                 break
             if outcome.trial is candidate:
                 qp = self._subproblem.at_candidate(problem, window)
@@ -142,8 +132,8 @@ class Optimizer:
                 break
         return outcome
 
-    def _reconcile(self, problem: Problem, window: Window, outcome: Outcome) -> bool:
-        """Deal with a candidate outside of the sets; whether to go on to the QPs."""
+    def _treat_violated_sets(self, problem: Problem, window: Window, outcome: Outcome) -> bool:
+        """Project a candidate outside of the sets, or leave them out; False skips the QPs."""
         violated = problem.violated_sets(outcome.trial)
         if not violated:
             return True
@@ -151,7 +141,7 @@ class Optimizer:
             outcome.events |= Status.CANDIDATE_OUTSIDE
             return False
         if self._outside == "project" and self._limit > 0:
-            projected = self._projected(problem, window, outcome)
+            projected = self._project(problem, window, outcome)
             if projected.cost < math.inf:
                 outcome.reference = outcome.trial = projected
                 outcome.events |= Status.PROJECTED
@@ -161,13 +151,13 @@ class Optimizer:
         outcome.events |= Status.SETS_DROPPED
         return True
 
-    def _projected(self, problem: Problem, window: Window, outcome: Outcome) -> Trial:
-        """The nearest trajectory that satisfies the linearised sets, if it does the true ones."""
+    def _project(self, problem: Problem, window: Window, outcome: Outcome) -> Trial:
+        """The candidate projected onto the sets by QPs; its cost is infinite if this fails."""
         candidate = outcome.trial
-        qp = self._subproblem.nearest(problem, window)
+        qp = self._subproblem.projection(problem, window)
         trial = candidate
         for attempt in range(1 + CORRECTIONS):
-            if outcome.late():
+            if outcome.time_is_up():
                 return replace(candidate, cost=math.inf, violation=math.inf)
             solution = self._solve(qp, outcome)
             step = None if solution is None else solution.d
@@ -177,22 +167,12 @@ class Optimizer:
             if trial.cost < math.inf or not math.isfinite(trial.violation):
                 return trial
             if attempt < CORRECTIONS:
-                self._subproblem.corrected(qp, problem, candidate, trial)
+                self._subproblem.correct_rows(qp, problem, candidate, trial)
                 outcome.corrections += 1
         return trial
 
-    def _solve(self, qp: QP, outcome: Outcome) -> Solution | None:
-        """What the solver makes of a QP in the time that remains; None if there is none."""
-        began = perf_counter()
-        left = outcome.remaining(began)
-        if left is not None and left <= 0.0:
-            return None
-        solution = self._solver.solve(qp, None, left)
-        outcome.count(solution.iterations, perf_counter() - began)
-        return solution
-
     def _step(self, problem: Problem, qp: QP, outcome: Outcome) -> bool:
-        """Solve one QP and judge its iterate; whether another QP is worth while."""
+        """Solve one QP and evaluate its step; whether another QP is worth solving."""
         solution = self._solve(qp, outcome)
         if solution is None:
             return False
@@ -203,27 +183,27 @@ class Optimizer:
             outcome.message = solution.message
             return False
         best = outcome.trial
-        target, enough = _target(best), self._tolerance * (best.cost + self._tolerance)
-        if not math.isfinite(enough):
-            enough = -1.0  # a candidate that cannot be judged: nothing converges to it
+        target, negligible = _target(best), self._tolerance * (best.cost + self._tolerance)
+        if not math.isfinite(negligible):
+            negligible = -1.0  # J is infinite here: no decrease is negligible
         solved = solution.status is SolveStatus.SOLVED
         if not solved:
             outcome.events |= Status.SOLVER_STOPPED
         trial = self._trial(problem, best, step)
         if trial.cost < target:
-            return self._accept(outcome, trial, solved, enough)
-        promised = abs(float(np.vdot(qp.gradient, step)))
+            return self._accept(outcome, trial, solved, negligible)
+        predicted = abs(float(np.vdot(qp.gradient, step)))  # the QP's decrease of J
         if 0.0 < trial.violation < math.inf and qp.rows:
             missed = trial
             if trial.violation <= NEARLY:
                 trial = self._trial(problem, best, LENGTHS[0] * step)
-            # A set missed by its curvature is missed by the first length as well.
-            if not trial.cost < target and not (solved and promised <= enough):
-                step = step.copy()  # a correction's solve reuses the solver's workspace
-                trial = self._corrected(problem, qp, outcome, missed)
+            # If the shortened step leaves the set, too, curvature is the reason.
+            if not trial.cost < target and not (solved and predicted <= negligible):
+                step = step.copy()  # the correction's solve overwrites it
+                trial = self._correct(problem, qp, outcome, missed)
         if not trial.cost < target:
-            # Near a minimum J cannot be lowered beyond its rounding: not a failure.
-            if solved and promised <= enough:
+            # At a minimum no step lowers J by more than rounding: this is no failure.
+            if solved and predicted <= negligible:
                 outcome.events |= Status.CONVERGED
                 return False
             for length in LENGTHS:
@@ -231,28 +211,28 @@ class Optimizer:
                 if trial.cost < target:
                     break
             else:
-                stalled = solved and promised <= STALLED * enough
+                stalled = solved and predicted <= STALLED * negligible
                 outcome.events |= Status.CONVERGED if stalled else Status.NO_DECREASE
                 return False
-        return self._accept(outcome, trial, solved, enough)
+        return self._accept(outcome, trial, solved, negligible)
 
     @staticmethod
-    def _accept(outcome: Outcome, trial: Trial, solved: bool, enough: float) -> bool:
-        """Take a better trajectory over; whether another QP is worth while."""
-        gained = outcome.trial.cost - trial.cost
+    def _accept(outcome: Outcome, trial: Trial, solved: bool, negligible: float) -> bool:
+        """Accept a better trajectory; whether another QP is worth solving."""
+        decrease = outcome.trial.cost - trial.cost
         outcome.trial, outcome.improved = trial, True
-        if solved and gained <= enough:
+        if solved and decrease <= negligible:
             outcome.events |= Status.CONVERGED
             return False
         return True
 
-    def _corrected(self, problem: Problem, qp: QP, outcome: Outcome, trial: Trial) -> Trial:
-        """Second-order corrections of a trial that misses a set by its curvature."""
+    def _correct(self, problem: Problem, qp: QP, outcome: Outcome, trial: Trial) -> Trial:
+        """Second-order corrections of a trial that curvature takes out of a set."""
         best = outcome.trial
         for _ in range(CORRECTIONS):
-            if outcome.late():
+            if outcome.time_is_up():
                 break
-            self._subproblem.corrected(qp, problem, best, trial)
+            self._subproblem.correct_rows(qp, problem, best, trial)
             solution = self._solve(qp, outcome)
             if solution is None:
                 break
@@ -263,6 +243,16 @@ class Optimizer:
             if trial.cost < math.inf or not math.isfinite(trial.violation):
                 break
         return trial
+
+    def _solve(self, qp: QP, outcome: Outcome) -> Solution | None:
+        """The solver's solution of a QP within the time left; None if none is left."""
+        began = perf_counter()
+        left = outcome.remaining(began)
+        if left is not None and left <= 0.0:
+            return None
+        solution = self._solver.solve(qp, None, left)
+        outcome.count(solution.iterations, perf_counter() - began)
+        return solution
 
     @staticmethod
     def _trial(problem: Problem, best: Trial, step: Array) -> Trial:
@@ -276,5 +266,5 @@ def _clipped(problem: Problem, trajectory: Array) -> Array:
 
 
 def _target(best: Trial) -> float:
-    """What a trial's cost must be below to count as better."""
+    """The cost below which a trial is better than the best one."""
     return best.cost - ROUNDING * best.cost if best.cost < math.inf else math.inf

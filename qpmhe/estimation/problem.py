@@ -1,4 +1,4 @@
-"""P_t: the true cost and the true constraints of a state trajectory (eq:optiMHE)."""
+"""The nonlinear problem P_t: cost and constraints of a state trajectory (eq:optiMHE)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,19 @@ _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
 @dataclass(slots=True)
 class Trial:
-    """A trajectory with its verdict."""
+    """A state trajectory, evaluated.
+
+    Attributes
+    ----------
+    trajectory, residuals : array
+        States (K + 1, n), and joint residuals (w, v) of the stages (K, n + p).
+    weights : (n + p, n + p) or (K, n + p, n + p) array
+        Of the quadratic form that majorises the stages' cost here, discount included.
+    cost : float
+        J, or infinity if a constraint is violated or the model fails.
+    violation : float
+        The largest violation of a constraint, 0 for the candidate, infinity if the model fails.
+    """
 
     trajectory: Array
     residuals: Array
@@ -56,9 +68,9 @@ class Problem:
     def __init__(self, system: System, cost: Cost) -> None:
         self._system, self._cost, self._quadratic = system, cost, cost.quadratic
         self._n, self._q = system.n, system.n + system.p
-        self._stage_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
+        self._evaluate_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
         self._prior_cost = contained(cost.prior_cost)
-        self._prior_rule = cost.observer_prior
+        self._observer_prior = cost.observer_prior
         #: Weight of the initial error, before discount and majorisation.
         self.prior_weight: Array = (
             np.eye(system.n) if isinstance(cost.prior, ObserverPrior) else cost.prior
@@ -66,39 +78,27 @@ class Problem:
         self._prior_band = band_of(self.prior_weight)
         self._discounted = cost.discount < 1.0
         self._candidate: Trial | None = None
-        #: Views of the bound window.
-        self.view: WindowView
+        self.view: WindowView  # of the bound window
         self.model = system
         self.prior: Array = np.zeros(system.n)
         self.inputs: Array = np.zeros((0, system.m))
         self.measurements: Array = np.zeros((0, system.p))
         self.stage_weights: Array = cost.stage_weight
-        #: Which components of y are there (K, p); None if all are.
+        #: Which components of y are not missing (K, p); None if none is missing.
         self.observed: NDArray[np.bool_] | None = None
         self.discounts: Array | None = None
         self.constrained = any((system.states, system.disturbances, system.noises))
         fixed = system.disturbances.fixed_components if system.disturbances else np.empty(0, int)
-        #: Components of w of zero width, whose states follow the model without noise.
+        #: Components whose disturbance is a constant, so that their states follow the model.
         self.noise_free: NDArray[np.intp] = fixed
         self.use_sets(system.states, system.disturbances, system.noises)
 
-    def use_sets(
-        self,
-        states: ConvexSet | None,
-        disturbances: ConvexSet | None,
-        noises: ConvexSet | None,
-    ) -> None:
-        """Judge by these sets from now on; None leaves one out."""
-        self.states, self.disturbances, self.noises = states, disturbances, noises
-        self._rolls_out = bool(self.noise_free.size) and disturbances is not None
-
     def bind(self, window: Window) -> None:
-        """Take over the window's data, all sets, and the prior z(t-N) as in (eq:prior)."""
+        """Take the window's data, with the prior z(t-N) of (eq:prior), and use all sets."""
         self._candidate = None
         self.view = view = window.view
         self.prior, self.measurements = view.prior, view.measurements
-        # Decided by what the window holds: an estimator that goes on from a snapshot must round
-        # as the one that it was taken of.
+        # `unusual` stays set for longer, and a snapshot sets it: no result may depend on it.
         unusual = window.unusual and (window.has_special_weights or window.has_irregular_steps)
         if unusual:
             self.inputs, self.model = window.inputs, window.model
@@ -109,82 +109,41 @@ class Problem:
             self.stage_weights, self.observed = self._cost.stage_weight, None
         if self._discounted:
             self.discounts = window.discounts
-        if self._prior_rule is not None and window.prior_covariance is not None:
-            self.prior_weight = self._prior_rule.weight(window.prior_covariance)
+        if self._observer_prior is not None and window.prior_covariance is not None:
+            self.prior_weight = self._observer_prior.weight(window.prior_covariance)
             self._prior_band = band_of(self.prior_weight)
         if self.constrained:
             system = self._system
             self.use_sets(system.states, system.disturbances, system.noises)
 
-    def violated_sets(self, trial: Trial) -> tuple[str, ...]:
-        """Names of the sets that a trajectory is outside of."""
-        n = self._n
-        amounts = {
-            "states": self.states and self.states.violation(trial.trajectory),
-            "disturbances": self.disturbances
-            and self.disturbances.violation(trial.residuals[:, :n]),
-            "noises": self.noises
-            and self.noises.violation(trial.residuals[:, n:], self.observed),
-        }
-        return tuple(name for name, amount in amounts.items() if amount and amount > FEASIBLE)
-
-    def leave_out(self, names: tuple[str, ...]) -> None:
-        """Judge without the sets of these names."""
-        self.use_sets(
-            None if "states" in names else self.states,
-            None if "disturbances" in names else self.disturbances,
-            None if "noises" in names else self.noises,
-        )
-
-    def prior_weight_at(self, offset: Array) -> Array:
-        """The weight (n, n) of the form that majorises the prior's cost at this offset."""
-        weight = self.prior_weight
-        if not self._cost.quadratic:
-            weight = self._cost.majorise_prior(offset, weight)
-        return weight if self.discounts is None else self.discounts[0] * weight
-
-    def prior_band_at(self, offset: Array) -> Array:
-        """The same weight as a band panel."""
-        if self._quadratic and self.discounts is None:
-            return self._prior_band
-        return band_of(self.prior_weight_at(offset))
-
-    def restored(self, trajectory: Array) -> Array:
-        """The trajectory with its noise-free components rolled out from its first state.
-
-        Component j with W_j = {c} is set to f_j(x_i) + c, stage by stage; the other
-        components keep their states. May raise what the model raises.
-        """
-        free, system = self.noise_free, self.model
-        assert self.disturbances is not None
-        shift = self.disturbances.lower[free]
-        restored = trajectory.copy()
-        for i in range(trajectory.shape[0] - 1):
-            moved = np.asarray(system.f(restored[i], self.inputs[i]))
-            restored[i + 1, free] = moved[free] + shift
-        return restored
+    def candidate(self, window: Window) -> Trial:
+        """The candidate of the bound window as a trial, whose cost the window knows."""
+        if self._candidate is None:
+            weights = self.stage_weights if self._quadratic else window.majorising_weights
+            if self.discounts is not None:
+                weights = weights * self.discounts[1:, None, None]
+            view = self.view
+            self._candidate = Trial(
+                view.candidate, view.residuals, weights, window.candidate_cost_of(view)
+            )
+        return self._candidate
 
     def evaluate(self, trajectory: Array) -> Trial:
-        """Judge a trajectory (K + 1, n) by the true model.
-
-        Never raises on account of the model: where f or h raise or are not finite, or a
-        constraint is violated, the cost is infinite.
-        """
+        """Evaluate a trajectory (K + 1, n); never raises, whatever the model does."""
         try:
-            if self._rolls_out:
-                trajectory = self.restored(trajectory)
+            if self._has_noise_free:
+                trajectory = self._rolled_out(trajectory)
             residuals = self._residuals(trajectory)
-            weights, cost = self._cost_of(residuals)
+            weights, cost = self._weights_and_cost(residuals)
             offset = trajectory[0] - self.prior
             if self._quadratic:
                 prior_cost = float(offset.dot(self.prior_weight).dot(offset))
             else:
                 prior_cost = self._prior_cost(offset, self.prior_weight)
             cost += prior_cost if self.discounts is None else float(self.discounts[0]) * prior_cost
-        # A model function outside its domain, or a loss that fails: such a trial is worthless.
-        except Exception:
-            nothing = np.full((trajectory.shape[0] - 1, self._q), np.nan)
-            return Trial(trajectory, nothing, self.stage_weights, math.inf, math.inf)
+        except Exception:  # a model function outside its domain, or a user's loss
+            residuals = np.full((trajectory.shape[0] - 1, self._q), np.nan)
+            return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf)
         if not math.isfinite(cost):
             return Trial(trajectory, residuals, weights, math.inf, math.inf)
         if not self.constrained:
@@ -194,22 +153,33 @@ class Problem:
             cost = math.inf
         return Trial(trajectory, residuals, weights, cost, violation)
 
+    def _rolled_out(self, trajectory: Array) -> Array:
+        """Set each noise-free component j, with W_j = {c}, to f_j(x_i) + c, stage by stage."""
+        free, system = self.noise_free, self.model
+        assert self.disturbances is not None
+        shift = self.disturbances.lower[free]
+        rolled_out = trajectory.copy()
+        for i in range(trajectory.shape[0] - 1):
+            predicted = np.asarray(system.f(rolled_out[i], self.inputs[i]))
+            rolled_out[i + 1, free] = predicted[free] + shift
+        return rolled_out
+
     def _residuals(self, trajectory: Array) -> Array:
         """Residuals w and v of each stage; raises what the model raises."""
         model = self.model
         if model.kernel is not None:
             return model.kernel.residuals(trajectory, self.measurements, self.inputs)
         states = trajectory[:-1]
-        # Contiguous differences put together are faster than writing into columns.
+        # Concatenating contiguous differences is faster than writing into columns.
         disturbances = trajectory[1:] - model.f.batch(states, self.inputs)
         noises = self.measurements - model.h.batch(states, self.inputs)
         residuals: Array = np.concatenate((disturbances, noises), axis=1)
         if residuals.shape[1] != self._q or residuals.dtype != np.float64:
-            raise TypeError("f or h gave other than real numbers of the right shape")
+            raise TypeError("f or h returned other than real numbers of the right shape")
         return residuals
 
-    def _cost_of(self, residuals: Array) -> tuple[Array, float]:
-        """Majorising weights, and the stages' cost."""
+    def _weights_and_cost(self, residuals: Array) -> tuple[Array, float]:
+        """The weights of `Trial`, and the stages' cost."""
         weights = self.stage_weights
         if self._quadratic:
             if self.discounts is not None:
@@ -220,34 +190,64 @@ class Problem:
                 weighted = np.matmul(residuals[:, None, :], weights)[:, 0]
             return weights, float(weighted.ravel().dot(residuals.ravel()))
         residuals, weights = read_only(residuals), read_only(weights)
-        costs = self._stage_costs(residuals, weights)
+        costs = self._evaluate_costs(residuals, weights)
         weights = self._majorise(residuals, weights)
         if self.discounts is not None:
             weights = weights * self.discounts[1:, None, None]
             costs = costs * self.discounts[1:]
         return weights, float(costs.sum())
 
-    def candidate(self, window: Window) -> Trial:
-        """The candidate of the bound window as a trial: its cost is known already."""
-        if self._candidate is None:
-            weights = self.stage_weights if self._quadratic else window.majorising_weights
-            if self.discounts is not None:
-                weights = weights * self.discounts[1:, None, None]
-            view = self.view
-            self._candidate = Trial(
-                view.candidate, view.residuals, weights, window.cost_over(view)
-            )
-        return self._candidate
-
     def violation(self, trajectory: Array, residuals: Array) -> float:
-        """The largest amount by which a point leaves its set, of those not left out."""
+        """The largest violation of the sets in use."""
         n, worst = self._n, 0.0
         if self.states is not None:
             worst = self.states.violation(trajectory)
         if self.disturbances is not None:
             rounding = _ROUNDING * np.abs(trajectory[1:]).max(axis=1, keepdims=True)
-            amount = self.disturbances.violation(residuals[:, :n], rounding=rounding)
-            worst = max(worst, amount)
+            worst = max(worst, self.disturbances.violation(residuals[:, :n], rounding=rounding))
         if self.noises is not None:
             worst = max(worst, self.noises.violation(residuals[:, n:], self.observed))
         return worst
+
+    def violated_sets(self, trial: Trial) -> tuple[str, ...]:
+        """Names of the sets that a trial leaves."""
+        n = self._n
+        violations = {
+            "states": self.states and self.states.violation(trial.trajectory),
+            "disturbances": self.disturbances
+            and self.disturbances.violation(trial.residuals[:, :n]),
+            "noises": self.noises
+            and self.noises.violation(trial.residuals[:, n:], self.observed),
+        }
+        return tuple(name for name, size in violations.items() if size and size > FEASIBLE)
+
+    def leave_out(self, names: tuple[str, ...]) -> None:
+        """Leave out the sets of these names."""
+        self.use_sets(
+            None if "states" in names else self.states,
+            None if "disturbances" in names else self.disturbances,
+            None if "noises" in names else self.noises,
+        )
+
+    def use_sets(
+        self,
+        states: ConvexSet | None,
+        disturbances: ConvexSet | None,
+        noises: ConvexSet | None,
+    ) -> None:
+        """Use these sets as constraints; None leaves one out."""
+        self.states, self.disturbances, self.noises = states, disturbances, noises
+        self._has_noise_free = bool(self.noise_free.size) and disturbances is not None
+
+    def prior_weight_at(self, offset: Array) -> Array:
+        """Weight (n, n) of the form that majorises the prior's cost at x_0 - prior = offset."""
+        weight = self.prior_weight
+        if not self._cost.quadratic:
+            weight = self._cost.majorise_prior(offset, weight)
+        return weight if self.discounts is None else self.discounts[0] * weight
+
+    def prior_band_at(self, offset: Array) -> Array:
+        """The same weight as a band panel."""
+        if self._quadratic and self.discounts is None:
+            return self._prior_band
+        return band_of(self.prior_weight_at(offset))

@@ -1,4 +1,4 @@
-"""The record of an estimator's run."""
+"""The results of a whole record."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ class Run:
     Parameters
     ----------
     states : (T + 1, n) array
-        Estimates of x(0), ..., x(T), each made before y of its own time: row 0 is the start.
+        Estimates of x(0), ..., x(T), each made before y of its own time; row 0 is the start.
     filtered : (T, n) array
         Estimates of x(0), ..., x(T-1), each made with y of its own time.
     costs, candidate_costs : (T,) array
         True cost J of estimate and candidate.
     times, solve_times : (T,) array
-        Seconds for each update, and for the QP solver in it. A compiled run is timed in
-        pieces of some hundred samples, and its solver not at all (NaN).
+        Seconds for each update, and for the QP solver in it. A compiled run gives means over
+        pieces of some hundred samples, and NaN for its solver.
     qps : (T,) array
         QPs solved.
     solver_iterations : (T,) array
-        The solver's own iterations, -1 where it does not tell.
+        The solver's own iterations, -1 where it reports none.
     delayed : (T, n) array
-        Estimates with the estimator's delay, NaN where the window did not reach that far.
+        Delayed estimates, NaN until the window reaches the delay.
     flags : (T,) array
         Values of the statuses.
     covariances : (T, n, n) array, optional
-        Covariances of the estimates of x(1), ..., x(T), if they were asked for; NaN where
-        the model could not be linearised.
+        Covariances of the estimates of x(1), ..., x(T), if requested; NaN where the model
+        could not be linearised.
 
     Attributes
     ----------
@@ -75,14 +75,14 @@ class Run:
     def of(
         cls, start: Array, estimates: Sequence[Estimate], covariances: Array | None = None
     ) -> Run:
-        """Collect what single updates returned.
+        """Collect the estimates of single updates.
 
         Parameters
         ----------
         start : (n,) array
             The estimate before the first update.
         estimates : sequence of Estimate
-            What the updates returned.
+            One for each update.
         covariances : (T, n, n) array, optional
             Covariances of their states.
         """
@@ -122,6 +122,6 @@ class Run:
         return float(has.sum()) / max(1, len(self))
 
     def reasons(self) -> dict[str, int]:
-        """How often each combination of flags occurred, the most frequent first."""
+        """Counts of each combination of flags, the most frequent first."""
         counts = Counter(str(status).removeprefix("Status.") for status in self.statuses)
         return dict(counts.most_common())

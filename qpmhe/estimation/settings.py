@@ -1,4 +1,4 @@
-"""Options of the estimator, validated in one view."""
+"""Options of the estimator, validated once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Policy = Literal["drop", "project", "keep"]
 Candidate = Literal["observer", "reinitialized"]
 Engine = Literal["python", "compiled"]
 
-# With max_qps=None the sequence ends by convergence; this bounds it where that fails.
+# Bounds the sequence of QPs with max_qps=None where it does not converge.
 _SAFETY_LIMIT = 100
 _SOLVER_TOLERANCE = 1e-7
 
@@ -40,7 +40,7 @@ class Settings:
     isolated: bool = False
 
     def __post_init__(self) -> None:
-        # NumPy's numbers are numbers, and some that are handed on do not take them.
+        # As Python's int: not everything that gets them accepts NumPy's integers.
         object.__setattr__(self, "horizon", count("horizon", self.horizon, 1))
         if self.max_qps is not None:
             count("max_qps", self.max_qps, 0, " None stands for convergence.")
@@ -59,8 +59,10 @@ class Settings:
                 f"delay is {self.delay!r}; expected at most the horizon, {self.horizon}: older "
                 "states are not in the window."
             )
-        if not isinstance(self.warm_start, bool):
-            raise OptionError(f"warm_start is {self.warm_start!r}; expected True or False.")
+        for name in ("warm_start", "isolated"):
+            flag = getattr(self, name)
+            if not isinstance(flag, bool):
+                raise OptionError(f"{name} is {flag!r}; expected True or False.")
         for name, choices in (
             ("engine", get_args(Engine)),
             ("outside", get_args(Policy)),
@@ -70,9 +72,6 @@ class Settings:
             if value not in choices:
                 known = ", ".join(repr(choice) for choice in choices)
                 raise OptionError(f"{name} is {value!r}; expected one of {known}.")
-
-        if not isinstance(self.isolated, bool):
-            raise OptionError(f"isolated is {self.isolated!r}; expected True or False.")
         if self.isolated and self.engine == "compiled":
             raise OptionError(
                 "isolated is True, but engine='compiled' solves its QPs itself, without a "
@@ -132,5 +131,5 @@ class Settings:
 
     @property
     def qp_limit(self) -> int:
-        """Most QPs of one window."""
+        """Largest number of QPs in one step."""
         return _SAFETY_LIMIT if self.max_qps is None else self.max_qps

@@ -1,4 +1,4 @@
-"""Whether a snapshot is sound, and of an estimator like this one."""
+"""Validation of a snapshot: undamaged, and of an estimator with the same arguments."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from ..observers import Observer
 from .settings import Settings
 
 __all__ = [
-    "SET_NAMES", "check_description", "check_size", "described", "near", "other",
-    "reading", "taken",
+    "SET_NAMES", "check_description", "check_size", "checked_array", "described", "mismatch",
+    "near", "reading",
 ]
 
 Array = NDArray[Any]
 
 SET_NAMES = ("states", "disturbances", "noises")
 
-# What another machine computes of the same numbers differs by less, as a share of their size;
-# and for entries that are much smaller than others of their array, as a share of these.
+# Largest difference between two machines that compute the same, as a share of a number's size,
+# and as a share of the largest entry of its array.
 _ROUNDING, _FLOOR = 1e-7, 1e-10
 
 
 def described(
     system: System, observer: Observer, cost: Cost, settings: Settings
 ) -> dict[str, Any]:
-    """What gives the stored numbers their meaning, as arrays, numbers and names.
+    """Model, observer and cost as arrays, numbers and names, to compare with another's.
 
-    Functions are described by values of f and h at some points; what else a user's function
-    does shows when the stored stages are computed once more. Caps, backend and policies of
-    the QPs are left out: they may change between snapshot and restart.
+    f and h are described by their values at some points; other differences show when the
+    stored stages are computed again. Caps, backend and policies of the QPs are left out: they
+    may change between snapshot and restart.
     """
     found: dict[str, Any] = {"candidate": settings.candidate, "sampling time": system.dt}
     for name in SET_NAMES:
@@ -70,7 +70,7 @@ def _describe(name: str, value: Any, found: dict[str, Any]) -> None:
     elif not (callable(value) or isinstance(value, (Mapping, System))):  # mappings are caches
         found[name] = type(value).__qualname__
         if not type(value).__module__.startswith("qpmhe."):
-            return  # what a user's class keeps need not be a parameter
+            return  # an attribute of a user's class need not be a parameter
         parts = dict(vars(value)) if hasattr(value, "__dict__") else {}
         for kind in type(value).__mro__:
             slots = getattr(kind, "__slots__", ())
@@ -80,12 +80,12 @@ def _describe(name: str, value: Any, found: dict[str, Any]) -> None:
 
 
 def check_description(found: Any, mine: dict[str, Any]) -> None:
-    """Refuse the state of an estimator that differs, and name what does."""
+    """Raise for the state of an estimator that differs, naming the difference."""
     if not isinstance(found, dict):
-        raise TypeError("it does not describe its estimator")
+        raise TypeError("the estimator is not described")
     for name in (*mine, *found):
         if name not in found or name not in mine or not _alike(found[name], mine[name]):
-            raise other(name)
+            raise mismatch(name)
 
 
 def _alike(one: Any, two: Any) -> bool:
@@ -104,29 +104,29 @@ def _alike(one: Any, two: Any) -> bool:
 def near(found: Array | float, expected: Array | float, size: Array | float) -> bool:
     """Whether numbers differ by no more than the rounding of terms of this size."""
     found, expected = np.asarray(found), np.asarray(expected)
-    there = np.isfinite(expected)
-    if not np.array_equal(found[~there], expected[~there], equal_nan=True):
+    finite = np.isfinite(expected)
+    if not np.array_equal(found[~finite], expected[~finite], equal_nan=True):
         return False
     with np.errstate(all="ignore"):
         close = np.abs(found - expected) <= _ROUNDING * np.asarray(size)
-    return bool((~there | close).all())
+    return bool((~finite | close).all())
 
 
 class _OtherEstimatorError(InvalidInputError):
     """The state is of another estimator."""
 
 
-def other(what: str) -> InvalidInputError:
-    """The error for the state of an estimator that differs in something."""
+def mismatch(what: str) -> InvalidInputError:
+    """The error for the state of an estimator that differs in this."""
     return _OtherEstimatorError(
         f"the state is of an estimator with another {what} (or it is damaged); make this one "
-        "with the arguments of the one that it was taken of."
+        "with the arguments of the one that it was taken from."
     )
 
 
 @contextmanager
 def reading() -> Iterator[None]:
-    """Turn whatever reading a snapshot raises into one error of ours."""
+    """Turn any exception while reading a snapshot into `InvalidInputError`."""
     try:
         yield
     except _OtherEstimatorError:
@@ -138,10 +138,10 @@ def reading() -> Iterator[None]:
         ) from error
 
 
-def taken(
+def checked_array(
     name: str, value: Any, shape: tuple[int, ...], kind: Any = np.float64, finite: bool = True
 ) -> Array:
-    """A copy of an array of a snapshot; `reading` turns what it raises into our error."""
+    """A copy of an array of a snapshot, with its shape, type and finiteness checked."""
     if not isinstance(value, np.ndarray) or value.dtype != kind or value.shape != shape:
         found = (value.shape, value.dtype) if isinstance(value, np.ndarray) else type(value)
         raise TypeError(f"{name} is {found}; expected an array {shape} of {np.dtype(kind)}")
@@ -151,7 +151,7 @@ def taken(
 
 
 def check_size(name: str, value: Any, fits: Callable[[int], bool]) -> int:
-    """An integer of a snapshot that fits."""
+    """An integer of a snapshot, checked."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not fits(int(value)):
         raise ValueError(f"{name} is {value!r}")
     return int(value)

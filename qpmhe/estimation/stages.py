@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .._checks import positive_definite
 from .linearization import Span, Stage, StageTerms
-from .snapshot import check_size, other, taken
+from .snapshot import check_size, checked_array, mismatch
 
 __all__ = ["Mark", "StageView", "Stages", "Views", "WindowView", "read_only"]
 
@@ -21,7 +21,8 @@ Mark = tuple[
     int, int, int, int, int, bool, "dict[int, Array] | None", "list[Array] | None"
 ]
 
-# Views of longer windows are not kept: they would outweigh the arrays, and are little of a step.
+# Views are made in advance up to this horizon: beyond it they would take more memory than the
+# arrays, and making them is a small part of a step.
 _KEPT = 1000
 View = TypeVar("View")
 
@@ -33,89 +34,15 @@ def read_only(array: Array) -> Array:
     return view
 
 
-class StageView:
-    """Views of one stage's entries in all arrays.
-
-    Attributes
-    ----------
-    z, next : (n,) array
-        State of the observer, and the one after it.
-    arguments : tuple
-        What the functions of the usual model take, read-only: z, and the inputs if there are any.
-    error : (p,) array
-        The fitting error, read-only.
-    y, u : array
-        The measurement (p,), and the input (m,).
-    weight : (n + p, n + p) array
-        The stage's.
-    terms : Stage
-        Its linear map and terms.
-    """
-
-    __slots__ = ("arguments", "error", "next", "terms", "u", "weight", "y", "z")
-
-    def __init__(self, stages: Stages, k: int) -> None:
-        self.z, self.next = stages._z[k], stages._z[k + 1]
-        self.y, self.u = stages._y[k], stages._u[k, :-1]
-        self.arguments: tuple[Array, ...] = tuple(
-            read_only(one) for one in ((self.z, self.u) if self.u.size else (self.z,))
-        )
-        self.weight = stages._weight[k]
-        self.terms = Stage(stages.terms, k)
-        self.error = read_only(self.terms.noise)
-
-
-class WindowView:
-    """Views of a whole window.
-
-    Attributes
-    ----------
-    candidate : (K + 1, n) array
-        The observer's trajectory.
-    prior : (n,) array
-        Its first state.
-    residuals, measurements, inputs : array
-        (K, n + p), (K, p) and (K, m).
-    costs : (K,) array
-        The stages' costs.
-    span : Span
-        The stages' terms.
-    """
-
-    __slots__ = ("candidate", "costs", "inputs", "measurements", "prior", "residuals", "span")
-
-    def __init__(self, stages: Stages, first: int, last: int) -> None:
-        self.candidate, self.prior = stages._z[first : last + 1], stages._z[first]
-        self.residuals = stages.terms.residuals[first:last]
-        self.measurements, self.inputs = stages._y[first:last], stages._u[first:last, :-1]
-        self.costs = stages._stage_cost[first:last]
-        self.span = Span(stages.terms, first, last - first)
-
-
-class Views(Sequence[View]):
-    """Views that are made when they are wanted, of which only the last is kept."""
-
-    def __init__(self, count: int, make: Callable[[int], View]) -> None:
-        self._count, self._make = count, make
-        self._k = -1
-        self._view: View | None = None
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, k: Any) -> Any:
-        if k >= self._count:
-            raise IndexError(k)
-        if k != self._k:
-            self._k, self._view = k, self._make(k)
-        return self._view
-
-
 class Stages:
     """Samples and what was computed on them, stage by stage.
 
     The arrays are longer than the window, which slides along them; at the end its stages
-    move back to the front. Thus every window is a plain slice.
+    move back to the front. Thus every window is a plain slice. Row k of an array belongs to
+    stage k, or to the state before it; the window consists of the stages ``start`` to ``end - 1``.
+
+    A stage is *special* if its weight is not the usual one, *irregular* if its step length is
+    not, and *unusual* if either holds.
     """
 
     def __init__(
@@ -134,29 +61,30 @@ class Stages:
         room = horizon + max(horizon // 4, 32)
         self.room = room
         self._z = np.zeros((room + 1, n))
-        # The input of each stage, and behind it the length of its step.
+        # The input of each stage, and in the last column the length of its step.
         self._y, self._u = np.zeros((room, p)), np.zeros((room, m + 1))
         self._u[:, m] = step
         self._irregular = np.zeros(room, dtype=np.bool_)
         self._observed = np.ones((room, p), dtype=np.bool_)
-        # Stages whose weight is not the cost's own, because y is missing or has its own noise.
+        # Because y is missing in part, or has a noise weight of its own.
         self._special = np.zeros(room, dtype=np.bool_)
-        self._own_noise: dict[int, Array] = {}  # by time
-        self._stage_weight = stage_weight
-        self._weight = np.tile(stage_weight, (room, 1, 1))
-        #: Whether any stage may be special or irregular; the places to come never are.
+        self._own_noise: dict[int, Array] = {}  # noise weights given with a sample, by time
+        self._usual_weight = stage_weight
+        self._weights = np.tile(stage_weight, (room, 1, 1))
+        #: Whether any stage may be unusual; those from ``end`` on never are.
         self.unusual: bool = False
-        # With a cost that is not quadratic: the weights that majorise it at the candidate.
-        self._majorising = self._weight if quadratic else np.zeros((room, n + p, n + p))
-        self._stage_cost = np.zeros(room)
+        # Weights of the quadratic form that majorises the cost at the candidate.
+        self._majorising_weights = self._weights if quadratic else np.zeros((room, n + p, n + p))
+        self._stage_costs = np.zeros(room)
         self.terms = StageTerms(room, n, p)
-        self._covariance = None if covariance is None else np.zeros((room + 1, n, n))
-        # What observers and losses get: foreign code cannot write into the window.
-        self._covariance_seen = None if self._covariance is None else read_only(self._covariance)
-        self._weight_seen, self._residuals_seen = (
-            read_only(array) for array in (self._weight, self.terms.residuals)
+        self._covariances = None if covariance is None else np.zeros((room + 1, n, n))  # of z
+        # For observers and losses: a user's code cannot write into the window.
+        self._read_only_covariances = (
+            None if self._covariances is None else read_only(self._covariances)
         )
-        # By stage; and of the full windows, by their first stage.
+        self._read_only_weights = read_only(self._weights)
+        self._read_only_residuals = read_only(self.terms.residuals)
+        # Views of each stage, and of each full window by its first stage.
         self._stage_views: Sequence[StageView] = Views(room, partial(StageView, self))
         self._window_views: Sequence[WindowView] = Views(
             room + 1 - horizon, lambda k: WindowView(self, k, k + horizon)
@@ -164,20 +92,15 @@ class Stages:
         if horizon <= _KEPT:
             self._stage_views = list(self._stage_views)
             self._window_views = list(self._window_views)
-        self.time = 0  # samples ever pushed: the window ends at x(time)
+        self.time = 0  # number of samples pushed: the window ends at x(time)
         self.start = self.end = 0
         self._last_special = self._last_irregular = -self.horizon - 1
-        # The last state at which the model worked, of the stages that are no longer here.
-        self._earlier = initial_state.copy()
+        # Before the first stage in the arrays: the last state at which the model worked.
+        self._earlier_state = initial_state.copy()
         self._earlier_covariance = None if covariance is None else covariance.copy()
         self._z[0] = initial_state
-        if self._covariance is not None:
-            self._covariance[0] = covariance
-
-    def _make_usual(self, first: int) -> None:
-        """Make the places from one on those of usual stages."""
-        self._observed[first:], self._special[first:], self._irregular[first:] = True, False, False
-        self._weight[first:], self._u[first:, -1] = self._stage_weight, self._step
+        if self._covariances is not None:
+            self._covariances[0] = covariance
 
     @property
     def length(self) -> int:
@@ -194,154 +117,7 @@ class Stages:
     @property
     def newest_failed(self) -> bool:
         """Whether the newest stage could not be evaluated."""
-        return not math.isfinite(self._stage_cost[self.end - 1])
-
-    def _per_stage(self) -> tuple[Array, ...]:
-        arrays: tuple[Array | Any, ...] = (
-            self._y, self._u, self._irregular, self._observed, self._special,
-            self._weight, self._stage_cost,
-        )
-        return arrays if self._majorising is self._weight else (*arrays, self._majorising)
-
-    def _last_good(self, before: int) -> tuple[Array, Array | None]:
-        """State and covariance of the last stage before this one at which the model worked."""
-        for k in range(before - 1, -1, -1):
-            if math.isfinite(self._stage_cost[k]):
-                return self._z[k], None if self._covariance is None else self._covariance[k]
-        return self._earlier, self._earlier_covariance
-
-    def make_room(self) -> None:
-        """Move the stages to the front where there is no place for another one."""
-        if self.end < self.room:
-            return
-        state, covariance = self._last_good(self.start)
-        earlier = state.copy(), None if covariance is None else covariance.copy()
-        kept = self._kept()
-        try:
-            self._settle(kept, earlier)
-        except BaseException:  # an interrupt: of half a move nothing could be told
-            self._settle(kept, earlier)
-            raise
-
-    def _settle(self, kept: list[Array], earlier: tuple[Array, Array | None]) -> None:
-        self._earlier, self._earlier_covariance = earlier
-        keep = len(kept[0])
-        self._put(kept, 0)
-        if self.unusual:
-            self._make_usual(keep)
-            self.unusual = bool(self._special[:keep].any() or self._irregular[:keep].any())
-        self.start, self.end = 0, keep
-
-    def _kept(self) -> list[Array]:
-        """Copies of the window's part of all arrays."""
-        stages, points = slice(self.start, self.end), slice(self.start, self.end + 1)
-        arrays = [array[stages].copy() for array in (*self._per_stage(), *self.terms.arrays())]
-        arrays.append(self._z[points].copy())
-        if self._covariance is not None:
-            arrays.append(self._covariance[points].copy())
-        return arrays
-
-    def _put(self, kept: list[Array], first: int) -> None:
-        """Put what `_kept` gave into the places from one on."""
-        arrays = [*self._per_stage(), *self.terms.arrays(), self._z]
-        if self._covariance is not None:
-            arrays.append(self._covariance)
-        for array, part in zip(arrays, kept, strict=True):
-            array[first : first + len(part)] = part
-
-    def mark(self, whole: bool) -> Mark:
-        """What `roll_back` needs."""
-        return (
-            self.start, self.end, self.time, self._last_special, self._last_irregular,
-            self.unusual, self._own_noise.copy() if self._own_noise else None,
-            self._kept() if whole else None,
-        )
-
-    def roll_back(self, mark: Mark) -> None:
-        """Undo all that was done since a mark, except for a move to the front."""
-        (
-            self.start, self.end, self.time, self._last_special, self._last_irregular,
-            unusual, own_noise, kept,
-        ) = mark
-        self._own_noise = own_noise or {}
-        if kept is not None:
-            self._put(kept, self.start)
-        if self.unusual:
-            self._make_usual(self.end)
-        self.unusual = unusual
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that the window knows, as copies of arrays and numbers."""
-        stages = slice(self.start, self.end)
-        points = slice(self.start, self.end + 1)
-        earlier, covariance = self._last_good(self.start)
-        return {
-            "earlier": earlier.copy(),
-            "earlier_covariance": None if covariance is None else covariance.copy(),
-            "time": self.time,
-            "z": self._z[points].copy(),
-            "covariance": None if self._covariance is None else self._covariance[points].copy(),
-            "stages": [array[stages].copy() for array in self._per_stage()],
-            "terms": [array[stages].copy() for array in self.terms.arrays()],
-            "own_noise": {time: weight.copy() for time, weight in self._own_noise.items()},
-            "last_special": self._last_special,
-            "last_irregular": self._last_irregular,
-        }
-
-    def load_state_dict(self, state: dict[str, Any], irregular: bool) -> None:
-        """Take over what `state_dict` of an equal window gave, into a fresh window.
-
-        Raises whatever comes of a state that is damaged; the window is void then.
-        """
-        time = check_size("time", state["time"], lambda found: found >= 0)
-        length = min(time, self.horizon)
-        points = [("z", self._z, state["z"]), ("covariance", self._covariance, state["covariance"])]
-        for name, mine, saved in points:
-            if (mine is None) != (saved is None):
-                raise other("observer")
-            if mine is not None:
-                mine[: length + 1] = taken(name, saved, (length + 1, *mine.shape[1:]))
-        self._earlier = taken("earlier", state["earlier"], self._earlier.shape)
-        if self._covariance is not None:
-            saved, shape = state["earlier_covariance"], self._covariance.shape[1:]
-            self._earlier_covariance = taken("earlier_covariance", saved, shape)
-        if len(state["stages"]) != len(self._per_stage()):
-            raise other("cost")
-        for arrays, part, loose in (
-            # Inputs, costs and terms where the model fails need not be finite.
-            (self._per_stage(), state["stages"], (self._u, self._stage_cost)),
-            (self.terms.arrays(), state["terms"], self.terms.arrays()),
-        ):
-            for array, saved in zip(arrays, part, strict=True):
-                finite = not any(array is one for one in loose)
-                array[:length] = taken(
-                    "a stage", saved, (length, *array.shape[1:]), array.dtype, finite
-                )
-        if not (self._stage_cost[:length] >= 0.0).all():
-            raise ValueError("a stage's cost is not a number >= 0")
-        steps, odd = self._u[:length, -1], self._irregular[:length]
-        if (steps[~odd] != self._step).any() or (odd.any() and not (
-            irregular and np.isfinite(steps).all() and (steps > 0.0).all()
-        )):
-            raise ValueError("a step's length is impossible")
-        p = self._y.shape[1]
-        for when, weight in state["own_noise"].items():
-            when = check_size("a sample's time", when, lambda t: time - length <= t < time)
-            self._own_noise[when] = positive_definite(
-                "noise_weight", taken("noise_weight", weight, (p, p))
-            )
-        latest = [
-            time - length + int(np.flatnonzero(flags[:length])[-1]) if flags[:length].any()
-            else -self.horizon - 1
-            for flags in (self._special, self._irregular)
-        ]
-        self._last_special = check_size(
-            "last_special", state["last_special"], lambda t: latest[0] <= t < time
-        )
-        self._last_irregular = check_size(
-            "last_irregular", state["last_irregular"], lambda t: latest[1] <= t < time
-        )
-        self.start, self.end, self.time, self.unusual = 0, length, time, True
+        return not math.isfinite(self._stage_costs[self.end - 1])
 
     @property
     def candidate(self) -> Array:
@@ -355,15 +131,248 @@ class Stages:
 
     @property
     def measurements(self) -> Array:
-        """y, with a number of no weight where it is missing: a view."""
+        """y, with any number where it is missing: a view."""
         return self._y[self.start : self.end]
 
     @property
     def observed(self) -> NDArray[np.bool_]:
-        """Which components of y are there: a view."""
+        """Which components of y are not missing: a view."""
         return self._observed[self.start : self.end]
 
     @property
     def prior_covariance(self) -> Array | None:
         """The observer's covariance at z(t-N), if it has one."""
-        return None if self._covariance is None else self._covariance[self.start]
+        return None if self._covariances is None else self._covariances[self.start]
+
+    def _stage_arrays(self) -> tuple[Array, ...]:
+        arrays: tuple[Array | Any, ...] = (
+            self._y, self._u, self._irregular, self._observed, self._special,
+            self._weights, self._stage_costs,
+        )
+        shared = self._majorising_weights is self._weights
+        return arrays if shared else (*arrays, self._majorising_weights)
+
+    def _last_good(self, before: int) -> tuple[Array, Array | None]:
+        """State and covariance of the last stage before this one at which the model worked."""
+        for k in range(before - 1, -1, -1):
+            if math.isfinite(self._stage_costs[k]):
+                return self._z[k], None if self._covariances is None else self._covariances[k]
+        return self._earlier_state, self._earlier_covariance
+
+    def make_room(self) -> None:
+        """Move the window to the front if the arrays are full."""
+        if self.end < self.room:
+            return
+        state, covariance = self._last_good(self.start)
+        earlier = state.copy(), None if covariance is None else covariance.copy()
+        kept = self._copies()
+        try:
+            self._move_to_front(kept, earlier)
+        except BaseException:  # an interrupt: finish the move, half of it is no window
+            self._move_to_front(kept, earlier)
+            raise
+
+    def _move_to_front(self, kept: list[Array], earlier: tuple[Array, Array | None]) -> None:
+        self._earlier_state, self._earlier_covariance = earlier
+        keep = len(kept[0])
+        self._write(kept, 0)
+        if self.unusual:
+            self._make_usual(keep)
+            self.unusual = bool(self._special[:keep].any() or self._irregular[:keep].any())
+        self.start, self.end = 0, keep
+
+    def _make_usual(self, first: int) -> None:
+        """Reset the stages from ``first`` on to usual ones."""
+        self._observed[first:], self._special[first:], self._irregular[first:] = True, False, False
+        self._weights[first:], self._u[first:, -1] = self._usual_weight, self._step
+
+    def _copies(self) -> list[Array]:
+        """Copies of the window's part of all arrays."""
+        stages, points = slice(self.start, self.end), slice(self.start, self.end + 1)
+        arrays = [array[stages].copy() for array in (*self._stage_arrays(), *self.terms.arrays())]
+        arrays.append(self._z[points].copy())
+        if self._covariances is not None:
+            arrays.append(self._covariances[points].copy())
+        return arrays
+
+    def _write(self, kept: list[Array], first: int) -> None:
+        """Write what `_copies` returned to the stages from ``first`` on."""
+        arrays = [*self._stage_arrays(), *self.terms.arrays(), self._z]
+        if self._covariances is not None:
+            arrays.append(self._covariances)
+        for array, part in zip(arrays, kept, strict=True):
+            array[first : first + len(part)] = part
+
+    def mark(self, whole: bool) -> Mark:
+        """What `roll_back` needs."""
+        return (
+            self.start, self.end, self.time, self._last_special, self._last_irregular,
+            self.unusual, self._own_noise.copy() if self._own_noise else None,
+            self._copies() if whole else None,
+        )
+
+    def roll_back(self, mark: Mark) -> None:
+        """Undo all changes since a mark, which must be later than the last `make_room`."""
+        (
+            self.start, self.end, self.time, self._last_special, self._last_irregular,
+            unusual, own_noise, kept,
+        ) = mark
+        self._own_noise = own_noise or {}
+        if kept is not None:
+            self._write(kept, self.start)
+        if self.unusual:
+            self._make_usual(self.end)
+        self.unusual = unusual
+
+    def state_dict(self) -> dict[str, Any]:
+        """Copies of all data of the window."""
+        stages = slice(self.start, self.end)
+        points = slice(self.start, self.end + 1)
+        earlier, covariance = self._last_good(self.start)
+        return {
+            "earlier": earlier.copy(),
+            "earlier_covariance": None if covariance is None else covariance.copy(),
+            "time": self.time,
+            "z": self._z[points].copy(),
+            "covariance": None if self._covariances is None else self._covariances[points].copy(),
+            "stages": [array[stages].copy() for array in self._stage_arrays()],
+            "terms": [array[stages].copy() for array in self.terms.arrays()],
+            "own_noise": {time: weight.copy() for time, weight in self._own_noise.items()},
+            "last_special": self._last_special,
+            "last_irregular": self._last_irregular,
+        }
+
+    def load_state_dict(self, state: dict[str, Any], may_be_irregular: bool) -> None:
+        """Load what `state_dict` of an equal window returned into a new window.
+
+        Raises any exception on a damaged state; the window is unusable then.
+        """
+        time = check_size("time", state["time"], lambda found: found >= 0)
+        length = min(time, self.horizon)
+        for name, mine, saved in (
+            ("z", self._z, state["z"]),
+            ("covariance", self._covariances, state["covariance"]),
+        ):
+            if (mine is None) != (saved is None):
+                raise mismatch("observer")
+            if mine is not None:
+                mine[: length + 1] = checked_array(name, saved, (length + 1, *mine.shape[1:]))
+        self._earlier_state = checked_array("earlier", state["earlier"], self._earlier_state.shape)
+        if self._covariances is not None:
+            saved, shape = state["earlier_covariance"], self._covariances.shape[1:]
+            self._earlier_covariance = checked_array("earlier_covariance", saved, shape)
+        if len(state["stages"]) != len(self._stage_arrays()):
+            raise mismatch("cost")
+        for arrays, part, may_be_infinite in (
+            # Inputs, and costs and terms where the model fails.
+            (self._stage_arrays(), state["stages"], (self._u, self._stage_costs)),
+            (self.terms.arrays(), state["terms"], self.terms.arrays()),
+        ):
+            for array, saved in zip(arrays, part, strict=True):
+                finite = not any(array is one for one in may_be_infinite)
+                array[:length] = checked_array(
+                    "a stage", saved, (length, *array.shape[1:]), array.dtype, finite
+                )
+        if not (self._stage_costs[:length] >= 0.0).all():
+            raise ValueError("a stage's cost is not a number >= 0")
+        steps, irregular = self._u[:length, -1], self._irregular[:length]
+        if (steps[~irregular] != self._step).any() or (irregular.any() and not (
+            may_be_irregular and np.isfinite(steps).all() and (steps > 0.0).all()
+        )):
+            raise ValueError("a step's length is impossible")
+        p = self._y.shape[1]
+        for when, weight in state["own_noise"].items():
+            when = check_size("a sample's time", when, lambda t: time - length <= t < time)
+            self._own_noise[when] = positive_definite(
+                "noise_weight", checked_array("noise_weight", weight, (p, p))
+            )
+        latest = [  # the times of the last special and irregular stages that are loaded
+            time - length + int(np.flatnonzero(flags[:length])[-1]) if flags[:length].any()
+            else -self.horizon - 1
+            for flags in (self._special, self._irregular)
+        ]
+        self._last_special = check_size(
+            "last_special", state["last_special"], lambda t: latest[0] <= t < time
+        )
+        self._last_irregular = check_size(
+            "last_irregular", state["last_irregular"], lambda t: latest[1] <= t < time
+        )
+        self.start, self.end, self.time, self.unusual = 0, length, time, True
+
+
+class StageView:
+    """Views of stage k's entries in all arrays.
+
+    Attributes
+    ----------
+    z, z_next : (n,) array
+        States of the observer before and after the stage.
+    arguments : tuple
+        Arguments of f and h of the usual model, read-only: z, and u if the system has inputs.
+    error : (p,) array
+        The fitting error y - h(z), read-only.
+    y, u : array
+        The measurement (p,), and the input (m,).
+    weight : (n + p, n + p) array
+        Weight of the joint residual.
+    terms : Stage
+        Linearised residual and terms of the QP.
+    """
+
+    __slots__ = ("arguments", "error", "terms", "u", "weight", "y", "z", "z_next")
+
+    def __init__(self, stages: Stages, k: int) -> None:
+        self.z, self.z_next = stages._z[k], stages._z[k + 1]
+        self.y, self.u = stages._y[k], stages._u[k, :-1]
+        self.arguments: tuple[Array, ...] = tuple(
+            read_only(one) for one in ((self.z, self.u) if self.u.size else (self.z,))
+        )
+        self.weight = stages._weights[k]
+        self.terms = Stage(stages.terms, k)
+        self.error = read_only(self.terms.noise)
+
+
+class WindowView:
+    """Views of a whole window.
+
+    Attributes
+    ----------
+    candidate : (K + 1, n) array
+        The observer's trajectory.
+    prior : (n,) array
+        z(t-N), its first state.
+    residuals, measurements, inputs : array
+        (K, n + p), (K, p) and (K, m).
+    costs : (K,) array
+        The stages' costs.
+    span : Span
+        The stages' terms.
+    """
+
+    __slots__ = ("candidate", "costs", "inputs", "measurements", "prior", "residuals", "span")
+
+    def __init__(self, stages: Stages, first: int, last: int) -> None:
+        self.candidate, self.prior = stages._z[first : last + 1], stages._z[first]
+        self.residuals = stages.terms.residuals[first:last]
+        self.measurements, self.inputs = stages._y[first:last], stages._u[first:last, :-1]
+        self.costs = stages._stage_costs[first:last]
+        self.span = Span(stages.terms, first, last - first)
+
+
+class Views(Sequence[View]):
+    """Views made on demand; only the last one is kept."""
+
+    def __init__(self, count: int, make: Callable[[int], View]) -> None:
+        self._count, self._make = count, make
+        self._k = -1
+        self._view: View | None = None
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, k: Any) -> Any:
+        if k >= self._count:
+            raise IndexError(k)
+        if k != self._k:
+            self._k, self._view = k, self._make(k)
+        return self._view

@@ -35,7 +35,7 @@ class Subproblem:
     - rows on ``w_i + d_{i+1} - A_i d_i`` from W and on ``v_i - C_i d_i`` from V; a component
       of W of zero width gives an equality row.
 
-    One QP, of the present window length, is kept and overwritten at each use.
+    There is one QP, of the present window length; each use overwrites it.
     """
 
     def __init__(self, system: System, cost: Cost, horizon: int) -> None:
@@ -44,7 +44,7 @@ class Subproblem:
         self._terms = StageTerms(horizon, n, p)
         self._scaled = StageTerms(horizon, n, p) if cost.discount < 1.0 else None
         self._disturbance_band = band_of(cost.disturbance)
-        self._nothing = np.zeros(n)
+        self._no_offset = np.zeros(n)
         self._x_rows = system.states.matrix if system.states else np.empty((0, n))
         self._w_rows = _as_rows(system.disturbances, n)
         self._v_rows = _as_rows(system.noises, p)
@@ -52,13 +52,13 @@ class Subproblem:
         ends = np.cumsum([0, *(len(rows) for rows in (self._w_rows, self._v_rows, self._x_rows))])
         self._w, self._v, self._x = (slice(a, b) for a, b in pairwise(ends))
         self._qp: QP | None = None
-        # What is added to the stages' panels: the bands of the prior, and of each Q_i behind it;
-        # whether the latter are those of one weight, and the prior's as it was given.
-        self._added: Array
+        # Added to the stages' panels: the band of the prior's weight, then the band of each Q_i.
+        self._added_bands: Array
+        # What they hold: whether one Q for all stages, and which band of the prior.
         self._uniform, self._prior_band = False, _NO_BAND
 
     def at_candidate(self, problem: Problem, window: Window) -> QP:
-        """The QP around the candidate, from what the window has kept."""
+        """The QP around the candidate, from the terms in the window."""
         trial = problem.candidate(window)
         if self._scaled is None:
             return self._assemble(problem, trial, problem.view.span, True)
@@ -81,87 +81,81 @@ class Subproblem:
         terms.set_all(count, trial.weights)
         return self._assemble(problem, trial, Span(terms, 0, count), False)
 
-    def forget(self) -> None:
-        """Make the QP anew at its next use: an interrupt may have left it half done."""
-        self._qp = None
-
-    @property
-    def jacobian(self) -> Array:
-        """Jacobians (K, n + p, n) of (f, h) along the trajectory of the last QP."""
-        return -self._minus_jacobian
-
-    def nearest(self, problem: Problem, window: Window) -> QP:
-        """The QP of the point nearest to the candidate among those that satisfy the rows."""
+    def projection(self, problem: Problem, window: Window) -> QP:
+        """The QP for the trajectory nearest to the candidate that satisfies the linearised sets."""
         qp = self.at_candidate(problem, window)
         qp.band[...] = band_of(np.eye(self._n))
         qp.gradient[...] = 0.0
         return qp
 
-    def corrected(self, qp: QP, problem: Problem, around: Trial, trial: Trial) -> None:
-        """Shift the rows of a QP by what its linearisation missed at a trial.
+    def correct_rows(self, qp: QP, problem: Problem, around: Trial, trial: Trial) -> None:
+        """Shift the rows of the QP around a trajectory by its linearisation error at a trial.
 
         With the same matrices, W and V then hold for the true residuals of a point near the
-        trial up to third order: a second-order correction. It is carried a little further,
-        so that the third order does not leave the sets again, and by twice what the solver
-        itself left violated.
+        trial up to third order: a second-order correction. The rows are tightened by a share
+        of the shift, for the third order, and by twice the solver's violation.
         """
         n, step = self._n, trial.trajectory - around.trajectory
-        linear = around.residuals + np.matmul(self._minus_jacobian, step[:-1, :, None])[:, :, 0]
-        linear[:, :n] += step[1:]
-        bent = trial.residuals - linear
+        linearised = around.residuals + np.matmul(self._minus_jacobian, step[:-1, :, None])[:, :, 0]
+        linearised[:, :n] += step[1:]
+        curvature = trial.residuals - linearised
         margin = np.full_like(qp.row_lower, 2.0 * qp.violation(step))
-        margin[:-1, self._w] += BEYOND * np.abs(bent[:, :n] @ self._w_rows.T)
-        margin[:-1, self._v] += BEYOND * np.abs(bent[:, n:] @ self._v_rows.T)
-        self._set_rows(qp, problem, around.residuals + bent, around.trajectory)
+        margin[:-1, self._w] += BEYOND * np.abs(curvature[:, :n] @ self._w_rows.T)
+        margin[:-1, self._v] += BEYOND * np.abs(curvature[:, n:] @ self._v_rows.T)
+        self._set_rows(qp, problem, around.residuals + curvature, around.trajectory)
         inwards = np.where(qp.row_upper - qp.row_lower > 4.0 * margin, margin, 0.0)
         qp.row_lower += inwards
         qp.row_upper -= inwards
+
+    def forget(self) -> None:
+        """Build the QP anew at its next use: an interrupt may have left it half written."""
+        self._qp = None
 
     def _assemble(self, problem: Problem, trial: Trial, span: Span, at_candidate: bool) -> QP:
         count = len(span.panel)
         qp = self._qp
         if qp is None or qp.stages != count + 1:
-            qp = self._fresh(count + 1)
+            qp = self._new_qp(count + 1)
         weights = trial.weights
         uniform = weights.ndim == 2
         if not (uniform and self._uniform):
             n = self._n
-            self._added[1:] = (
+            self._added_bands[1:] = (
                 self._disturbance_band if uniform
                 else [band_of(weight[:n, :n]) for weight in weights]
             )
             self._uniform = uniform
-        # The candidate starts at the prior.
-        offset = self._nothing if at_candidate else trial.trajectory[0] - problem.prior
+        # The candidate starts at the prior: no offset, and no gradient from it.
+        offset = self._no_offset if at_candidate else trial.trajectory[0] - problem.prior
         prior_band = problem.prior_band_at(offset)
         if prior_band is not self._prior_band:
-            self._added[0] = self._prior_band = prior_band
-        current_first, current_rest, last, band_rest, band_last = self._views
-        np.add(span.panel, self._added[:-1], band_rest)
-        band_last[...] = self._added[-1]
-        np.add(span.current_rest, span.next_rest, current_rest)
-        current_first[...] = span.current_first
+            self._added_bands[0] = self._prior_band = prior_band
+        gradient_first, gradient_rest, gradient_last, band_rest, band_last = self._views
+        np.add(span.panel, self._added_bands[:-1], band_rest)
+        band_last[...] = self._added_bands[-1]
+        np.add(span.gradient_rest, span.next_gradient_rest, gradient_rest)
+        gradient_first[...] = span.gradient_first
         if not at_candidate:
-            current_first += problem.prior_weight_at(offset).dot(offset)
-        last[...] = span.next_last
+            gradient_first += problem.prior_weight_at(offset).dot(offset)
+        gradient_last[...] = span.next_gradient_last
         self._minus_jacobian = span.minus_jacobian
         if problem.constrained:
-            self._bound(qp, problem, trial)
+            self._set_inequalities(qp, problem, trial)
         return qp
 
-    def _fresh(self, stages: int) -> QP:
-        """A QP of so many stages in place of the present one."""
+    def _new_qp(self, stages: int) -> QP:
+        """A QP of another length in place of the present one."""
         self._qp = qp = QP(stages, self._n, self._rows)
         qp.bounded = False  # until there are bounds
         qp.row_next[:-1, self._w] = self._w_rows
         qp.row_own[:, self._x] = self._x_rows
         band, gradient = qp.band, qp.gradient
         self._views = gradient[0], gradient[1:-1], gradient[-1], band[:-1], band[-1]
-        self._added = np.empty_like(band)
+        self._added_bands = np.empty_like(band)
         self._uniform, self._prior_band = False, _NO_BAND
         return qp
 
-    def _bound(self, qp: QP, problem: Problem, trial: Trial) -> None:
+    def _set_inequalities(self, qp: QP, problem: Problem, trial: Trial) -> None:
         n, states = self._n, problem.states
         qp.bounded = states is not None and bool(states.bounded_components.size)
         if qp.bounded and states is not None:
@@ -177,37 +171,40 @@ class Subproblem:
 
     def _set_rows(self, qp: QP, problem: Problem, residuals: Array, trajectory: Array) -> None:
         n = self._n
-        for rows, matrix, one, points in (
+        for rows, matrix, convex_set, points in (
             (self._w, self._w_rows, problem.disturbances, residuals[:, :n]),
             (self._v, self._v_rows, problem.noises, residuals[:, n:]),
             (self._x, self._x_rows, problem.states, trajectory),
         ):
             stages = slice(0, points.shape[0])
-            if one is None:
+            if convex_set is None:
                 qp.row_lower[stages, rows], qp.row_upper[stages, rows] = -np.inf, np.inf
                 continue
-            low, high = (one.row_lower, one.row_upper) if rows is self._x else _sides(one)
+            if rows is self._x:  # its bounds are the QP's
+                low, high = convex_set.row_lower, convex_set.row_upper
+            else:
+                low, high = _sides(convex_set)
             value = points @ matrix.T
             qp.row_lower[stages, rows] = low - value
             qp.row_upper[stages, rows] = high - value
         if problem.observed is not None and problem.noises is not None:
             missing = ~problem.observed
-            void = (missing @ (self._v_rows != 0.0).T.astype(np.intp)) > 0
-            qp.row_lower[:-1, self._v][void] = -np.inf
-            qp.row_upper[:-1, self._v][void] = np.inf
+            unknown = (missing @ (self._v_rows != 0.0).T.astype(np.intp)) > 0
+            qp.row_lower[:-1, self._v][unknown] = -np.inf
+            qp.row_upper[:-1, self._v][unknown] = np.inf
 
 
-def _as_rows(one: ConvexSet | None, dimension: int) -> Array:
+def _as_rows(convex_set: ConvexSet | None, dimension: int) -> Array:
     """All inequalities of a set as rows: unit rows of its bounded components first."""
-    if one is None:
+    if convex_set is None:
         return np.empty((0, dimension))
-    return np.vstack((np.eye(dimension)[one.bounded_components], one.matrix))
+    return np.vstack((np.eye(dimension)[convex_set.bounded_components], convex_set.matrix))
 
 
-def _sides(one: ConvexSet) -> tuple[Array, Array]:
+def _sides(convex_set: ConvexSet) -> tuple[Array, Array]:
     """Lower and upper sides of the rows of `_as_rows`."""
-    bounded = one.bounded_components
+    bounded = convex_set.bounded_components
     return (
-        np.append(one.lower[bounded], one.row_lower),
-        np.append(one.upper[bounded], one.row_upper),
+        np.append(convex_set.lower[bounded], convex_set.row_lower),
+        np.append(convex_set.upper[bounded], convex_set.row_upper),
     )

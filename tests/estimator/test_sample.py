@@ -62,7 +62,7 @@ def test_an_observer_is_checked_with_the_system_and_the_initial_state():
     mhe = estimator(observer, system)
     assert len(observer.checked) == 1
     # A copy: a system is never changed by an estimator.
-    assert observer.checked[0][0] is mhe._own
+    assert observer.checked[0][0] is mhe._own_system
     assert mhe.system is system
     np.testing.assert_array_equal(observer.checked[0][1], START)
     mhe.reset([2.0, 3.0])
@@ -103,7 +103,7 @@ def test_a_sample_tells_the_state_the_error_and_the_input(jacobians, max_qps):
         np.testing.assert_allclose(at, z, rtol=1e-12)
         np.testing.assert_allclose(error, y - C @ z, rtol=1e-10, atol=1e-12)
         np.testing.assert_array_equal(kept["u"], u)
-        assert model is mhe._own
+        assert model is mhe._own_system
         assert kept["observed"] is kept["noise_weight"] is kept["covariance"] is None
         if jacobians:
             np.testing.assert_allclose(kept["f_jacobian"], A, rtol=1e-12)
@@ -132,7 +132,7 @@ def test_a_sample_tells_the_model_of_its_step():
         _, _, model, kept = observer.heard[-1]
         expected = np.eye(2) + (0.1 if dt is None else dt) * (A - np.eye(2)) / 0.1
         np.testing.assert_allclose(kept["f_jacobian"], expected, rtol=1e-10)
-        assert model is (mhe._own if dt is None else mhe._own.timed)
+        assert model is (mhe._own_system if dt is None else mhe._own_system.timed)
         np.testing.assert_array_equal(kept["u"], [0.5] if dt is None else [0.5, dt])
 
 

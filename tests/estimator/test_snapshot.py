@@ -214,9 +214,9 @@ def test_how_models_of_other_steps_are_called_goes_along():
     generator = np.random.default_rng(0)
     for _ in range(40):
         one.update(generator.uniform(0.0, 10.0, 1), dt=0.11)
-    one._own.timed.f.mode = "looped"
+    one._own_system.timed.f.mode = "looped"
     other.load_state_dict(one.state_dict())
-    assert other._own.timed.f.mode == "looped"
+    assert other._own_system.timed.f.mode == "looped"
     assert other.system.timed.f.mode == "batched"
     state = one.state_dict()
     state["modes"] = state["modes"][:3]

@@ -215,7 +215,7 @@ def test_a_system_is_as_it_was_made():
         mhe = qpmhe.MovingHorizonEstimator(
             system, qpmhe.Luenberger([[0.3], [0.1]]), cost_of(), horizon=3, initial_state=start
         )
-    assert mhe._own.derivatives["f"] == "finite differences"
+    assert mhe._own_system.derivatives["f"] == "finite differences"
     assert system.derivatives["f"] == "complex step"
     assert mhe.system is system
 

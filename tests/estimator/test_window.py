@@ -121,7 +121,7 @@ def test_kept_terms_equal_terms_built_afresh(kind, horizon, missing):
         fresh.residuals[:count] = residuals
         fresh.set_all(count, weights)
         kept = slice(window.start, window.start + count)
-        for name in ("linear", "panel", "current", "next"):
+        for name in ("linear", "panel", "gradient", "next_gradient"):
             np.testing.assert_allclose(
                 getattr(window.terms, name)[kept], getattr(fresh, name)[:count],
                 rtol=1e-12, atol=1e-12, err_msg=f"{name} at {t}",
@@ -149,10 +149,10 @@ def test_terms_equal_plain_loops(sizes, horizon):
                     terms.panel[place, column], panel, rtol=1e-12, atol=1e-12
                 )
             np.testing.assert_allclose(
-                terms.current[place], -jacobian.T @ weight @ residual, rtol=1e-12, atol=1e-12
+                terms.gradient[place], -jacobian.T @ weight @ residual, rtol=1e-12, atol=1e-12
             )
             np.testing.assert_allclose(
-                terms.next[place], weight[:n, :n] @ residual[:n], rtol=1e-12, atol=1e-12
+                terms.next_gradient[place], weight[:n, :n] @ residual[:n], rtol=1e-12, atol=1e-12
             )
 
 
@@ -310,7 +310,7 @@ def test_a_failed_stage_steps_back_and_costs_infinitely(root, where, kind):
             assert (window.candidate_cost == math.inf) is left
     kept = slice(window.start, window.start + 3)
     assert all(
-        np.isfinite(getattr(window.terms, name)[kept]).all() for name in ("panel", "current")
+        np.isfinite(getattr(window.terms, name)[kept]).all() for name in ("panel", "gradient")
     )
 
 
