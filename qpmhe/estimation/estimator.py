@@ -48,16 +48,11 @@ class MovingHorizonEstimator:
     horizon : int
         N >= 1. Before N samples have come, all are used (Remark rem:emtpyN).
     initial_state : (n,) array_like
-<<<<<<< HEAD
-        Initial estimate, at the time of the first measurement; within the state set.
-    backend : str or Solver
-=======
         Estimate of x(0), the state at the first measurement; within the state set.
-    backend : str
->>>>>>> wt-reader
+    backend : str or Solver
         QP solver, one of ``qpmhe.solvers.available()``. ``auto`` uses a banded Cholesky
-        factorisation and another solver only where inequalities bind; a named backend is
-        always really used. Or a solver made by ``qpmhe.solvers.create``, which brings its own
+        factorisation and another solver only where inequalities bind; a named backend solves
+        every QP. Or a solver made by ``qpmhe.solvers.create``, which brings its own
         cap and tolerances. It may serve several estimators of one thread, and starts afresh
         whenever it passes from one to another.
     max_qps : int or None
@@ -332,97 +327,6 @@ class MovingHorizonEstimator:
             )
         return self._engine.amend(int(time), self._measurement(y))
 
-<<<<<<< HEAD
-    def covariances(self) -> Array:
-        """Covariances of the last estimate's trajectory, by linearisation along it.
-
-        The inverse of the Gauss-Newton Hessian's diagonal blocks, computed in O(N n^3):
-        with inverse covariances as weights, the covariance of the error of each state given
-        the window's measurements and the prior. Inequalities do not enter; noise-free
-        components do.
-
-        Returns
-        -------
-        (N_t + 1, n, n) array
-            The last one is that of ``estimate.state``, the one before that of
-            ``estimate.filtered``.
-
-        Raises
-        ------
-        InvalidInputError
-            Before the first measurement, or if the model cannot be linearised there.
-        """
-        return self._engine.covariances()
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that was learnt from measurements so far, as plain arrays and numbers.
-
-        An estimator made with the same arguments goes on bit for bit after
-        `load_state_dict`, in the same process or another.
-
-        Returns
-        -------
-        dict
-            Copies; safe to keep, to pickle, or to write down.
-        """
-        return self._engine.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where another estimator stopped.
-
-        Parameters
-        ----------
-        state : dict
-            What `state_dict` gave of an estimator with the same arguments.
-
-        Raises
-        ------
-        InvalidInputError
-            If it is not such a state: damaged, or of an estimator with another model,
-            observer, cost, sets or candidate. The estimator is left as it was. QP caps,
-            backend, tolerances and policies may differ.
-
-        Notes
-        -----
-        Every stored stage is computed once more, and compared.
-        """
-        self._engine.load_state_dict(state)
-
-    def __getstate__(self) -> dict[str, Any]:
-        solver = self.settings.backend
-        if isinstance(solver, Solver):
-            try:
-                pickle.dumps(solver)
-            except Exception as error:
-                raise InvalidInputError(
-                    f"the solver {solver!r} given as backend cannot be pickled "
-                    f"({type(error).__name__}: {error}), nor can its estimator; give the name of "
-                    "a registered backend, or keep state_dict() instead."
-                ) from error
-        return {
-            "arguments": (self.system, self.observer, self.cost),
-            "settings": self.settings,
-            "initial_state": self.initial_state,
-            "state": self.state_dict(),
-        }
-
-    def __setstate__(self, saved: dict[str, Any]) -> None:
-        # The checks and the solver's making run again: a snapshot is input like any other.
-        self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
-            *saved["arguments"], initial_state=saved["initial_state"], **vars(saved["settings"])
-        )
-        self.load_state_dict(saved["state"])
-
-    def _input(self, u: ArrayLike | None) -> Array:
-        m = self.system.m
-        if u is None:
-            raise InvalidInputError(f"u is missing; the system has {m} inputs: update(y, u).")
-        if m == 0:
-            raise InvalidInputError("u was given, but the system has no inputs; leave it out.")
-        return vector("u", u, m, finite=False)
-
-=======
->>>>>>> wt-reader
     def run(
         self,
         measurements: ArrayLike,
@@ -536,6 +440,16 @@ class MovingHorizonEstimator:
         self._engine.load_state_dict(state)
 
     def __getstate__(self) -> dict[str, Any]:
+        solver = self.settings.backend
+        if isinstance(solver, Solver):
+            try:
+                pickle.dumps(solver)
+            except Exception as error:
+                raise InvalidInputError(
+                    f"the solver {solver!r} given as backend cannot be pickled "
+                    f"({type(error).__name__}: {error}), nor can its estimator; give the name of "
+                    "a registered backend, or keep state_dict() instead."
+                ) from error
         return {
             "arguments": (self.system, self.observer, self.cost),
             "settings": self.settings,
