@@ -126,30 +126,14 @@ _RESIDUALS = ("residuals",)
 
 
 class _Evaluator:
-    """Functions of (x, u) over (n,) or (B, n) that work on buffers kept between calls.
-
-    Parameters
-    ----------
-    maker : callable
-        Makes the buffers.
-    """
+    """Functions of (x, u) over (n,) or (B, n) that work on buffers kept between calls."""
 
     def __init__(self, maker: Maker) -> None:
         self._maker = maker
         self._local = threading.local()  # two threads must not share buffers
 
     def one(self, name: str, x: Array, u: Array | None = None) -> Array:
-        """A fresh array of one of the four functions' values.
-
-        Parameters
-        ----------
-        name : str
-            Which.
-        x : (n,) or (B, n) array
-            States.
-        u : array, optional
-            Inputs, where there are any.
-        """
+        """A fresh array of one of the four functions' values."""
         single = x.ndim == 1
         if not single and x.shape[0] == 0:  # the virtual machine cannot map over nothing
             return np.zeros_like(self._buffers(1, (name,))[2][name][:0])
@@ -165,15 +149,7 @@ class _Evaluator:
         return value
 
     def stage(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """f, h and their joint Jacobian at one state: good until the next call.
-
-        Parameters
-        ----------
-        x : (n,) array
-            The state.
-        u : (m,) array
-            The input.
-        """
+        """f, h and their joint Jacobian at one state: good until the next call."""
         states, inputs, results, evaluate = self._buffers(1, _NAMES)
         states[...] = x
         inputs[...] = u
@@ -181,15 +157,7 @@ class _Evaluator:
         return results["f"], results["h"], results["joint"]
 
     def residuals(self, trajectory: Array, y: Array, u: Array) -> Array:
-        """A fresh array of w and v along a trajectory.
-
-        Parameters
-        ----------
-        trajectory : (K + 1, n) array
-            States.
-        y, u : (K, p) and (K, m) array
-            Measurements and inputs.
-        """
+        """A fresh array of w and v along a trajectory."""
         states, inputs, results, evaluate = self._buffers(y.shape[0], _RESIDUALS)
         states[...] = trajectory
         inputs[...] = u
@@ -199,13 +167,7 @@ class _Evaluator:
         return value
 
     def prepare(self, horizon: int) -> None:
-        """Make the buffers of the first window and of a full one, in this thread.
-
-        Parameters
-        ----------
-        horizon : int
-            N.
-        """
+        """Make the buffers of the first window and of a full one, in this thread."""
         self._buffers(1, _NAMES)
         for count in dict.fromkeys((1, horizon)):
             self._buffers(count, _RESIDUALS)

@@ -152,15 +152,7 @@ def _assembled(model: _Model, m: int, sets: dict[str, Any]) -> System:
 
 
 class _Model:
-    """f, h, A and C of NumPy arrays, the parts 0 to 3.
-
-    Parameters
-    ----------
-    programs : Programs
-        What computes them.
-    length : float or None
-        Length of the step. None takes it from behind the inputs, if the programs want one.
-    """
+    """f, h, A and C of NumPy arrays, the parts 0 to 3."""
 
     def __init__(self, programs: Programs, length: float | None) -> None:
         self.n, self.p = programs.n, programs.p

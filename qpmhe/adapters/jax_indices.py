@@ -26,22 +26,6 @@ def check_indices(jax: Any, name: str, function: Callable[..., Any], probes: Pro
     Indices are checked where the user's own code uses them: not within the compiled
     functions of JAX's libraries (``jnp.interp``, ``jnp.take``), and not where a mode says
     what such an index means. A branch that no probe takes is not checked.
-
-    Parameters
-    ----------
-    jax : module
-        JAX.
-    name : str
-        What the error calls the function.
-    function : callable
-        A function of one state and one input that JAX can trace.
-    probes : list of (x, u)
-        The points.
-
-    Raises
-    ------
-    ModelError
-        Naming the function, the index, and the size of what it indexes.
     """
     traced = jax.make_jaxpr(function)(*probes[0])
     if not _indexes(jax, traced.jaxpr):

@@ -31,21 +31,7 @@ _DIRECTION = 6.0
 
 
 class Programs:
-    """The programs of a model. Arguments are all x, then all u, then all lengths of steps.
-
-    Parameters
-    ----------
-    f, h : callable
-        The user's functions of one state; f is the rate if ``timed``.
-    n, p, m : int
-        Numbers of states, outputs and inputs.
-    method : str
-        How the rate is discretised.
-    timed : bool
-        Whether the length of the step is an argument.
-    probes : list of (x, u)
-        Points at which the functions must not index out of range.
-    """
+    """The programs of a model. Arguments are all x, then all u, then all lengths of steps."""
 
     def __init__(
         self,

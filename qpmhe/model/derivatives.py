@@ -25,27 +25,10 @@ _DIFFERENCE_STEP = float(np.finfo(np.float64).eps) ** (1 / 3)
 class Jacobian:
     """The Jacobian with respect to x of a `BatchedFunction` with vector values.
 
-    Parameters
-    ----------
-    function : BatchedFunction
-        The function, of shape (d,).
-    given : callable or None
-        The user's Jacobian, g(x) or g(x, u) with values (d, n); compared with finite
-        differences at the probes.
-    inputs : int
-        Length m of u.
-    probes : list of (x, u)
-        Points at which the methods are tried against finite differences.
-
     Attributes
     ----------
     method : str
         ``given``, ``complex step`` or ``finite differences``.
-
-    Raises
-    ------
-    ModelError
-        If the given Jacobian is not the function's derivative at a probe.
     """
 
     def __init__(
@@ -140,33 +123,14 @@ class Jacobian:
         return bool(usable)
 
     def check(self, x: Array, u: Array) -> None:
-        """Try the method again at a state that will be used.
-
-        Parameters
-        ----------
-        x : (n,) array
-            The state.
-        u : (m,) array
-            The input.
-
-        Raises
-        ------
-        ModelError
-            If a given Jacobian is not the derivative there.
-        """
+        """Try the method again at a state that will be used."""
         if self._given is not None:
             self._compare(self._given, [(x, u)])
         elif self.method == "complex step" and not self._complex_step_works([(x, u)]):
             self.use("finite differences")
 
     def copy(self, function: BatchedFunction) -> Jacobian:
-        """The same Jacobian, of a copy of its function; its method can change independently.
-
-        Parameters
-        ----------
-        function : BatchedFunction
-            The copy.
-        """
+        """The same Jacobian, of a copy of its function; its method can change independently."""
         other = copy(self)
         other._function = function
         if self._given is None:
@@ -177,13 +141,7 @@ class Jacobian:
         return other
 
     def use(self, method: str) -> None:
-        """Compute by this method from now on, unless the user gave the Jacobian.
-
-        Parameters
-        ----------
-        method : str
-            ``complex step`` or ``finite differences``.
-        """
+        """Compute by this method from now on, unless the user gave the Jacobian."""
         if self._given is None:
             self.method = method
             self.batch = self._complex if method == "complex step" else self._differences

@@ -22,29 +22,7 @@ METHODS: tuple[str, ...] = get_args(Method)
 def discretize(
     rate: Function, jacobian: Function | None, method: str
 ) -> tuple[Function, Function | None]:
-    r"""Turn :math:`\dot x = f_c(x, u)` into :math:`x^+ = f(x, u)` with u held over the step.
-
-    Parameters
-    ----------
-    rate : callable
-        f_c(x) or f_c(x, u), vectorised over leading dimensions, (..., n).
-    jacobian : callable or None
-        Its derivative with respect to x, (..., n, n), same arguments.
-    method : {"euler", "rk4"}
-        ``euler``: x + dt f_c(x, u). ``rk4``: the classical Runge-Kutta method of order 4.
-
-    Returns
-    -------
-    step : callable
-        f(dt, x, *u), where dt is a number or an array (..., 1), in the time unit of the rate.
-    step_jacobian : callable or None
-        Its exact derivative with respect to x, where that of the rate is given.
-
-    Raises
-    ------
-    OptionError
-        If the method is unknown.
-    """
+    r"""Turn :math:`\dot x = f_c(x, u)` into :math:`x^+ = f(x, u)` with u held over the step."""
     if method not in METHODS:
         raise OptionError(f"method is {method!r}; expected one of {', '.join(METHODS)}.")
     if method == "euler":

@@ -35,13 +35,7 @@ class Trusted(NamedTuple):
 
 
 def contained(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Foreign code that may raise an Exception or be interrupted, and nothing else.
-
-    Parameters
-    ----------
-    function : callable
-        The function; a SystemExit that it raises becomes an `EvaluationError`.
-    """
+    """Foreign code that may raise an Exception or be interrupted, and nothing else."""
 
     def call(*arguments: Any) -> Any:
         try:
@@ -62,19 +56,6 @@ class BatchedFunction:
     value, writes into no argument, and computes each state's value from this state alone.
     Then it is called once for many states, as NumPy's own functions are (``batched``), or
     with the states as columns (``columns``), which suits ``np.array([x[1], -x[0]])``.
-
-    Parameters
-    ----------
-    name : str
-        What error texts call it.
-    function : callable or Trusted
-        The user's function.
-    shape : tuple of int
-        Shape of its value at one state, such as (n,) or (p, n).
-    inputs : int
-        Length m of u; with 0, the function is called as g(x).
-    probes : list of (x, u)
-        Points to try; points where the function raises or is not finite are passed over.
 
     Attributes
     ----------
@@ -282,21 +263,6 @@ def takes_input(name: str, function: Callable[..., Any], inputs: int) -> bool:
     """Whether a model function is one of x and u, by its parameters.
 
     The second positional parameter is the input, whatever its name and default are.
-
-    Parameters
-    ----------
-    name : str
-        What error texts call it.
-    function : callable
-        The function.
-    inputs : int
-        Length m of u; with 0 it is a function of x alone.
-
-    Raises
-    ------
-    ModelError
-        If it cannot be called as name(x) or name(x, u), or if it is not clear which of its
-        parameters is the input.
     """
     if isinstance(function, np.ufunc):
         if function.nin > 1 + (inputs > 0):
@@ -347,20 +313,7 @@ def takes_input(name: str, function: Callable[..., Any], inputs: int) -> bool:
 
 
 def check_inputs(m: int, **takes_input: bool) -> None:
-    """Refuse inputs that no function of the model takes.
-
-    Parameters
-    ----------
-    m : int
-        Number of inputs.
-    **takes_input : bool
-        For each function, by name, whether it takes them.
-
-    Raises
-    ------
-    ModelError
-        If none does, although there are inputs.
-    """
+    """Refuse inputs that no function of the model takes."""
     if m and not any(takes_input.values()):
         names = list(takes_input)
         raise ModelError(

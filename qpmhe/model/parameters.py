@@ -193,10 +193,7 @@ class _Split:
         return self._written(x, theta) if m == 0 else self._written(x, u, theta)
 
     def _by_columns(self, x: Array) -> bool:
-        """Whether the states are the columns of x; shapes do not say so where it is square.
-
-        While the ways of writing are tried out, it never is.
-        """
+        """Whether the states are the columns of x; shapes do not say so where it is square."""
         if self._found is None:
             return bool(x.shape[-1] != self._n)
         return self._found.mode == "columns"
@@ -295,11 +292,7 @@ def _check_arguments(name: str, written: Function, m: int) -> None:
 def _parameter_probes(
     probes: Probes, nominal: Array, chosen: Index, bounds: ConvexSet | None
 ) -> Probes:
-    """The probes with parameters behind their inputs: nominal first, and then others.
-
-    Only those that are estimated vary; if none did, a function that takes the parameters of
-    one state for those of all would pass for a batched one.
-    """
+    """The probes with parameters behind their inputs: nominal first, and then others."""
     generator = np.random.default_rng(20210829)
     joined: Probes = []
     for i, (x, u) in enumerate(probes):

@@ -317,22 +317,7 @@ def _call(
 
 
 def trace(function: Callable[..., Any], arguments: Sequence[Labels]) -> Labels | None:
-    """Call a function on symbols.
-
-    Parameters
-    ----------
-    function : callable
-        The function.
-    arguments : sequence of arrays of unsigned integers
-        For each argument the labels of its entries, a bit for each label.
-
-    Returns
-    -------
-    array of unsigned integers, or None
-        For each entry of the value the labels of all entries of the arguments that it was
-        computed from. None where the function asked for a value, by a branch, a conversion to
-        float or a look-up; wrote into an argument; raised; or returned no array.
-    """
+    """Call a function on symbols."""
     record = _Record()
     given = [record.symbols(labels) for labels in arguments]
     before = [one.view(np.ndarray).copy() for one in given]

@@ -27,20 +27,7 @@ _LARGE_ORDER = ("piqp", "clarabel", "osqp", "proxqp")
 
 
 class AutoSolver(Solver):
-    """Solve by `BandedSolver`; where its result violates an inequality, by a QP solver.
-
-    Parameters
-    ----------
-    options : SolverOptions
-        Handed to the QP solver. With an iteration cap, solvers that return nothing at the
-        cap are passed over. With a time limit, solvers with a clock are preferred, and each
-        gets what remains of it.
-
-    Notes
-    -----
-    Where no QP solver brings an iterate, the unconstrained minimiser does as a trial. An
-    iterate of the banded solver lives in its workspace until the next solve.
-    """
+    """Solve by `BandedSolver`; where its result violates an inequality, by a QP solver."""
 
     _judges = True
 

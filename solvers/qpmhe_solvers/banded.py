@@ -29,11 +29,6 @@ class BandedSolver(Solver):
     UNCONSTRAINED: a legal trial, not the QP's solution. LAPACK's banded Cholesky
     factorisation (``pbsv``) takes O(K n^3) time and no iterations. Equality rows are kept:
     the optimality conditions, ordered by stages, are banded too, and solved by ``gbsv``.
-
-    Parameters
-    ----------
-    options : SolverOptions
-        Kept for the common contract; a direct solve has nothing to cap.
     """
 
     _judges, _keeps = True, False

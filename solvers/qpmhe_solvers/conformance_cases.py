@@ -56,10 +56,7 @@ def _judged(solver: Solver, qp: QP, what: str) -> tuple[Array | None, list[str]]
 def _as_fresh(
     name: str, qps: list[QP], what: str, *, shift: bool = False, back: bool = False
 ) -> Iterator[str]:
-    """Where one solver's answers to QPs in turn are not those of solvers made anew.
-
-    With ``back``, the QPs come once more in opposite order.
-    """
+    """Where one solver's answers to QPs in turn are not those of solvers made anew."""
     kept = create(name, tight())
     fresh = [create(name, tight()).solve(qp).d for qp in qps]
     order = [*range(len(qps)), *reversed(range(len(qps) if back else 0))]

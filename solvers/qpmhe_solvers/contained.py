@@ -28,12 +28,6 @@ class ContainedSolver:
 
     Several of these may share one solver. Whenever it passes from one to another, it starts
     afresh: nothing that it keeps from one trajectory warm-starts the other.
-
-    Parameters
-    ----------
-    solver : Solver
-        Any. What an overridden `solve` of a user's class returns is checked, and it is lent
-        copies; others are called as they are.
     """
 
     def __init__(self, solver: Solver) -> None:
@@ -45,22 +39,7 @@ class ContainedSolver:
     def solve(
         self, qp: QP, start: Array | None = None, time_limit: float | None = None
     ) -> Solution:
-        """Solve a QP; see `Solver.solve`.
-
-        Parameters
-        ----------
-        qp : QP
-            The problem.
-        start : (K, n) array, optional
-            A point near the solution.
-        time_limit : float, optional
-            Seconds for this solve, > 0; the solver's own limit if left out.
-
-        Returns
-        -------
-        Solution
-            With a finite float64 iterate of shape (K, n), or FAILED with the reason.
-        """
+        """Solve a QP; see `Solver.solve`."""
         solver = self.solver
         try:
             if solver._user != self._number:
@@ -95,13 +74,7 @@ class ContainedSolver:
             _quietly(self.solver.forget)
 
     def prepare(self, size: int) -> None:
-        """Do beforehand what the first QPs would wait for; see `Solver.prepare`.
-
-        Parameters
-        ----------
-        size : int
-            Unknowns of the largest QP to come.
-        """
+        """Do beforehand what the first QPs would wait for; see `Solver.prepare`."""
         _quietly(self.solver.prepare, size)
 
 

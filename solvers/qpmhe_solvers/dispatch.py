@@ -26,37 +26,7 @@ _KEPT = 8
 
 @dataclass(frozen=True)
 class Translation:
-    """How our vocabulary reads in one solver's own.
-
-    Parameters
-    ----------
-    method, package : str
-        Kind of algorithm, and the module and distribution of the solver.
-    matrices : {"csc", "dense"}
-        The form in which the solver takes its matrices here.
-    bounds : {"box", "rows"}
-        Whether it takes infinite bounds natively, or finite bounds as inequality rows.
-    cap, time_limit : str or None
-        Keyword of the iteration cap and of the time limit in seconds.
-    absolute, relative : tuple of str
-        Keywords of the tolerances.
-    start : bool
-        Whether a primal start is used by the solver and does it good.
-    default_cap : int or None
-        Cap where none is asked for and the solver's own would let it run for minutes.
-    beyond_cap : int
-        What is added to a cap, where the solver ends before the iteration of that number.
-    needs_row : bool
-        Whether a QP without any inequality row goes wrong, so that a void row is added.
-    reports_infeasibility : bool
-        Whether its words say so where a QP has no feasible point.
-    others : tuple
-        Keywords with values that suit numbers of order one.
-    objective : float
-        Factor of the objective, a power of two.
-    keep_empty : bool
-        Whether to give matrices without rows, which qpsolvers would make at each solve.
-    """
+    """How our vocabulary reads in one solver's own."""
 
     method: str
     package: str
@@ -131,21 +101,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
 
 
 class DispatchSolver(Solver):
-    """Hand the QP to one solver through ``qpsolvers.solve_problem``.
-
-    Parameters
-    ----------
-    name : str
-        The solver's name in qpsolvers, one of `TRANSLATIONS`.
-    options : SolverOptions
-        Limits and accuracy, translated into the solver's own keywords.
-
-    Notes
-    -----
-    The solver itself is set up anew each time. What it is handed is laid out once for each
-    pattern of limits and filled in place, so that one instance serves one thread. No solver of
-    the table writes into it, or holds on to it after its solve: the tests look.
-    """
+    """Hand the QP to one solver through ``qpsolvers.solve_problem``."""
 
     _keeps = False
 
@@ -164,13 +120,7 @@ class DispatchSolver(Solver):
         return {**vars(self), "_forms": {}}  # copies of arrays no longer share their numbers
 
     def prepare(self, size: int) -> None:
-        """Import what qpsolvers and the solver import at their first solve.
-
-        Parameters
-        ----------
-        size : int
-            Unknowns of the largest QP to come.
-        """
+        """Import what qpsolvers and the solver import at their first solve."""
         self._rehearse()
         self._forms.clear()
 

@@ -122,17 +122,7 @@ class GatheredQP(QP):
         self.bounded = qp.bounded
 
     def peaks(self) -> list[float]:
-        """What says how well the numbers are scaled, the signs left out.
-
-        Returns
-        -------
-        list of float
-            For each component of the state the largest entry of the Hessian's diagonal, or a
-            certain multiple of the smallest if that is less: the accuracy is to do for the
-            stage that is known least. The largest entry of each row of [F, G] over all stages.
-            The smaller of the largest entry of the gradient and the largest step ``g / H`` of
-            an entry of the diagonal, or the violation at zero if that is larger.
-        """
+        """What says how well the numbers are scaled, the signs left out."""
         # Any mode but the default one writes into ``out`` without a buffer between.
         self.numbers.take(self._entries, out=self._seen, mode="clip")
         diagonal, steps, positive = self._diagonal, self._steps, self._positive

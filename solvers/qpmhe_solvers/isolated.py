@@ -46,25 +46,6 @@ class IsolatedSolver(Solver):
     The process is started once, and ends with this solver. Where it dies, or exceeds the time
     limit, the QP has FAILED and another process takes its place. That one starts meanwhile; a
     QP that comes before it is ready waits for it, for half of the time limit at most.
-
-    Parameters
-    ----------
-    backend : Backend
-        The backend. A factory that belongs to the main script can be sent if cloudpickle or
-        joblib is installed; otherwise it is to be in a module.
-    options : SolverOptions
-        Limits and accuracy. A backend without a clock is stopped at the time limit as well: by
-        ending its process.
-
-    Raises
-    ------
-    BackendError
-        If the backend cannot be sent to another process, or not be made there.
-
-    Notes
-    -----
-    Copying and pickling gives a solver with a process of its own. One instance serves one
-    thread.
     """
 
     _judges = True
@@ -117,13 +98,7 @@ class IsolatedSolver(Solver):
         self._send("shift")
 
     def prepare(self, size: int) -> None:
-        """Forwarded, and waited for; see `Solver.prepare`.
-
-        Parameters
-        ----------
-        size : int
-            Unknowns of the largest QP to come.
-        """
+        """Forwarded, and waited for; see `Solver.prepare`."""
         self._size = size
         child = self._living()
         if not child.wait(_START):
@@ -312,13 +287,7 @@ def _read(pipe: IO[bytes]) -> object:
 
 
 def serve(parent: int) -> None:
-    """What the child process does: make a solver, then answer until the pipe is closed.
-
-    Parameters
-    ----------
-    parent : int
-        Process with which it ends.
-    """
+    """What the child process does: make a solver, then answer until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for who waits for the answer
     # What backends print must not get between the answers.
     back, commands = os.fdopen(os.dup(1), "wb"), os.fdopen(os.dup(0), "rb")

@@ -35,21 +35,6 @@ class QpsolversMatrices:
     the bounds, unless these go to l and u, and the general rows. A takes the general rows whose
     sides are equal.
 
-    Parameters
-    ----------
-    qp : QP
-        Any problem with the sizes and the pattern.
-    dense : bool
-        Whether P, G and A are dense arrays; otherwise CSC matrices with sorted indices.
-    box : bool
-        Whether bounds go to l and u.
-    needs_row : bool
-        Whether a G without rows gets a void one.
-    keep_empty : bool
-        Whether a G or A without rows is given as such, not as None.
-    objective : float
-        Factor of P and q.
-
     Attributes
     ----------
     arguments : tuple

@@ -13,17 +13,7 @@ __all__ = ["Pattern", "chosen_rows", "hessian_pattern", "rows_pattern"]
 
 @dataclass(frozen=True)
 class Pattern:
-    """Where the entries of a sparse matrix come from; they run by column, then by row.
-
-    Parameters
-    ----------
-    source : (nnz,) array of int
-        Entry of the stored numbers, in CSC order.
-    rows, columns : (nnz,) array of int
-        Place in the matrix.
-    indptr : (width + 1,) array of int
-        Where each column starts.
-    """
+    """Where the entries of a sparse matrix come from; they run by column, then by row."""
 
     source: NDArray[np.intp]
     rows: NDArray[np.int32]

@@ -39,17 +39,6 @@ class Scale:
     that does so for the largest entry of each row; and one number t, for the unit of the cost,
     that does so for the gradient or the step, as `GatheredQP.peaks` puts them together.
 
-    Parameters
-    ----------
-    exponents : (n + rows + 1,) array of int
-        Of the factors in S, R and t.
-    places : (2, ...) array of int
-        See `_places`.
-    sizes : tuple of int
-        stages, n and rows of its QPs.
-    key : int
-        What no other scale is called.
-
     Attributes
     ----------
     sizes, key
@@ -107,10 +96,7 @@ class Scale:
 
 @lru_cache(maxsize=64)
 def _places(sizes: tuple[int, int, int]) -> Index:
-    """Which two of the exponents of S, R, t, 1/S, 1/R, 1/t and 1 make up each factor.
-
-    First the numbers of a `GatheredQP`, then the units of constraints and multipliers.
-    """
+    """Which two of the exponents of S, R, t, 1/S, 1/R, 1/t and 1 make up each factor."""
     stages, n, rows = sizes
     s, r, t = np.arange(n), n + np.arange(rows), np.array(n + rows)
     one = 2 * (n + rows + 1)
@@ -131,13 +117,6 @@ def _places(sizes: tuple[int, int, int]) -> Index:
 
 class Scaling:
     """The scales of one solver.
-
-    Parameters
-    ----------
-    held : bool
-        Whether a scale is held as long as it fits, so that the numbers of a workspace keep
-        their meaning from QP to QP. What is held depends on the QPs since the last `forget`,
-        and on no unit. Otherwise each QP has its own.
 
     Attributes
     ----------

@@ -81,22 +81,7 @@ class Solver(ABC):
 
     @abstractmethod
     def _solve(self, qp: QP, start: Array | None) -> RawSolution | Solution:
-        """Solve qp. It may raise, and it may lie: `solve` contains all of it.
-
-        Parameters
-        ----------
-        qp : QP
-            The problem, scaled by powers of two so that its numbers are of order one, with
-            arrays of its own for this solve. Read it only: what is written into it is lost, and
-            `check` reports it.
-        start : (K, n) array or None
-            As given to `solve`, scaled likewise, if it is finite and of the right shape.
-
-        Returns
-        -------
-        RawSolution
-            In the scaled numbers; `solve` takes iterate and multipliers back.
-        """
+        """Solve qp. It may raise, and it may lie: `solve` contains all of it."""
 
     def shift(self) -> None:  # noqa: B027 - most keep nothing
         """Say that the trajectory moved on by one stage since the last solve.
@@ -260,10 +245,7 @@ class Solver(ABC):
         )
 
     def _confirmed(self, qp: QP, d: Array, found: tuple[float, float, float]) -> bool:
-        """Whether the residuals bear a claim out; a claim without multipliers cannot be checked.
-
-        All numbers are scaled ones, which have no unit.
-        """
+        """Whether the residuals bear a claim out; a claim without multipliers cannot be checked."""
         primal, dual, gap = found
         tolerance = self.options.absolute_tolerance + self.options.relative_tolerance
         limit = max(tolerance, min(_SLACK * tolerance, _LOOSEST))
@@ -287,18 +269,7 @@ def _forgetting(forget: Callable[[Any], None]) -> Callable[[Any], None]:
 
 
 def expect_qp(qp: object) -> None:
-    """Refuse what is no QP.
-
-    Parameters
-    ----------
-    qp : object
-        What a solver was given.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is none.
-    """
+    """Refuse what is no QP."""
     if not isinstance(qp, QP):
         raise InvalidInputError(
             f"qp is {qp!r}; expected a qpmhe.solvers.QP: make one by its sizes and fill its "
@@ -307,13 +278,7 @@ def expect_qp(qp: object) -> None:
 
 
 def failure(error: BaseException) -> Solution:
-    """The solution of a solver that raised.
-
-    Parameters
-    ----------
-    error : BaseException
-        What it raised.
-    """
+    """The solution of a solver that raised."""
     try:
         message = f"{type(error).__name__}: {error}"
     except Exception:  # its own words raise, too
@@ -322,22 +287,7 @@ def failure(error: BaseException) -> Solution:
 
 
 def as_iterate(given: object, words: object, qp: QP) -> tuple[Array | None, str]:
-    """An iterate (K, n) as a copy, and the message that goes with it; None if it is none.
-
-    Parameters
-    ----------
-    given : object
-        What the solver brought.
-    words : object
-        The solver's own.
-    qp : QP
-        What was to be solved.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If ``given`` cannot be read as numbers.
-    """
+    """An iterate (K, n) as a copy, and the message that goes with it; None if it is none."""
     message = words if isinstance(words, str) else f"its message is a {type(words).__name__}"
     if given is None:
         return None, message or "the solver returned no iterate"
@@ -353,28 +303,14 @@ def as_iterate(given: object, words: object, qp: QP) -> tuple[Array | None, str]
 
 
 def as_count(value: object) -> int | None:
-    """A count of iterations; None where it is none.
-
-    Parameters
-    ----------
-    value : object
-        What the solver says.
-    """
+    """A count of iterations; None where it is none."""
     if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0:
         return int(value)
     return None
 
 
 def as_multipliers(values: object, size: int) -> Array | None:
-    """Multipliers that can be used; None stands for all that cannot.
-
-    Parameters
-    ----------
-    values : object
-        What the solver brought.
-    size : int
-        How many there should be.
-    """
+    """Multipliers that can be used; None stands for all that cannot."""
     if values is None:
         return None
     try:

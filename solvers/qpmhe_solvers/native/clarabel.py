@@ -19,11 +19,6 @@ class ClarabelSolver(NativeSolver):
     """Solve by Clarabel.
 
     It knows no start: it begins anew each time.
-
-    Parameters
-    ----------
-    options : SolverOptions
-        All of them reach Clarabel.
     """
 
     package = "clarabel"

@@ -34,11 +34,6 @@ class DaqpSolver(NativeSolver):
 
     It starts with the limits that the start lies on, or those that were active last, as
     active; where it stops at a cap or time limit, there is no iterate.
-
-    Parameters
-    ----------
-    options : SolverOptions
-        Cap, time limit, and the absolute tolerance.
     """
 
     package = "daqp"

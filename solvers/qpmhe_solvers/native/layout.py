@@ -24,27 +24,7 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Style:
-    """How one solver wants its QP.
-
-    Parameters
-    ----------
-    matrices : {"csc", "dense"}
-        CSC matrices with sorted indices, or dense arrays.
-    triangle : {"upper", "full"}
-        What is stored of a sparse Hessian; a dense one is full.
-    bounds : {"box", "rows"}
-        Whether bounds on the unknowns go apart, or become rows of the constraint matrix.
-    equalities : {"apart", "among"}
-        Whether equality rows have a matrix of their own, or stand first among the rows.
-    sides : {1, 2}
-        Whether a row has an upper side only, or both.
-    infinite : bool
-        Whether a row may have infinite limits on all its sides; otherwise it is made void.
-    needs_row : bool
-        Whether a matrix of one-sided rows that has none gets a void one.
-    objective : float
-        Factor of the objective, a power of two.
-    """
+    """How one solver wants its QP."""
 
     matrices: Literal["csc", "dense"]
     triangle: Literal["upper", "full"] = "full"
@@ -106,15 +86,6 @@ class Layout:
 
     in two-sided styles; with one side, C x <= u alone, its rows being the equality rows, those
     with an upper limit, and those with a lower limit, negated.
-
-    Parameters
-    ----------
-    style : Style
-        How the solver wants it.
-    structure : Structure
-        The limits that there is room for.
-    stages, n, rows : int
-        Sizes of the QP.
 
     Attributes
     ----------
@@ -190,13 +161,7 @@ class Layout:
         return _csc(pattern, values, height, self.size)
 
     def voids(self, qp: GatheredQP) -> Voids | None:
-        """The rows of C without a limit in this QP, as far as the solver cannot have such.
-
-        Parameters
-        ----------
-        qp : GatheredQP
-            A QP that the structure has room for.
-        """
+        """The rows of C without a limit in this QP, as far as the solver cannot have such."""
         if self.style.infinite:
             return None
         lower = np.isfinite(qp.all_lower)[self.constraints]
@@ -211,15 +176,7 @@ class Layout:
         return Voids(np.flatnonzero(void[self._entry_rows]), below, rows)
 
     def fill(self, qp: GatheredQP, voids: Voids | None) -> None:
-        """Write the numbers of a QP into the arrays.
-
-        Parameters
-        ----------
-        qp : GatheredQP
-            A QP that the structure has room for.
-        voids : Voids or None
-            What `voids` returned for it.
-        """
+        """Write the numbers of a QP into the arrays."""
         # Any mode but the default one writes into ``out`` without a buffer between.
         qp.numbers.take(self._source, out=self._values, mode="clip")
         for part in self._objective:
@@ -235,17 +192,7 @@ class Layout:
             target[places] = values
 
     def duals(self, rows: Array, equalities: Array | None, box: Array | None) -> Array:
-        """Multipliers of all constraints, from those of C, A and the box.
-
-        Parameters
-        ----------
-        rows, equalities, box : array
-            Multipliers, positive on the upper side; None where there is no such part.
-
-        Returns
-        -------
-        (K n + K rows,) array
-        """
+        """Multipliers of all constraints, from those of C, A and the box."""
         duals = np.zeros(self.count + 1)  # the last one is that of a void row
         if self._negated is None:
             duals[self.constraints] = rows

@@ -21,13 +21,7 @@ _RHO = 0.1
 
 
 class OsqpSolver(NativeSolver):
-    """Solve by OSQP.
-
-    Parameters
-    ----------
-    options : SolverOptions
-        All of them reach OSQP.
-    """
+    """Solve by OSQP."""
 
     package = "osqp"
     style = Style("csc", triangle="upper", bounds="rows", equalities="among")

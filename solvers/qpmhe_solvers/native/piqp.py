@@ -20,11 +20,6 @@ class PiqpSolver(NativeSolver):
 
     Its multistage factorisation wants the unknowns in the order of the stages, as they are.
     PIQP knows no start: it begins anew each time.
-
-    Parameters
-    ----------
-    options : SolverOptions
-        Cap and tolerances; there is no time limit.
     """
 
     package = "piqp"
@@ -71,13 +66,7 @@ class PiqpSolver(NativeSolver):
 
 
 class PiqpDenseSolver(PiqpSolver):
-    """Solve by PIQP with dense matrices.
-
-    Parameters
-    ----------
-    options : SolverOptions
-        Cap and tolerances; there is no time limit.
-    """
+    """Solve by PIQP with dense matrices."""
 
     style = Style("dense", infinite=False)
 

@@ -23,12 +23,6 @@ class ProxqpSolver(NativeSolver):
 
     It begins at the minimiser under the equality rows each time: starts with the multipliers
     of the last solve took as many iterations or more, and longer.
-
-    Parameters
-    ----------
-    options : SolverOptions
-        Tolerances, and a cap on the outer iterations, which are the ones reported; there is
-        no time limit.
     """
 
     package = "proxsuite"
@@ -81,11 +75,6 @@ class ProxqpSparseSolver(ProxqpSolver):
     """Solve by ProxQP with sparse matrices.
 
     It begins at the minimiser under the equality rows each time, like the dense one.
-
-    Parameters
-    ----------
-    options : SolverOptions
-        Tolerances, and a cap on the outer iterations; there is no time limit.
     """
 
     style = Style("csc", bounds="rows")

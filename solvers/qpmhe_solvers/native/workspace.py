@@ -30,23 +30,7 @@ _KNOWN = 64
 
 
 class Answer(NamedTuple):
-    """What a solver said.
-
-    Parameters
-    ----------
-    x : array or None
-        The iterate.
-    duals : (K n + K rows,) array or None
-        Multipliers of all constraints, positive on the upper side.
-    solved : bool
-        Whether it says so.
-    sound : bool
-        Whether the workspace may be kept: solved, or stopped at a limit.
-    iterations : int or None
-        Its count.
-    message : str
-        Its words.
-    """
+    """What a solver said."""
 
     x: Array | None
     duals: Array | None
@@ -67,20 +51,7 @@ class _Workspace:
 
 
 class NativeSolver(Solver):
-    """A solver with workspaces, one for each structure and size of QPs; few are kept.
-
-    Parameters
-    ----------
-    options : SolverOptions
-        Limits and accuracy. With ``warm_start``, multipliers of the last solve in a workspace
-        start the next one, moved by one stage at each `shift`, where the solver gains by that.
-
-    Notes
-    -----
-    A workspace is dropped when its solver fails, raises, calls a QP infeasible, or brings a
-    number that is not finite. Workspaces stay behind when the solver is copied or pickled.
-    One instance serves one thread.
-    """
+    """A solver with workspaces, one for each structure and size of QPs; few are kept."""
 
     #: The module of the solver, and how it wants its QPs.
     package: ClassVar[str]
