@@ -43,4 +43,4 @@ class CompilationError(QpmheError):
 
 
 class EngineWarning(UserWarning):
-    """Something is carried out by a slower means than was asked for; results are the same."""
+    """A slower means than the one asked for is in use; the results are the same."""

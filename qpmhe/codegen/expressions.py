@@ -92,7 +92,7 @@ def casadi_model(
         if known or m is None or isinstance(h, ca.Function):
             m = _agreed("m", m, known[0].numel_in(1) if known else 0)
     elif n is None:
-        raise InvalidInputError("n is missing: f is no casadi.Function, which would tell it.")
+        raise InvalidInputError("n is missing: f is no casadi.Function, which would state it.")
     n, m = count("n", n, 1), count("m", 0 if m is None else m, 0)
     made_f = _canonical(ca, "f", f, n, m)
     made_h = _canonical(ca, "h", h, n, m)

@@ -144,7 +144,7 @@ def _filled(
     record["discount"] = cost.discount
     record["sample_time"] = system.dt or 0.0
     single = layout.real == "float"
-    # What single precision can tell apart ends earlier.
+    # Single precision distinguishes less.
     record["tolerance"] = max(settings.tolerance, 1e-6 if single else 0.0)
     record["solver_tolerance"] = max(settings.solver_tolerance, 1e-4 if single else 0.0)
     for name in SET_NAMES:

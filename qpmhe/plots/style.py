@@ -1,4 +1,4 @@
-"""The look that all figures share: light ink, and colours that all colour vision tells apart."""
+"""The look that all figures share: light ink, and colours that all readers can distinguish."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LIGHT", "REAL", "STYLES", "panels", "save"]
 
-# Okabe and Ito's palette; dashes tell the rest.
+# Okabe and Ito's palette; dashes distinguish the rest.
 STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#D55E00", "linestyle": "-"},
     {"color": "#0072B2", "linestyle": "--"},
