@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import InitVar, dataclass, replace
 from functools import cached_property
+from itertools import product
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from ._checks import count, numbers
 from .costs import Cost
 from .errors import InvalidInputError, OptionError, ShapeError, UnknownOptionError
 from .estimation.engine import PythonEngine
-from .estimation.estimate import Estimate, Status
+from .estimation.estimate import Status
 from .estimation.estimator import MovingHorizonEstimator, check_start
 from .estimation.settings import Settings
 from .model.system import System
@@ -36,19 +36,14 @@ Index = NDArray[np.intp]
 class BatchEstimator:
     """K independent estimators of one system, for Monte Carlo studies and fleets.
 
-    Member k is what a `qpmhe.MovingHorizonEstimator` with the same arguments is for the
-    record of member k, with the same promise. With ``engine="compiled"`` threads share the
-    members; otherwise the members take turns. A member whose model fails or whose measurement
-    is missing falls back by itself.
+    Each member gives what a `qpmhe.MovingHorizonEstimator` with the same arguments gives for
+    its record. With ``engine="compiled"`` threads share the members; otherwise the members take
+    turns. A member whose model fails or whose measurement is missing falls back by itself.
 
     Parameters
     ----------
-    system : System
-        The model, which all members share.
-    observer : Observer
-        The auxiliary observer.
-    cost : Cost
-        The cost.
+    system, observer, cost
+        As for `qpmhe.MovingHorizonEstimator`; all members share them.
     members : int
         K >= 1.
     initial_states : (n,) or (K, n) array_like
@@ -57,15 +52,8 @@ class BatchEstimator:
         How many threads share the members where ``engine="compiled"``; one for each
         processor if left out.
     **options
-        As for `qpmhe.MovingHorizonEstimator`: the horizon, and whatever else it takes. A
-        time budget is that of each member.
-
-    Attributes
-    ----------
-    members : int
-        K.
-    mode : str
-        ``compiled``, or ``looped`` for a loop over Python's estimators.
+        As for `qpmhe.MovingHorizonEstimator`, such as the horizon. Each member has the whole
+        time budget.
 
     Raises
     ------
@@ -95,6 +83,8 @@ class BatchEstimator:
         threads: int | None = None,
         **options: Any,
     ) -> None:
+        if "initial_state" in options:
+            raise UnknownOptionError("unknown option 'initial_state'; expected initial_states.")
         self.members = count("members", members, 1)
         if not isinstance(system, System):
             raise InvalidInputError(f"system is {system!r}; expected a qpmhe.System.")
@@ -114,7 +104,7 @@ class BatchEstimator:
         if isinstance(observer, Observer):
             self._checked(states)
         try:
-            # The checks of all that members have in common are those of a single estimator.
+            # A single estimator checks all that the members have in common.
             one = MovingHorizonEstimator(
                 system, observer, cost, initial_state=states[0], **options
             )
@@ -145,7 +135,7 @@ class BatchEstimator:
 
     @property
     def mode(self) -> str:
-        """``compiled`` or ``looped``."""
+        """``compiled``, or ``looped`` for a loop over Python's estimators."""
         return "compiled" if self.settings.engine == "compiled" else "looped"
 
     @property
@@ -218,7 +208,7 @@ class BatchEstimator:
         code, of all or of none: see ``time``.
         """
         y = _measurements(Y, self.members, self.system.p)
-        return self._step(y, _inputs(U, self.members, self.system.m))
+        return self._step(y, _inputs(U, (self.members, self.system.m), "update(Y, U)"))
 
     def _step(self, y: Array, u: Array) -> BatchEstimate:
         if isinstance(self._engine, _Looped):
@@ -244,14 +234,28 @@ class BatchEstimator:
         Raises
         ------
         ShapeError, InvalidInputError
-            If a shape is wrong; no sample has been taken then.
+            If an argument does not fit; no sample has been taken then.
         """
         ys = _record(Y, self.members, self.system.p)
-        us = _input_record(U, self.members, self.system.m, ys.shape[1])
+        shape, n = ys.shape[:2], self.system.n
+        us = _inputs(U, (*shape, self.system.m), "run(Y, U)")
         if not isinstance(self._engine, _Looped):
             return BatchRun(**self._engine.run(ys, us))
-        found = (self._step(ys[:, t], us[:, t]) for t in range(ys.shape[1]))
-        return BatchRun.of(self.states, found, ys.shape[1])
+        found = BatchRun(
+            states=np.empty((shape[0], shape[1] + 1, n)), filtered=np.empty((*shape, n)),
+            delayed=np.full((*shape, n), np.nan), costs=np.empty(shape),
+            candidate_costs=np.empty(shape), statuses=np.empty(shape, np.int64),
+            qps=np.empty(shape, np.intp),
+        )
+        found.states[:, 0] = self.states
+        for t in range(shape[1]):
+            one = self._step(ys[:, t], us[:, t])
+            found.states[:, t + 1], found.filtered[:, t] = one.states, one.filtered
+            if one.delayed is not None:
+                found.delayed[:, t] = one.delayed
+            found.costs[:, t], found.candidate_costs[:, t] = one.costs, one.candidate_costs
+            found.statuses[:, t], found.qps[:, t] = one.flags, one.qps
+        return found
 
     def __getstate__(self) -> dict[str, Any]:
         saved = self.__dict__.copy()
@@ -311,10 +315,11 @@ class _Looped:
     def step(self, y: Array, u: Array) -> BatchEstimate:
         time = self.time
         try:
-            return _collected([
+            found = [
                 engine.step(y[k], u[k], None, None, perf_counter())
                 for k, engine in enumerate(self._engines)
-            ], self._delay)
+            ]
+            return _collected(found, self._delay)
         except BaseException:
             for engine in self._engines:
                 if engine.time > time:
@@ -335,6 +340,7 @@ def _collected(found: list[Estimate], delay: int) -> BatchEstimate:
     )
 
 
+@dataclass(eq=False, repr=False)
 class BatchEstimate:
     """The results of one `BatchEstimator.update`, after the measurements y(t) of K members.
 
@@ -345,60 +351,49 @@ class BatchEstimate:
     ----------
     time : int
         t, the index of the newest measurements; the first is 0.
-    trajectories : (K, N_t + 1, n) array
-        Estimates of all states in the windows.
-    candidates : (K, N_t + 1, n) array
-        The observers' trajectories, or their projections onto the sets.
+    trajectories, candidates : (K, N_t + 1, n) array
+        Estimates of all states in the windows; the observers' trajectories, or their
+        projections onto the sets.
     costs, candidate_costs : (K,) array
-        True cost J of the estimates and of the candidates; costs <= candidate_costs.
-    flags : (K,) int array
-        Outcome and events as values of `Status`, whose sums of flags they are.
-    qps : (K,) int array
-        QPs solved.
+        True cost J of both; costs <= candidate_costs.
+    flags, qps : (K,) int array
+        Outcome and events as values of `Status`; QPs solved.
     delayed : (K, n) array or None
         Estimates of x(t+1-k) for the estimator's delay k; None until the windows reach it.
     """
 
-    def __init__(
-        self,
-        time: int,
-        trajectories: Array,
-        costs: Array,
-        candidates: Array,
-        candidate_costs: Array,
-        flags: Flags,
-        qps: Index,
-        delay: int = 0,
-    ) -> None:
-        self.time = time
-        self.trajectories, self.costs = trajectories, costs
-        self.candidates, self.candidate_costs = candidates, candidate_costs
-        self.flags, self.qps = flags, qps
-        self.delayed: Array | None = None
-        if delay < trajectories.shape[1]:
-            self.delayed = trajectories[:, trajectories.shape[1] - 1 - delay]
+    time: int
+    trajectories: Array
+    costs: Array
+    candidates: Array
+    candidate_costs: Array
+    flags: Flags
+    qps: Index
+    delay: InitVar[int] = 0
+
+    def __post_init__(self, delay: int) -> None:
+        newest = self.trajectories.shape[1] - 1
+        self.delayed = None if delay > newest else self.trajectories[:, newest - delay]
 
     @property
     def states(self) -> Array:
         """Estimates of x(t+1), (K, n): predictions one step ahead of the measurements."""
-        value: Array = self.trajectories[:, -1]
-        return value
+        return self.trajectories[:, -1]
 
     @property
     def filtered(self) -> Array:
         """Estimates of x(t), (K, n), the last measured time."""
-        value: Array = self.trajectories[:, -2]
-        return value
+        return self.trajectories[:, -2]
 
     @cached_property
     def statuses(self) -> list[Status]:
         """Outcome and events of each member."""
-        return statuses_of(self.flags)
+        return [Status(value) for value in self.flags.tolist()]
 
     @property
     def improved(self) -> NDArray[np.bool_]:
         """Whose estimate is better than the candidate, (K,)."""
-        return having(self.flags, Status.IMPROVED)
+        return np.asarray((self.flags & Status.IMPROVED.value) != 0)
 
     def __len__(self) -> int:
         return self.costs.size
@@ -410,10 +405,11 @@ class BatchEstimate:
         )
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class BatchRun:
     """Results of T consecutive updates of K members, as arrays.
 
-    Parameters
+    Attributes
     ----------
     states : (K, T + 1, n) array
         Estimates of x(0), ..., x(T), each made before y of its own time: the first is the
@@ -424,185 +420,89 @@ class BatchRun:
         Estimates with the estimator's delay, NaN where the windows did not reach that far.
     costs, candidate_costs : (K, T) array
         True cost J of estimates and candidates.
-    statuses : (K, T) int array
-        Outcome and events of each step as values of `Status`; ``Status(value)`` is the flag.
-    qps : (K, T) int array
-        QPs solved.
+    statuses, qps : (K, T) int array
+        Outcome and events of each step, from which ``Status(value)`` makes a flag; QPs solved.
     """
 
-    def __init__(
-        self,
-        *,
-        states: Array,
-        filtered: Array,
-        delayed: Array,
-        costs: Array,
-        candidate_costs: Array,
-        statuses: Flags,
-        qps: Index,
-    ) -> None:
-        self.states, self.filtered, self.delayed = states, filtered, delayed
-        self.costs, self.candidate_costs = costs, candidate_costs
-        self.statuses, self.qps = statuses, qps
-
-    @classmethod
-    def of(cls, start: Array, estimates: Iterable[BatchEstimate], count: int) -> BatchRun:
-        """Collect what single updates returned.
-
-        Parameters
-        ----------
-        start : (K, n) array
-            The estimates before the first update.
-        estimates : iterable of BatchEstimate
-            What the updates return; none is kept, as they hold whole windows.
-        count : int
-            How many there are.
-        """
-        members, n = start.shape
-        # Time first while they are written, members first as they are read.
-        states, filtered, delayed = (
-            np.empty((count + more, members, n)) for more in (1, 0, 0)
-        )
-        costs, candidate_costs = np.empty((count, members)), np.empty((count, members))
-        statuses, qps = np.empty((count, members), np.int64), np.empty((count, members), np.intp)
-        states[0] = start
-        for t, one in enumerate(estimates):
-            states[t + 1], filtered[t] = one.states, one.filtered
-            delayed[t] = np.nan if one.delayed is None else one.delayed
-            costs[t], candidate_costs[t] = one.costs, one.candidate_costs
-            statuses[t], qps[t] = one.flags, one.qps
-        return cls(
-            states=states.transpose(1, 0, 2), filtered=filtered.transpose(1, 0, 2),
-            delayed=delayed.transpose(1, 0, 2), costs=costs.T,
-            candidate_costs=candidate_costs.T, statuses=statuses.T, qps=qps.T,
-        )
+    states: Array
+    filtered: Array
+    delayed: Array
+    costs: Array
+    candidate_costs: Array
+    statuses: Flags
+    qps: Index
 
     def __len__(self) -> int:
         return int(self.costs.shape[1])
 
     def share(self, flag: Status) -> float:
-        """The share of all members' steps whose status has this flag.
-
-        Parameters
-        ----------
-        flag : Status
-            The flag.
-        """
-        return float(having(self.statuses, flag).mean()) if self.statuses.size else 0.0
-
-
-def having(flags: Flags, flag: Status) -> NDArray[np.bool_]:
-    """Where values of `Status` have a flag."""
-    return np.asarray((flags & flag.value) == flag.value)
-
-
-def statuses_of(flags: Flags) -> list[Status]:
-    """Each value of `Status` as the flag that it is."""
-    known = {value: Status(value) for value in np.unique(flags).tolist()}
-    return [known[value] for value in flags.tolist()]
+        """The share of all members' steps whose status has this ``flag``."""
+        has = (self.statuses & flag.value) == flag.value
+        return float(has.mean()) if has.size else 0.0
 
 
 def _starts(value: ArrayLike, members: int, n: int) -> Array:
-    """Initial states (K, n), a copy, from one for all (n,) or one for each (K, n)."""
-    given = numbers("initial_states", _even("initial_states", value, "states", ""))
-    if given.ndim == 0 and n == 1:
-        given = given.reshape(1)
-    if given.shape not in ((n,), (members, n)):
-        raise ShapeError(
-            f"initial_states has shape {given.shape}; expected ({members}, {n}), a row for each "
-            f"member, or ({n},) for all of them."
-        )
+    """Initial states (K, n), a copy."""
+    shapes = (n,), (members, n)
+    remedy = f"a row for each member, or ({n},) for all of them."
+    given = _shaped("initial_states", value, shapes, remedy, finite=True)
     return np.array(np.broadcast_to(given, (members, n)))
 
 
 def _measurements(value: ArrayLike | None, members: int, p: int) -> Array:
-    """Measurements (K, p) of one time; (K,) will do where p is 1, None is nothing at all."""
+    """Measurements (K, p) of one time; None stands for a missing row, or for all."""
     if type(value) is np.ndarray and value.shape == (members, p) and value.dtype == np.float64:
         return value
     if value is None:
         return np.full((members, p), np.nan)
     if isinstance(value, (list, tuple)):
-        nothing = np.nan if p == 1 and not any(map(np.ndim, _there(value))) else [np.nan] * p
+        like = next((row for row in value if row is not None), [np.nan] * p)
+        nothing = np.full(np.shape(like), np.nan).tolist()
         value = [nothing if row is None else row for row in value]
-    given = numbers("Y", _even("Y", value, "components", _MISSING), finite=False)
-    if given.shape == (members,) and p == 1:
-        given = given[:, None]
-    if given.shape != (members, p):
-        raise ShapeError(
-            f"Y has shape {given.shape}; expected ({members}, {p}), a row for each member. "
-            "Rows of NaN stand for members without a measurement."
-        )
-    return given
-
-
-def _inputs(value: ArrayLike | None, members: int, m: int) -> Array:
-    """Inputs (K, m) of one time, from one for all (m,) or one for each (K, m)."""
-    if _without_inputs(value, m, "update(Y, U)"):
-        return np.zeros((members, 0))
-    assert value is not None
-    given = numbers("U", _even("U", value, "components", ""), finite=False)
-    if given.ndim == 0 and m == 1:
-        given = given.reshape(1)
-    if given.shape not in ((m,), (members, m)):
-        raise ShapeError(
-            f"U has shape {given.shape}; expected ({members}, {m}), a row for each member, or "
-            f"({m},) for all of them."
-        )
-    return np.array(np.broadcast_to(given, (members, m)))
+    remedy = f"a row for each member. {_MISSING}"
+    return _shaped("Y", value, ((members, p),), remedy)
 
 
 def _record(value: ArrayLike, members: int, p: int) -> Array:
-    """Measurements (K, T, p) of a record; (K, T) will do where p is 1."""
-    given = numbers("Y", _even("Y", value, "samples", _MISSING), finite=False)
-    if given.ndim == 2 and p == 1:
-        given = given[:, :, None]
-    if given.ndim != 3 or given.shape[::2] != (members, p):
-        raise ShapeError(
-            f"Y has shape {given.shape}; expected ({members}, T, {p}): a record for each member, "
-            "with a row for each sample."
-        )
-    return given
+    """Measurements (K, T, p) of a record."""
+    remedy = f"a record for each member, with a row for each sample. {_MISSING}"
+    return _shaped("Y", value, ((members, None, p),), remedy)
 
 
-def _input_record(value: ArrayLike | None, members: int, m: int, steps: int) -> Array:
-    """Inputs (K, T, m) of a record, from one for all (T, m) or one for each (K, T, m)."""
-    if _without_inputs(value, m, "run(Y, U)"):
-        return np.zeros((members, steps, 0))
-    assert value is not None
-    given = numbers("U", _even("U", value, "samples", ""), finite=False)
-    if given.ndim == 1 and m == 1:
-        given = given[:, None]
-    if given.shape not in ((steps, m), (members, steps, m)):
-        raise ShapeError(
-            f"U has shape {given.shape}; expected ({members}, {steps}, {m}), a record for each "
-            f"member as long as its measurements, or ({steps}, {m}) for all of them."
-        )
-    return np.broadcast_to(given, (members, steps, m))
-
-
-_MISSING = " Fill up with NaN, which stands for what was not measured."
-
-
-def _there(rows: Any) -> list[Any]:
-    return [row for row in rows if row is not None]
-
-
-def _without_inputs(value: ArrayLike | None, m: int, call: str) -> bool:
-    """Whether there are none, as it must be where the system has none."""
+def _inputs(value: ArrayLike | None, shape: tuple[int, ...], call: str) -> Array:
+    """Inputs of the shape (K, ..., m), the same for all members if given without K."""
+    m, common = shape[-1], shape[1:]
     if value is None and m:
         raise InvalidInputError(f"U is missing; the system has {m} inputs: {call}.")
-    if value is not None and m == 0:
+    if value is None:
+        return np.zeros(shape)
+    if m == 0:
         raise InvalidInputError("U was given, but the system has no inputs; leave it out.")
-    return value is None
+    remedy = f"inputs for each member and each sample of Y, or {common} for all members."
+    return np.array(np.broadcast_to(_shaped("U", value, (common, shape), remedy), shape))
 
 
-def _even(name: str, value: ArrayLike, parts: str, remedy: str) -> ArrayLike:
-    """The value, if it is no list of rows of different lengths."""
+_MISSING = "NaN stands for what was not measured; fill up with it."
+
+
+def _shaped(
+    name: str, value: ArrayLike, shapes: tuple[tuple[int | None, ...], ...], remedy: str,
+    *, finite: bool = False,
+) -> Array:
+    """The value in one of the shapes, of which None is any length and a last 1 may be left out."""
     if isinstance(value, (list, tuple)):
         lengths = sorted({len(row) for row in value if hasattr(row, "__len__")})
         if len(lengths) > 1:
+            parts = "samples" if len(shapes[-1]) == 3 else "states" if finite else "components"
             raise ShapeError(
                 f"{name} has rows of {lengths[0]} to {lengths[-1]} {parts}; expected the same "
-                f"number for every member.{remedy}"
+                f"number for every member: {remedy}"
             )
-    return value
+    given = numbers(name, value, finite=finite)
+    for one, shape in product((given, given[..., None]), shapes):
+        if one.ndim == len(shape) and all(
+            size in (length, None) for length, size in zip(one.shape, shape, strict=True)
+        ):
+            return one
+    expected = str(shapes[-1]).replace("None", "T")
+    raise ShapeError(f"{name} has shape {given.shape}; expected {expected}, {remedy}")

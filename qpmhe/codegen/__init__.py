@@ -38,25 +38,25 @@ def write(
 ) -> tuple[Path, Path]:
     """Write the estimator as a C99 header and source that need nothing but libm.
 
-    The source holds observer, growing window, candidate, Gauss-Newton QPs by a
-    block-banded factorisation (an interior-point method where inequalities bind), judgement
-    by the true cost, and fallback, without allocation and with bounded loops. It is the text
-    that ``engine="compiled"`` compiles. Weights, gain, sets and options of the estimator
-    become ``<name>_default_settings``; how to call it stands at the top of the header.
+    The source holds observer, growing window, candidate, Gauss-Newton QPs by a block-banded
+    factorisation (an interior-point method where inequalities bind), the verdict by the true
+    cost, and the fallback, without allocation and with bounded loops. ``engine="compiled"``
+    compiles the same text. Weights, gain, sets and options of the estimator become
+    ``<name>_default_settings``; the top of the header says how to call it.
 
     Parameters
     ----------
     estimator : MovingHorizonEstimator
-        What to write: its system made with `qpmhe.from_casadi`, its observer of constant
-        gain, its cost quadratic. What it has measured so far is not written.
+        What to write: a system made with `qpmhe.from_casadi`, an observer of constant gain, a
+        quadratic cost. Its measurements so far are not written.
     directory : str or path
         Where; made if need be.
     name : str
-        Name of the files and prefix of all public names: a C identifier of at most 60
-        letters, and not the name of a system's header, such as ``math``.
+        Name of the files and prefix of all public names: a C identifier of at most 60 letters,
+        and not the name of a system's header, such as ``math``.
     real : {"double", "float"}
-        Precision. In single precision sets are kept to 1e-5 and the tolerances are widened
-        to what can be told apart.
+        Precision. In single precision sets are kept to 1e-5, and tolerances are no smaller than
+        what can be told apart.
 
     Returns
     -------
@@ -65,10 +65,8 @@ def write(
 
     Raises
     ------
-    OptionError
-        If something has no C form, or an option is unknown; the text tells the remedy.
-    CompilationError
-        If CasADi has no C code for a part of the model.
+    OptionError, CompilationError
+        If something has no C form, or an option is unknown; if CasADi has no C code for the model.
     InvalidInputError
         If this is no estimator, or the directory cannot be written.
     """

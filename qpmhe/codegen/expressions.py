@@ -15,13 +15,7 @@ __all__ = ["CasadiModel", "casadi_model", "import_casadi"]
 
 
 def import_casadi() -> Any:
-    """The casadi package, which is imported late.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is not installed.
-    """
+    """The casadi package, imported late; InvalidInputError if it is not installed."""
     try:
         import casadi
     except ImportError as error:
@@ -33,18 +27,10 @@ def import_casadi() -> Any:
 
 @dataclass(frozen=True)
 class CasadiModel:
-    """f and h, or the rate of an ODE and h, as functions of (x, u).
+    """f and h as functions of (x, u) to a dense column, with n, p, m states, outputs and inputs.
 
-    Parameters
-    ----------
-    f, h : casadi.Function
-        (x, u) to a dense column; u has no rows where there are no inputs.
-    n, p, m : int
-        Numbers of states, outputs and inputs.
-    dt : float or None
-        Sampling time of an ODE; None where f is the discrete-time map itself.
-    method : str or None
-        Its discretisation.
+    f is the rate of an ODE with sampling time ``dt`` and discretisation ``method``, or the
+    discrete-time map itself, where these are None. u has no rows where there are no inputs.
     """
 
     f: Any
@@ -56,19 +42,9 @@ class CasadiModel:
     method: str | None = None
 
     def with_jacobian(self, which: str) -> tuple[Any, list[int]]:
-        """A function of (x, u) to the value and the nonzeros of its Jacobian by x.
+        """A function of (x, u) to f or h and the nonzeros of its Jacobian by x.
 
-        Parameters
-        ----------
-        which : {"f", "h"}
-            The function.
-
-        Returns
-        -------
-        function : casadi.Function
-            (x, u) to the value and a column of nonzeros.
-        places : list of int
-            Where each nonzero is in the dense Jacobian, counted by rows.
+        Also where each nonzero is in the dense Jacobian, counted by rows.
         """
         ca, function = import_casadi(), getattr(self, which)
         x, u = _symbols(ca, function, self.n, self.m)
@@ -107,20 +83,7 @@ def casadi_model(
     dt: float | None = None,
     method: str = "rk4",
 ) -> CasadiModel:
-    """Check a model given to CasADi and bring it to the common form.
-
-    Parameters
-    ----------
-    f, h : casadi.Function or callable
-        As for `qpmhe.from_casadi`.
-    n, p, m, dt, method
-        As there.
-
-    Raises
-    ------
-    InvalidInputError
-        If CasADi is missing, or an argument does not fit; subclasses tell what.
-    """
+    """Check the arguments of `qpmhe.from_casadi`, and bring the model to the common form."""
     ca = import_casadi()
     if method not in METHODS:
         raise OptionError(f"method is {method!r}; expected one of {', '.join(METHODS)}.")

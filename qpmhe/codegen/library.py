@@ -126,14 +126,9 @@ def generated(
 class EstimatorLibrary:
     """Functions and structures of one compiled estimator.
 
-    Attributes
-    ----------
-    layout : Layout
-        Its sizes.
-    settings : structured array
-        The ``mhe_settings`` in use; must outlive all estimators that point to it.
-    update, update_members, amend, reset, run : ctypes functions
-        The C functions of these names; `update` is ``mhe_update_undoable``.
+    ``settings``, the ``mhe_settings`` in use, must outlive all estimators that point to it.
+    ``update``, ``update_members``, ``amend``, ``reset`` and ``run`` are the C functions of these
+    names; `update` is ``mhe_update_undoable``.
     """
 
     def __init__(

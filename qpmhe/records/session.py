@@ -38,20 +38,15 @@ _EVERY = 100
 class Summary:
     """What happened in a record.
 
-    Parameters
+    Attributes
     ----------
-    samples : int
-        Samples of this run.
-    before : int
-        Samples of the earlier run that this one resumed.
+    samples, before : int
+        Samples of this run, and of the earlier run that it resumed.
     improved, incomplete : int
         How many of the samples improved on the observer, and how many lacked outputs.
-    inserted : int
-        Samples without measurement that fill gaps.
-    held : int
-        Missing inputs that were replaced by the last value.
-    repeated : int
-        Lines that were skipped because their time was there already.
+    inserted, held, repeated : int
+        Samples without measurement that fill gaps; missing inputs that were replaced by the last
+        value; lines that were skipped because their time was there already.
     failed, stale : int
         Steps at which the model failed (``MODEL_FAILED``), and others whose window still has
         such a step (``FAILED_STAGE``).
@@ -115,46 +110,36 @@ def estimate_record(
     ----------
     model : str
         Name in the catalogue, ``package.module:function`` or ``path/file.py:function``.
-    record : str or Path
-        CSV (or gzip of it) or Parquet file with a header; ``-`` is standard input.
-    out : str or Path
-        File in .csv or .parquet, which must not exist yet; ``-`` is standard output.
-    time : str, optional
-        Column of the time, numbers or ISO dates (whose differences count in seconds).
-    outputs, inputs : str, optional
-        Columns of y and u, as ``y1=column,y2=column``, or columns in order.
+    record, out : str or Path
+        CSV (or gzip of it) or Parquet file with a header, ``-`` is standard input; and a new file
+        in .csv or .parquet, ``-`` is standard output.
+    time, outputs, inputs : str, optional
+        Columns of the time, numbers or ISO dates (whose differences count in seconds), and of y
+        and u, as ``y1=column,y2=column``, or columns in order.
     separator, decimal, encoding : str, optional
         How a CSV file is written, where the file does not show it.
     missing : sequence of str
         Words (or numbers) that stand for a missing value, besides the usual ones.
-    dt : float, optional
-        Usual step of a discrete-time model, in its unit of time.
-    time_scale : float
-        The record's unit of time in the model's.
-    equal_steps : bool
-        Whether steps must be equal also where the model takes any.
+    dt, time_scale : float, optional
+        Usual step of a discrete-time model, in its unit of time; the record's unit in the model's.
+    equal_steps, skip_repeated : bool
+        Whether steps must be equal also where the model takes any; whether to skip lines whose
+        time is that of the line before.
     max_gap : int, optional
-        Most samples without measurement in a row. If left out, 1000, and a record that
-        consists of gaps of one size is refused: its unit of time is not the model's.
-    skip_repeated : bool
-        Whether to skip lines whose time is that of the line before.
-    covariances : {"none", "std", "full"}
-        What to write of the covariances.
-    step_time : bool
-        Whether to write the seconds of each step.
-    resume : bool
-        Whether to resume at the checkpoint beside ``out``, if there is one.
-    overwrite : bool
-        Whether to replace existing files.
-    checkpoint_every : int, optional
-        Samples from checkpoint to checkpoint, 100 if left out. A solver forgets its warm
-        start there, so the number affects the last bits of the results.
-    checkpoint_seconds : float
-        Least time between two writes of the checkpoint.
-    progress : callable, optional
-        Called after each sample with the bytes (or rows) read and their total, if it is known.
-    report : callable, optional
-        Called with a text when the model fails for the first time; the run continues.
+        Most samples without measurement in a row. By default 1000, and a record that consists of
+        gaps of one size is refused: its unit of time is not the model's.
+    covariances, step_time : {"none", "std", "full"}, bool
+        What to write of the covariances; whether to write the seconds of each step.
+    resume, overwrite : bool
+        Whether to resume at the checkpoint beside ``out``, if there is one; whether to replace
+        existing files.
+    checkpoint_every, checkpoint_seconds : int, float, optional
+        Samples from checkpoint to checkpoint, 100 by default, and the least time between two
+        writes. A solver forgets its warm start at a checkpoint, so their number affects the last
+        bits of the results.
+    progress, report : callable, optional
+        Called after each sample with the bytes (or rows) read and their total, if it is known;
+        called with a text when the model fails for the first time.
     **options
         Options of `qpmhe.MovingHorizonEstimator` that replace the model's own.
 
@@ -165,12 +150,11 @@ def estimate_record(
 
     Raises
     ------
-    RecordError
-        If the record cannot be read or used; the rows before stay, and can be resumed.
+    RecordError, WriteError
+        If the record cannot be read or used, or results cannot be written, as on a full disk; the
+        rows before stay, and can be resumed.
     CheckpointError
         If the checkpoint does not fit.
-    WriteError
-        If results cannot be written, as on a full disk; the rows before stay.
     InvalidInputError
         If model, options or files do not fit, or a file exists already; nothing has been
         written then.

@@ -44,18 +44,7 @@ _UNREADABLE = {
 class RecordError(InvalidInputError):
     """A record that cannot be read or used; the text names file, line, column and remedy.
 
-    Parameters
-    ----------
-    what : str
-        What is wrong, and what to do about it.
-    file : str
-        The record, as the user calls it.
-    line : int, optional
-        Its line, counted from 1; of a Parquet file, the row.
-    column : str, optional
-        The column's name.
-    unit : str
-        What is counted: ``line`` or ``row``.
+    ``what`` is wrong, and what to do about it; ``unit`` is ``line``, or ``row`` of a Parquet file.
     """
 
     def __init__(

@@ -37,20 +37,8 @@ OBSERVER = "observer"
 class Cell:
     """What distinguishes one run from all others of a study.
 
-    Attributes
-    ----------
-    model, backend : str
-        Names; the backend is `OBSERVER` where no QP is solved.
-    qps : int or None
-        QPs per sample; None iterates to convergence.
-    solver_iterations : int or None
-        Cap inside each QP; None is the solver's default.
-    horizon : int
-        N.
-    start : str
-        Where the sequences of QPs start.
-    seed, steps : int
-        Seed and number of samples of the record.
+    ``backend`` is `OBSERVER` where no QP is solved; ``qps`` is None to converge, and
+    ``solver_iterations``, the cap inside each QP, None for the solver's default.
     """
 
     model: str
@@ -83,26 +71,11 @@ class Cell:
 
 @dataclass(frozen=True)
 class Task:
-    """A cell as it is sent to a worker.
+    """A cell as it is sent to a worker, and what to measure: "accuracy", "time", "covariance".
 
-    Attributes
-    ----------
-    cell : Cell
-        What to run.
-    source : ModelSource
-        Where its model comes from.
-    parts : frozenset of str
-        What to measure: "accuracy", "time", "covariance".
-    timeout : float
-        Seconds after which the cell gives up between two steps.
-    keep : bool
-        Whether to return the trajectory.
-    shared : bool
-        Whether other cells run on the same machine at the same time.
-    registered : Backend, optional
-        The backend, for workers in which it is not registered.
-    isolated : bool
-        Whether the solver runs in a process of its own, which may crash alone.
+    It gives up between two steps after ``timeout`` seconds. ``keep`` returns the trajectory,
+    ``shared`` says that other cells run on the machine at the same time, ``registered`` is the
+    backend for workers that do not know it, and ``isolated`` runs the solver in another process.
     """
 
     cell: Cell
@@ -197,7 +170,6 @@ def _measured(task: Task, limit: float) -> Result:
 
 
 def _register(entry: Backend) -> None:
-    """Register a backend that was registered where the study was started."""
     try:
         backend(entry.name)
     except BackendError:

@@ -46,41 +46,37 @@ WORDS = {"qps": "converged", "solver_iterations": "none", "horizons": "default"}
 class Study:
     """A grid of estimators, each run on records of many seeds.
 
-    Cells that would be the same are one: with ``qps=0`` no QP is solved, so that there is one
-    cell, whose backend is called ``observer``; a backend without a cap has one cell for all
+    Cells that would be the same are one: with ``qps=0`` no QP is solved, so there is one cell,
+    whose backend is called ``observer``; a backend without a cap has one cell for all
     ``solver_iterations``.
 
     Parameters
     ----------
     models : sequence of str
-        Names of the catalogue, with keyword arguments where wanted
-        (``chain_of_masses(masses=2)``), or functions that return system, observer, cost and
-        scenario: ``package.module:function`` or ``path/file.py:function``.
+        Names of the catalogue, with arguments where wanted (``chain_of_masses(masses=2)``), or
+        functions that return system, observer, cost and scenario: ``package.module:function`` or
+        ``path/file.py:function``.
     backends : sequence of str, optional
-        QP backends; if left out, all that are installed, without the generic forms
-        (``qpsolvers:...``) of those that have one of their own.
-    qps : sequence of int or None
-        QPs per sample, the paper's i; None iterates to convergence, 0 is the observer.
-    solver_iterations : sequence of int or None
-        Caps on the solver's own iterations in each QP; None leaves the solver's default.
-    horizons : sequence of int or None
-        N; None takes the scenario's.
+        QP backends; by default all that are installed, without the forms ``qpsolvers:...``.
+    qps, solver_iterations, horizons : sequence of int or None
+        QPs per sample, the paper's i (0 is the observer; None iterates to convergence); caps on
+        the solver's iterations in each QP (None: its default); N (None: the scenario's).
     starts : sequence of {"candidate", "best"}
         Where the sequences of QPs start.
     seeds : int or sequence of int
         Seeds of the records; a number k stands for 0, ..., k-1.
     steps : int, optional
-        Samples of a record; the scenario's if left out.
+        Samples of a record; the scenario's by default.
     measure : {"both", "accuracy", "time"}
-        What is recorded. With "time" one cell runs at a time, unless more jobs are asked for.
+        What is recorded. With "time" one cell runs at a time, unless you ask for more jobs.
     deadline : float, optional
         Seconds; the results report the share of steps that take longer.
     covariances : bool
-        Whether covariances are computed, and errors judged by them (NEES).
+        Whether to compute covariances, and judge errors by them (NEES).
     cell_timeout : float
         Seconds for one cell.
     folder : str or Path, optional
-        What the paths of models are relative to; the working directory if left out.
+        The paths of models are relative to it; by default to the working directory.
 
     Raises
     ------
@@ -122,18 +118,10 @@ class Study:
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Study:
-        """Read a study from a file, and check it before anything runs.
+        """Read a study from the TOML file ``path``, and check it before anything runs.
 
-        Parameters
-        ----------
-        path : str or Path
-            A TOML file whose keys are the parameters of this class, without ``folder``.
-
-        Raises
-        ------
-        StudyError
-            If it cannot be read, is empty, has an unknown key or a value that does not fit;
-            the text has the file and the line.
+        Its keys are the parameters of this class, without ``folder``. A `StudyError` names the file
+        and the line of what does not fit.
         """
         path = Path(path)
         text = _read(path)

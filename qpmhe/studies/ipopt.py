@@ -26,11 +26,9 @@ Array = NDArray[np.float64]
 class IpoptEstimator:
     """The estimator of Definition def:estimator with Ipopt on the nonlinear program.
 
-    The program is (eq:optiMHE) in the state trajectory, as in `Problem`: with disturbances
-    as variables of their own and the dynamics as constraints, Ipopt took a quarter longer.
-    It is built once for each window length and started at the candidate. An iterate is
-    judged as everywhere else in this package: by its state trajectory, the true cost and
-    the true constraints, against the candidate.
+    The program is (eq:optiMHE) in the state trajectory, as in `Problem`: with disturbances as
+    variables, too, Ipopt took a quarter longer. It is built once for each window length and
+    starts at the candidate. The true cost and the true constraints judge its iterate.
     """
 
     def __init__(

@@ -21,14 +21,11 @@ _FAILURES = (
 
 
 def accuracy(estimates: Array, states: Array, settled: int) -> dict[str, Any]:
-    r"""Root mean square errors of the estimates of x(0), ..., x(T).
+    """Root mean square errors of the estimates of x(0), ..., x(T), arrays of (T + 1, n).
 
-    .. math::
-        \mathrm{rmse} = \Bigl(\frac1{T+1} \sum_{t=0}^{T} |\hat x(t) - x(t)|^2\Bigr)^{1/2}
-
-    Both arrays are (T + 1, n). Returns ``rmse``, ``rmse_settled`` over t >= settled, and
-    ``rmse_states``, ``rmse_settled_states``, lists of the same for each state alone. NaN where
-    no time counts as settled.
+    ``rmse`` is the root of the mean of |x_hat(t) - x(t)|^2 over all t, ``rmse_settled`` over
+    t >= settled, and ``rmse_states``, ``rmse_settled_states`` list the same for each state. NaN
+    where no time counts as settled.
     """
     with np.errstate(all="ignore"):
         squares = (estimates - states) ** 2
@@ -51,8 +48,7 @@ def consistency(estimates: Array, states: Array, covariances: Array) -> float:
     .. math::
         \frac1T \sum_{t=1}^{T} (\hat x(t) - x(t))^\top P(t)^{-1} (\hat x(t) - x(t))
 
-    The covariances P(1), ..., P(T) are (T, n, n); times where one is not finite or singular are
-    left out.
+    Times at which P(t), (T, n, n) in all, is not finite or singular are left out.
     """
     values = []
     for error, covariance in zip(estimates[1:] - states[1:], covariances, strict=True):

@@ -41,17 +41,7 @@ SETTLED = 2.0
 
 @dataclass(frozen=True)
 class PaperStudy:
-    """One record of the example, and estimators on it.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the noise.
-    steps : int
-        Number of measurements.
-    method : str
-        Discretisation, ``euler`` or ``rk4``.
-    """
+    """One record of the example, by ``seed``, ``steps`` and ``method``: ``euler`` or ``rk4``."""
 
     seed: int = 0
     steps: int = 150
@@ -92,24 +82,8 @@ class PaperStudy:
 class Row:
     """Accuracy, time and outcome of one run.
 
-    Attributes
-    ----------
-    label : str
-        What was run.
-    cap : int or None
-        Cap on the iterations inside each QP.
-    states : (T + 1, n) array
-        The estimates.
-    rmse, rmse_settled : float
-        Root mean square of |x(t) - estimate(t)| over all t, and from `SETTLED` on.
-    median_time, high_time : float
-        Median and 95th percentile of the seconds per update.
-    improved : float
-        Share of steps whose estimate is better than the candidate.
-    mean_cost : float
-        Mean of J over all steps.
-    stopped : str
-        What ended the steps, with shares.
+    The RMSEs are over all t and from `SETTLED` on, the times the median and the 95th percentile
+    of the seconds per update, ``mean_cost`` the mean of J, and ``stopped`` what ended the steps.
     """
 
     label: str
@@ -130,12 +104,10 @@ class Reproduction:
 
     Attributes
     ----------
-    study : PaperStudy
-        The record.
-    backend : str
-        Backend of ``rows``.
+    study, backend : PaperStudy, str
+        The record, and the backend of ``rows``.
     rows : list of Row
-        i = 0, 1, 2, 5 and converged; then Ipopt's, where it was asked for.
+        i = 0, 1, 2, 5 and converged; then Ipopt's, where asked for.
     backends : list of Row
         Every installed backend at each cap, with i = 2.
     files : list of Path
@@ -169,16 +141,15 @@ def reproduce(
     Parameters
     ----------
     out : path, optional
-        Folder for the figure (PNG, SVG) and tables (CSV); it is made. Nothing is written if
-        left out.
+        Folder for the figure (PNG, SVG) and tables (CSV); without it nothing is written.
     seed, steps, method
         As of `PaperStudy`.
     backend_name : str
         QP backend of the paper's rows.
     ipopt : bool
-        Whether CasADi with Ipopt, the paper's tool, runs beside.
+        Whether to run CasADi with Ipopt, the paper's tool, as well.
     progress : callable, optional
-        Is given the number of steps that are done and of all steps.
+        Called with the numbers of finished and of all steps.
 
     Returns
     -------
@@ -187,10 +158,8 @@ def reproduce(
 
     Raises
     ------
-    BackendError
-        If the backend is unknown or not installed.
-    InvalidInputError
-        If the folder cannot be made, or CasADi is missing though asked for.
+    BackendError, InvalidInputError
+        If the backend or CasADi is missing, or the folder cannot be made.
     """
     create(backend_name)  # before any work: a wrong name must not cost a minute
     folder = None if out is None else Path(out)

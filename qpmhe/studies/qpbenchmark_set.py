@@ -46,17 +46,7 @@ class MheQpbenchmark(qpbenchmark.TestSet):
 
 
 class ExportedSet(NamedTuple):
-    """What was exported.
-
-    Parameters
-    ----------
-    script : Path
-        The Python file that qpbenchmark takes.
-    problems : list of Path
-        One ``.npz`` file a problem, as ``qpsolvers.Problem.load`` reads it.
-    skipped : dict of Path to str
-        Files that were left out, and why.
-    """
+    """The script that qpbenchmark takes, the ``.npz`` problems, and why files were left out."""
 
     script: Path
     problems: list[Path]
@@ -70,7 +60,7 @@ def export_qpbenchmark(
     matrices: Matrices = "sparse",
     title: str = "QPs of moving horizon estimation",
 ) -> ExportedSet:
-    r"""Write dumped QPs as a test set that the runner of qpbenchmark takes.
+    r"""Write dumped QPs as a test set for the runner of qpbenchmark.
 
     Each becomes
 
@@ -79,19 +69,18 @@ def export_qpbenchmark(
         G x \le h, \quad A x = b, \quad l \le x \le u
 
     without infinite entries: a side of the bounds that is finite throughout is l or u, and one
-    that is finite in part goes to the rows of G. Left out are data that are not finite, on
-    which some solvers hang, and bounds that exclude each other.
+    that is finite in part goes to the rows of G. Data that are not finite, on which some solvers
+    hang, and bounds that exclude each other are left out.
 
     Parameters
     ----------
     files_or_folder : path, or iterable of paths
         Files of `qpmhe.solvers.dump`, and folders of such.
     out : str or path
-        The folder to write; it is made. It gets the file ``mhe_qpbenchmark.py`` and a folder
-        of problems.
+        The folder for ``mhe_qpbenchmark.py`` and a folder of problems.
     matrices : {"sparse", "dense"}
-        What solvers that take both kinds are given. With ``sparse``, solvers without a sparse
-        interface do not take part. The files are dense in any case, of (K n)^2 numbers and more.
+        What solvers that take both kinds get. With ``sparse``, solvers without a sparse interface
+        do not take part. The files are dense in any case, of (K n)^2 numbers and more.
     title : str
         Title of the report.
 
@@ -102,11 +91,9 @@ def export_qpbenchmark(
 
     Raises
     ------
-    InvalidInputError
-        If a file is none of `dump`, nothing can be exported, ``out`` holds problems already, or
-        cannot be written to.
-    OptionError
-        If ``matrices`` is neither.
+    InvalidInputError, OptionError
+        If there is nothing to export, a file is none of `dump`, ``out`` holds problems already or
+        cannot be written, or ``matrices`` is neither.
     """
     if matrices not in get_args(Matrices):
         raise OptionError(f"matrices is {matrices!r}; expected 'sparse' or 'dense'.")

@@ -64,20 +64,20 @@ def run(
 
     A study that is stopped or killed loses no finished cell; the same call resumes it. A cell
     that fails is a row with its reason. Where a cell kills its worker process, it runs once
-    more alone, then with the solver in a process of its own; no other cell is lost.
+    more alone, then with the solver in another process; no other cell is lost.
 
     Parameters
     ----------
     study : Study
         What to run.
     store : Store, str or Path
-        Where results go. Cells of other studies may be in it.
+        Where results go. It may hold cells of other studies.
     jobs : int, optional
-        Cells at a time on this machine; as many as there are cores if left out, one if only
-        times are measured.
+        Cells at a time on this machine; by default the number of cores, or one if only times are
+        measured.
     scheduler : str, optional
-        Address of a Dask scheduler, such as ``tcp://10.0.0.1:8786``, whose workers run the
-        cells in place of this machine; best with one thread each.
+        Address of a Dask scheduler, such as ``tcp://10.0.0.1:8786``, whose workers run the cells
+        instead; best with one thread each.
     progress : bool or rich.console.Console
         Whether (and where) to show a progress bar; on the standard error stream by default.
     retry_failed : bool
@@ -90,10 +90,8 @@ def run(
 
     Raises
     ------
-    StoreError
-        If the store cannot be used, or no longer.
-    StudyError
-        If the cluster cannot be reached, or no longer.
+    StoreError, StudyError
+        If the store, or the cluster, cannot be used, or no longer.
     InvalidInputError
         If an argument does not fit, or a package is missing.
     """

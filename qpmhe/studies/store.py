@@ -87,10 +87,8 @@ _REMEDIES = {
 class Store:
     """A file of results, which `run` writes and everybody may read meanwhile.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file. It need not exist until something is read.
+    ``path`` is the file, which need not exist until something is read. Reading raises `StoreError`
+    where there is no store, or none that can be read.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -102,30 +100,20 @@ class Store:
         return f"Store({str(self.path)!r})"
 
     def frame(self) -> DataFrame:
-        """All cells, one row each, in the order of their keys' first storing.
+        """All cells as a pandas.DataFrame, one row each, in the order of their keys' first storing.
 
-        Returns
-        -------
-        pandas.DataFrame
-            With the columns
+        Its columns are
 
-            - key, model, backend, qps (NA: to convergence), solver_iterations (NA: no cap),
-              horizon, start, seed, steps: the cell;
-            - outcome ("done", "failed") and reason;
-            - rmse, rmse_settled, rmse_states, rmse_settled_states, nees, cost_ratio,
-              improved, kept, fallback, reasons, cap_hits, qps_mean, solver_iterations_mean:
-              see `qpmhe.studies.metrics`;
-            - time_median, time_p95, time_p99, time_max [s], late (share of steps over the
-              last study's deadline), times (seconds of each step, None where not measured),
-              shared (whether other cells ran meanwhile);
-            - environment (index into ``meta()["environments"]``) and finished (UTC).
-
-        Raises
-        ------
-        StoreError
-            If there is no such store, or it cannot be read.
-        InvalidInputError
-            If pandas is not installed.
+        - key, model, backend, qps (NA: to convergence), solver_iterations (NA: no cap), horizon,
+          start, seed, steps: the cell;
+        - outcome ("done", "failed") and reason;
+        - rmse, rmse_settled, rmse_states, rmse_settled_states, nees, cost_ratio, improved, kept,
+          fallback, reasons, cap_hits, qps_mean, solver_iterations_mean: see
+          `qpmhe.studies.metrics`;
+        - time_median, time_p95, time_p99, time_max [s], late (share of steps over the last study's
+          deadline), times (seconds of each step, None where not measured), shared (whether other
+          cells ran meanwhile);
+        - environment (index into ``meta()["environments"]``) and finished (UTC).
         """
         pandas = need("pandas", "a data frame of results")
         names = [name for name in COLUMNS if name != "parts"]
@@ -148,17 +136,9 @@ class Store:
     def meta(self) -> dict[str, Any]:
         """Where and with which settings the results were computed.
 
-        Returns
-        -------
-        dict
-            ``study``: settings of the last study; ``studies``: of all, each with the time it
-            ``started``; ``environments``: list of dicts, see
-            `qpmhe.studies.environment.environment`; ``schema``: version of the tables.
-
-        Raises
-        ------
-        StoreError
-            If there is no such store, or it cannot be read.
+        ``study`` has the settings of the last study, ``studies`` the settings of all with the time
+        each ``started``, ``environments`` what `qpmhe.studies.environment` found, ``schema`` the
+        version of the tables.
         """
         with _reading(self.path) as connection:
             studies = [
@@ -179,23 +159,10 @@ class Store:
         }
 
     def trajectory(self, key: str) -> dict[str, Any] | None:
-        """The run of a cell, which is kept for the first seed of each configuration.
+        """The run of the cell ``key``, which is kept for the first seed of each configuration.
 
-        Parameters
-        ----------
-        key : str
-            The cell's.
-
-        Returns
-        -------
-        dict or None
-            ``times`` (T + 1,), ``states`` and ``estimates`` (T + 1, n), ``labels``,
-            ``title``, ``time_unit``; None where none was kept.
-
-        Raises
-        ------
-        StoreError
-            If there is no such store, or it cannot be read.
+        A dict of ``times`` (T + 1,), ``states`` and ``estimates`` (T + 1, n), ``labels``, ``title``
+        and ``time_unit``; None where none was kept.
         """
         with _reading(self.path) as connection:
             found = connection.execute(
@@ -215,12 +182,10 @@ class Store:
 
     @contextmanager
     def writing(self) -> Iterator[Writer]:
-        """The right to write, for one process at a time; the file is made if it does not exist.
+        """Open for writing, one process at a time; the file is made if it does not exist.
 
-        Raises
-        ------
-        StoreError
-            If it is no store of this version, damaged, read-only, or another study writes.
+        Raises `StoreError` if it is no store of this version, damaged, read-only, or another study
+        writes.
         """
         _check_file(self.path)
         with (
@@ -287,31 +252,11 @@ class Writer:
 
 
 def export(store: Store | str | Path, path: str | Path) -> Path:
-    """Write all cells of a store into a table.
+    """Write all cells of a store into the file ``path``, ``.csv`` or ``.parquet``, and return it.
 
-    In CSV, lists and ``reasons`` are JSON texts; in Parquet, lists are lists and ``reasons``
-    is a JSON text.
-
-    Parameters
-    ----------
-    store : Store, str or Path
-        What is exported.
-    path : str or Path
-        The file, ``.csv`` or ``.parquet``; it is replaced if it exists.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    OptionError
-        If the file's name ends differently.
-    StoreError
-        If the store cannot be read.
-    InvalidInputError
-        If the file cannot be written, or a package is missing.
+    In CSV, lists and ``reasons`` are JSON texts; in Parquet, only ``reasons`` is. An existing file
+    is replaced. Raises `OptionError` if the name ends differently, `StoreError` if the store
+    cannot be read, `InvalidInputError` if the file cannot be written or a package is missing.
     """
     target = Path(path)
     if target.suffix not in (".csv", ".parquet"):
@@ -338,7 +283,6 @@ def _text(value: Any) -> str | None:
 
 
 def _encoded(name: str, value: Any) -> Any:
-    """A value as SQLite keeps it."""
     if value is None:
         return None
     if name in _JSON:
@@ -349,7 +293,6 @@ def _encoded(name: str, value: Any) -> Any:
 
 
 def _decoded(name: str, value: Any) -> Any:
-    """A value as the data frame has it."""
     if value is None:
         return float("nan") if name in _REAL else None
     if name in _JSON:

@@ -53,8 +53,7 @@ def summarise(frame: DataFrame) -> DataFrame:
     Parameters
     ----------
     frame : pandas.DataFrame
-        One row a cell, with the columns of the store: `CONFIGURATION`, ``seed``, ``steps``,
-        ``outcome``, ``reasons``, ``shared``, and the metrics.
+        One row a cell, with the columns of the store.
 
     Returns
     -------
@@ -64,15 +63,15 @@ def summarise(frame: DataFrame) -> DataFrame:
         - of `CONFIGURATION`; ``seeds`` (cells), ``failures`` (cells that failed), ``shared``
           (whether any time was taken on shared cores);
         - of `METRICS`: the mean over finished cells, with ``_low`` and ``_high``. Times in
-          seconds per step. ``failed_steps`` is the share of steps where solver or model
-          failed. ``rmse_excess`` is ``rmse`` relative to that of the most accurate
-          configuration of the same problem (`PROBLEM`), minus 1, taken seed by seed, so that
-          what the seeds have in common cancels;
+          seconds per step. ``failed_steps`` is the share of steps where solver or model failed.
+          ``rmse_excess`` is ``rmse`` relative to the most accurate configuration of the same
+          problem (`PROBLEM`), minus 1, seed by seed, so that what the seeds have in common
+          cancels;
         - ``rmse_states`` and ``rmse_settled_states``: lists, a value a state;
         - ``reasons``: dict, share of the steps with each flag of `qpmhe.Status`;
-        - ``pareto``: whether no configuration of the same problem is faster
-          (``time_median``) and more accurate (``rmse``, where a difference below `TOLERANCE`
-          is none). Only configurations without failed cells take part.
+        - ``pareto``: whether no configuration of the same problem is faster (``time_median``)
+          and more accurate (``rmse``, by more than `TOLERANCE`). Only configurations without
+          failed cells take part.
 
     Raises
     ------

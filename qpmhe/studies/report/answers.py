@@ -32,8 +32,7 @@ class Answer:
 class Case:
     """The configurations that can be compared: those of one model, horizon and record length.
 
-    ``key`` names files and links, ``title`` is for reading, and ``summary`` has their rows of
-    `qpmhe.studies.summarise`.
+    ``key`` names files and links.
     """
 
     key: str
@@ -158,11 +157,10 @@ def cases(summary: DataFrame) -> list[Case]:
 
 
 def chosen(summary: DataFrame) -> tuple[Any | None, Any] | None:
-    """The fastest configuration near the best RMSE, and the most accurate one.
+    """The fastest configuration near the best RMSE, and the most accurate, of equals the fastest.
 
-    Where several have the best RMSE within `qpmhe.studies.summary.TOLERANCE`, the fastest of
-    these is taken. The first is None where there are no times; all is None where no
-    configuration finished all its runs.
+    The first is None where there are no times; all is None where no configuration finished all
+    its runs.
     """
     rows = summary[(summary["failures"] == 0) & np.isfinite(summary["rmse"].astype(float))]
     if rows.empty:

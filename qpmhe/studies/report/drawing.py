@@ -56,17 +56,10 @@ def styles(backends: Iterable[str]) -> dict[str, Style]:
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis, whose ticks follow from its kind and the values on it.
+    """An axis, whose ticks follow from its kind and its values, or categories.
 
-    Attributes
-    ----------
-    title : str
-        What it shows.
-    kind : str
-        "linear"; "time", logarithmic seconds; "error", logarithmic where values differ much;
-        "ratio", logarithmic from 1; "share"; "category".
-    values : sequence
-        All values, or all categories.
+    Kinds: "linear"; "time", logarithmic seconds; "error", logarithmic where values differ much;
+    "ratio", logarithmic from 1; "share"; "category".
     """
 
     title: str
@@ -98,28 +91,13 @@ class Axis:
 
 @dataclass(frozen=True)
 class Mark:
-    """A series.
+    """A series in the style of its backend.
 
-    Attributes
-    ----------
-    kind : str
-        "points", "line" (with markers), "level" (a horizontal line), "steps", "curve" (a plain
-        line), "box" (one box of quartiles; x has the quantiles 0.01, 0.25, 0.5, 0.75, 0.99, 1)
-        or "front" (ringed points joined by steps).
-    x, y : sequence
-        Values, or categories.
-    backend : str
-        Whose style it has.
-    hover : sequence of str
-        Text of each point.
-    bars : pair of sequences, optional
-        Length of the error bars below and above.
-    sizes, hollow, pale : sequences
-        Of each point: radius in points, whether only its outline is drawn, whether it is faint.
-    meta : mapping
-        What the page's menus and the columns of a file choose by.
-    label : str
-        Its entry in a legend of its own.
+    Kinds: "points", "line" (with markers), "level" (a horizontal line), "steps", "curve" (a plain
+    line), "box" (one box of quartiles; x has the quantiles 0.01, 0.25, 0.5, 0.75, 0.99, 1) and
+    "front" (ringed points joined by steps). ``hover``, ``sizes`` (radius in points), ``hollow``
+    and ``pale`` are of each point, ``bars`` the lengths of error bars below and above. The page's
+    menus and the columns of a file choose by ``meta``; ``label`` is for a legend.
     """
 
     kind: str
@@ -146,20 +124,10 @@ class Panel:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Panels one above the other.
+    """Panels one above the other; ``height`` in pixels, ``deadline`` a vertical line.
 
-    Attributes
-    ----------
-    panels : list of Panel
-        From above.
-    height : int
-        Pixels on the page.
-    deadline : float, optional
-        A vertical line.
-    note : str
-        What stands below the figure in a file, in place of the axes' titles.
-    gap : float
-        Between two panels, relative to their height.
+    ``note`` stands below the figure in a file, in place of the axes' titles; ``gap`` is between
+    two panels, relative to their height.
     """
 
     panels: list[Panel]

@@ -186,15 +186,7 @@ class Profile:
 
     :math:`\rho_s(\tau) = |\{p : t_{p,s} \le \tau \min_{s'} t_{p,s'}\}| / |P|`
     (Dolan and More, Mathematical Programming 91, 2002, doi 10.1007/s101070100263).
-
-    Attributes
-    ----------
-    backend, words : str
-        The solver, and its configuration.
-    ratios : (k,) array
-        Sorted time ratios of the k problems that it solves.
-    problems : int
-        |P|.
+    ``ratios`` are sorted, of the problems that it solves; ``problems`` is |P|.
     """
 
     backend: str
@@ -212,10 +204,10 @@ class Profile:
 def profiles(frame: DataFrame) -> list[Profile]:
     """A profile for each backend over the problems: model, horizon, length of the record, and seed.
 
-    A backend is represented by the one of its configurations that solves most problems, of
-    several such by the one with the lowest geometric mean time. Solved means: the run
-    finished and its J is on average within `SOLVED` of the converged one. The time is the
-    median per step. There are none where fewer than two problems or no times are there.
+    A backend is represented by its configuration that solves most problems, of several such by
+    the one with the lowest geometric mean time (median per step). Solved means: the run finished
+    and its J is on average within `SOLVED` of the converged one. There are none without times or
+    with fewer than two problems.
     """
     problems = [*PROBLEM, "seed"]
     cells = frame[frame["backend"] != "observer"]

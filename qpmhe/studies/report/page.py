@@ -86,7 +86,7 @@ def write_report(
 
     Parameters
     ----------
-    source : Source, path or (frame, meta)
+    source : Store, path or (frame, meta)
         A store or its file; or its frame and meta alone, then without trajectories.
     out : path
         The folder; it is made.
@@ -94,14 +94,13 @@ def write_report(
     Returns
     -------
     Path
-        The HTML file. It holds all that it shows and asks for nothing over the network.
+        The HTML file, which needs nothing from the network.
 
     Raises
     ------
-    StoreError
-        If the store cannot be read.
-    InvalidInputError
-        If there is no finished cell, the folder cannot be made, or a library is missing.
+    StoreError, InvalidInputError
+        If the store cannot be read or has no finished cell, the folder cannot be made, or a
+        library is missing.
     """
     absent = [name for name in ("pandas", "plotly", "itables", "jinja2") if not find_spec(name)]
     if absent:
