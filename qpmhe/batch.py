@@ -73,15 +73,8 @@ class BatchEstimator:
     """
 
     def __init__(
-        self,
-        system: System,
-        observer: Observer,
-        cost: Cost,
-        *,
-        members: int,
-        initial_states: ArrayLike,
-        threads: int | None = None,
-        **options: Any,
+        self, system: System, observer: Observer, cost: Cost, *, members: int,
+        initial_states: ArrayLike, threads: int | None = None, **options: Any,
     ) -> None:
         if "initial_state" in options:
             raise UnknownOptionError("unknown option 'initial_state'; expected initial_states.")

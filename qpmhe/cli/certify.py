@@ -24,14 +24,8 @@ __all__ = ["certify"]
 
 
 def certify(
-    console: Console,
-    model: str,
-    box: str | None = None,
-    horizon: str | None = None,
-    report: Path | None = None,
-    *,
-    input_box: str | None = None,
-    seed: int = 0,
+    console: Console, model: str, box: str | None = None, horizon: str | None = None,
+    report: Path | None = None, *, input_box: str | None = None, seed: int = 0,
     seconds: float = 60.0,
 ) -> bool:
     """Certify a model with `qpmhe.certificates.certify_model`, and show the result."""

@@ -45,13 +45,8 @@ class Replay(NamedTuple):
 
 
 def run(
-    console: Console,
-    paths: Sequence[Path],
-    backends: Sequence[str] = (),
-    *,
-    max_iterations: int | None = None,
-    tolerance: float | None = None,
-    every: bool = False,
+    console: Console, paths: Sequence[Path], backends: Sequence[str] = (), *,
+    max_iterations: int | None = None, tolerance: float | None = None, every: bool = False,
 ) -> bool:
     """Solve each QP of the files with each backend, and print a table for each file."""
     changes: dict[str, int | float] = {}

@@ -30,10 +30,7 @@ _LONGEST_NAME = 60
 
 
 def write(
-    estimator: MovingHorizonEstimator,
-    directory: str | PathLike[str],
-    *,
-    name: str = "mhe",
+    estimator: MovingHorizonEstimator, directory: str | PathLike[str], *, name: str = "mhe",
     real: str = "double",
 ) -> tuple[Path, Path]:
     """Write the estimator as a C99 header and source that need nothing but libm.

@@ -194,8 +194,7 @@ def _allowed(name: str, xs: Array, found: dict[str, Array]) -> Array:
 
 
 def model_fault(
-    interpreter: Interpreter,
-    maker: Callable[[bool, int, tuple[str, ...]], Buffers],
+    interpreter: Interpreter, maker: Callable[[bool, int, tuple[str, ...]], Buffers],
     batches: Sequence[Batch],
 ) -> str:
     """Where a model's machine code differs from the interpreter; empty where it does not."""
@@ -442,8 +441,7 @@ class _Judged:
 
     def __init__(
         self, xs: Array, found: dict[str, Array], ys: Array, weights: Array, gain: Array,
-        disturbance: Array, prior_weight: Array, prior: Array, discount: float,
-        is_candidate: bool,
+        disturbance: Array, prior_weight: Array, prior: Array, discount: float, is_candidate: bool,
     ) -> None:
         self.xs, self._f, self.observed = xs, found["f"], np.isfinite(ys)
         count = len(ys)

@@ -72,9 +72,7 @@ def _processor() -> str:
 
 
 def compiled_library(
-    files: dict[str, str],
-    main: str,
-    key: str | None = None,
+    files: dict[str, str], main: str, key: str | None = None,
     check: Callable[[ctypes.CDLL], str] | None = None,
 ) -> ctypes.CDLL:
     """Compile C source and load it; a library made before is loaded from the cache.

@@ -65,11 +65,7 @@ class CompiledEngine:
     name = "compiled"
 
     def __init__(
-        self,
-        system: System,
-        observer: Observer,
-        cost: Cost,
-        settings: Settings,
+        self, system: System, observer: Observer, cost: Cost, settings: Settings,
         initial_state: Array,
     ) -> None:
         self._library = library = EstimatorLibrary(system, observer, cost, settings)

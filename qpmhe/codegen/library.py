@@ -104,11 +104,7 @@ def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:
 
 
 def generated(
-    system: System,
-    observer: Observer,
-    cost: Cost,
-    settings: Settings,
-    name: str = "mhe",
+    system: System, observer: Observer, cost: Cost, settings: Settings, name: str = "mhe",
     real: str = "double",
 ) -> tuple[dict[str, str], str, Layout, NDArray[Any]]:
     """Source of an estimator, its structure, its layout and its settings."""

@@ -31,12 +31,7 @@ class CompiledMembers:
     """The generated C step for each member of a batch."""
 
     def __init__(
-        self,
-        system: System,
-        observer: Observer,
-        cost: Cost,
-        settings: Settings,
-        states: Array,
+        self, system: System, observer: Observer, cost: Cost, settings: Settings, states: Array,
         threads: int | None,
     ) -> None:
         self._library = library = EstimatorLibrary(system, observer, cost, settings)

@@ -100,8 +100,7 @@ class CsvTable:
     unit = "line"
 
     def __init__(
-        self, stream: BinaryIO, name: str, separator: str | None, encoding: str,
-        total: int | None,
+        self, stream: BinaryIO, name: str, separator: str | None, encoding: str, total: int | None
     ) -> None:
         self._stream, self.name, self._encoding, self.total = stream, name, encoding, total
         self._separator = _SEPARATOR_NAMES.get(separator or "", separator)

@@ -32,17 +32,9 @@ class IpoptEstimator:
     """
 
     def __init__(
-        self,
-        system: System,
-        observer: Observer,
-        cost: QuadraticCost,
-        *,
-        f: Callable[[Any], Any],
-        h: Callable[[Any], Any],
-        horizon: int,
-        initial_state: Array,
-        max_iterations: int | None = None,
-        tolerance: float = 1e-8,
+        self, system: System, observer: Observer, cost: QuadraticCost, *, f: Callable[[Any], Any],
+        h: Callable[[Any], Any], horizon: int, initial_state: Array,
+        max_iterations: int | None = None, tolerance: float = 1e-8,
     ) -> None:
         try:
             import casadi

@@ -55,9 +55,7 @@ class ExportedSet(NamedTuple):
 
 def export_qpbenchmark(
     files_or_folder: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-    out: str | os.PathLike[str],
-    *,
-    matrices: Matrices = "sparse",
+    out: str | os.PathLike[str], *, matrices: Matrices = "sparse",
     title: str = "QPs of moving horizon estimation",
 ) -> ExportedSet:
     r"""Write dumped QPs as a test set for the runner of qpbenchmark.

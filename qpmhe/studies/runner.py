@@ -52,13 +52,8 @@ _SIGNALS = re.compile(r"exit codes of the workers are \{(.*?)\}")
 
 
 def run(
-    study: Study,
-    store: Store | str | Path,
-    *,
-    jobs: int | None = None,
-    scheduler: str | None = None,
-    progress: bool | Console = True,
-    retry_failed: bool = False,
+    study: Study, store: Store | str | Path, *, jobs: int | None = None,
+    scheduler: str | None = None, progress: bool | Console = True, retry_failed: bool = False,
 ) -> Store:
     """Run the cells of a study that the store does not have, and store each as it ends.
 

@@ -266,10 +266,7 @@ def _faint(color: str, alpha: float) -> str:
 
 
 def static(
-    drawing: Drawing,
-    drawn: Mapping[str, Style],
-    size: tuple[float, float],
-    title: str,
+    drawing: Drawing, drawn: Mapping[str, Style], size: tuple[float, float], title: str,
     columns: Sequence[tuple[str, Mapping[str, Any]]] = (("", {}),),
 ) -> Figure:
     """The figure with matplotlib: a row for each panel, a column for each choice of marks."""

@@ -304,10 +304,7 @@ def _cells(frame: DataFrame, case: Case) -> DataFrame:
 
 
 def _page(
-    frame: DataFrame,
-    meta: Mapping[str, Any],
-    parts: list[Part],
-    drawn: Mapping[str, Style],
+    frame: DataFrame, meta: Mapping[str, Any], parts: list[Part], drawn: Mapping[str, Style],
     profile: list[Profile],
 ) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
