@@ -21,11 +21,8 @@ from .reproduce import reproduce
 __all__ = ["app", "main"]
 
 app = typer.Typer(
-    name="qpmhe",
-    help="Suboptimal moving horizon estimation by sequences of convex QPs.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
+    name="qpmhe", help="Suboptimal moving horizon estimation by sequences of convex QPs.",
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
 )
 
 

@@ -88,12 +88,12 @@ def show_report(console: Console, store: Path, out: Path) -> None:
     console.print(f"wrote {page}, and its figures as PNG and SVG beside it", highlight=False)
 
 
-def show(console: Console, summary: DataFrame, *, every: bool = False) -> None:
+def show(console: Console, summary: DataFrame) -> None:
     """Print the answers and a table for each model and horizon, the best of a column marked.
 
-    What was asked for (a deadline, covariances) is always shown, further columns as there is
-    room. Of more than 40 configurations, those of the Pareto front, of the answers, and the
-    fastest near the best of each backend are shown, or all with ``every``.
+    Deadline and NEES are always shown where asked for, further columns as there is room. Of
+    more than 40 configurations, only the Pareto front, the answers, and each backend's fastest
+    near its best are shown.
     """
     for case in cases(summary):
         console.print()
@@ -107,9 +107,9 @@ def show(console: Console, summary: DataFrame, *, every: bool = False) -> None:
         chosen_ones = filled & set(_ALWAYS)
         for name in _THEN:
             more = chosen_ones | {name}
-            if name in filled and _width(console, _table(case, rows, every, more)) <= console.width:
+            if name in filled and _width(console, _table(case, rows, more)) <= console.width:
                 chosen_ones = more
-        console.print(_table(case, rows, every, chosen_ones, filled - chosen_ones))
+        console.print(_table(case, rows, chosen_ones, filled - chosen_ones))
 
 
 def _width(console: Console, table: Table) -> int:
@@ -118,14 +118,14 @@ def _width(console: Console, table: Table) -> int:
 
 
 def _table(
-    case: Case, rows: DataFrame, every: bool, names: Set[str], absent: Set[str] = frozenset()
+    case: Case, rows: DataFrame, names: Set[str], absent: Set[str] = frozenset()
 ) -> Table:
     columns = [one for one in _COLUMNS if one.name in names]
     best = {
         one.name: _best(rows.loc[case.whole.index], one.name, one.less) for one in columns
     }
     drawn, caption = rows, "*: the best, of equals the fastest. front: Pareto front."
-    if not every and len(rows) > _MOST_ROWS:
+    if len(rows) > _MOST_ROWS:
         drawn = rows.loc[sorted(_selection(case) | {one for one in best.values() if one >= 0})]
         caption = (
             f"{len(drawn)} of {len(rows)} configurations: the Pareto front, the best of each "

@@ -48,10 +48,8 @@ def show(console: Console) -> None:
     for entry in backends():
         version = entry.version if entry.available else "none"
         table.add_row(
-            entry.name,
-            "own" if entry.module is None else version,
-            _SHORT.get(entry.method, entry.method),
-            _SHORT.get(entry.matrices, entry.matrices),
+            entry.name, "own" if entry.module is None else version,
+            _SHORT.get(entry.method, entry.method), _SHORT.get(entry.matrices, entry.matrices),
             *("x" if getattr(entry, flag) else "-" for flag in _FLAGS.values()),
             style=None if entry.available else "dim",
         )

@@ -32,9 +32,7 @@ def template(name: str) -> str:
 def renamed(text: str, name: str) -> str:
     """The text with the prefix ``mhe`` of all names replaced."""
     return re.sub(
-        r"\b(?:mhe|MHE)_",
-        lambda found: f"{name if found[0] == 'mhe_' else name.upper()}_",
-        text,
+        r"\b(?:mhe|MHE)_", lambda found: f"{name if found[0] == 'mhe_' else name.upper()}_", text
     )
 
 

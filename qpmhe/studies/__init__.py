@@ -10,17 +10,6 @@ from .store import Store, export
 from .summary import summarise
 
 __all__ = [
-    "ExportedSet",
-    "PaperStudy",
-    "Reproduction",
-    "Store",
-    "StoreError",
-    "Study",
-    "StudyError",
-    "export",
-    "export_qpbenchmark",
-    "reproduce",
-    "run",
-    "summarise",
-    "write_report",
+    "ExportedSet", "PaperStudy", "Reproduction", "Store", "StoreError", "Study", "StudyError",
+    "export", "export_qpbenchmark", "reproduce", "run", "summarise", "write_report",
 ]

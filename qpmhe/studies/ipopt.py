@@ -81,17 +81,10 @@ class IpoptEstimator:
         improved = math.isfinite(trial.cost) and trial.cost < candidate.cost * (1 - 1e-12)
         best = trial if improved else candidate
         estimate = Estimate(
-            window.time - 1,
-            best.trajectory.copy(),
-            best.residuals.copy(),
-            best.cost,
-            window.candidate.copy(),
-            candidate.cost,
-            Status.IMPROVED if improved else Status.CANDIDATE,
-            str(solve.stats()["return_status"]),
-            0,
-            int(solve.stats()["iter_count"]),
-            solve_time,
+            window.time - 1, best.trajectory.copy(), best.residuals.copy(), best.cost,
+            window.candidate.copy(), candidate.cost,
+            Status.IMPROVED if improved else Status.CANDIDATE, str(solve.stats()["return_status"]),
+            0, int(solve.stats()["iter_count"]), solve_time,
         )
         estimate.step_time = perf_counter() - began
         return estimate

@@ -24,6 +24,7 @@ from ..models.batch_reactor import batch_reactor, casadi_output, casadi_rate
 from ..models.scenario import Record
 from ..plots import save, trajectories
 from .ipopt import IpoptEstimator
+from .metrics import accuracy, timing
 
 __all__ = ["SETTLED", "PaperStudy", "Reproduction", "Row", "reproduce"]
 
@@ -204,18 +205,11 @@ def reproduce(
 
 
 def _row(label: str, cap: int | None, run: Run, record: Record, dt: float) -> Row:
-    squares = np.sum((run.states - record.states) ** 2, axis=1)
-    late = squares[round(SETTLED / dt) :]
+    errors, times = accuracy(run.states, record.states, round(SETTLED / dt)), timing(run.times)
     return Row(
-        label=label,
-        cap=cap,
-        states=run.states,
-        rmse=float(np.sqrt(squares.mean())),
-        rmse_settled=float(np.sqrt(late.mean())) if late.size else float("nan"),
-        median_time=float(np.median(run.times)),
-        high_time=float(np.percentile(run.times, 95)),
-        improved=run.share(Status.IMPROVED),
-        mean_cost=float(run.costs.mean()),
+        label, cap, run.states, rmse=errors["rmse"], rmse_settled=errors["rmse_settled"],
+        median_time=times["time_median"], high_time=times["time_p95"],
+        improved=run.share(Status.IMPROVED), mean_cost=float(run.costs.mean()),
         stopped=_stopped(run),
     )
 

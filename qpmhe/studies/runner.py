@@ -20,7 +20,7 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from qpmhe_solvers import backend
 
@@ -112,28 +112,6 @@ def run(
     return target
 
 
-class Workers(Protocol):
-    """Where cells run."""
-
-    jobs: int
-
-    def submit(self, task: Task) -> Future[Result]:
-        """Send a task."""
-        ...
-
-    def ready(self) -> bool:
-        """Whether there are workers at all."""
-        ...
-
-    def restart(self) -> None:
-        """Replace workers that may have died."""
-        ...
-
-    def close(self) -> None:
-        """Leave nothing running."""
-        ...
-
-
 class _Processes:
     """Processes of this machine, each with one thread."""
 
@@ -155,6 +133,7 @@ class _Processes:
         return True
 
     def restart(self) -> None:
+        """Replace workers that may have died."""
         if self._executor is not None:
             self._executor.shutdown(wait=True, kill_workers=True)
             self._executor = None
@@ -234,13 +213,13 @@ def _identity(distributed: Any, address: str, seconds: float) -> dict[str, Any]:
     return answer if isinstance(answer, dict) else {}
 
 
-def _workers(study: Study, jobs: int | None, scheduler: str | None) -> Workers:
+def _workers(study: Study, jobs: int | None, scheduler: str | None) -> _Processes | _Cluster:
     if scheduler is not None:
         return _Cluster(scheduler)
     return _Processes(jobs or (1 if study.measure == "time" else environment()["cores"]))
 
 
-def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
+def _results(workers: _Processes | _Cluster, tasks: Iterable[Task]) -> Iterator[Result]:
     """The row of each task, in the order in which they end."""
     waiting, suspects = deque(tasks), deque[Task]()
     sent: dict[Future[Result], Task] = {}
@@ -282,7 +261,7 @@ def _results(workers: Workers, tasks: Iterable[Task]) -> Iterator[Result]:
 
 
 def _answer(
-    workers: Workers, task: Task, future: Future[Result], start: float | None
+    workers: _Processes | _Cluster, task: Task, future: Future[Result], start: float | None
 ) -> Result | Exception:
     """The row of a task that ended, or the error where the process died that may have run it."""
     try:
@@ -299,7 +278,7 @@ def _answer(
         return error
 
 
-def _again(workers: Workers, task: Task) -> Result:
+def _again(workers: _Processes | _Cluster, task: Task) -> Result:
     """Run a cell alone at which a process may have died, at last with its solver isolated."""
     words = ""
     for isolated in (False, True) if task.cell.backend != OBSERVER else (False,):

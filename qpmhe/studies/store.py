@@ -206,14 +206,10 @@ class Writer:
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self._path, self._connection = path, connection
 
-    @contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with _explained(self._path), _transaction(self._connection):
-            yield self._connection
-
     def begin(self, settings: dict[str, Any], fingerprints: dict[str, str]) -> None:
         """Note that a study begins, with its settings and the fingerprints of its models' files."""
-        with self._transaction() as connection:
+        connection = self._connection
+        with _explained(self._path), _transaction(connection):
             known = dict(connection.execute("SELECT name, fingerprint FROM models").fetchall())
             for name, fingerprint in fingerprints.items():
                 if known.get(name, fingerprint) != fingerprint:
@@ -239,7 +235,8 @@ class Writer:
 
     def put(self, result: dict[str, Any]) -> None:
         """Store what `qpmhe.studies.cell.compute` gives."""
-        with self._transaction() as connection:
+        connection = self._connection
+        with _explained(self._path), _transaction(connection):
             row = {name: result.get(name) for name in COLUMNS}
             row["environment"] = _environment(connection, result["environment"])
             row["finished"] = _now()

@@ -14,7 +14,9 @@ from ..errors import InvalidInputError, ShapeError
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
-__all__ = ["CONFIGURATION", "METRICS", "PROBLEM", "TOLERANCE", "pareto_front", "summarise"]
+__all__ = [
+    "CONFIGURATION", "METRICS", "PROBLEM", "TOLERANCE", "cells_of", "pareto_front", "summarise",
+]
 
 #: What distinguishes configurations.
 CONFIGURATION = (
@@ -163,13 +165,14 @@ def _excess(done: DataFrame, summary: DataFrame) -> Series:
         ranked = rows.sort_values(["failures", "rmse"])
         if ranked.empty or not np.isfinite(ranked["rmse"].iloc[0]):
             continue
-        best = _cells_of(done, ranked.iloc[0], CONFIGURATION).groupby("seed")["rmse"].mean()
-        mine = _cells_of(done, ranked.iloc[0], PROBLEM)
+        best = cells_of(done, ranked.iloc[0], CONFIGURATION).groupby("seed")["rmse"].mean()
+        mine = cells_of(done, ranked.iloc[0], PROBLEM)
         excess[mine.index] = mine["rmse"] / mine["seed"].map(best).astype(float) - 1.0
     return excess
 
 
-def _cells_of(cells: DataFrame, row: Any, keys: tuple[str, ...]) -> DataFrame:
+def cells_of(cells: DataFrame, row: Any, keys: tuple[str, ...]) -> DataFrame:
+    """The cells that have the same values as a row of the summary."""
     import pandas as pd
 
     chosen = np.ones(len(cells), dtype=bool)

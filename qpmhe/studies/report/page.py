@@ -8,14 +8,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...errors import InvalidInputError
 from ...plots import save, trajectories
 from ..store import Store
-from ..summary import TOLERANCE, pareto_front, summarise
+from ..summary import PROBLEM, TOLERANCE, cells_of, pareto_front, summarise
 from . import figures
 from .answers import Case, cases, chosen, failures, limitations
 from .drawing import Axis, Drawing, Mark, Panel, Style, interactive, static, styles
@@ -25,7 +25,6 @@ from .words import (
     cap_words,
     configuration_words,
     listed,
-    missing,
     percent,
     qps_heading,
     qps_words,
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-__all__ = ["Source", "write_report"]
+__all__ = ["write_report"]
 
 #: States that the page draws, and a file.
 MOST_STATES, _MOST_STATIC = 12, 6
@@ -63,24 +62,8 @@ _ROLES = {
 }
 
 
-class Source(Protocol):
-    """What a report is made of; `qpmhe.studies.Store` is one."""
-
-    def frame(self) -> DataFrame:
-        """One row a cell."""
-        ...
-
-    def meta(self) -> Mapping[str, Any]:
-        """``study`` (settings), ``environments`` (list of mappings)."""
-        ...
-
-    def trajectory(self, key: str) -> Mapping[str, Any] | None:
-        """Times, states, estimates, labels, title and time_unit of a cell; None if not kept."""
-        ...
-
-
 def write_report(
-    source: Source | str | Path | tuple[DataFrame, Mapping[str, Any]], out: str | Path
+    source: Store | str | Path | tuple[DataFrame, Mapping[str, Any]], out: str | Path
 ) -> Path:
     """Write ``index.html``, figures as PNG and SVG, and ``summary.csv`` into a folder.
 
@@ -120,8 +103,9 @@ def write_report(
     except OSError as error:
         raise InvalidInputError(f"cannot make the folder {folder}: {error.strerror}.") from error
     summary = summarise(frame)
+    deadline = (meta.get("study") or {}).get("deadline")
     found = [
-        Part(case, _cells(frame, case), (meta.get("study") or {}).get("deadline"))
+        Part(case, cells_of(frame, case.summary.iloc[0], PROBLEM), deadline)
         for case in cases(summary)
     ]
     if not isinstance(source, tuple):
@@ -158,7 +142,7 @@ class Part:
     runs: Runs = field(default_factory=Runs)
 
 
-def choose_runs(source: Source, cells: DataFrame, case: Case, most: int) -> Runs:
+def choose_runs(source: Store, cells: DataFrame, case: Case, most: int) -> Runs:
     """The runs of one case: the best configurations' first, up to this many bytes."""
     runs = Runs()
     seed = cells["seed"].min()
@@ -291,16 +275,6 @@ def _run_file(runs: Runs) -> Figure:
         labels, f"time t ({first['time_unit']})",
     )[0].figure
     return figure
-
-
-def _cells(frame: DataFrame, case: Case) -> DataFrame:
-    first = case.summary.iloc[0]
-    same = frame["model"] == first["model"]
-    for name in ("horizon", "steps"):
-        column, value = frame[name], first[name]
-        equal = column.isna() if missing(value) else (column == value).fillna(False)
-        same &= equal.astype(bool)
-    return frame[same]
 
 
 def _page(

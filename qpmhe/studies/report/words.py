@@ -3,22 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 __all__ = [
-    "cap_words",
-    "configuration_words",
-    "listed",
-    "missing",
-    "number",
-    "percent",
-    "qps_heading",
-    "qps_words",
-    "ranked",
-    "seconds",
-    "time_tick",
-    "usual_first",
+    "cap_words", "configuration_words", "listed", "missing", "number", "percent", "qps_heading",
+    "qps_words", "ranked", "seconds", "time_tick", "usual_first",
 ]
 
 USUAL_START = "candidate"
@@ -56,12 +46,8 @@ def configuration_words(row: Any) -> str:
     backend = str(row["backend"])
     if backend == "observer":
         return backend
-    qps, cap = row["qps"], row["solver_iterations"]
-    parts = [backend]
-    if missing(qps):
-        parts.append("QPs to convergence")
-    else:
-        parts.append(f"{int(qps)} QP{'' if int(qps) == 1 else 's'} per sample")
+    qps, cap = qps_words(row["qps"]), row["solver_iterations"]
+    parts = [backend, qps_heading(qps) + (" per sample" if qps != "converged" else "")]
     if not missing(cap):
         parts.append(f"cap {int(cap)}")
     if row["start"] != USUAL_START:
@@ -87,22 +73,20 @@ def number(value: Any, digits: int = 3) -> str:
 
 def seconds(value: Any) -> str:
     """A duration in s, ms or us with three significant digits."""
-    if missing(value):
-        return "–"  # noqa: RUF001
-    x = float(value)
+    return "–" if missing(value) else _with_unit(float(value), number)  # noqa: RUF001
+
+
+def time_tick(value: float) -> str:
+    """A round duration for an axis, without zeros behind the point."""
+    return _with_unit(value, "{:.3g}".format)
+
+
+def _with_unit(value: float, words: Callable[[float], str]) -> str:
     for unit, size in (("s", 1.0), ("ms", 1e-3)):
         # What would be rounded to 1000 of the smaller unit belongs to this one.
-        if abs(x) >= 0.9995 * size:
-            return f"{number(x / size)} {unit}"
-    return f"{number(x / 1e-6)} µs"
-
-
-def time_tick(value: float, _: Any = None) -> str:
-    """A round duration for an axis, without zeros behind the point."""
-    for unit, size in (("s", 1.0), ("ms", 1e-3)):
-        if value >= 0.9995 * size:
-            return f"{value / size:.3g} {unit}"
-    return f"{value / 1e-6:.3g} µs"
+        if abs(value) >= 0.9995 * size:
+            return f"{words(value / size)} {unit}"
+    return f"{words(value / 1e-6)} µs"
 
 
 def percent(share: Any) -> str:
