@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -118,3 +119,12 @@ def need(module: str, purpose: str, extra: str = "studies") -> ModuleType:
         raise InvalidInputError(
             f"{purpose} needs {package}, which is not installed; pip install 'qpmhe[{extra}]'."
         ) from error
+
+
+def make_folder(path: str | Path) -> Path:
+    """Make a folder where there is none."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(f"cannot make the folder {path}: {error.strerror}.") from error
+    return Path(path)

@@ -10,13 +10,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from .._checks import make_folder
 from ..certificates.audit import Audit
 from ..certificates.certificate import ASSUMED, Certificate
 from ..certificates.monitor import NEEDED, UNNEEDED
 from ..certificates.properties import Detectability, ObserverStability
 from ..certificates.regions import Region
 from ..certificates.report import LABELS, Report, certify_model
-from ..errors import InvalidInputError, OptionError
+from ..errors import OptionError
 from ..model.sets import Box
 from ..models.loading import find, load
 
@@ -110,11 +111,7 @@ def _check_report(report: Path) -> None:
             f"--report is {str(report)!r}; expected a file name that ends with .json, beside which "
             "the picture goes as .png and .svg."
         )
-    folder = report.parent
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidInputError(f"cannot write into {folder}: {error.strerror}.") from error
+    make_folder(report.parent)
 
 
 def _assumptions_table(findings: Audit) -> Table:

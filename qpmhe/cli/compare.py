@@ -11,7 +11,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from ..errors import InvalidInputError, OptionError
+from .._checks import make_folder
+from ..errors import OptionError
 from ..studies import Store, Study, StudyError, run
 from ..studies.grid import WORDS
 from .report import show_report
@@ -116,12 +117,7 @@ def study(
 
 def _run(what: Study, store: Path, out: Path, **options: Any) -> None:
     console = Console()
-    try:
-        store.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidInputError(
-            f"cannot make the folder {store.parent}: {error.strerror}."
-        ) from error
+    make_folder(store.parent)
     # As after Ctrl-C, worker processes and progress bar end before this process.
     before = signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
     try:

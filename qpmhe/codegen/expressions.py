@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from .._checks import count, positive
+from .._checks import count, need, positive
 from ..errors import InvalidInputError, ModelError, OptionError
 from ..model.discretize import METHODS
 from ..model.functions import check_inputs, takes_input
@@ -16,13 +16,7 @@ __all__ = ["CasadiModel", "casadi_model", "import_casadi"]
 
 def import_casadi() -> Any:
     """The casadi package, imported late; InvalidInputError if it is not installed."""
-    try:
-        import casadi
-    except ImportError as error:
-        raise InvalidInputError(
-            "the model needs CasADi, which is not installed; pip install 'qpmhe[casadi]'."
-        ) from error
-    return casadi
+    return need("casadi", "the model", "casadi")
 
 
 @dataclass(frozen=True)
@@ -145,7 +139,7 @@ def _canonical(ca: Any, name: str, given: Any, n: int, m: int) -> Any:
             )
         call = given if given.n_in() > 1 else _without_input(given)
     elif callable(given):
-        call = _with_inputs(name, given, m)
+        call = given if takes_input(name, given, m) else _without_input(given)
     else:
         raise ModelError(f"{name} is {given!r}; expected a casadi.Function or a callable.")
     error: Exception | None = None
@@ -199,12 +193,5 @@ def _asserts(ca: Any, call: Callable[[Any, Any], Any], n: int, m: int) -> bool:
     return False
 
 
-def _with_inputs(name: str, function: Callable[..., Any], m: int) -> Callable[[Any, Any], Any]:
-    return function if takes_input(name, function, m) else _without_input(function)
-
-
 def _without_input(function: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
-    def call(x: Any, _: Any) -> Any:
-        return function(x)
-
-    return call
+    return lambda x, _: function(x)

@@ -116,11 +116,7 @@ class Layout:
 
 
 def settings_record(
-    layout: Layout,
-    system: System,
-    observer: Observer,
-    cost: Cost,
-    settings: Settings,
+    layout: Layout, system: System, observer: Observer, cost: Cost, settings: Settings
 ) -> NDArray[Any]:
     """The estimator's data and options as one ``mhe_settings``."""
     # What single precision cannot hold becomes infinite, and is refused below.
@@ -136,11 +132,7 @@ def settings_record(
 
 
 def _filled(
-    layout: Layout,
-    system: System,
-    observer: Observer,
-    cost: Cost,
-    settings: Settings,
+    layout: Layout, system: System, observer: Observer, cost: Cost, settings: Settings
 ) -> NDArray[Any]:
     record = np.zeros((), layout.settings_type())
     gain = observer.constant_gain

@@ -1,15 +1,8 @@
 """What a study compares: models, backends, caps, horizons and seeds; in Python or in a TOML file.
 
 In a TOML file the keys are the parameters of `Study`. TOML has no None: ``"converged"`` stands for
-it in ``qps``, ``"none"`` in ``solver_iterations``, ``"default"`` in ``horizons``::
-
-    models = ["batch_reactor", "chain_of_masses(masses=2)", "my_model.py:make"]
-    backends = ["daqp", "osqp"]
-    qps = [0, 1, 2, "converged"]
-    solver_iterations = [1, 5, "none"]
-    seeds = 20
-
-Paths of models are relative to the file.
+it in ``qps``, ``"none"`` in ``solver_iterations``, ``"default"`` in ``horizons``. Paths of models
+are relative to the file.
 """
 
 from __future__ import annotations

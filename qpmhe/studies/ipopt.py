@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import need
 from ..costs import QuadraticCost
 from ..errors import InvalidInputError
 from ..estimation.estimate import Estimate, Status
@@ -36,17 +37,11 @@ class IpoptEstimator:
         h: Callable[[Any], Any], horizon: int, initial_state: Array,
         max_iterations: int | None = None, tolerance: float = 1e-8,
     ) -> None:
-        try:
-            import casadi
-        except ImportError as error:
-            raise InvalidInputError(
-                "Ipopt comes with CasADi, which is not installed; pip install 'qpmhe[casadi]'."
-            ) from error
+        self._casadi = need("casadi", "Ipopt, which is part of CasADi,", "casadi")
         if system.m or cost.observer_prior is not None:
             raise InvalidInputError(
                 "the comparison with Ipopt takes systems without inputs and constant prior weights."
             )
-        self._casadi = casadi
         self._system, self._cost, self._f, self._h = system, cost, f, h
         self._prior = cost.prior
         self._window = Window(system, observer, cost, horizon, initial_state, False)

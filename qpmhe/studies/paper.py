@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers import available, backend, create
 
-from ..errors import InvalidInputError
+from .._checks import make_folder
 from ..estimation.estimate import Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
@@ -163,14 +163,7 @@ def reproduce(
         If the backend or CasADi is missing, or the folder cannot be made.
     """
     create(backend_name)  # before any work: a wrong name must not cost a minute
-    folder = None if out is None else Path(out)
-    if folder is not None:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InvalidInputError(
-                f"cannot make the folder {folder}: {error.strerror}."
-            ) from error
+    folder = None if out is None else make_folder(out)
     study = PaperStudy(seed, steps, method)
     runs: list[tuple[str, int | None, Callable[[], Any]]] = [
         ("converged" if i is None else f"i = {i}", None, partial(study.estimator, i, backend_name))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -148,9 +149,7 @@ def cases(summary: DataFrame) -> list[Case]:
         title = f"{model}, " + ("usual N" if missing(horizon) else f"N = {int(horizon)}")
         if several["steps"]:
             title += f", T = {int(steps)}"
-        safe = "".join(c if c.isalnum() else "-" for c in title).strip("-")
-        while "--" in safe:
-            safe = safe.replace("--", "-")
+        safe = re.sub(r"[\W_]+", "-", title).strip("-")
         key = safe if safe not in {case.key for case in found} else f"{safe}-{place}"
         found.append(Case(key, title, rows))
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -141,14 +141,14 @@ class Drawing:
         def fits(mark: Mark) -> bool:
             return all(mark.meta.get(key, value) == value for key, value in meta.items())
 
-        return Drawing(
-            [Panel(one.x, one.y, [*filter(fits, one.marks)]) for one in self.panels],
-            self.height, self.deadline, self.note, self.gap,
-        )
+        panels = [Panel(one.x, one.y, [*filter(fits, one.marks)]) for one in self.panels]
+        return replace(self, panels=panels)
 
 
-def interactive(drawing: Drawing, drawn: Mapping[str, Style]) -> dict[str, Any]:
-    """The figure as plotly.js takes it, in plain lists and numbers."""
+def interactive(drawing: Drawing | None, drawn: Mapping[str, Style]) -> dict[str, Any] | None:
+    """The figure, if there is one, as plotly.js takes it, in plain lists and numbers."""
+    if drawing is None:
+        return None
     count = len(drawing.panels)
     layout: dict[str, Any] = {
         "height": drawing.height, "autosize": True, "showlegend": False,

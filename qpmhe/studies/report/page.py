@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..._checks import make_folder
 from ...errors import InvalidInputError
 from ...plots import save, trajectories
 from ..store import Store
@@ -97,11 +98,7 @@ def write_report(
         raise InvalidInputError(
             "the study has no finished cell, so that there is nothing to report; run it first."
         )
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidInputError(f"cannot make the folder {folder}: {error.strerror}.") from error
+    folder = make_folder(out)
     summary = summarise(frame)
     deadline = (meta.get("study") or {}).get("deadline")
     found = [
@@ -197,6 +194,7 @@ def _run_figure(first: Mapping[str, Any]) -> dict[str, Any]:
         for j in range(n)
     ], 90 + (170 if n <= 4 else 115) * n, gap=0.12)
     figure = interactive(drawing, _ROLES)
+    assert figure is not None
     for trace in figure["data"]:
         role, j = trace["meta"]["role"], trace["meta"]["state"]
         trace |= {"x": times, "name": role, "legendgroup": role, "showlegend": j == 0}
@@ -338,7 +336,7 @@ def _figures(part: Part, drawn: Mapping[str, Style], overall: Drawing | None) ->
             summary["time_median"].where(whole), summary[by].where(whole), TOLERANCE
         )
         rows = _in_percent(summary) if metric == "rmse_excess" else summary
-        measures[metric] = _interactive(figures.accuracy(rows, metric, label, front), drawn)
+        measures[metric] = interactive(figures.accuracy(rows, metric, label, front), drawn)
     rest = summary[summary["backend"] != "observer"]
     qps = [(word, word) for word in ranked(map(qps_words, rest["qps"]))]
     caps = [(word, word) for word in ranked(map(cap_words, rest["solver_iterations"]))]
@@ -346,9 +344,9 @@ def _figures(part: Part, drawn: Mapping[str, Style], overall: Drawing | None) ->
     numbers = [word for word, _ in qps if word.isdigit()]
     return {
         "accuracy": measures,
-        "anytime": _interactive(figures.anytime(summary), drawn),
-        "times": _interactive(figures.times(figures.spreads(part.cells), part.deadline), drawn),
-        "profile": _interactive(overall, drawn),
+        "anytime": interactive(figures.anytime(summary), drawn),
+        "times": interactive(figures.times(figures.spreads(part.cells), part.deadline), drawn),
+        "profile": interactive(overall, drawn),
         "trajectories": None if runs.first is None else _run_figure(runs.first),
         "runs": {"observer": runs.observer, "all": runs.all},
         "menus": {
@@ -363,10 +361,6 @@ def _figures(part: Part, drawn: Mapping[str, Style], overall: Drawing | None) ->
             "run": runs.entries[0][0] if runs.entries else None,
         },
     }
-
-
-def _interactive(drawing: Drawing | None, drawn: Mapping[str, Style]) -> dict[str, Any] | None:
-    return None if drawing is None else interactive(drawing, drawn)
 
 
 def _in_percent(summary: DataFrame) -> DataFrame:
