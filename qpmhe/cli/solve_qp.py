@@ -63,7 +63,7 @@ def run(
     for one, asked in zip(stored, options, strict=True):
         rows: list[Replay] = []
         for name in wanted or [_default(one)]:
-            # A solver can crash the process: then the last thing on screen tells which one.
+            # A solver can crash the process: then the last line on screen names it.
             with console.status(f"{escape(str(one.path))}: {escape(name)}"):
                 rows.append(replay(one, name, asked))
         console.print(_table(one, asked, rows), highlight=False)

@@ -1,7 +1,7 @@
 """Compiled code compared with CasADi's interpreter, before it is used.
 
-A compiler's mistake changes numbers without any sign. Rounding is told apart from it by what
-the interpreter itself makes of arguments that differ in their last digits.
+A compiler's mistake changes numbers without any sign. What the interpreter itself computes from
+arguments that differ in their last digits shows how far rounding alone can go.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ def model_fault(
                     whole = np.isfinite(true).all(axis=(1, 2))
                     got, true, allowed = got[whole], true[whole], allowed[whole]
                 if differs(got, true, allowed):
-                    return f"{name} of {count} states at once is not that of CasADi's interpreter"
+                    return f"{name} of {count} states at once differs from CasADi's interpreter"
         fault = _residual_fault(maker, timed, xs, given, found)
         if fault:
             return fault

@@ -240,7 +240,7 @@ class CompiledEngine:
         self._replace(memory)
 
     def _check(self, record: Any, linearized: bool) -> None:
-        """Insist on a possible window, whose stages are what is computed of them here."""
+        """Refuse a window that is impossible, or whose stages the model does not reproduce."""
         horizon, system, settings = self._sizes[2], self._system, self._library.settings
         time, length = int(record["time"]), int(record["length"])
         sets = sum(1 << k for k, name in enumerate(SET_NAMES) if getattr(system, name))
@@ -324,7 +324,7 @@ class CompiledEngine:
             if stage["w"].any() or stage["v"].any():
                 raise ValueError("a failed stage has residuals")
             return np.eye(n), np.zeros((p, n))
-        # Of cancelled residuals the rounding is that of the terms.
+        # Residuals that cancel are rounded as their terms are.
         error_size = np.abs(stage["y"]) + np.abs(error)
         sizes = np.maximum(sizes, np.abs(correction))
         if not near(stage["v"], error, error_size):

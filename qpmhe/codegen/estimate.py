@@ -1,4 +1,4 @@
-"""What a step of the compiled engine tells, read where C has written it."""
+"""The estimate of the compiled engine, read where C has written it."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def may_fail(function: Any) -> bool:
 def fixed_call(
     function: Any, arguments: Sequence[Array], results: Sequence[Array], fallible: bool = True
 ) -> Callable[[], bool]:
-    """A call of a function on arrays in place, which tells whether it worked.
+    """A call of a function on arrays in place, which returns whether it worked.
 
     Where it did not, the results are not written, or only in part.
     """

@@ -175,7 +175,7 @@ def _asserts(ca: Any, call: Callable[[Any, Any], Any], n: int, m: int) -> bool:
         if isinstance(value, (list, tuple)):
             value = ca.vertcat(*value)
         function = ca.Function("tried", [x, u], [ca.MX(value)])
-    except Exception:  # of scalar operations alone, then; or what is told when it is used
+    except Exception:  # of scalar operations alone, or reported when it is used
         return False
     found, waiting = set(), [function]
     while waiting:

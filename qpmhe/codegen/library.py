@@ -93,7 +93,7 @@ def _is_flat(one: ConvexSet) -> bool:
 
 
 def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:
-    """Zeros, or an error that tells how many bytes there are not."""
+    """Zeros, or an error that says how many bytes are missing."""
     try:
         return np.zeros(count, kind)
     except (MemoryError, ValueError) as error:  # the latter of more than can be addressed
@@ -163,7 +163,7 @@ class EstimatorLibrary:
         self.run.argtypes = [pointer, integer, pointer, integer, pointer, pointer, pointer]
 
     def _check_sizes(self, library: ctypes.PyDLL) -> int:
-        """Insist that C and NumPy lay the structures out alike; the workspace's size."""
+        """Refuse structures that C and NumPy lay out differently; the workspace's size."""
         sizes = np.zeros(4, np.int64)
         library.mhe_sizes.restype = None
         library.mhe_sizes(ctypes.c_void_p(sizes.ctypes.data))

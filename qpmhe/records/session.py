@@ -124,7 +124,7 @@ def estimate_record(
         Usual step of a discrete-time model, in its unit of time; the record's unit in the model's.
     equal_steps, skip_repeated : bool
         Whether steps must be equal also where the model takes any; whether to skip lines whose
-        time is that of the line before.
+        time repeats the line before.
     max_gap : int, optional
         Most samples without measurement in a row. By default 1000, and a record that consists of
         gaps of one size is refused: its unit of time is not the model's.
@@ -499,6 +499,6 @@ class _Session:
 
 
 def _digest(before: str, sample: Measurement) -> str:
-    """Digest of all samples, from that of those before."""
+    """Digest of all samples, from the digest of the samples before."""
     content = f"{before} {sample.time.text} ".encode() + sample.y.tobytes() + sample.u.tobytes()
     return hashlib.sha256(content).hexdigest()

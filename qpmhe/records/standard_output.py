@@ -46,7 +46,7 @@ def _duplicate(text: object) -> Iterator[BinaryIO]:
     kept = os.dup(_STANDARD_OUTPUT)
     rows = os.fdopen(kept, "wb")
     try:
-        if sys.__stderr__ is None:  # closed: its number may be that of another file by now
+        if sys.__stderr__ is None:  # closed: another file may have its number by now
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, _STANDARD_OUTPUT)
             os.close(nowhere)

@@ -122,7 +122,7 @@ class Reproduction:
     files: list[Path]
 
     def excess(self, row: Row) -> float:
-        """Mean cost of a row above that of the converged one, relative."""
+        """How far a row's mean cost is above the converged one, relative."""
         converged = next(one for one in self.rows if one.label == "converged")
         return row.mean_cost / converged.mean_cost - 1.0
 

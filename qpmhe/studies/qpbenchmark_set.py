@@ -23,7 +23,7 @@ __all__ = ["ExportedSet", "export_qpbenchmark"]
 
 Matrices = Literal["sparse", "dense"]
 
-# qpbenchmark makes the name of the class from that of the file.
+# qpbenchmark derives the name of the class from the name of the file.
 _SCRIPT = "mhe_qpbenchmark.py"
 _CODE = '''"""A test set of qpbenchmark: qpbenchmark {script} --results-path results.csv run."""
 

@@ -156,7 +156,7 @@ def _add_means(summary: DataFrame, done: DataFrame, names: list[str]) -> None:
 
 
 def _excess(done: DataFrame, summary: DataFrame) -> Series:
-    """RMSE of each cell above that of the best configuration on the same seed, relative."""
+    """How far each cell's RMSE is above the best configuration's on the same seed, relative."""
     import pandas as pd
 
     excess = pd.Series(np.nan, index=done.index, dtype=float)
