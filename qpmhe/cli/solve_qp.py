@@ -62,7 +62,7 @@ def run(
     tables: list[list[Replay]] = []
     for one, asked in zip(stored, options, strict=True):
         rows: list[Replay] = []
-        for name in wanted or [_default(one)]:
+        for name in wanted or [one.backend if one.backend in available() else "auto"]:
             # A solver can crash the process: then the last line on screen names it.
             with console.status(f"{escape(str(one.path))}: {escape(name)}"):
                 rows.append(replay(one, name, asked))
@@ -102,10 +102,6 @@ def _judged(name: str, qp: QP, solution: Solution, seconds: float = np.nan) -> R
     with np.errstate(all="ignore"):
         residuals = Residuals.of(qp, d, bound_duals, row_duals)
         return Replay(name, solution, residuals, qp.objective(d), seconds)
-
-
-def _default(stored: StoredQP) -> str:
-    return stored.backend if stored.backend in available() else "auto"
 
 
 def _solved(row: Replay) -> bool:

@@ -25,11 +25,12 @@ def environment() -> dict[str, Any]:
     packages = dict.fromkeys(
         [*_PACKAGES, *(entry.distribution for entry in backends() if entry.distribution)]
     )
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "versions": {"qpmhe": __version__}
         | {name: _version(name) for name in sorted(packages) if _version(name)},
         "cpu": _processor(),
-        "cores": _cores(),
+        "cores": cores or 1,
         "python": platform.python_version(),
         "os": platform.platform(),
         "host": platform.node(),
@@ -53,12 +54,6 @@ def _processor() -> str:
     except OSError:  # not a Linux
         pass
     return platform.processor() or platform.machine()
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def revision() -> str | None:

@@ -146,11 +146,8 @@ class Study:
 
     def settings(self) -> dict[str, Any]:
         """The grid as plain lists and numbers; what the store keeps of it."""
-        found = {name: getattr(self, name) for name in _CHECKS}
-        return {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in found.items()
-        }
+        found = ((name, getattr(self, name)) for name in _CHECKS)
+        return {key: list(one) if isinstance(one, tuple) else one for key, one in found}
 
     def cells(self) -> tuple[Cell, ...]:
         """All cells, each once, seed by seed, so that the first results cover the whole grid."""
@@ -241,10 +238,6 @@ def _several(name: str, value: Any, known: str) -> list[Any]:
     return found
 
 
-def _models(value: Any) -> tuple[str, ...]:
-    return _distinct(_several("models", value, "name at least one model"))
-
-
 def _backends(value: Any) -> tuple[str, ...]:
     if value is None:
         return tuple(name for name in available() if ":" not in name)
@@ -299,7 +292,7 @@ def _switch(value: Any) -> bool:
 
 # The check of each option, in order; each returns the value in its standard form.
 _CHECKS: dict[str, Callable[[Any], Any]] = {
-    "models": _models,
+    "models": lambda value: _distinct(_several("models", value, "name at least one model")),
     "backends": _backends,
     "qps": _numbers("qps", 0, " None stands for convergence."),
     "solver_iterations": _numbers("solver_iterations", 1, " None leaves the solver's default."),

@@ -97,7 +97,12 @@ def run(
         if scheduler is not None:
             raise OptionError("jobs is for this machine; with a scheduler, leave it out.")
     target = store if isinstance(store, Store) else Store(store)
-    with closing(_workers(study, jobs, scheduler)) as workers, target.writing() as writer:
+    alone = study.measure == "time"  # other cells would share the cores
+    made = (
+        _Processes(jobs or (1 if alone else environment()["cores"])) if scheduler is None
+        else _Cluster(scheduler)
+    )
+    with closing(made) as workers, target.writing() as writer:
         writer.begin(
             {**study.settings(), "jobs": workers.jobs, "scheduler": scheduler},
             {source.name: source.fingerprint for source in study.sources},
@@ -211,12 +216,6 @@ def _identity(distributed: Any, address: str, seconds: float) -> dict[str, Any]:
     with ThreadPoolExecutor(1) as thread:  # there may be an event loop in this one
         answer = thread.submit(lambda: asyncio.run(limited())).result()
     return answer if isinstance(answer, dict) else {}
-
-
-def _workers(study: Study, jobs: int | None, scheduler: str | None) -> _Processes | _Cluster:
-    if scheduler is not None:
-        return _Cluster(scheduler)
-    return _Processes(jobs or (1 if study.measure == "time" else environment()["cores"]))
 
 
 def _results(workers: _Processes | _Cluster, tasks: Iterable[Task]) -> Iterator[Result]:
