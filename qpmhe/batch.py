@@ -17,7 +17,7 @@ from ._checks import count, numbers
 from .costs import Cost
 from .errors import InvalidInputError, OptionError, ShapeError, UnknownOptionError
 from .estimation.engine import PythonEngine
-from .estimation.estimate import Status
+from .estimation.estimate import Estimate, Status
 from .estimation.estimator import MovingHorizonEstimator, check_start
 from .estimation.settings import Settings
 from .model.system import System
