@@ -139,7 +139,7 @@ def test_a_model_that_is_not_known_is_named():
 
 def test_a_report_that_cannot_be_written_is_told(shown, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(QpmheError, match="cannot write"):
+    with pytest.raises(QpmheError, match="cannot make the folder"):
         shown("(gain=-2.0)", report=tmp_path / "file" / "x.json")
 
 

@@ -17,7 +17,7 @@ def by_hand(qps, cap=None, backend="daqp", horizon=10, start="candidate", seed=3
     record = scenario.simulate(seed, STEPS)
     mhe = qpmhe.MovingHorizonEstimator(
         system, observer, cost, horizon=horizon, initial_state=scenario.initial_estimate,
-        backend=backend, max_qps=qps, max_solver_iterations=cap, start=start,
+        backend=backend, max_qps=qps, max_solver_iterations=cap, warm_start=start == "best",
     )
     estimates, covariances = [], []
     for y in record.measurements:
