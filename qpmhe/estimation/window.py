@@ -130,9 +130,9 @@ class Window(Stages):
             observed = self._observed[k]
         cost = self._evaluate_stage(k, time, observed)
         if not math.isfinite(cost) and observed is None:
-            there = np.abs(y) < LARGEST
-            if not there.all():
-                self._observed[k] = observed = there
+            small = np.abs(y) < LARGEST
+            if not small.all():  # a huge component may be the reason: without it
+                self._observed[k] = observed = small
                 self._set_weight(k, time)
                 cost = self._evaluate_stage(k, time, observed)
         model_failed = not math.isfinite(cost)
