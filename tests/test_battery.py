@@ -94,7 +94,7 @@ def test_batches_are_as_single_states(cell):
     x, u = rng.uniform(0.1, 0.9, (7, 4)), rng.uniform(-9, 9, (7, 1))
     for function in (system.f, system.h, system.f_jacobian, system.h_jacobian):
         singly = np.array([function(a, b) for a, b in zip(x, u, strict=True)])
-        np.testing.assert_allclose(function(x, u), singly, rtol=1e-13, atol=1e-15)
+        np.testing.assert_allclose(function.batch(x, u), singly, rtol=1e-13, atol=1e-15)
 
 
 def test_a_step_is_the_mean_of_many_small_ones(cell):

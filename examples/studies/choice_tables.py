@@ -291,9 +291,9 @@ def starts(figures: Figures) -> str:
         one = figures.time(zoo, 1)
         rows.append((
             f"`{zoo}`", number(figures.mean("cost_ratio", zoo, 1), 3),
-            number(figures.mean("cost_ratio", zoo, 1, warm_start=True), 3),
+            number(figures.mean("cost_ratio", zoo, 1, start="best"), 3),
             number(figures.mean("cost_ratio", zoo, 2), 3),
-            number(figures.time(zoo, 1, warm_start=True) / one, 1),
+            number(figures.time(zoo, 1, start="best") / one, 1),
             number(figures.time(zoo, 2) / one, 1),
         ))
     return table(

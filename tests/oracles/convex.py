@@ -49,6 +49,6 @@ def minimum(x, w, v, slopes, prior, weights, losses, discount=1.0, boxes=(None, 
             constraints += [rows >= np.tile(box[0], (rows.shape[0], 1)),
                             rows <= np.tile(box[1], (rows.shape[0], 1))]
     problem = cp.Problem(cp.Minimize(cost), constraints)
-    tight = dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), 1e-10)
+    tight = dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), 1e-9)
     problem.solve(solver=cp.CLARABEL, **tight)
     return problem.value, x + d.value

@@ -347,7 +347,7 @@ class Clock:
         self.now = 0.0
         self.limits = []
         for module in ("estimator", "engine", "optimizer"):
-            monkeypatch.setattr(f"qpmhe.{module}.perf_counter", lambda: self.now)
+            monkeypatch.setattr(f"qpmhe.estimation.{module}.perf_counter", lambda: self.now)
 
     def solver(self, options):
         clock, inner = self, qpmhe.solvers.create("auto", options)
