@@ -50,7 +50,8 @@ class Translation:
 # IPMs and quadprog ignore it; clarabel and scs hand a QP without rows to a least-squares
 # routine that calls it unbounded; ecos and cvxopt choke on infinite bounds, and ecos on a
 # relative tolerance of 0. highs without rows claims to be optimal far from the optimum, and adds
-# 1e-7 to the Hessian's diagonal, which is much where weights spread over decades. proxqp takes
+# 1e-7 to the Hessian's diagonal, which is much where weights spread over decades; with 1e-12 it
+# can cycle for ever, so it gets 1e-9 and a cap. proxqp takes
 # a direction d with |H d| <= 1e-4 |d| for an unbounded one, as osqp and piqp do; qpsolvers lets
 # nobody change that of proxqp.
 TRANSLATIONS: Mapping[str, Translation] = {
@@ -72,7 +73,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
     "highs": Translation(
         "active set", "highspy", "csc", "box", "qp_iteration_limit",
         ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), time_limit="time_limit",
-        needs_row=True, others=(("qp_regularization_value", 1e-12),),
+        needs_row=True, default_cap=10000, others=(("qp_regularization_value", 1e-9),),
     ),
     "osqp": Translation(
         "ADMM", "osqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit",
