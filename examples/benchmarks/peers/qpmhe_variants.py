@@ -54,7 +54,7 @@ class Qpmhe(Peer):
             self._mhe = qpmhe.MovingHorizonEstimator(
                 system, problem.observer, problem.cost, horizon=problem.horizon,
                 initial_state=problem.scenario.initial_estimate, max_qps=self.max_qps,
-                start=self.start, **options,
+                warm_start=self.start == "best", **options,
             )
         except qpmhe.QpmheError as error:
             raise UnavailableError(str(error)) from error
