@@ -59,7 +59,8 @@ class Loss(ABC):
     def cost(self, s: Array, weight: Array) -> Array:
         """The loss of each row of s, (K, d), for one weight of all or of each.
 
-        The weight is that of the loss, or what is left of it where components are missing.
+        The weight is the one of the loss, reduced to the observed components where some are
+        missing.
         """
         if self.per_component:
             diagonal = np.diagonal(weight, axis1=-2, axis2=-1)

@@ -63,7 +63,7 @@ class MovingHorizonEstimator:
         cap of the solver given as ``backend``.
     solver_tolerance : float
         Tolerance on the QP's residuals in scaled numbers, which have no unit; see
-        `qpmhe.solvers.SolverOptions`. If left out, that of a solver given as ``backend``.
+        `qpmhe.solvers.SolverOptions`. If left out, a solver given as ``backend`` keeps its own.
     tolerance : float
         The sequence of QPs has converged when a QP that was solved lowers J by less than
         this share of it.

@@ -83,7 +83,7 @@ class Outcome:
 class Optimizer:
     """Gauss-Newton steps from the candidate, each judged by the true problem.
 
-    A step that does not lower J below that of the best trajectory so far is shortened, and
+    A step that does not lower J below the best so far is shortened, and
     dropped if no length helps. So J of the result is never above the candidate's, and the
     result satisfies the constraints, whatever the solver returns.
     """

@@ -202,7 +202,7 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
     0.03 m/s a step, the noise 0.03 m. The chain starts displaced from rest by
     :math:`0.3 \sin(\pi i / (M+1))` m along every axis, the estimation from rest. The prior
     weighs with 0.3 m and the velocity that goes with it, :math:`0.3 \sqrt{D/m}`. The observer's
-    constant gain is that of the stationary Kalman predictor about rest.
+    constant gain is the gain of the stationary Kalman predictor about rest.
 
     Parameters
     ----------

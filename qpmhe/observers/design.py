@@ -30,7 +30,7 @@ def design_luenberger(
 
     With A and C the Jacobians of f and h at the point, the error of the observer's state
     obeys :math:`e(t+1) = (A - K C)\, e(t)` near it. The gain K either places the
-    eigenvalues of A - K C, or is that of the stationary Kalman predictor
+    eigenvalues of A - K C, or is the gain of the stationary Kalman predictor
 
     .. math::
         K = A P C^\top S^{-1}, \quad S = C P C^\top + R, \quad

@@ -8,7 +8,7 @@ from problems import Problem
 
 import qpmhe
 
-from .base import Array, Peer, UnavailableError, WindowData
+from .base import Array, Peer, WindowData
 
 __all__ = ["Qpmhe"]
 
@@ -50,14 +50,11 @@ class Qpmhe(Peer):
             system = problem.casadi_system()
         if self.variant == "compiled":
             options["engine"] = "compiled"
-        try:
-            self._mhe = qpmhe.MovingHorizonEstimator(
-                system, problem.observer, problem.cost, horizon=problem.horizon,
-                initial_state=problem.scenario.initial_estimate, max_qps=self.max_qps,
-                warm_start=self.start == "best", **options,
-            )
-        except qpmhe.QpmheError as error:
-            raise UnavailableError(str(error)) from error
+        self._mhe = qpmhe.MovingHorizonEstimator(
+            system, problem.observer, problem.cost, horizon=problem.horizon,
+            initial_state=problem.scenario.initial_estimate, max_qps=self.max_qps,
+            warm_start=self.start == "best", **options,
+        )
 
     def restart(self) -> None:
         """Begin a record."""
