@@ -35,7 +35,8 @@ class PiqpSolver(NativeSolver):
         settings = handle.settings
         settings.eps_abs = settings.eps_duality_gap_abs = options.absolute_tolerance
         settings.eps_rel = settings.eps_duality_gap_rel = options.relative_tolerance
-        settings.eps_dual_inf = 1e-12  # H is positive definite: there is always a minimiser
+        if hasattr(settings, "eps_dual_inf"):  # PIQP 0.6.1 has no such limit
+            settings.eps_dual_inf = 1e-12  # H is positive definite: there is always a minimiser
         if options.max_iterations is not None:
             settings.max_iter = int(options.max_iterations)
         handle.setup(layout.hessian, layout.gradient, *self._others(layout))
