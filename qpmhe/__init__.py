@@ -20,9 +20,9 @@ from .costs import (
     QuadraticCost,
     RobustCost,
 )
-from .errors import QpmheError
+from .errors import ObserverWarning, QpmheError
 from .estimation.engines import Engine, register_engine
-from .estimation.estimate import Estimate, Status
+from .estimation.estimate import DroppedRow, Estimate, Status
 from .estimation.estimator import MovingHorizonEstimator
 from .estimation.run import Run
 from .model.parameters import augment_parameters
@@ -56,6 +56,7 @@ __all__ = [
     "ConvexSet",
     "Cost",
     "CostConstants",
+    "DroppedRow",
     "Estimate",
     "ExtendedKalman",
     "HighGain",
@@ -65,6 +66,7 @@ __all__ = [
     "MovingHorizonEstimator",
     "Observer",
     "ObserverPrior",
+    "ObserverWarning",
     "OutputInjection",
     "Polytope",
     "Power",

@@ -114,9 +114,12 @@ class BatchEstimator:
     def _checked(self, states: Array) -> Array:
         """The initial states, if a single estimator takes each of them."""
         own = self.system.copy()
-        for k in np.unique(states, axis=0, return_index=True)[1].tolist():
-            check_start(own, self.observer, states[k], f"initial_states[{k}]")
-        return states
+        _, first, which = np.unique(states, axis=0, return_index=True, return_inverse=True)
+        checked = [
+            check_start(own, self.observer, self.cost, states[k], f"initial_states[{k}]")
+            for k in first.tolist()
+        ]
+        return np.array(checked)[which.ravel()]
 
     def _made(self, states: Array) -> _Looped | CompiledMembers:
         parts = self.system, self.observer, self.cost, self.settings

@@ -17,6 +17,7 @@ __all__ = [
     "EngineWarning",
     "InvalidInputError",
     "ModelError",
+    "ObserverWarning",
     "OptionError",
     "QpmheError",
     "SetError",
@@ -40,6 +41,10 @@ class SetError(InvalidInputError):
 
 class CompilationError(QpmheError):
     """C code that could not be compiled or loaded here."""
+
+
+class ObserverWarning(UserWarning):
+    """An observer that the estimates cannot rely on, or that had to be moved into its set."""
 
 
 class EngineWarning(UserWarning):

@@ -381,7 +381,7 @@ class _Rehearsal:
         self, t: int, record: Any, candidate: Array, trajectory: Array, cost: float,
         candidate_cost: float, status: int, w: Array | None = None, v: Array | None = None,
     ) -> str:
-        projected = bool(status & Status.PROJECTED.value)
+        projected = bool(status & Status.CANDIDATE_OUTSIDE.value)
         prior = self._window(record)["z"][0]
         reference = self._judge(t, candidate, prior, not projected)
         best = self._judge(t, trajectory, prior, False)

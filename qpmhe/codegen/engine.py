@@ -16,7 +16,6 @@ from ..costs import Cost
 from ..errors import InvalidInputError
 from ..estimation.covariance import window_covariances
 from ..estimation.estimate import Estimate
-from ..estimation.problem import Problem
 from ..estimation.run import Run
 from ..estimation.settings import Settings
 from ..estimation.snapshot import (
@@ -30,7 +29,7 @@ from ..estimation.snapshot import (
 )
 from ..model.system import System
 from ..observers import Observer
-from .estimate import CompiledEstimate, dropped_names
+from .estimate import CompiledEstimate
 from .library import EstimatorLibrary
 
 __all__ = ["CompiledEngine", "RunLog"]
@@ -91,7 +90,9 @@ class CompiledEngine:
         self._usual, self._result = (*self._arguments, ctypes.c_double(0.0), None, out), out
         self._amending = memory, workspace
         self._call = library.update
-        self._observer, self._problem = observer, Problem(system, cost)
+        self._observer = observer
+        sets = system.disturbances
+        self._noise_free = sets.fixed_components if sets else np.empty(0, np.intp)
         self._time = self._memory["time"]
 
     def reset(self, initial_state: Array) -> None:
@@ -200,10 +201,22 @@ class CompiledEngine:
             raise InvalidInputError("there is no estimate yet; update first.")
         length = self.length
         stages = record["stages"][(record["first"] + np.arange(length)) % self._sizes[2]]
+        system, cost, count = self._system, self._cost, length
+        irregular = bool(stages["is_irregular"].any())
+        inputs = stages["u"][:, : system.m]
+        weights = np.zeros((count, system.n + system.p, system.n + system.p))
+        weights[:, : system.n, : system.n] = cost.disturbance
+        weights[:, system.n :, system.n :] = stages["noise_weight"]
+        factors = cost.discount ** np.append(count, np.arange(count - 1, -1, -1.0))
         with np.errstate(all="ignore"):
-            _bind(self._problem, self._system, self._cost, stages)
-            self._problem.leave_out(dropped_names(int(record["dropped"])))
-            return window_covariances(self._problem, record["trajectory"][: length + 1].copy())
+            return window_covariances(
+                system.timed if irregular else system,
+                record["trajectory"][: length + 1].copy(),
+                np.column_stack((inputs, stages["step"])) if irregular else inputs,
+                weights * factors[1:, None, None],
+                np.asarray(cost.prior) * factors[0],
+                self._noise_free,
+            )
 
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt from measurements so far, as plain arrays and numbers."""
@@ -370,20 +383,3 @@ def _terms(
         "own": -(aa.T @ q @ w + cc.T @ r @ v), "following": q @ w,
     }
 
-
-def _bind(problem: Problem, system: System, cost: Cost, stages: NDArray[Any]) -> None:
-    """Bind a problem to the stages of a C window."""
-    count, m = len(stages), system.m
-    irregular = bool(stages["is_irregular"].any())
-    problem.model = system.timed if irregular else system
-    inputs = stages["u"][:, :m]
-    problem.inputs = np.column_stack((inputs, stages["step"])) if irregular else inputs
-    problem.prior, problem.measurements = stages["z"][0].copy(), stages["y"]
-    weights = np.zeros((count, system.n + system.p, system.n + system.p))
-    weights[:, : system.n, : system.n] = cost.disturbance
-    weights[:, system.n :, system.n :] = stages["noise_weight"]
-    problem.stage_weights = weights
-    problem.observed = stages["is_observed"] != 0
-    if cost.discount < 1.0:
-        problem.discounts = cost.discount ** np.append(count, np.arange(count - 1, -1, -1.0))
-    problem.use_sets(system.states, system.disturbances, system.noises)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimation.estimate import Estimate, Status
+from ..estimation.estimate import DroppedRow, Estimate, Status
 from .layout import SET_NAMES
 
 __all__ = ["CompiledEstimate", "dropped_names"]
@@ -99,9 +99,20 @@ class CompiledEstimate(Estimate):
         return self._numbers[4]
 
     @property
-    def dropped(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of the sets that were left out."""
-        return dropped_names(self._numbers[5])
+    def dropped(self) -> tuple[DroppedRow, ...]:  # type: ignore[override]
+        """None: the C step takes no sets."""
+        return ()
+
+    @property
+    def nearest_points(self) -> int:  # type: ignore[override]
+        """None: the C step takes no sets."""
+        return 0
+
+    @property
+    def filtered(self) -> Array:
+        """Estimate of x(t), the last measured time."""
+        value: Array = self.trajectory[-2]
+        return value
 
     @property
     def delayed(self) -> Array | None:  # type: ignore[override]
@@ -122,8 +133,3 @@ def _restored(
     estimate = CompiledEstimate(block, numbers, time, sizes, delay)
     estimate.step_time = step_time
     return estimate
-
-
-def dropped_names(bits: int) -> tuple[str, ...]:
-    """Names of the sets whose bits are set."""
-    return tuple(name for i, name in enumerate(SET_NAMES) if bits >> i & 1)

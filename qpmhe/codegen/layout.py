@@ -159,7 +159,7 @@ def _filled(
     record["max_qps"] = min(settings.qp_limit, _MOST)
     most = settings.max_solver_iterations
     record["max_iterations"] = 0 if settings.backend == "banded" else min(most or 50, _MOST)
-    record["outside"] = _POLICIES.index(settings.outside)
+    record["outside"] = 0
     record["start_at_best"] = settings.warm_start
     record["reinitialize"] = settings.candidate == "reinitialized"
     record["delay"] = settings.delay

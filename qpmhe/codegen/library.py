@@ -41,12 +41,10 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     if cost.observer_prior is not None:
         return "a prior weight from the observer has no C form; take a constant one."
     for name in SET_NAMES:
-        one = getattr(system, name)
-        if one is not None and _is_flat(one):
+        if getattr(system, name) is not None:
             return (
-                f"the set of {name} has a direction of zero width (equal bounds, or a polytope "
-                f"less than {FEASIBLE:g} wide), which the interior-point method in C cannot "
-                "take; widen it."
+                f"the compiled step does not take a set of {name} yet; take engine='python', or "
+                f"leave {name} out."
             )
     size = _window_size(system, settings.horizon)
     if size > _MOST_BYTES:

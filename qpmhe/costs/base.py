@@ -154,6 +154,12 @@ class Cost(ABC):
         joint[self.n :, self.n :] = self.noise if noise is None else noise
         return joint
 
+    def initial_weight(self, covariance: Array | None) -> Array:
+        """The weight of the initial error, given the observer's covariance of it if it has one."""
+        if self.observer_prior is None or covariance is None:
+            return np.asarray(self.prior)
+        return self.observer_prior.weight(covariance)
+
     def check_noise(self, noise: Array) -> None:  # noqa: B027 - most costs take any weight
         """Raise a `WeightError` unless the cost can use this noise weight (p, p) of one sample."""
 

@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidInputError
-from .problem import Problem
+from ..model.system import System
 
 __all__ = ["window_covariances"]
 
 Array = NDArray[np.float64]
 
 
-def window_covariances(problem: Problem, trajectory: Array) -> Array:
+def window_covariances(
+    model: System,
+    trajectory: Array,
+    inputs: Array,
+    weights: Array,
+    prior_weight: Array,
+    noise_free: NDArray[np.intp],
+) -> Array:
     """Covariances (K + 1, n, n) of the states of a trajectory, given its window.
 
     Diagonal blocks of the inverse of the Gauss-Newton Hessian of J/2, by the Kalman filter
     and the Bryson-Frazier smoother of the linearised model. These invert no covariance of a
     state, so that components of w may have zero covariance (noise-free ones).
+
+    Parameters
+    ----------
+    model : System
+        The system that takes these inputs.
+    trajectory, inputs : array
+        States (K + 1, n), and inputs of the stages.
+    weights, prior_weight : array
+        Of the quadratic forms of the stages, (q, q) or (K, q, q) with q = n + p, and of the
+        initial error (n, n).
+    noise_free : (k,) array
+        Components without a disturbance.
 
     References
     ----------
@@ -28,25 +45,21 @@ def window_covariances(problem: Problem, trajectory: Array) -> Array:
     Control 18 (1973), the modified Bryson-Frazier smoother.
     """
     states, n, count = trajectory[:-1], trajectory.shape[1], trajectory.shape[0] - 1
-    trial = problem.evaluate(trajectory)
-    if trial.violation == math.inf:
-        raise InvalidInputError("the model has no finite values along the estimate.")
     try:
-        a = np.asarray(problem.model.f_jacobian.batch(states, problem.inputs))
-        c = np.asarray(problem.model.h_jacobian.batch(states, problem.inputs))
+        a = np.asarray(model.f_jacobian.batch(states, inputs))
+        c = np.asarray(model.h_jacobian.batch(states, inputs))
     except Exception as error:
         raise InvalidInputError(
             f"the model has no Jacobians along the estimate: {error}"
         ) from error
     if not (np.isfinite(a).all() and np.isfinite(c).all()):
         raise InvalidInputError("the Jacobians are not finite along the estimate.")
-    q, eye = trial.weights.shape[-1], np.eye(n)
-    weights = np.broadcast_to(trial.weights, (count, q, q))
+    q, eye = weights.shape[-1], np.eye(n)
+    weights = np.broadcast_to(weights, (count, q, q))
     noisy = np.ones(n, dtype=np.bool_)
-    if problem.disturbances is not None:
-        noisy[problem.noise_free] = False
+    noisy[noise_free] = False
     block = np.ix_(noisy, noisy)
-    prior = np.linalg.inv(problem.prior_weight_at(trajectory[0] - problem.prior))
+    prior = np.linalg.inv(prior_weight)
     covariance = np.empty((count + 1, n, n))  # first predicted, then smoothed
     covariance[0] = 0.5 * (prior + prior.T)
     # I - K C and C^T S^{-1} C of each stage, from the information C^T R C of its outputs (R their

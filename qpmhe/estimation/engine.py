@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import deque
 from collections.abc import Iterable
 from time import perf_counter
@@ -16,17 +17,18 @@ from qpmhe_solvers.contained import ContainedSolver
 
 from .._checks import check_problem
 from ..costs import Cost
-from ..errors import InvalidInputError
+from ..errors import InvalidInputError, ObserverWarning
 from ..model.system import System
 from ..observers import Observer
 from .covariance import window_covariances
 from .estimate import Estimate, Status
 from .optimizer import Optimizer
-from .problem import Problem
+from .problem import Formulation
 from .settings import Settings
-from .snapshot import SET_NAMES, check_description, checked_array, described, reading
+from .snapshot import check_description, check_size, checked_array, described, reading
 from .stages import Mark
 from .subproblem import Subproblem
+from .watch import ObserverWatch
 from .window import Window
 
 __all__ = ["PythonEngine"]
@@ -62,15 +64,15 @@ class PythonEngine:
             solver.prepare((settings.horizon + 1) * system.n)
         if system.kernel is not None:
             system.kernel.prepare(settings.horizon)
-        self._problem = Problem(system, cost)
-        self._subproblem = Subproblem(system, cost, settings.horizon)
+        self._formulation = formulation = Formulation(system, observer, cost)
+        self._subproblem = Subproblem(system, cost, formulation.constraints, settings.horizon)
         self._optimizer = Optimizer(self._subproblem, solver, settings)
         self._with_terms = settings.qp_limit > 0
         self._window = self._fresh_window(initial_state)
+        self._watch = ObserverWatch(settings.horizon)
         self._known_modes = system.call_modes()  # as found at construction
-        self._undo_point: tuple[Mark, Array | None, tuple[str, ...], tuple[Array, ...]]
+        self._undo_point: tuple[Mark, Array | None, tuple[int, int], tuple[Array, ...]]
         self._trajectory: Array | None = None  # of the last estimate
-        self._dropped: tuple[str, ...] = ()  # the sets that it leaves out
         # Estimates of x(t-N), ..., x(t), each made at its own time; otherwise of x(t) only.
         self._reinitialized = settings.candidate == "reinitialized"
         self._history: deque[Array] = deque(
@@ -81,7 +83,7 @@ class PythonEngine:
         settings = self._settings
         return Window(
             self._system, self._observer, self._cost, settings.horizon, initial_state,
-            self._with_terms,
+            self._with_terms, settings.project_observer,
         )
 
     @property
@@ -111,68 +113,79 @@ class PythonEngine:
             with np.errstate(all="ignore"):
                 if window.length == self._settings.horizon:
                     self._solver.shift()
-                missing, model_failed, jacobian_failed = window.push(y, u, dt, noise_weight)
+                window.push(y, u, dt, noise_weight)
                 if reinitialized:
-                    first = self._history[len(self._history) - window.length]
-                    missing, model_failed, jacobian_failed = window.replay(window.length, first)
-                estimate = self._estimate(missing, model_failed, jacobian_failed, began)
+                    window.replay(window.length, self._history[len(self._history) - window.length])
+                estimate = self._estimate(began)
             assert self._trajectory is not None
             state = self._trajectory[-1]
             # A view keeps its whole trajectory in memory: one may, N may not.
             self._history.append(state.copy() if reinitialized else state)
+            self._warn()
             return estimate
-        except BaseException:  # an interrupt: the sample is not taken
+        except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
             self.undo()
             raise
 
-    def _estimate(
-        self, missing: bool, model_failed: bool, jacobian_failed: bool, began: float
-    ) -> Estimate:
+    def _warn(self) -> None:
+        text = self._watch.warning()
+        if text is not None:
+            warnings.warn(text, ObserverWarning, stacklevel=4)
+
+    def _estimate(self, began: float) -> Estimate:
         """Solve the present window's problem."""
-        window, problem, settings = self._window, self._problem, self._settings
-        problem.bind(window)
+        window, settings = self._window, self._settings
+        problem = self._formulation.problem(window)
         start = self._shifted() if settings.warm_start else None
         deadline = math.inf if settings.time_budget is None else began + settings.time_budget
-        outcome = self._optimizer.improve(problem, window, start, deadline)
-        trial, reference = outcome.trial, outcome.reference
-        trajectory, residuals = trial.trajectory, trial.residuals
+        outcome = self._optimizer.improve(problem, start, deadline)
+        trial, candidate, message = outcome.trial, problem.candidate, outcome.message
         status = Status.IMPROVED if outcome.improved else Status.CANDIDATE
         if outcome.events:
             status |= outcome.events
-        if missing:
-            status |= Status.MISSING
-        if model_failed or jacobian_failed:
-            status |= Status.MODEL_FAILED
-        elif not math.isfinite(reference.cost):
-            status |= Status.FAILED_STAGE
-        if not math.isfinite(reference.cost):
+        if window.events:
+            status |= Status(window.events)
+        if window.failure:
+            message = f"{window.failure} {message}".strip()
+        if not math.isfinite(candidate.cost):
             status &= ~Status.NO_DECREASE  # the model failed, not the solver
+            if Status.MODEL_FAILED not in status:
+                status |= Status.FAILED_STAGE
+        trajectory, residuals, filtered = trial.trajectory, trial.residuals, None
+        far = self._watch.note(
+            trajectory[-1] - candidate.trajectory[-1], problem.prior_weight, status
+        )
+        if far:
+            status |= far
         if not outcome.improved:
-            trajectory = trajectory.copy()  # it is a view of the window
-        if problem.observed is not None or not outcome.improved:
+            # They are views of the window.
+            trajectory, residuals = trajectory.copy(), residuals.copy()
+            filtered = window.filtered()
+        if problem.observed is not None:
             residuals = residuals.copy()
-            if problem.observed is not None:
-                residuals[:, self._system.n :][~problem.observed] = np.nan
+            residuals[:, self._system.n :][~problem.observed] = np.nan
         estimate = Estimate(
             window.time - 1,
             trajectory,
             residuals,
             trial.cost,
-            reference.trajectory.copy(),
-            reference.cost,
+            candidate.trajectory.copy(),
+            candidate.cost,
             status,
-            outcome.message,
+            message,
             outcome.qps,
             outcome.solver_iterations,
             outcome.solve_time,
             outcome.corrections,
             outcome.dropped,
             settings.delay,
+            outcome.nearest_points,
+            filtered,
         )
-        if model_failed and outcome.improved:
+        if window.newest_failed and outcome.improved:
             window.restart(estimate.state)
         # The estimate's arrays are the user's.
-        self._trajectory, self._dropped = trajectory.copy(), outcome.dropped
+        self._trajectory = trajectory.copy()
         estimate.step_time = perf_counter() - began
         return estimate
 
@@ -197,23 +210,21 @@ class PythonEngine:
             with np.errstate(all="ignore"):
                 self._window.amend(time, y)
                 self._trajectory = None  # of this window already: no warm start from it
-                missing = not self._window.observed[-1].all()
-                model_failed = self._window.newest_failed
-                estimate = self._estimate(missing, model_failed, False, began)
+                estimate = self._estimate(began)
             self._history[-1] = estimate.state.copy()
-            return estimate
         except BaseException:
             self.undo()
             raise
+        return estimate
 
     def _set_undo_point(self, whole: bool) -> None:
         """Save what `undo` needs; all stages where some will be rewritten."""
         mark = self._window.mark(whole)
-        self._undo_point = mark, self._trajectory, self._dropped, tuple(self._history)
+        self._undo_point = mark, self._trajectory, self._watch.counts, tuple(self._history)
 
     def undo(self) -> None:
         """Undo the last step; the solver loses its warm start."""
-        mark, self._trajectory, self._dropped, history = self._undo_point
+        mark, self._trajectory, self._watch.counts, history = self._undo_point
         self._window.roll_back(mark)
         self._history.clear()
         self._history.extend(history)
@@ -223,24 +234,24 @@ class PythonEngine:
     def reset(self, initial_state: Array) -> None:
         """Forget all measurements and start at this state."""
         self._solver.forget()
-        self.replace(self._fresh_window(initial_state), None, (), [initial_state.copy()])
+        self.replace(self._fresh_window(initial_state), None, (0, 0), [initial_state.copy()])
 
     @property
-    def memory(self) -> tuple[Window, Array | None, tuple[str, ...], deque[Array]]:
+    def memory(self) -> tuple[Window, Array | None, tuple[int, int], deque[Array]]:
         """The arguments of `replace`."""
-        return self._window, self._trajectory, self._dropped, self._history
+        return self._window, self._trajectory, self._watch.counts, self._history
 
     def replace(
-        self, window: Window, trajectory: Array | None, dropped: tuple[str, ...],
+        self, window: Window, trajectory: Array | None, watched: tuple[int, int],
         history: Iterable[Array],
     ) -> None:
         """Replace the memory: all of it or, if interrupted, nothing."""
         before = self.memory
         try:
-            self._window, self._trajectory, self._dropped = window, trajectory, dropped
+            self._window, self._trajectory, self._watch.counts = window, trajectory, watched
             self._history = deque(history, maxlen=self._history.maxlen)
         except BaseException:
-            self._window, self._trajectory, self._dropped, self._history = before
+            self._window, self._trajectory, self._watch.counts, self._history = before
             raise
 
     def run(self, ys: Array, us: Array | None) -> None:
@@ -250,11 +261,16 @@ class PythonEngine:
         """Covariances along the last estimate."""
         if self._trajectory is None:
             raise InvalidInputError("there is no estimate yet; update first.")
-        problem = self._problem
         with np.errstate(all="ignore"):
-            problem.bind(self._window)
-            problem.leave_out(self._dropped)
-            return window_covariances(problem, self._trajectory.copy())
+            problem = self._formulation.problem(self._window)
+            trial = problem.evaluate(self._trajectory.copy())
+            if trial.violation == math.inf:
+                raise InvalidInputError("the model has no finite values along the estimate.")
+            return window_covariances(
+                problem.model, trial.trajectory, problem.inputs, trial.weights,
+                problem.prior_weight_at(trial.trajectory[0] - problem.prior),
+                problem.constraints.noise_free,
+            )
 
     def state_dict(self) -> dict[str, Any]:
         """The memory as plain arrays and numbers."""
@@ -268,7 +284,7 @@ class PythonEngine:
             "window": self._window.state_dict(),
             "history": [state.copy() for state in self._history],
             "trajectory": None if self._trajectory is None else self._trajectory.copy(),
-            "dropped": self._dropped,
+            "watched": self._watch.counts,
             # How the model is called: another way would round differently.
             "modes": list(modes),
             "methods": list(methods),
@@ -304,7 +320,7 @@ class PythonEngine:
 
     def _checked_memory(
         self, state: dict[str, Any]
-    ) -> tuple[Window, Array | None, tuple[str, ...], list[Array]]:
+    ) -> tuple[Window, Array | None, tuple[int, int], list[Array]]:
         """The memory in a state, as `replace` takes it."""
         n, with_terms = self._system.n, state["linearized"]
         if not isinstance(with_terms, bool):
@@ -323,15 +339,10 @@ class PythonEngine:
             trajectory = checked_array("trajectory", trajectory, (loaded.length + 1, n))
             if not np.array_equal(trajectory[-1], history[-1]):
                 raise ValueError("history does not end where the trajectory does")
-        dropped = state["dropped"]
-        if not isinstance(dropped, tuple) or not all(
-            isinstance(name, str) and getattr(self._system, name, None) is not None
-            and name in SET_NAMES for name in dropped
-        ):
-            raise ValueError(f"dropped is {dropped!r}")
         same_terms = with_terms == self._with_terms
         recomputed.check_stages(loaded, same_terms)
-        return loaded if same_terms else recomputed, trajectory, dropped, history
+        far, dropped = (check_size("watched", k, lambda c: 0 <= c <= loaded.time) for k in state["watched"])
+        return loaded if same_terms else recomputed, trajectory, (far, dropped), history
 
     def _checked_modes(
         self, modes: Any, methods: Any

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Estimate", "Status"]
+__all__ = ["DroppedRow", "Estimate", "Status"]
 
 Array = NDArray[np.float64]
 
@@ -30,9 +31,12 @@ class Status(enum.Flag):
     MODEL_FAILED = enum.auto()
     FAILED_STAGE = enum.auto()
     MISSING = enum.auto()
-    SETS_DROPPED = enum.auto()
-    PROJECTED = enum.auto()
     CANDIDATE_OUTSIDE = enum.auto()
+    ROWS_DROPPED = enum.auto()
+    OBSERVER_PROJECTED = enum.auto()
+    PREDICTION_OUTSIDE = enum.auto()
+    METRIC_SINGULAR = enum.auto()
+    OBSERVER_FAR = enum.auto()
     TIME_UP = enum.auto()
 
     def explain(self) -> str:
@@ -68,20 +72,53 @@ _TEXTS = {
         "The measurement is missing in part or whole (not finite); its noise term was left "
         "out and the observer predicted without it."
     ),
-    Status.SETS_DROPPED: (
-        "The observer's candidate is outside of the sets, which were left out in this step; "
-        "widen them, take another observer, or try outside='project'."
-    ),
-    Status.PROJECTED: (
-        "The observer's candidate is outside of the sets; the nearest trajectory inside took "
-        "its place as the candidate, which the theorem does not cover."
-    ),
     Status.CANDIDATE_OUTSIDE: (
-        "The observer's candidate is outside of the sets and was kept all the same; choose "
-        "outside='drop' or 'project' to improve on it."
+        "The observer's candidate violates the sets of disturbances or noises (or of states, with "
+        "project_observer=False)."
+    ),
+    Status.ROWS_DROPPED: (
+        "No trajectory was found that satisfies all sets at a cost not above the candidate's; the "
+        "inequalities in estimate.dropped were left out. Widen these sets, or raise max_qps."
+    ),
+    Status.OBSERVER_PROJECTED: "The observer's step left the set of states; it was projected.",
+    Status.PREDICTION_OUTSIDE: (
+        "The model's prediction from the observer's state left the set of states: (eq:kappa) does "
+        "not bound the observer's correction at this sample."
+    ),
+    Status.METRIC_SINGULAR: (
+        "The observer's covariance is singular and leaves no way into the set of states; the "
+        "observer was projected in another metric."
+    ),
+    Status.OBSERVER_FAR: (
+        "The observer has been far from the estimates for a whole horizon; take another gain or "
+        "observer, or candidate='reinitialized', which starts it anew from the estimates."
     ),
     Status.TIME_UP: "The time budget was spent; the best trajectory so far is the estimate.",
 }
+
+
+class DroppedRow(NamedTuple):
+    """An inequality that an estimate was allowed to violate.
+
+    Attributes
+    ----------
+    set : str
+        ``states``, ``disturbances`` or ``noises``.
+    row : int
+        The component that it bounds, or the dimension of the set plus the row of its matrix.
+    side : str
+        ``lower`` or ``upper``.
+    time : int
+        The time i of x(i), w(i) or v(i).
+    """
+
+    set: str
+    row: int
+    side: str
+    time: int
+
+    def __str__(self) -> str:
+        return f"{self.side} bound of {self.set}, row {self.row}, at time {self.time}"
 
 
 class Estimate:
@@ -101,7 +138,8 @@ class Estimate:
         Estimate of x(t+1), the paper's estimate: a prediction one step ahead of the newest
         measurement.
     filtered : (n,) array
-        Estimate of x(t), the last measured time.
+        Estimate of x(t) that has used y(t). Where the candidate was kept it is the observer's own
+        measurement update, and z(t) for an observer without one.
     trajectory : (N_t + 1, n) array
         Estimates of all states in the window.
     disturbances : (N_t, n) array
@@ -111,17 +149,20 @@ class Estimate:
     cost, candidate_cost : float
         True cost J of the estimate and of the observer's candidate; cost <= candidate_cost.
     candidate : (N_t + 1, n) array
-        The observer's trajectory, or its projection onto the sets.
+        The observer's trajectory.
     delayed : (n,) array or None
         Estimate of x(t+1-k) for the estimator's delay k; None until the window reaches it.
-    dropped : tuple of str
-        Names of the sets that were left out: "states", "disturbances", "noises".
+    dropped : tuple of DroppedRow
+        The inequalities that the estimate violates because no trajectory was found that
+        satisfies all of them at a cost not above the candidate's.
     status : Status
         Outcome and events.
     message : str
-        Message of the QP solver if it failed.
-    qps, corrections : int
-        QPs solved, and second-order corrections solved beside them.
+        What the model, the observer or the cost raised where it failed, and at which state;
+        the QP solver's message where that failed.
+    qps, corrections, nearest_points : int
+        QPs solved and, beside them, second-order corrections and QPs for a feasible trajectory
+        near an infeasible candidate.
     solver_iterations : int or None
         Sum of the solver's own iterations; None where it reports none.
     step_time, solve_time : float
@@ -129,9 +170,9 @@ class Estimate:
     """
 
     __slots__ = (
-        "_residuals", "candidate", "candidate_cost", "corrections", "cost", "delayed", "dropped",
-        "message", "qps", "solve_time", "solver_iterations", "state", "status", "step_time",
-        "time", "trajectory",
+        "_filtered", "_residuals", "candidate", "candidate_cost", "corrections", "cost", "delayed",
+        "dropped", "message", "nearest_points", "qps", "solve_time", "solver_iterations", "state",
+        "status", "step_time", "time", "trajectory",
     )
 
     def __init__(
@@ -148,8 +189,10 @@ class Estimate:
         solver_iterations: int | None,
         solve_time: float,
         corrections: int = 0,
-        dropped: tuple[str, ...] = (),
+        dropped: tuple[DroppedRow, ...] = (),
         delay: int = 0,
+        nearest_points: int = 0,
+        filtered: Array | None = None,
     ) -> None:
         self.time = time
         self.trajectory = trajectory
@@ -159,7 +202,8 @@ class Estimate:
         self.candidate = candidate
         self.status, self.message = status, message
         self.qps, self.solver_iterations = qps, solver_iterations
-        self.corrections, self.dropped = corrections, dropped
+        self.corrections, self.nearest_points, self.dropped = corrections, nearest_points, dropped
+        self._filtered = filtered
         self.delayed: Array | None = self.state if delay == 0 else None
         if 0 < delay < trajectory.shape[0]:
             self.delayed = trajectory[trajectory.shape[0] - 1 - delay]
@@ -167,8 +211,8 @@ class Estimate:
 
     @property
     def filtered(self) -> Array:
-        """Estimate of x(t), the last measured time."""
-        value: Array = self.trajectory[-2]
+        """Estimate of x(t) that has used y(t)."""
+        value: Array = self.trajectory[-2] if self._filtered is None else self._filtered
         return value
 
     @property
@@ -180,6 +224,18 @@ class Estimate:
     def noises(self) -> Array:
         """v(i) along the trajectory, NaN where y is missing."""
         return self._residuals[:, self.trajectory.shape[1] :]
+
+    def explain(self) -> str:
+        """What happened, and what can be done about it, in sentences; names dropped rows."""
+        text = self.status.explain()
+        if self.dropped:
+            text += f" Dropped: {'; '.join(map(str, self.dropped))}."
+        elif Status.CANDIDATE_OUTSIDE in self.status:
+            text += (
+                " The estimate satisfies all sets." if self.improved
+                else " The estimate violates them as well."
+            )
+        return f"{text} {self.message}".strip()
 
     @property
     def improved(self) -> bool:

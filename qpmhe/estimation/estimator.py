@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from time import perf_counter
 from typing import Any
 
@@ -14,9 +15,11 @@ from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import positive, positive_definite, record, vector
 from ..costs import Cost
-from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
+from .._linalg import inverse
+from ..errors import InvalidInputError, ModelError, ObserverWarning, OptionError, ShapeError
 from ..model.system import System
 from ..observers import Observer
+from ..observers.projection import NearestPoint
 from .engines import engine_for
 from .estimate import Estimate
 from .run import Run
@@ -48,7 +51,8 @@ class MovingHorizonEstimator:
     horizon : int
         N >= 1. Before N samples have come, all are used (Remark rem:emtpyN).
     initial_state : (n,) array_like
-        Estimate of x(0), the state at the first measurement; within the state set.
+        Estimate of x(0), the state at the first measurement. Outside of the state set it is
+        projected onto it, with an `ObserverWarning`.
     backend : str or Solver
         QP solver, one of ``qpmhe.solvers.available()``. ``auto`` uses a banded Cholesky
         factorisation and another solver only where inequalities bind; a named backend solves
@@ -72,11 +76,15 @@ class MovingHorizonEstimator:
         made by `qpmhe.from_casadi`, a quadratic cost and an observer with constant gain,
         compiles it once and keeps it in a cache on disk; an interior-point method in it solves
         QPs with active inequalities. Without a C compiler it warns and runs the Python step.
-    outside : {"drop", "project", "keep"}
-        What to do where the candidate is outside of the sets: ``drop`` leaves the violated
-        sets out in this step, the paper's remedy after Assumption ass:observer; ``project``
-        takes the nearest trajectory inside as candidate, if one QP finds a truly feasible
-        one, and drops otherwise; ``keep`` returns the candidate.
+    project_observer : bool
+        Whether the observer's state is projected onto X after each step, in the observer's own
+        metric: `Observer.metric`, the inverse of its covariance, or the Lyapunov matrix of its
+        linearised error. False gives the paper's plain observer, which may leave X.
+    infeasible : {"drop_rows", "keep_candidate"}
+        What to do where the candidate violates a set and no trajectory is found that satisfies
+        all sets at a cost not above the candidate's: ``drop_rows`` leaves out the inequalities
+        that the candidate violates, one by one and in this step only; ``keep_candidate``
+        returns the candidate.
     warm_start : bool
         Whether the sequence starts at the shifted previous estimate where its true J is lower
         than the candidate's. What beats the candidate is accepted in either case.
@@ -125,7 +133,8 @@ class MovingHorizonEstimator:
         solver_tolerance: float = 1e-7,
         tolerance: float = 1e-9,
         engine: str = "python",
-        outside: str = "drop",
+        project_observer: bool = True,
+        infeasible: str = "drop_rows",
         warm_start: bool = False,
         candidate: str = "observer",
         time_budget: float | None = None,
@@ -134,7 +143,7 @@ class MovingHorizonEstimator:
     ) -> None:
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
-            engine, outside, warm_start, candidate, time_budget, delay, isolated,
+            engine, project_observer, infeasible, warm_start, candidate, time_budget, delay, isolated,
         )
         self.system, self.observer, self.cost = system, observer, cost
         _require(system, System, "system", "qpmhe.System")
@@ -167,8 +176,7 @@ class MovingHorizonEstimator:
 
     def _checked_start(self, initial_state: ArrayLike) -> Array:
         state = vector("initial_state", initial_state, self.system.n)
-        check_start(self._own_system, self.observer, state)
-        return state
+        return check_start(self._own_system, self.observer, self.cost, state)
 
     def reset(self, initial_state: ArrayLike | None = None) -> None:
         """Forget all measurements and start again.
@@ -471,19 +479,38 @@ def _require(value: object, kind: type, name: str, expected: str) -> None:
 
 
 def check_start(
-    system: System, observer: Observer, state: Array, name: str = "initial_state"
-) -> None:
-    """Check that model and observer work at an initial state, and that it is in its set."""
+    system: System, observer: Observer, cost: Cost, state: Array, name: str = "initial_state"
+) -> Array:
+    """Check that model and observer work at an initial state; return it, projected onto X."""
     try:
+        state = _inside(system, observer, cost, state, name)
         system.check(state, np.zeros(system.m))
         observer.check(system, state)
     except ModelError as error:
         if name == "initial_state":
             raise
         raise ModelError(f"{name}: {error}") from error
-    states = system.states
-    if states is not None and states.violation(state) > 0.0:
-        raise InvalidInputError(
-            f"{name} is {state.tolist()}, which is outside of the state set "
-            f"{states!r}; start within it."
-        )
+    return state
+
+
+def _inside(
+    system: System, observer: Observer, cost: Cost, state: Array, name: str
+) -> Array:
+    if system.states is None:
+        return state
+    nearest = NearestPoint(system.states)
+    if nearest.contains(state):
+        return state
+    weight = observer.metric
+    if weight is None:
+        weight = cost.initial_weight(observer.initial_covariance())
+    if weight.shape[0] != system.n:
+        return state  # the check of the observer says so
+    inside = nearest(state, inverse(weight)).point
+    warnings.warn(
+        f"{name} is {state.tolist()}, outside of the state set {system.states!r}; the estimator "
+        f"starts at the nearest point in it, {inside.tolist()}.",
+        ObserverWarning,
+        stacklevel=5,
+    )
+    return inside

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 __all__ = [
-    "BEYOND", "CORRECTIONS", "FEASIBLE", "LARGEST", "LENGTHS", "NEARLY", "ROUNDING", "STALLED",
+    "BEYOND", "CORRECTIONS", "FEASIBLE", "LARGEST", "LENGTHS", "NEAREST_POINTS", "NEARLY",
+    "ROUNDING", "STALLED",
     "c_definitions",
 ]
 
@@ -14,7 +15,8 @@ LENGTHS = (0.9999, 0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)
 #: A decrease of J by less than this share of it is rounding, and no improvement.
 ROUNDING = 1e-12
 
-#: A step that violates a set by less than this is shortened before it is corrected.
+#: A step that misses a row by less than this share of its scale is shortened before it is
+#: corrected.
 NEARLY = 1e-6
 
 #: On curved sets, FEASIBLE limits how far J can be lowered. If no step length lowers it, the
@@ -27,7 +29,11 @@ CORRECTIONS = 2
 #: A second-order correction is lengthened by this share of itself, to end inside the set.
 BEYOND = 0.1
 
-#: Largest violation of a feasible trial: QP solvers end on the boundary up to their tolerance.
+#: Most QPs for a point near an infeasible candidate that satisfies all rows.
+NEAREST_POINTS = 5
+
+#: Largest miss of a row of a feasible trial, as a share of the row's scale: QP solvers end on the
+#: boundary up to their tolerance.
 FEASIBLE = 5e-9
 
 #: A larger measurement counts as missing: its square would not be finite.
@@ -46,6 +52,7 @@ def c_definitions(prefix: str, real: str) -> str:
         values |= _SINGLE
     lines = [f"#define {prefix}_{name} (({real}){value!r})" for name, value in values.items()]
     lines.append(f"#define {prefix}_CORRECTIONS {CORRECTIONS}")
+    lines.append(f"#define {prefix}_NEAREST_POINTS {NEAREST_POINTS}")
     lengths = ", ".join(f"({real}){length!r}" for length in LENGTHS)
     lines.append(f"#define {prefix}_LENGTHS {{{lengths}}}")
     return "\n".join(lines)

@@ -140,14 +140,17 @@ class StageTerms:
         self.gradient[:count] = square[:, 1:, 0]
         self.next_gradient[:count] = weighted[:, : self.gradient.shape[1], 0]
 
-    def copy_scaled(self, terms: StageTerms, first: int, factors: Array) -> None:
-        """Copy the stages of ``terms`` from ``first`` on, each with its cost times a factor."""
+    def copy_scaled(self, span: Span, factors: Array) -> None:
+        """Copy stages to the first ones here, each with its cost times a factor."""
         count = factors.size
-        stages = slice(first, first + count)
-        self.linear[:count] = terms.linear[stages]
-        np.multiply(terms.panel[stages], factors[:, None, None], out=self.panel[:count])
-        np.multiply(terms.gradient[stages], factors[:, None], out=self.gradient[:count])
-        np.multiply(terms.next_gradient[stages], factors[:, None], out=self.next_gradient[:count])
+        self.linear[:count, :, 1:] = span.minus_jacobian
+        np.multiply(span.panel, factors[:, None, None], out=self.panel[:count])
+        np.multiply(span.gradient_first, factors[0], out=self.gradient[0])
+        np.multiply(span.gradient_rest, factors[1:, None], out=self.gradient[1:count])
+        np.multiply(
+            span.next_gradient_rest, factors[:-1, None], out=self.next_gradient[: count - 1]
+        )
+        np.multiply(span.next_gradient_last, factors[-1], out=self.next_gradient[count - 1])
 
     def arrays(self) -> tuple[Array, ...]:
         """The arrays, each with one entry a stage."""

@@ -12,12 +12,19 @@ from numpy.typing import NDArray
 from qpmhe_solvers import QP, Solution, SolveStatus
 from qpmhe_solvers.contained import ContainedSolver
 
-from .estimate import Status
-from .limits import CORRECTIONS, LENGTHS, NEARLY, ROUNDING, STALLED
+from .estimate import DroppedRow, Status
+from .limits import (
+    CORRECTIONS,
+    FEASIBLE,
+    LENGTHS,
+    NEAREST_POINTS,
+    NEARLY,
+    ROUNDING,
+    STALLED,
+)
 from .problem import Problem, Trial
 from .settings import Settings
 from .subproblem import Subproblem
-from .window import Window
 
 __all__ = ["Optimizer", "Outcome"]
 
@@ -29,15 +36,14 @@ class Outcome:
 
     Attributes
     ----------
-    reference : Trial
-        The candidate, or its projection onto the sets.
     trial : Trial
-        The best trajectory so far, at first the reference.
+        The best trajectory so far, at first the candidate. Its cost is infinite as long as it
+        violates a constraint of the problem being solved.
     improved : bool
-        Whether it is better than the reference.
+        Whether it is an estimate better than the candidate.
     events : Status
         Why the sequence stopped, and what happened.
-    message, qps, corrections, solver_iterations, solve_time, dropped
+    dropped, message, qps, corrections, nearest_points, solver_iterations, solve_time
         As in `Estimate`.
     """
 
@@ -47,13 +53,13 @@ class Outcome:
     message: str = ""
     qps: int = 0
     corrections: int = 0
+    nearest_points: int = 0
     solver_iterations: int | None = 0
     solve_time: float = 0.0
-    dropped: tuple[str, ...] = ()
+    dropped: tuple[DroppedRow, ...] = ()
 
     def __init__(self, candidate: Trial, deadline: float = math.inf) -> None:
-        self.reference = self.trial = candidate
-        self.deadline = deadline
+        self.trial, self.deadline = candidate, deadline
 
     def time_is_up(self) -> bool:
         """Whether the deadline has passed; adds it to the events."""
@@ -83,148 +89,164 @@ class Outcome:
 class Optimizer:
     """Gauss-Newton steps from the candidate, each judged by the true problem.
 
-    A step that does not lower J below the best so far is shortened, and
-    dropped if no length helps. So J of the result is never above the candidate's, and the
-    result satisfies the constraints, whatever the solver returns.
+    A step that does not lower J below the best so far is shortened, and dropped if no length
+    helps. So J of the result is never above the candidate's, whatever the solver returns.
+
+    Where the candidate satisfies all rows, so does the result. Where it does not, the result is
+
+    (a) a trajectory that satisfies all rows, with J no greater than the candidate's; else
+    (b) one that satisfies all but the rows that the candidate violates, with such a J; else
+    (c) the candidate.
     """
 
     def __init__(
-        self,
-        subproblem: Subproblem,
-        solver: ContainedSolver,
-        settings: Settings,
+        self, subproblem: Subproblem, solver: ContainedSolver, settings: Settings
     ) -> None:
         self._subproblem, self._solver = subproblem, solver
         self._limit, self._tolerance = settings.qp_limit, settings.tolerance
-        self._outside = settings.outside
+        self._may_drop = settings.infeasible == "drop_rows"
 
     def improve(
-        self,
-        problem: Problem,
-        window: Window,
-        start: Array | None = None,
-        deadline: float = math.inf,
+        self, problem: Problem, start: Array | None = None, deadline: float = math.inf
     ) -> Outcome:
-        """Run the sequence on a bound problem; never raises, whatever solver and model do."""
-        candidate = problem.candidate(window)
+        """Run the sequence; never raises, whatever solver and model do."""
+        candidate = problem.candidate
         outcome = Outcome(candidate, deadline)
-        if problem.constrained and not self._treat_violated_sets(problem, window, outcome):
-            return outcome
+        feasible = candidate.violation <= FEASIBLE
+        if not feasible:
+            outcome.events |= Status.CANDIDATE_OUTSIDE
         if self._limit == 0:
             outcome.events |= Status.NO_QPS
             return outcome
-        qp: QP | None = None
+        if feasible:
+            self._search(problem, outcome, start, self._limit)
+            outcome.improved = outcome.trial is not candidate
+        else:
+            self._restore(problem, outcome, start)
+        return outcome
+
+    def _restore(self, problem: Problem, outcome: Outcome, start: Array | None) -> None:
+        """The sequence from a candidate outside of the sets."""
+        candidate = problem.candidate
+        outside = replace(candidate, cost=math.inf)
+        outcome.trial = outside
+        self._search(problem, outcome, start, self._limit)
+        if not outcome.trial.cost < math.inf and self._to_nearest_point(problem, outcome):
+            self._search(problem, outcome, None, self._limit - outcome.qps)
+        if outcome.trial.cost <= candidate.cost and outcome.trial is not outside:
+            outcome.improved = True
+            return
+        outcome.trial = candidate
+        if not self._may_drop or outcome.time_is_up():
+            return
+        outcome.events &= ~(Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED)
+        relaxed = problem.without_violated()
+        self._search(relaxed, outcome, start, max(1, self._limit - outcome.qps))
+        outcome.improved = outcome.trial is not candidate
+        if outcome.improved:
+            outcome.dropped = problem.missed_rows(outcome.trial)
+            if outcome.dropped:
+                outcome.events |= Status.ROWS_DROPPED
+
+    def _search(self, problem: Problem, outcome: Outcome, start: Array | None, limit: int) -> None:
+        """At most so many QPs, each around the best trajectory so far."""
         if start is not None:
-            trial = problem.evaluate(_clipped(problem, start.copy()))
+            trial = problem.evaluate(problem.clipped(start.copy()))
             if trial.cost < _target(outcome.trial):
-                outcome.trial, outcome.improved = trial, True
-        for _ in range(self._limit):
+                outcome.trial = trial
+        for _ in range(limit):
             if outcome.time_is_up():
                 break
-            if outcome.trial is candidate:
-                qp = self._subproblem.at_candidate(problem, window)
-            else:
-                qp = self._subproblem.at(problem, outcome.trial)
+            qp = self._subproblem.at(problem, outcome.trial)
             if qp is None:
                 outcome.events |= Status.MODEL_FAILED
+                outcome.message = self._subproblem.failure
                 break
             if not self._step(problem, qp, outcome):
                 break
-        return outcome
 
-    def _treat_violated_sets(self, problem: Problem, window: Window, outcome: Outcome) -> bool:
-        """Project a candidate outside of the sets, or leave them out; False skips the QPs."""
-        violated = problem.violated_sets(outcome.trial)
-        if not violated:
-            return True
-        if self._outside == "keep":
-            outcome.events |= Status.CANDIDATE_OUTSIDE
-            return False
-        if self._outside == "project" and self._limit > 0:
-            projected = self._project(problem, window, outcome)
-            if projected.cost < math.inf:
-                outcome.reference = outcome.trial = projected
-                outcome.events |= Status.PROJECTED
+    def _to_nearest_point(self, problem: Problem, outcome: Outcome) -> bool:
+        """Look for a feasible trajectory near an infeasible one; whether one was found."""
+        nearest = outcome.trial
+        for _ in range(NEAREST_POINTS):
+            qp = self._subproblem.nearest_point(problem, nearest)
+            solution = None if qp is None else self._solve(qp, outcome)
+            if solution is None:
+                return False
+            outcome.nearest_points += 1
+            if solution.d is None:
+                return False
+            trial = self._trial(problem, nearest, solution.d)
+            if trial.cost < math.inf:
+                outcome.trial = trial
                 return True
-        problem.leave_out(violated)
-        outcome.dropped = violated
-        outcome.events |= Status.SETS_DROPPED
-        return True
-
-    def _project(self, problem: Problem, window: Window, outcome: Outcome) -> Trial:
-        """The candidate projected onto the sets by QPs; its cost is infinite if this fails."""
-        candidate = outcome.trial
-        qp = self._subproblem.projection(problem, window)
-        trial = candidate
-        for attempt in range(1 + CORRECTIONS):
-            if outcome.time_is_up():
-                return replace(candidate, cost=math.inf, violation=math.inf)
-            solution = self._solve(qp, outcome)
-            step = None if solution is None else solution.d
-            if step is None:
-                return replace(candidate, cost=math.inf, violation=math.inf)
-            trial = self._trial(problem, candidate, step)
-            if trial.cost < math.inf or not math.isfinite(trial.violation):
-                return trial
-            if attempt < CORRECTIONS:
-                self._subproblem.correct_rows(qp, problem, candidate, trial)
-                outcome.corrections += 1
-        return trial
+            if not trial.violation < nearest.violation:
+                return False
+            nearest = trial
+        return False
 
     def _step(self, problem: Problem, qp: QP, outcome: Outcome) -> bool:
-        """Solve one QP and evaluate its step; whether another QP is worth solving."""
+        """Solve one QP and take its step; whether another QP is worth solving."""
         solution = self._solve(qp, outcome)
         if solution is None:
             return False
         outcome.qps += 1
-        step = solution.d
-        if step is None:
+        if solution.d is None:
             outcome.events |= Status.SOLVER_FAILED
             outcome.message = solution.message
             return False
-        best = outcome.trial
-        target, negligible = _target(best), self._tolerance * (best.cost + self._tolerance)
-        if not math.isfinite(negligible):
-            negligible = -1.0  # J is infinite here: no decrease is negligible
         solved = solution.status is SolveStatus.SOLVED
         if not solved:
             outcome.events |= Status.SOLVER_STOPPED
+        best = outcome.trial
+        # Where J is infinite, no decrease is negligible.
+        negligible = self._tolerance * best.cost if best.cost < math.inf else -1.0
+        trial = self._lower(problem, qp, outcome, solution.d, negligible if solved else -1.0)
+        if trial.cost < _target(best):
+            outcome.trial = trial
+            if solved and best.cost - trial.cost <= negligible:
+                outcome.events |= Status.CONVERGED
+                return False
+            return True
+        predicted = _predicted(qp, solution.d)
+        at_minimum = solved and predicted <= max(
+            STALLED * negligible, problem.rounding_cost(best) if best.cost < math.inf else -1.0
+        )
+        outcome.events |= Status.CONVERGED if at_minimum else Status.NO_DECREASE
+        outcome.message = problem.failure(trial)
+        return False
+
+    def _lower(
+        self, problem: Problem, qp: QP, outcome: Outcome, step: Array, negligible: float
+    ) -> Trial:
+        """The first trial along a step whose J is below the best so far, or the last trial.
+
+        A step whose predicted decrease is negligible is not shortened: at a minimum no step
+        lowers J by more than rounding.
+        """
+        best, target = outcome.trial, _target(outcome.trial)
         trial = self._trial(problem, best, step)
         if trial.cost < target:
-            return self._accept(outcome, trial, solved, negligible)
-        predicted = abs(float(np.vdot(qp.gradient, step)))  # the QP's decrease of J
+            return trial
+        negligible_step = _predicted(qp, step) <= negligible
         if 0.0 < trial.violation < math.inf and qp.rows:
             missed = trial
             if trial.violation <= NEARLY:
                 trial = self._trial(problem, best, LENGTHS[0] * step)
             # If the shortened step leaves the set, too, curvature is the reason.
-            if not trial.cost < target and not (solved and predicted <= negligible):
+            if not trial.cost < target and not negligible_step:
                 step = step.copy()  # the correction's solve overwrites it
                 trial = self._correct(problem, qp, outcome, missed)
-        if not trial.cost < target:
-            # At a minimum no step lowers J by more than rounding: this is no failure.
-            if solved and predicted <= negligible:
-                outcome.events |= Status.CONVERGED
-                return False
-            for length in LENGTHS:
-                trial = self._trial(problem, best, length * step)
-                if trial.cost < target:
-                    break
-            else:
-                stalled = solved and predicted <= STALLED * negligible
-                outcome.events |= Status.CONVERGED if stalled else Status.NO_DECREASE
-                return False
-        return self._accept(outcome, trial, solved, negligible)
-
-    @staticmethod
-    def _accept(outcome: Outcome, trial: Trial, solved: bool, negligible: float) -> bool:
-        """Accept a better trajectory; whether another QP is worth solving."""
-        decrease = outcome.trial.cost - trial.cost
-        outcome.trial, outcome.improved = trial, True
-        if solved and decrease <= negligible:
-            outcome.events |= Status.CONVERGED
-            return False
-        return True
+            if trial.cost < target:
+                return trial
+        # Between two infeasible points there is no feasible one of a convex set.
+        if negligible_step or best.violation > FEASIBLE:
+            return trial
+        for length in LENGTHS:
+            trial = self._trial(problem, best, length * step)
+            if trial.cost < target:
+                break
+        return trial
 
     def _correct(self, problem: Problem, qp: QP, outcome: Outcome, trial: Trial) -> Trial:
         """Second-order corrections of a trial that curvature takes out of a set."""
@@ -256,15 +278,14 @@ class Optimizer:
 
     @staticmethod
     def _trial(problem: Problem, best: Trial, step: Array) -> Trial:
-        return problem.evaluate(_clipped(problem, best.trajectory + step))
-
-
-def _clipped(problem: Problem, trajectory: Array) -> Array:
-    if problem.states is not None:
-        np.clip(trajectory, problem.states.lower, problem.states.upper, out=trajectory)
-    return trajectory
+        return problem.evaluate(problem.clipped(best.trajectory + step))
 
 
 def _target(best: Trial) -> float:
     """The cost below which a trial is better than the best one."""
     return best.cost - ROUNDING * best.cost if best.cost < math.inf else math.inf
+
+
+def _predicted(qp: QP, step: Array) -> float:
+    """The decrease of J along a step, by the QP."""
+    return abs(float(np.vdot(qp.gradient, step)))

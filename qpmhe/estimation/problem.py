@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers.qp import band_of
 
-from ..costs import Cost, ObserverPrior
-from ..model.functions import contained
-from ..model.sets import ConvexSet
+from .._linalg import inverse
+from ..costs import Cost
+from ..model.functions import contained, raised_along
 from ..model.system import System
+from ..observers import Observer
+from .constraints import Constraints
+from .estimate import DroppedRow
 from .limits import FEASIBLE
 from .stages import read_only
 from .window import Window
 
-if TYPE_CHECKING:
-    from .stages import WindowView
-
-__all__ = ["Problem", "Trial"]
+__all__ = ["Formulation", "Problem", "Trial"]
 
 Array = NDArray[np.float64]
 
-# The disturbance is a difference of states, whose rounding comes on top of FEASIBLE.
-_ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
+_EPS = 8.0 * float(np.finfo(np.float64).eps)
 
 
 @dataclass(slots=True)
@@ -43,7 +42,9 @@ class Trial:
     cost : float
         J, or infinity if a constraint is violated or the model fails.
     violation : float
-        The largest violation of a constraint, 0 for the candidate, infinity if the model fails.
+        The largest violation of a row in its scale (see `Rows`), infinity if the model fails.
+    error : Exception or None
+        What the model or the cost raised.
     """
 
     trajectory: Array
@@ -51,10 +52,30 @@ class Trial:
     weights: Array
     cost: float
     violation: float = 0.0
+    error: Exception | None = None
+
+
+class Formulation:
+    """What all problems of an estimator have in common."""
+
+    def __init__(self, system: System, observer: Observer, cost: Cost) -> None:
+        self.system, self.cost, self.quadratic = system, cost, cost.quadratic
+        self.evaluate_costs, self.majorise = contained(cost.stage_costs), contained(cost.majorise)
+        self.prior_cost = contained(cost.prior_cost)
+        self.observer_prior = cost.observer_prior
+        self.discounted = cost.discount < 1.0
+        #: Weight of the initial error of the first window.
+        self.prior_weight: Array = cost.initial_weight(observer.initial_covariance())
+        self.prior_band = band_of(self.prior_weight)
+        self.constraints = Constraints(system, cost, inverse(self.prior_weight))
+
+    def problem(self, window: Window) -> Problem:
+        """The problem of the present window."""
+        return Problem(self, window)
 
 
 class Problem:
-    r"""The estimation problem of one window, in its state trajectory.
+    r"""The estimation problem of one window, in its state trajectory; immutable.
 
     The disturbance enters additively in full dimension, so every trajectory
     :math:`x_0, \dots, x_K` satisfies the dynamics with :math:`w_i = x_{i+1} - f(x_i, u_i)`,
@@ -63,104 +84,141 @@ class Problem:
     .. math::
         \min_x\; \gamma^K \Gamma(x_0 - \bar x) + \sum_{i<K} \gamma^{K-1-i} l(w_i, v_i)
         \quad \text{s.t.} \quad x_i \in \mathbb X,\ w_i \in \mathbb W,\ v_i \in \mathbb V.
+
+    Parameters
+    ----------
+    formulation : Formulation
+        What it has in common with other windows' problems.
+    window : Window
+        The data, with the prior z(t-N) of (eq:prior).
+
+    Attributes
+    ----------
+    candidate : Trial
+        The observer's trajectory (eq:warmstart), with its true J whether it is feasible or not.
+    constraints : Constraints
+        The rows that a trial must satisfy.
+    prior, inputs, measurements : array
+        z(t-N) (n,), u (K, m) and y (K, p).
+    observed : (K, p) bool array or None
+        Which components of y are not missing; None if none is missing.
+    prior_weight : (n, n) array
+        Weight of the initial error, before discount and majorisation.
     """
 
-    def __init__(self, system: System, cost: Cost) -> None:
-        self._system, self._cost, self._quadratic = system, cost, cost.quadratic
-        self._n, self._q = system.n, system.n + system.p
-        self._evaluate_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
-        self._prior_cost = contained(cost.prior_cost)
-        self._observer_prior = cost.observer_prior
-        #: Weight of the initial error, before discount and majorisation.
-        self.prior_weight: Array = (
-            np.eye(system.n) if isinstance(cost.prior, ObserverPrior) else cost.prior
-        )
-        self._prior_band = band_of(self.prior_weight)
-        self._discounted = cost.discount < 1.0
-        self._candidate: Trial | None = None
-        self.view: WindowView  # of the bound window
-        self.model = system
-        self.prior: Array = np.zeros(system.n)
-        self.inputs: Array = np.zeros((0, system.m))
-        self.measurements: Array = np.zeros((0, system.p))
-        self.stage_weights: Array = cost.stage_weight
-        #: Which components of y are not missing (K, p); None if none is missing.
-        self.observed: NDArray[np.bool_] | None = None
-        self.discounts: Array | None = None
-        self.constrained = any((system.states, system.disturbances, system.noises))
-        fixed = system.disturbances.fixed_components if system.disturbances else np.empty(0, int)
-        #: Components whose disturbance is a constant, so that their states follow the model.
-        self.noise_free: NDArray[np.intp] = fixed
-        self.use_sets(system.states, system.disturbances, system.noises)
+    __slots__ = (
+        "_clip", "_formulation", "_has_noise_free", "_prior_band", "candidate", "constrained",
+        "constraints", "discounts", "inputs", "measurements", "model", "observed", "prior",
+        "prior_weight", "span", "stage_weights", "time",
+    )
 
-    def bind(self, window: Window) -> None:
-        """Take the window's data, with the prior z(t-N) of (eq:prior), and use all sets."""
-        self._candidate = None
-        self.view = view = window.view
-        self.prior, self.measurements = view.prior, view.measurements
+    def __init__(self, formulation: Formulation, window: Window) -> None:
+        self._formulation, view, cost = formulation, window.view, formulation.cost
+        self.prior, self.measurements, self.span = view.prior, view.measurements, view.span
+        self.time = window.time - window.length
+        self.observed: NDArray[np.bool_] | None = None
         # `unusual` stays set for longer, and a snapshot sets it: no result may depend on it.
-        unusual = window.unusual and (window.has_special_weights or window.has_irregular_steps)
-        if unusual:
+        if window.unusual and (window.has_special_weights or window.has_irregular_steps):
             self.inputs, self.model = window.inputs, window.model
             self.stage_weights = window.stage_weights
-            self.observed = window.observed if window.has_special_weights else None
+            if window.has_special_weights:
+                self.observed = window.observed
         else:
-            self.inputs, self.model = view.inputs, self._system
-            self.stage_weights, self.observed = self._cost.stage_weight, None
-        if self._discounted:
-            self.discounts = window.discounts
-        if self._observer_prior is not None and window.prior_covariance is not None:
-            self.prior_weight = self._observer_prior.weight(window.prior_covariance)
+            self.inputs, self.model = view.inputs, formulation.system
+            self.stage_weights = cost.stage_weight
+        self.discounts = window.discounts if formulation.discounted else None
+        self.prior_weight, self._prior_band = formulation.prior_weight, formulation.prior_band
+        if formulation.observer_prior is not None and window.prior_covariance is not None:
+            self.prior_weight = formulation.observer_prior.weight(window.prior_covariance)
             self._prior_band = band_of(self.prior_weight)
+        weights = self.stage_weights if formulation.quadratic else window.majorising_weights
+        if self.discounts is not None:
+            weights = weights * self.discounts[1:, None, None]
+        self.candidate = Trial(
+            view.candidate, view.residuals, weights, window.candidate_cost_of(view)
+        )
+        self._constrain(formulation.constraints)
         if self.constrained:
-            system = self._system
-            self.use_sets(system.states, system.disturbances, system.noises)
+            if self.observed is not None:
+                self._constrain(formulation.constraints.observed(self.observed))
+            self.candidate.violation = self._violation(self.candidate)
 
-    def candidate(self, window: Window) -> Trial:
-        """The candidate of the bound window as a trial, whose cost the window knows."""
-        if self._candidate is None:
-            weights = self.stage_weights if self._quadratic else window.majorising_weights
-            if self.discounts is not None:
-                weights = weights * self.discounts[1:, None, None]
-            view = self.view
-            self._candidate = Trial(
-                view.candidate, view.residuals, weights, window.candidate_cost_of(view)
+    def _constrain(self, constraints: Constraints) -> None:
+        self.constraints, self.constrained = constraints, bool(constraints)
+        self._has_noise_free = bool(constraints.noise_free.size)
+        self._clip: tuple[Array, Array] | None = None
+        states = constraints.states
+        if states is not None and states.bounds:
+            shape = (*states.lower.shape[:-1], self.prior.size)
+            lower, upper = np.full(shape, -np.inf), np.full(shape, np.inf)
+            lower[..., states.components] = states.lower[..., : states.bounds]
+            upper[..., states.components] = states.upper[..., : states.bounds]
+            self._clip = lower, upper
+
+    def without_violated(self) -> Problem:
+        """The problem without the rows that the candidate violates, but for noise-free ones."""
+        other, candidate = copy(self), self.candidate
+        other._constrain(
+            self.constraints.without_violated(
+                candidate.trajectory, candidate.residuals, self.measurements
             )
-        return self._candidate
+        )
+        return other
+
+    def missed_rows(self, trial: Trial) -> tuple[DroppedRow, ...]:
+        """The rows of this problem that a trial violates."""
+        return self.constraints.missed_rows(
+            trial.trajectory, trial.residuals, self.measurements, self.time
+        )
+
+    def clipped(self, trajectory: Array) -> Array:
+        """A trajectory with each state in its bounds; written in place."""
+        if self._clip is not None:
+            np.clip(trajectory, *self._clip, out=trajectory)
+        return trajectory
 
     def evaluate(self, trajectory: Array) -> Trial:
         """Evaluate a trajectory (K + 1, n); never raises, whatever the model does."""
+        formulation, prior_weight = self._formulation, self.prior_weight
         try:
             if self._has_noise_free:
                 trajectory = self._rolled_out(trajectory)
             residuals = self._residuals(trajectory)
             weights, cost = self._weights_and_cost(residuals)
             offset = trajectory[0] - self.prior
-            if self._quadratic:
-                prior_cost = float(offset.dot(self.prior_weight).dot(offset))
+            if formulation.quadratic:
+                prior_cost = float(offset.dot(prior_weight).dot(offset))
             else:
-                prior_cost = self._prior_cost(offset, self.prior_weight)
+                prior_cost = formulation.prior_cost(offset, prior_weight)
             cost += prior_cost if self.discounts is None else float(self.discounts[0]) * prior_cost
-        except Exception:  # a model function outside its domain, or a user's loss
-            residuals = np.full((trajectory.shape[0] - 1, self._q), np.nan)
-            return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf)
+        except Exception as error:  # a model function outside its domain, or a user's loss
+            residuals = np.full_like(self.candidate.residuals, np.nan)
+            return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf, error)
+        trial = Trial(trajectory, residuals, weights, cost)
         if not math.isfinite(cost):
-            return Trial(trajectory, residuals, weights, math.inf, math.inf)
-        if not self.constrained:
-            return Trial(trajectory, residuals, weights, cost)
-        violation = self.violation(trajectory, residuals)
-        if violation > FEASIBLE:
-            cost = math.inf
-        return Trial(trajectory, residuals, weights, cost, violation)
+            trial.cost = trial.violation = math.inf
+        elif self.constrained:
+            trial.violation = self._violation(trial)
+            if trial.violation > FEASIBLE:
+                trial.cost = math.inf
+        return trial
+
+    def failure(self, trial: Trial) -> str:
+        """What the model or the cost raised at a trial, as a message; blank if nothing."""
+        if trial.error is None:
+            return ""
+        functions = {"f": self.model.f, "h": self.model.h}
+        return raised_along(trial.error, functions, trial.trajectory[:-1], self.inputs)
+
+    def _violation(self, trial: Trial) -> float:
+        return self.constraints.violation(trial.trajectory, trial.residuals, self.measurements)
 
     def _rolled_out(self, trajectory: Array) -> Array:
         """Set each noise-free component j, with W_j = {c}, to f_j(x_i) + c, stage by stage."""
-        free, system = self.noise_free, self.model
-        assert self.disturbances is not None
-        shift = self.disturbances.lower[free]
+        free, shift = self.constraints.noise_free, self.constraints.constant
         rolled_out = trajectory.copy()
         for i in range(trajectory.shape[0] - 1):
-            predicted = np.asarray(system.f(rolled_out[i], self.inputs[i]))
+            predicted = np.asarray(self.model.f(rolled_out[i], self.inputs[i]))
             rolled_out[i + 1, free] = predicted[free] + shift
         return rolled_out
 
@@ -174,14 +232,14 @@ class Problem:
         disturbances = trajectory[1:] - model.f.batch(states, self.inputs)
         noises = self.measurements - model.h.batch(states, self.inputs)
         residuals: Array = np.concatenate((disturbances, noises), axis=1)
-        if residuals.shape[1] != self._q or residuals.dtype != np.float64:
+        if residuals.shape != self.candidate.residuals.shape or residuals.dtype != np.float64:
             raise TypeError("f or h returned other than real numbers of the right shape")
         return residuals
 
     def _weights_and_cost(self, residuals: Array) -> tuple[Array, float]:
         """The weights of `Trial`, and the stages' cost."""
-        weights = self.stage_weights
-        if self._quadratic:
+        weights, formulation = self.stage_weights, self._formulation
+        if formulation.quadratic:
             if self.discounts is not None:
                 weights = weights * self.discounts[1:, None, None]
             if weights.ndim == 2:
@@ -190,64 +248,29 @@ class Problem:
                 weighted = np.matmul(residuals[:, None, :], weights)[:, 0]
             return weights, float(weighted.ravel().dot(residuals.ravel()))
         residuals, weights = read_only(residuals), read_only(weights)
-        costs = self._evaluate_costs(residuals, weights)
-        weights = self._majorise(residuals, weights)
+        costs = formulation.evaluate_costs(residuals, weights)
+        weights = formulation.majorise(residuals, weights)
         if self.discounts is not None:
             weights = weights * self.discounts[1:, None, None]
             costs = costs * self.discounts[1:]
         return weights, float(costs.sum())
 
-    def violation(self, trajectory: Array, residuals: Array) -> float:
-        """The largest violation of the sets in use."""
-        n, worst = self._n, 0.0
-        if self.states is not None:
-            worst = self.states.violation(trajectory)
-        if self.disturbances is not None:
-            rounding = _ROUNDING * np.abs(trajectory[1:]).max(axis=1, keepdims=True)
-            worst = max(worst, self.disturbances.violation(residuals[:, :n], rounding=rounding))
-        if self.noises is not None:
-            worst = max(worst, self.noises.violation(residuals[:, n:], self.observed))
-        return worst
-
-    def violated_sets(self, trial: Trial) -> tuple[str, ...]:
-        """Names of the sets that a trial leaves."""
-        n = self._n
-        violations = {
-            "states": self.states and self.states.violation(trial.trajectory),
-            "disturbances": self.disturbances
-            and self.disturbances.violation(trial.residuals[:, :n]),
-            "noises": self.noises
-            and self.noises.violation(trial.residuals[:, n:], self.observed),
-        }
-        return tuple(name for name, size in violations.items() if size and size > FEASIBLE)
-
-    def leave_out(self, names: tuple[str, ...]) -> None:
-        """Leave out the sets of these names."""
-        self.use_sets(
-            None if "states" in names else self.states,
-            None if "disturbances" in names else self.disturbances,
-            None if "noises" in names else self.noises,
-        )
-
-    def use_sets(
-        self,
-        states: ConvexSet | None,
-        disturbances: ConvexSet | None,
-        noises: ConvexSet | None,
-    ) -> None:
-        """Use these sets as constraints; None leaves one out."""
-        self.states, self.disturbances, self.noises = states, disturbances, noises
-        self._has_noise_free = bool(self.noise_free.size) and disturbances is not None
+    def rounding_cost(self, trial: Trial) -> float:
+        """What rounding of the residuals of a trial can contribute to J."""
+        sizes = np.abs(np.concatenate((trial.trajectory[1:], self.measurements), axis=1)) * _EPS
+        weights = np.broadcast_to(np.abs(trial.weights), (len(sizes), *trial.weights.shape[-2:]))
+        return float(np.einsum("ki,kij,kj->", sizes, weights, sizes))
 
     def prior_weight_at(self, offset: Array) -> Array:
         """Weight (n, n) of the form that majorises the prior's cost at x_0 - prior = offset."""
-        weight = self.prior_weight
-        if not self._cost.quadratic:
-            weight = self._cost.majorise_prior(offset, weight)
+        weight, formulation = self.prior_weight, self._formulation
+        if not formulation.quadratic:
+            weight = formulation.cost.majorise_prior(offset, weight)
         return weight if self.discounts is None else self.discounts[0] * weight
 
     def prior_band_at(self, offset: Array) -> Array:
         """The same weight as a band panel."""
-        if self._quadratic and self.discounts is None:
+        if self._formulation.quadratic and self.discounts is None:
             return self._prior_band
         return band_of(self.prior_weight_at(offset))
+

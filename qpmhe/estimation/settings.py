@@ -10,9 +10,9 @@ from qpmhe_solvers import Solver, SolverOptions
 from .._checks import count, positive
 from ..errors import BackendError, OptionError
 
-__all__ = ["Candidate", "Engine", "Policy", "Settings"]
+__all__ = ["Candidate", "Engine", "Infeasible", "Settings"]
 
-Policy = Literal["drop", "project", "keep"]
+Infeasible = Literal["drop_rows", "keep_candidate"]
 Candidate = Literal["observer", "reinitialized"]
 Engine = Literal["python", "compiled"]
 
@@ -32,7 +32,8 @@ class Settings:
     solver_tolerance: float = _SOLVER_TOLERANCE
     tolerance: float = 1e-9
     engine: str = "python"
-    outside: str = "drop"
+    project_observer: bool = True
+    infeasible: str = "drop_rows"
     warm_start: bool = False
     candidate: str = "observer"
     time_budget: float | None = None
@@ -59,13 +60,13 @@ class Settings:
                 f"delay is {self.delay!r}; expected at most the horizon, {self.horizon}: older "
                 "states are not in the window."
             )
-        for name in ("warm_start", "isolated"):
+        for name in ("project_observer", "warm_start", "isolated"):
             flag = getattr(self, name)
             if not isinstance(flag, bool):
                 raise OptionError(f"{name} is {flag!r}; expected True or False.")
         for name, choices in (
             ("engine", get_args(Engine)),
-            ("outside", get_args(Policy)),
+            ("infeasible", get_args(Infeasible)),
             ("candidate", get_args(Candidate)),
         ):
             value = getattr(self, name)

@@ -5,26 +5,38 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import positive_definite
+from ..observers.projection import ErrorMetric
 from .linearization import Span, Stage, StageTerms
 from .snapshot import check_size, checked_array, mismatch
 
 __all__ = ["Mark", "StageView", "Stages", "Views", "WindowView", "read_only"]
 
 Array = NDArray[np.float64]
-Mark = tuple[
-    int, int, int, int, int, bool, "dict[int, Array] | None", "list[Array] | None"
-]
 
 # Views are made in advance up to this horizon: beyond it they would take more memory than the
 # arrays, and making them is a small part of a step.
 _KEPT = 1000
 View = TypeVar("View")
+
+
+class Mark(NamedTuple):
+    """A point to which a window can be rolled back: what a sample changes."""
+
+    start: int
+    end: int
+    time: int
+    last_special: int
+    last_irregular: int
+    unusual: bool
+    own_noise: dict[int, Array] | None
+    metric: tuple[Array, bool] | None
+    arrays: list[Array] | None
 
 
 def read_only(array: Array) -> Array:
@@ -92,6 +104,8 @@ class Stages:
         if horizon <= _KEPT:
             self._stage_views = list(self._stage_views)
             self._window_views = list(self._window_views)
+        #: Metric of the projection onto X, where the observer has no covariance.
+        self.metric: ErrorMetric | None = None
         self.time = 0  # number of samples pushed: the window ends at x(time)
         self.start = self.end = 0
         self._last_special = self._last_irregular = -self.horizon - 1
@@ -205,24 +219,25 @@ class Stages:
 
     def mark(self, whole: bool) -> Mark:
         """What `roll_back` needs."""
-        return (
+        return Mark(
             self.start, self.end, self.time, self._last_special, self._last_irregular,
             self.unusual, self._own_noise.copy() if self._own_noise else None,
+            None if self.metric is None else self.metric.state,
             self._copies() if whole else None,
         )
 
     def roll_back(self, mark: Mark) -> None:
         """Undo all changes since a mark, which must be later than the last `make_room`."""
-        (
-            self.start, self.end, self.time, self._last_special, self._last_irregular,
-            unusual, own_noise, kept,
-        ) = mark
-        self._own_noise = own_noise or {}
-        if kept is not None:
-            self._write(kept, self.start)
+        self.start, self.end, self.time = mark.start, mark.end, mark.time
+        self._last_special, self._last_irregular = mark.last_special, mark.last_irregular
+        self._own_noise = mark.own_noise or {}
+        if self.metric is not None and mark.metric is not None:
+            self.metric.state = mark.metric
+        if mark.arrays is not None:
+            self._write(mark.arrays, self.start)
         if self.unusual:
             self._make_usual(self.end)
-        self.unusual = unusual
+        self.unusual = mark.unusual
 
     def state_dict(self) -> dict[str, Any]:
         """Copies of all data of the window."""
@@ -240,6 +255,7 @@ class Stages:
             "own_noise": {time: weight.copy() for time, weight in self._own_noise.items()},
             "last_special": self._last_special,
             "last_irregular": self._last_irregular,
+            "metric": None if self.metric is None else self.metric.state,
         }
 
     def load_state_dict(self, state: dict[str, Any], may_be_irregular: bool) -> None:
@@ -297,6 +313,15 @@ class Stages:
         self._last_irregular = check_size(
             "last_irregular", state["last_irregular"], lambda t: latest[1] <= t < time
         )
+        if (self.metric is None) != (state["metric"] is None):
+            raise mismatch("observer")
+        if self.metric is not None:
+            covariance, settled = state["metric"]
+            if not isinstance(settled, bool):
+                raise TypeError(f"metric is {settled!r}")
+            n = self._z.shape[1]
+            checked = checked_array("metric", covariance, (n, n))
+            self.metric.state = positive_definite("metric", checked), settled
         self.start, self.end, self.time, self.unusual = 0, length, time, True
 
 

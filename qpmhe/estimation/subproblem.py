@@ -11,12 +11,12 @@ from qpmhe_solvers import QP
 from qpmhe_solvers.qp import band_of
 
 from ..costs import Cost
-from ..model.sets import ConvexSet
+from ..model.functions import raised_along
 from ..model.system import System
+from .constraints import Constraints, Rows
 from .limits import BEYOND
 from .linearization import Span, StageTerms
 from .problem import Problem, Trial
-from .window import Window
 
 __all__ = ["Subproblem"]
 
@@ -38,54 +38,70 @@ class Subproblem:
     There is one QP, of the present window length; each use overwrites it.
     """
 
-    def __init__(self, system: System, cost: Cost, horizon: int) -> None:
+    def __init__(self, system: System, cost: Cost, constraints: Constraints, horizon: int) -> None:
         n, p = system.n, system.p
         self._n, self._p = n, p
         self._terms = StageTerms(horizon, n, p)
         self._scaled = StageTerms(horizon, n, p) if cost.discount < 1.0 else None
         self._disturbance_band = band_of(cost.disturbance)
         self._no_offset = np.zeros(n)
-        self._x_rows = system.states.matrix if system.states else np.empty((0, n))
-        self._w_rows = _as_rows(system.disturbances, n)
-        self._v_rows = _as_rows(system.noises, p)
-        self._rows = sum(rows.shape[0] for rows in (self._w_rows, self._v_rows, self._x_rows))
+        states, w, v = constraints.states, constraints.disturbances, constraints.noises
+        # Bounds of states are the QP's own.
+        self._x_rows = states.matrix[states.bounds :] if states else np.empty((0, n))
+        self._w_rows = w.matrix if w else np.empty((0, n))
+        self._v_rows = v.matrix if v else np.empty((0, p))
         ends = np.cumsum([0, *(len(rows) for rows in (self._w_rows, self._v_rows, self._x_rows))])
+        self._rows = int(ends[-1])
         self._w, self._v, self._x = (slice(a, b) for a, b in pairwise(ends))
         self._qp: QP | None = None
+        #: Why `at` found no QP the last time.
+        self.failure = ""
         # Added to the stages' panels: the band of the prior's weight, then the band of each Q_i.
         self._added_bands: Array
         # What they hold: whether one Q for all stages, and which band of the prior.
         self._uniform, self._prior_band = False, _NO_BAND
 
-    def at_candidate(self, problem: Problem, window: Window) -> QP:
-        """The QP around the candidate, from the terms in the window."""
-        trial = problem.candidate(window)
-        if self._scaled is None:
-            return self._assemble(problem, trial, problem.view.span, True)
-        self._scaled.copy_scaled(window.terms, window.start, window.discounts[1:])
-        return self._assemble(problem, trial, Span(self._scaled, 0, window.length), True)
-
     def at(self, problem: Problem, trial: Trial) -> QP | None:
-        """The QP around any trajectory; None where the model has no Jacobians there."""
+        """The QP around a trajectory; None, and `failure`, where it has no Jacobians there.
+
+        The candidate's terms are in the window already.
+        """
+        if trial.trajectory is problem.candidate.trajectory:
+            span = problem.span
+            if self._scaled is not None:
+                count = len(span.panel)
+                self._scaled.copy_scaled(span, problem.discounts[1:])
+                span = Span(self._scaled, 0, count)
+            return self._assemble(problem, trial, span, True)
         states, terms, n = trial.trajectory[:-1], self._terms, self._n
         count = states.shape[0]
         model, linear = problem.model, terms.linear[:count]
         try:
             np.negative(model.f_jacobian.batch(states, problem.inputs), out=linear[:, :n, 1:])
             np.negative(model.h_jacobian.batch(states, problem.inputs), out=linear[:, n:, 1:])
-        except Exception:  # a user's Jacobian outside its domain
+        except Exception as error:  # a user's Jacobian outside its domain
+            self.failure = raised_along(
+                error,
+                {"the Jacobian of f": model.f_jacobian, "the Jacobian of h": model.h_jacobian},
+                states,
+                problem.inputs,
+            )
             return None
         if not np.isfinite(linear).all():
+            self.failure = "the Jacobian of f or h is not finite along the trajectory."
             return None
         linear[:, :, 0] = trial.residuals
         terms.set_all(count, trial.weights)
         return self._assemble(problem, trial, Span(terms, 0, count), False)
 
-    def projection(self, problem: Problem, window: Window) -> QP:
-        """The QP for the trajectory nearest to the candidate that satisfies the linearised sets."""
-        qp = self.at_candidate(problem, window)
-        qp.band[...] = band_of(np.eye(self._n))
-        qp.gradient[...] = 0.0
+    def nearest_point(self, problem: Problem, trial: Trial) -> QP | None:
+        """The QP for the nearest trajectory that satisfies the linearised sets; None as in `at`.
+
+        Its metric is the Gauss-Newton Hessian of J.
+        """
+        qp = self.at(problem, trial)
+        if qp is not None:
+            qp.gradient[...] = 0.0
         return qp
 
     def correct_rows(self, qp: QP, problem: Problem, around: Trial, trial: Trial) -> None:
@@ -99,7 +115,9 @@ class Subproblem:
         linearised = around.residuals + np.matmul(self._minus_jacobian, step[:-1, :, None])[:, :, 0]
         linearised[:, :n] += step[1:]
         curvature = trial.residuals - linearised
-        margin = np.full_like(qp.row_lower, 2.0 * qp.violation(step))
+        values = qp.rows_times(step)
+        missed = np.maximum(qp.row_lower - values, values - qp.row_upper)
+        margin = 2.0 * np.maximum(missed, 0.0)
         margin[:-1, self._w] += BEYOND * np.abs(curvature[:, :n] @ self._w_rows.T)
         margin[:-1, self._v] += BEYOND * np.abs(curvature[:, n:] @ self._v_rows.T)
         self._set_rows(qp, problem, around.residuals + curvature, around.trajectory)
@@ -156,13 +174,14 @@ class Subproblem:
         return qp
 
     def _set_inequalities(self, qp: QP, problem: Problem, trial: Trial) -> None:
-        n, states = self._n, problem.states
-        qp.bounded = states is not None and bool(states.bounded_components.size)
-        if qp.bounded and states is not None:
-            np.subtract(states.lower, trial.trajectory, out=qp.lower)
-            np.subtract(states.upper, trial.trajectory, out=qp.upper)
-        else:
+        n, states = self._n, problem.constraints.states
+        qp.bounded = states is not None and bool(states.bounds)
+        if states is not None and qp.bounded:
+            bounds, components = slice(0, states.bounds), states.components
+            points = trial.trajectory[:, components]
             qp.lower[...], qp.upper[...] = -np.inf, np.inf
+            qp.lower[:, components] = states.lower[..., bounds] - points
+            qp.upper[:, components] = states.upper[..., bounds] - points
         if self._rows:
             minus = self._minus_jacobian
             np.matmul(self._w_rows, minus[:, :n], out=qp.row_own[:-1, self._w])
@@ -170,41 +189,19 @@ class Subproblem:
             self._set_rows(qp, problem, trial.residuals, trial.trajectory)
 
     def _set_rows(self, qp: QP, problem: Problem, residuals: Array, trajectory: Array) -> None:
-        n = self._n
-        for rows, matrix, convex_set, points in (
-            (self._w, self._w_rows, problem.disturbances, residuals[:, :n]),
-            (self._v, self._v_rows, problem.noises, residuals[:, n:]),
-            (self._x, self._x_rows, problem.states, trajectory),
+        n, constraints = self._n, problem.constraints
+        for place, rows, points in (
+            (self._w, constraints.disturbances, residuals[:, :n]),
+            (self._v, constraints.noises, residuals[:, n:]),
+            (self._x, constraints.states, trajectory),
         ):
-            stages = slice(0, points.shape[0])
-            if convex_set is None:
-                qp.row_lower[stages, rows], qp.row_upper[stages, rows] = -np.inf, np.inf
-                continue
-            if rows is self._x:  # its bounds are the QP's
-                low, high = convex_set.row_lower, convex_set.row_upper
-            else:
-                low, high = _sides(convex_set)
-            value = points @ matrix.T
-            qp.row_lower[stages, rows] = low - value
-            qp.row_upper[stages, rows] = high - value
-        if problem.observed is not None and problem.noises is not None:
-            missing = ~problem.observed
-            unknown = (missing @ (self._v_rows != 0.0).T.astype(np.intp)) > 0
-            qp.row_lower[:-1, self._v][unknown] = -np.inf
-            qp.row_upper[:-1, self._v][unknown] = np.inf
+            if rows is not None and place.start < place.stop:
+                _set_sides(qp, slice(0, len(points)), place, rows, points)
 
 
-def _as_rows(convex_set: ConvexSet | None, dimension: int) -> Array:
-    """All inequalities of a set as rows: unit rows of its bounded components first."""
-    if convex_set is None:
-        return np.empty((0, dimension))
-    return np.vstack((np.eye(dimension)[convex_set.bounded_components], convex_set.matrix))
-
-
-def _sides(convex_set: ConvexSet) -> tuple[Array, Array]:
-    """Lower and upper sides of the rows of `_as_rows`."""
-    bounded = convex_set.bounded_components
-    return (
-        np.append(convex_set.lower[bounded], convex_set.row_lower),
-        np.append(convex_set.upper[bounded], convex_set.row_upper),
-    )
+def _set_sides(qp: QP, stages: slice, place: slice, rows: Rows, points: Array) -> None:
+    """Write the sides of a set's last rows, as many as the QP has place for."""
+    values = rows.values(points)
+    last = slice(values.shape[1] - (place.stop - place.start), None)
+    qp.row_lower[stages, place] = (rows.lower - values)[:, last]
+    qp.row_upper[stages, place] = (rows.upper - values)[:, last]

@@ -7,18 +7,27 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from .._linalg import inverse
 from ..costs import Cost
-from ..model.functions import contained
+from ..model.functions import contained, raised
 from ..model.system import Function, System
 from ..observers import Observer, Sample
+from ..observers.projection import ErrorMetric, NearestPoint
+from .estimate import Status
 from .limits import LARGEST
 from .linearization import Stage, StageTerms
 from .snapshot import mismatch, near
-from .stages import Stages, WindowView
+from .stages import Stages, StageView, WindowView
 
 __all__ = ["Window"]
 
 Array = NDArray[np.float64]
+
+# As integers: to combine flags of an enumeration takes longer than the rest of the step's logic.
+_MISSING, _MODEL_FAILED = Status.MISSING.value, Status.MODEL_FAILED.value
+_PROJECTED, _PREDICTION_OUTSIDE, _METRIC_SINGULAR = (
+    Status.OBSERVER_PROJECTED.value, Status.PREDICTION_OUTSIDE.value, Status.METRIC_SINGULAR.value
+)
 
 
 class Window(Stages):
@@ -28,8 +37,7 @@ class Window(Stages):
     on it alone is therefore computed once, when a stage enters the window: the residuals
     :math:`(L(i), v_z(i))`, their cost, the Jacobians and the Gauss-Newton terms.
 
-    `push`, `replay` and `_compute_stage` report of the newest stage they compute whether a
-    component of y is missing, the model failed, and only its Jacobians failed.
+    ``events`` and ``failure`` say what happened at the stage computed last, which is the newest.
     """
 
     def __init__(
@@ -40,6 +48,7 @@ class Window(Stages):
         horizon: int,
         initial_state: Array,
         with_terms: bool,
+        project: bool,
     ) -> None:
         n, p, m = system.n, system.p, system.m
         self._system, self._observer, self._cost = system, observer, cost
@@ -51,11 +60,24 @@ class Window(Stages):
             cost.quadratic, system.dt or 0.0,
         )
         self._sample = Sample(system, np.zeros(m))
+        self._running = ""  # what is being evaluated
+        #: Flags of `Status` for the stage computed last.
+        self.events: int = 0
+        self._nearest: NearestPoint | None = None  # where the observer is kept in X
+        if project and system.states is not None:
+            self._nearest = NearestPoint(system.states)
+            if self._covariances is None or observer.metric is not None:
+                noise = np.sqrt(inverse(cost.noise).diagonal())
+                self.metric = ErrorMetric(
+                    observer, cost.initial_weight(observer.initial_covariance()), noise
+                )
         self._correct = contained(observer.correct)
         self._evaluate_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
         self._functions = system.f.direct, system.h.direct
         self._jacobian_functions = system.f_jacobian.direct, system.h_jacobian.direct
         self._jacobians_finite = True  # of the stage computed last
+        #: Why the model failed at the stage computed last; blank if it did not.
+        self.failure = ""
         self._minus_stand_in = -np.eye(n + p, n)  # -G where the model has no Jacobians
         self._ones = np.ones(horizon)
         # gamma^N for the prior of a full window, then gamma^(N-1), ..., gamma^0 for its stages.
@@ -75,7 +97,7 @@ class Window(Stages):
 
     def push(
         self, y: Array, u: Array, dt: float | None = None, noise_weight: Array | None = None
-    ) -> tuple[bool, bool, bool]:
+    ) -> None:
         """Store the sample y(t), u(t), and advance the observer to z(t+1)."""
         if self.end == self.room:
             self.make_room()
@@ -91,14 +113,13 @@ class Window(Stages):
         if noise_weight is not None:
             self._own_noise[self.time] = noise_weight
             self._set_weight(k, self.time)
-        outcome = self._compute_stage(k, self.time)
+        self._compute_stage(k, self.time)
         self.end = k + 1
         self.time += 1
         if self.end - self.start > self.horizon:
             self.start += 1
             if self._own_noise:
                 self._own_noise.pop(self.time - self.horizon - 1, None)
-        return outcome
 
     def amend(self, time: int, y: Array) -> None:
         """Fill the finite components of y into a sample of the window, and redo what follows."""
@@ -109,17 +130,15 @@ class Window(Stages):
         self._set_weight(k, time)
         self.replay(self.time - time)
 
-    def replay(self, steps: int, state: Array | None = None) -> tuple[bool, bool, bool]:
+    def replay(self, steps: int, state: Array | None = None) -> None:
         """Redo the last ``steps`` stages, from another state of the observer if one is given."""
         first = self.end - steps
         if state is not None:
             self._z[first] = state
-        outcome = False, False, False
         for k in range(first, self.end):
-            outcome = self._compute_stage(k, self.time - (self.end - k))
-        return outcome
+            self._compute_stage(k, self.time - (self.end - k))
 
-    def _compute_stage(self, k: int, time: int) -> tuple[bool, bool, bool]:
+    def _compute_stage(self, k: int, time: int) -> None:
         """Compute stage k, of this time, from its sample and the observer's state."""
         y = self._stage_views[k].y
         observed: NDArray[np.bool_] | None = None
@@ -128,6 +147,7 @@ class Window(Stages):
             self._set_weight(k, time)
         elif self.unusual and not self._observed[k].all():
             observed = self._observed[k]
+        self.failure = ""
         cost = self._evaluate_stage(k, time, observed)
         if not math.isfinite(cost) and observed is None:
             small = np.abs(y) < LARGEST
@@ -140,7 +160,13 @@ class Window(Stages):
             self._fill_failed(k)
         self._stage_costs[k] = cost
         jacobian_failed = not model_failed and self._with_terms and not self._jacobians_finite
-        return observed is not None, model_failed, jacobian_failed
+        if (model_failed or jacobian_failed) and not self.failure:
+            what = "the model, the observer or the cost" if model_failed else "a Jacobian"
+            self.failure = f"{what} is not finite at x = {self._stage_views[k].z.tolist()}."
+        if observed is not None:
+            self.events |= _MISSING
+        if model_failed or jacobian_failed:
+            self.events |= _MODEL_FAILED
 
     def _set_weight(self, k: int, time: int) -> None:
         """Set the weight of stage k from its observed components and its noise weight."""
@@ -161,65 +187,132 @@ class Window(Stages):
     def _evaluate_stage(self, k: int, time: int, observed: NDArray[np.bool_] | None) -> float:
         """Evaluate the model and the observer at stage k; return its cost, or infinity."""
         view = self._stage_views[k]
-        z, z_next, u, terms = view.z, view.z_next, view.u, view.terms
-        model, error, sample = self._system, terms.noise, self._sample
+        self.events = 0
         try:
-            if self.unusual and self._irregular[k]:
-                model, u = self._system.timed, self._u[k]
-            kernel = model.kernel if self._with_jacobians else None
-            if kernel is None:
-                usual = model is self._system
-                arguments = view.arguments if usual else (view.arguments[0], u)
-                f, h = self._functions if usual else (model.f, model.h)
-                # Used at once: the functions may return the same array at each call.
-                np.subtract(view.y, h(*arguments), error)
-                if self._with_jacobians:
-                    self._differentiate(
-                        terms,
-                        self._jacobian_functions if usual else (model.f_jacobian, model.h_jacobian),
-                        arguments,
-                    )
-            else:
-                predicted, output, jacobian = kernel.stage(z, u)
-                np.subtract(view.y, output, error)
-                np.negative(jacobian, terms.linear[:, 1:])
-            if observed is not None:
-                error[~observed] = 0.0
-            sample.system, sample.u, sample.observed = model, u, observed
-            if self._observer.needs_jacobians:
-                sample.f_jacobian, sample.h_jacobian = -terms.minus_a, -terms.minus_c
-            if self._own_noise or sample.noise_weight is not None:
-                sample.noise_weight = self._own_noise.get(time)
-            if self._read_only_covariances is not None:
-                sample.covariance = self._read_only_covariances[k]
-            correction, posterior = self._correct(view.arguments[0], view.error, sample)
-            terms.disturbance[...] = correction
-            np.add(f(*arguments) if kernel is None else predicted, correction, z_next)
-        except Exception:  # a model function outside its domain: bad luck, not bad input
-            return math.inf
-        if self._covariances is not None:
-            if posterior is None or not np.isfinite(posterior).all():
+            self._evaluate_model(k, view, observed)
+            self._running = "the observer's correction"
+            if not self._advance_observer(k, time, view):
                 return math.inf
-            self._covariances[k + 1] = posterior
-        if not math.isfinite(z_next.dot(z_next)):
+        except Exception as raising:  # a model function outside its domain: not bad input
+            self.failure = raised(self._running, raising, view.z)
             return math.inf
         self._jacobians_finite = True
         if self._quadratic:
             # Even without terms: so the cost is the same to the last digit.
-            cost = self.terms.set_stage(terms, view.weight)
+            cost = self.terms.set_stage(view.terms, view.weight)
             if math.isfinite(cost):
                 return cost
         return self._cost_and_terms(k)
 
-    @staticmethod
+    def _evaluate_model(
+        self, k: int, view: StageView, observed: NDArray[np.bool_] | None
+    ) -> None:
+        """Write y - h(z), the Jacobians and, as z(t+1), f(z); describe the stage in the sample."""
+        model, u, terms, sample = self._system, view.u, view.terms, self._sample
+        self._running = "the model"
+        if self.unusual and self._irregular[k]:
+            model, u = self._system.timed, self._u[k]
+        kernel = model.kernel if self._with_jacobians else None
+        if kernel is None:
+            usual = model is self._system
+            arguments = view.arguments if usual else (view.arguments[0], u)
+            f, h = self._functions if usual else (model.f, model.h)
+            # Used at once: the functions may return the same array at each call.
+            self._running = "h"
+            np.subtract(view.y, h(*arguments), terms.noise)
+            self._running = "f"
+            view.z_next[...] = f(*arguments)
+            if self._with_jacobians:
+                self._differentiate(
+                    terms,
+                    self._jacobian_functions if usual else (model.f_jacobian, model.h_jacobian),
+                    arguments,
+                )
+        else:
+            view.z_next[...], output, jacobian = kernel.stage(view.z, u)
+            np.subtract(view.y, output, terms.noise)
+            np.negative(jacobian, terms.linear[:, 1:])
+        if observed is not None:
+            terms.noise[~observed] = 0.0
+        sample.system, sample.u, sample.observed = model, u, observed
+
+    def _advance_observer(self, k: int, time: int, view: StageView) -> bool:
+        """Add the correction to f(z), and project; whether state and covariance are finite."""
+        sample, terms, z_next = self._sample, view.terms, view.z_next
+        if self._observer.needs_jacobians:
+            sample.f_jacobian, sample.h_jacobian = -terms.minus_a, -terms.minus_c
+        if self._own_noise or sample.noise_weight is not None:
+            sample.noise_weight = self._own_noise.get(time)
+        if self._read_only_covariances is not None:
+            sample.covariance = self._read_only_covariances[k]
+        correction, posterior = self._correct(view.arguments[0], view.error, sample)
+        terms.disturbance[...] = correction
+        predicted = z_next.copy() if self._nearest is not None else None
+        z_next += correction
+        if self._covariances is not None:
+            if posterior is None or not np.isfinite(posterior).all():
+                return False
+            self._covariances[k + 1] = posterior
+        if not math.isfinite(z_next.dot(z_next)):
+            return False
+        if predicted is not None:
+            self._project(view, predicted, posterior)
+        return True
+
+    def _project(self, view: StageView, predicted: Array, covariance: Array | None) -> None:
+        """Project z(t+1) onto X in the observer's metric, and set its correction to match."""
+        nearest, metric, z_next = self._nearest, self.metric, view.z_next
+        assert nearest is not None
+        if metric is not None:
+            if not metric.settled:
+                if self._with_jacobians:
+                    a, c = -view.terms.minus_a, -view.terms.minus_c
+                else:
+                    model, u = self._sample.system, self._sample.u
+                    a, c = model.f_jacobian(view.z, u), model.h_jacobian(view.z, u)
+                metric.settle(view.z, a, c, self._sample)
+            covariance = metric.covariance
+        if nearest.contains(z_next):
+            return
+        assert covariance is not None
+        found = nearest(z_next, covariance)
+        z_next[...] = found.point
+        np.subtract(z_next, predicted, view.terms.disturbance)
+        self.events |= _PROJECTED
+        if not nearest.contains(predicted):
+            self.events |= _PREDICTION_OUTSIDE
+        if not found.reached:
+            self.events |= _METRIC_SINGULAR
+
+    def filtered(self) -> Array | None:
+        """The observer's estimate of x(t) that has used y(t), within X; None if it has none."""
+        if self.newest_failed:
+            return None
+        view = self._stage_views[self.end - 1]
+        try:
+            found = self._observer.filter(view.arguments[0], view.error, self._sample)
+            if found is None:
+                return None
+            state = np.array(found[0], np.float64)
+            if not np.isfinite(state).all():
+                return None
+            if self._nearest is not None and not self._nearest.contains(state):
+                state = self._nearest(state, found[1]).point
+        except Exception:  # a user's observer: z(t) is there
+            return None
+        return state
+
     def _differentiate(
-        terms: Stage, jacobians: tuple[Function, Function], arguments: tuple[Array, ...]
+        self, terms: Stage, jacobians: tuple[Function, Function], arguments: tuple[Array, ...]
     ) -> None:
         f_jacobian, h_jacobian = jacobians
+        running = "the Jacobian of f"
         try:
             np.negative(f_jacobian(*arguments), terms.minus_a)
+            running = "the Jacobian of h"
             np.negative(h_jacobian(*arguments), terms.minus_c)
-        except Exception:  # a user's Jacobian outside its domain
+        except Exception as raising:  # a user's Jacobian outside its domain
+            self.failure = raised(running, raising, arguments[0])
             # An observer without Jacobians goes on; `_cost_and_terms` finds the NaN.
             terms.linear[:, 1:] = np.nan
 
@@ -234,7 +327,8 @@ class Window(Stages):
             if self._with_terms and not self._quadratic:
                 self._majorising_weights[k] = self._majorise(residual[None], weight)[0]
                 weight = self._majorising_weights[k]
-        except Exception:  # a user's loss
+        except Exception as error:  # a user's loss
+            self.failure = raised("the cost", error, self._stage_views[k].z)
             return math.inf
         if self._with_terms:
             jacobian = stage.linear[:, 1:].ravel()

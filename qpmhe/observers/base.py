@@ -50,6 +50,8 @@ class Observer(ABC):
     #: Whether `correct` reads the Jacobians of f and h at z.
     needs_jacobians: bool = False
 
+    _metric: Array | None = None
+
     @abstractmethod
     def check(self, system: System, initial_state: Array) -> None:
         """Raise an `InvalidInputError` unless it fits the system and initial_state, z(0)."""
@@ -58,6 +60,22 @@ class Observer(ABC):
     def constant_gain(self) -> Array | None:
         """The gain K (n, p) of an observer whose correction is K v at all times; None otherwise."""
         return None
+
+    @property
+    def metric(self) -> Array | None:
+        """A metric M (n, n) in which the error is proved to contract; None if none is known.
+
+        The observer is projected onto X in it: only then does the proof hold with X, too.
+        """
+        return self._metric
+
+    def _check_metric(self, system: System) -> None:
+        """Check the size of a metric that was given."""
+        if self._metric is not None and self._metric.shape[0] != system.n:
+            raise ShapeError(
+                f"metric has shape {self._metric.shape}; expected ({system.n}, {system.n}), "
+                "for the states."
+            )
 
     def initial_covariance(self) -> Array | None:
         """The covariance (n, n) of the initial estimate; None for observers without one."""
@@ -74,6 +92,13 @@ class Observer(ABC):
         sample : Sample
             What else is known of the stage; overwritten at the next one.
         """
+
+    def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array] | None:
+        """The estimate of x(t) that has used y(t), and its covariance; None if there is none.
+
+        Parameters are those of `correct`. A Kalman filter's measurement update.
+        """
+        return None
 
 
 class KalmanType(Observer):

@@ -43,16 +43,36 @@ class ExtendedKalman(KalmanType):
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""
-        a, c, covariance = sample.f_jacobian, sample.h_jacobian, sample.covariance
-        if a is None or c is None or covariance is None:
-            raise ValueError("the extended Kalman observer needs Jacobians and a covariance")
-        r = self._noise_of(sample)
-        if sample.observed is not None:
-            there = sample.observed
-            c, r, v = c[there], r[np.ix_(there, there)], v[there]
+        a, c, covariance = _given(sample)
+        c, r, v = self._seen(c, v, sample)
         cross = a @ covariance @ c.T
         gain = np.linalg.solve(c @ covariance @ c.T + r, cross.T).T if v.size else cross
         # Joseph's form: symmetric, and positive semidefinite by construction.
         closed = a - gain @ c
         following = closed @ covariance @ closed.T + gain @ r @ gain.T + self._disturbance
         return gain @ v, 0.5 * (following + following.T)
+
+    def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
+        """The filter's measurement update; see `Observer.filter`."""
+        _, c, covariance = _given(sample)
+        c, r, v = self._seen(c, v, sample)
+        if not v.size:
+            return z, covariance
+        cross = covariance @ c.T
+        gain = np.linalg.solve(c @ cross + r, cross.T).T
+        closed = np.eye(z.size) - gain @ c
+        return z + gain @ v, closed @ covariance @ closed.T + gain @ r @ gain.T
+
+    def _seen(self, c: Array, v: Array, sample: Sample) -> tuple[Array, Array, Array]:
+        """Rows of C, covariance of the noise, and fitting error of the outputs that are there."""
+        r, there = self._noise_of(sample), sample.observed
+        if there is None:
+            return c, r, v
+        return c[there], r[np.ix_(there, there)], v[there]
+
+
+def _given(sample: Sample) -> tuple[Array, Array, Array]:
+    a, c, covariance = sample.f_jacobian, sample.h_jacobian, sample.covariance
+    if a is None or c is None or covariance is None:
+        raise ValueError("the extended Kalman observer needs Jacobians and a covariance")
+    return a, c, covariance

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from .._checks import Array
+from .._checks import Array, positive_definite
 from ..errors import ModelError
 from ..model.system import System
 from .base import Observer, Sample
@@ -24,15 +25,21 @@ class OutputInjection(Observer):
         correction(z, v): z (n,) and the fitting error v (p,) to (n,). Where it meets the
         system, a `ModelError` is raised if its value has the wrong shape, is not finite, or
         does not vanish for v = 0.
+    metric : (n, n) array_like, optional
+        As of `Luenberger`.
     """
 
-    def __init__(self, correction: Callable[[Array, Array], Any]) -> None:
+    def __init__(
+        self, correction: Callable[[Array, Array], Any], metric: ArrayLike | None = None
+    ) -> None:
         if not callable(correction):
             raise ModelError(f"correction is {correction!r}; expected a function of z and v.")
         self._correction = correction
+        self._metric = None if metric is None else positive_definite("metric", metric)
 
     def check(self, system: System, initial_state: Array) -> None:
         """Check that values have shape (n,), and that L(z, 0) = 0; see `Observer.check`."""
+        self._check_metric(system)
         self._check_at(initial_state, system.p)
         generator = np.random.default_rng(20210829)
         for _ in range(3):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array, numbers
+from .._checks import Array, numbers, positive_definite
 from ..errors import ShapeError
 from ..model.system import System
 from .base import Observer, Sample
@@ -25,11 +25,16 @@ class Luenberger(Observer):
         K, of the discrete-time observer; a vector (n,) will do where p is 1. An
         `InvalidInputError` is raised if it is not finite; its shape is checked where it meets
         the system.
+    metric : (n, n) array_like, optional
+        M, symmetric positive definite (a `WeightError` is raised otherwise), in which the error
+        is proved to contract: |x(t+1) - z(t+1)|_M <= rho |x(t) - z(t)|_M without noise. The
+        observer is projected onto X in it; see `qpmhe.MovingHorizonEstimator`.
     """
 
-    def __init__(self, gain: ArrayLike) -> None:
+    def __init__(self, gain: ArrayLike, metric: ArrayLike | None = None) -> None:
         given = numbers("gain", gain)
         self.gain: Array = given.reshape(-1, 1) if given.ndim < 2 else given
+        self._metric = None if metric is None else positive_definite("metric", metric)
 
     def check(self, system: System, initial_state: Array) -> None:
         """Check that the gain has shape (n, p); see `Observer.check`."""
@@ -39,6 +44,7 @@ class Luenberger(Observer):
                 f"gain has shape {self.gain.shape}; expected (n, p) = {shape}: a row for each "
                 "state, a column for each output."
             )
+        self._check_metric(system)
 
     @property
     def constant_gain(self) -> Array | None:

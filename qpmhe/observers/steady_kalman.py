@@ -86,6 +86,8 @@ class SteadyStateKalman(Observer):
         self.gain, self.covariance = stationary(
             self._a, self._c, self._disturbance, self._noise, point
         )
+        cross = self.covariance @ self._c.T
+        self._filter_gain = np.linalg.solve(self._c @ cross + self._noise, cross.T).T
         self._prior = self.covariance
         if prior is not None:
             self._prior = positive_definite("prior covariance", prior, system.n)
@@ -117,13 +119,26 @@ class SteadyStateKalman(Observer):
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the covariance of the next error; see `Observer.correct`."""
-        before = self.covariance if sample.covariance is None else sample.covariance
-        closed, entering = self._closed, self._entering
-        if sample.observed is not None or sample.noise_weight is not None:
-            r = self._noise if sample.noise_weight is None else np.linalg.inv(sample.noise_weight)
-            gain = self.gain
-            if sample.observed is not None:
-                gain = np.where(sample.observed, gain, 0.0)
+        if sample.observed is None and sample.noise_weight is None:
+            closed, entering = self._closed, self._entering
+        else:
+            gain, r = self._given(self.gain, sample)
             closed, entering = self._a - gain @ self._c, self._disturbance + gain @ r @ gain.T
-        following = closed @ before @ closed.T + entering
+        following = closed @ self._before(sample) @ closed.T + entering
         return self.gain @ v, 0.5 * (following + following.T)
+
+    def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
+        r"""The measurement update with the gain :math:`P C^\top S^{-1}`; see `Observer.filter`."""
+        gain, r = self._given(self._filter_gain, sample)
+        closed = np.eye(z.size) - gain @ self._c
+        return z + gain @ v, closed @ self._before(sample) @ closed.T + gain @ r @ gain.T
+
+    def _before(self, sample: Sample) -> Array:
+        return self.covariance if sample.covariance is None else sample.covariance
+
+    def _given(self, gain: Array, sample: Sample) -> tuple[Array, Array]:
+        """A gain without the columns of missing outputs, and this sample's noise covariance."""
+        if sample.observed is not None:
+            gain = np.where(sample.observed, gain, 0.0)
+        weight = sample.noise_weight
+        return gain, self._noise if weight is None else np.linalg.inv(weight)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array, positive
+from ..model.sets import ConvexSet
 from .base import KalmanType, Sample
 
 __all__ = ["UnscentedKalman"]
@@ -45,7 +46,7 @@ class UnscentedKalman(KalmanType):
     Linear in v, so that (eq:kappa) holds with the largest :math:`|K(t)|` met. The model is
     evaluated at 2n + 1 states in each step. Where X has bounds, the two sigma points of a
     direction are drawn nearer to z, with a larger weight, so far that they satisfy the
-    bounds (but not nearer than a thousandth); where f or h cannot be evaluated at a sigma
+    bounds (but not nearer than a thousandth; where z is on a bound, both lie inside); where f or h cannot be evaluated at a sigma
     point, the stage fails as it does where they cannot be evaluated at z. Steps of unusual
     length and missing outputs are taken as they are.
 
@@ -80,32 +81,64 @@ class UnscentedKalman(KalmanType):
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""
-        system, covariance = sample.system, sample.covariance
-        if covariance is None:
-            raise ValueError("the unscented Kalman observer needs a covariance")
-        r = self._noise_of(sample)
-        moves = self._spread * np.linalg.cholesky(covariance).T
-        share = np.ones(z.size)
-        if system.states is not None:
-            room = np.minimum(system.states.upper - z, z - system.states.lower)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                # No movement asks for no room; where z is on a bound this is 0 / 0.
-                steps = np.where(moves == 0.0, math.inf, room / np.abs(moves))
-            share = np.clip(steps.min(axis=1), _CLOSEST, 1.0)
-            moves *= share[:, None]
-        points = np.concatenate((z[None], z + moves, z - moves))
-        inputs = np.broadcast_to(sample.u, (points.shape[0], sample.u.size))
-        # Roots of the weights go into the deviations, so that sums become products.
-        roots = np.tile(1.0 / (math.sqrt(2.0) * self._spread * share), 2)[:, None]
-        f, h = system.f.batch(points, inputs), system.h.batch(points, inputs)
+        _, points, roots, inputs = self._sigma_points(z, sample)
+        f = sample.system.f.batch(points, inputs)
         ahead: Array = (f[1:] - f[0]) * roots
-        if sample.observed is not None:
-            there = sample.observed
-            h, r, v = h[:, there], r[np.ix_(there, there)], v[there]
+        seen, r, v = self._seen(points, inputs, roots, v, sample)
         if v.size == 0:
             return np.zeros_like(z), ahead.T @ ahead + self._disturbance
-        seen: Array = (h[1:] - h[0]) * roots
         gain = np.linalg.solve(seen.T @ seen + r, seen.T @ ahead).T
         left = ahead - seen @ gain.T
         following = left.T @ left + gain @ r @ gain.T + self._disturbance
         return gain @ v, 0.5 * (following + following.T)
+
+    def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
+        """The filter's measurement update with the same sigma points; see `Observer.filter`."""
+        moves, points, roots, inputs = self._sigma_points(z, sample)
+        around: Array = moves * roots
+        seen, r, v = self._seen(points, inputs, roots, v, sample)
+        if v.size == 0:
+            return z, around.T @ around
+        gain = np.linalg.solve(seen.T @ seen + r, seen.T @ around).T
+        left = around - seen @ gain.T
+        return z + gain @ v, left.T @ left + gain @ r @ gain.T
+
+    def _sigma_points(self, z: Array, sample: Sample) -> tuple[Array, Array, Array, Array]:
+        """Deviations, z and the sigma points, roots of their weights, and their inputs."""
+        covariance = sample.covariance
+        if covariance is None:
+            raise ValueError("the unscented Kalman observer needs a covariance")
+        ahead = self._spread * np.linalg.cholesky(covariance).T
+        moves, share = np.concatenate((ahead, -ahead)), np.ones(2 * z.size)
+        if sample.system.states is not None:
+            moves, share = _inside(z, moves, sample.system.states)
+        points = np.concatenate((z[None], z + moves))
+        # Roots of the weights go into the deviations, so that sums become products.
+        roots = (1.0 / (math.sqrt(2.0) * self._spread * share))[:, None]
+        inputs = np.broadcast_to(sample.u, (points.shape[0], sample.u.size))
+        return moves, points, roots, inputs
+
+    def _seen(
+        self, points: Array, inputs: Array, roots: Array, v: Array, sample: Sample
+    ) -> tuple[Array, Array, Array]:
+        """Deviations, noise covariance and fitting error of the outputs that are there."""
+        h, r, there = sample.system.h.batch(points, inputs), self._noise_of(sample), sample.observed
+        if there is not None:
+            h, r, v = h[:, there], r[np.ix_(there, there)], v[there]
+        return (h[1:] - h[0]) * roots, r, v
+
+
+def _inside(z: Array, moves: Array, states: ConvexSet) -> tuple[Array, Array]:
+    """The moves (2n, n), drawn nearer to z so that they stay in the bounds, and by how much."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        room = np.where(moves > 0.0, states.upper - z, z - states.lower)
+        steps = np.where(moves == 0.0, math.inf, room / np.abs(moves))
+    allowed = steps.min(axis=1).reshape(2, -1)  # of z + d_j and of z - d_j
+    nearer, farther = allowed.min(axis=0), allowed.max(axis=0)
+    # Where z is on a bound both points lie inside of it: a sum of products ignores their sign.
+    on_bound = (nearer < _CLOSEST) & (farther >= _CLOSEST)
+    inwards = np.where(allowed[0] >= allowed[1], 1.0, -1.0)
+    signs = np.where(on_bound, inwards, np.array([[1.0], [-1.0]]))
+    share = np.tile(np.clip(np.where(on_bound, farther, nearer), _CLOSEST, 1.0), 2)
+    ahead = moves[: z.size]
+    return np.concatenate((signs[0, :, None] * ahead, signs[1, :, None] * ahead)) * share[:, None], share

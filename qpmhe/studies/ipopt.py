@@ -14,7 +14,7 @@ from .._checks import need
 from ..costs import QuadraticCost
 from ..errors import InvalidInputError
 from ..estimation.estimate import Estimate, Status
-from ..estimation.problem import Problem
+from ..estimation.problem import Formulation
 from ..estimation.window import Window
 from ..model.system import System
 from ..observers import Observer
@@ -44,8 +44,8 @@ class IpoptEstimator:
             )
         self._system, self._cost, self._f, self._h = system, cost, f, h
         self._prior = cost.prior
-        self._window = Window(system, observer, cost, horizon, initial_state, False)
-        self._problem = Problem(system, cost)
+        self._window = Window(system, observer, cost, horizon, initial_state, False, True)
+        self._formulation = Formulation(system, observer, cost)
         self._options: dict[str, Any] = {
             "print_time": False,
             "ipopt.print_level": 0,
@@ -60,12 +60,12 @@ class IpoptEstimator:
     def update(self, y: Array) -> Estimate:
         """Take y(t) in and estimate x(t+1); as `qpmhe.MovingHorizonEstimator.update`."""
         began = perf_counter()
-        window, problem, n = self._window, self._problem, self._system.n
+        window, n = self._window, self._system.n
         window.push(y, np.zeros(0))
-        problem.bind(window)
+        problem = self._formulation.problem(window)
         count = window.length
         solve, bounds = self._programs.get(count) or self._build(count)
-        candidate = problem.candidate(window)
+        candidate = problem.candidate
         start = candidate.trajectory.ravel()
         parameters = np.concatenate((problem.prior, problem.measurements.ravel()))
         solving = perf_counter()

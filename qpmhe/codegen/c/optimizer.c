@@ -306,12 +306,12 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
         if (s->outside == MHE_PROJECT && s->max_qps > 0 && mhe_project(e, k, o, offset)) {
             o->reference = o->best = o->spare;
             o->spare = k->trials + 2;
-            o->events |= MHE_PROJECTED;
+            o->events |= MHE_CANDIDATE_OUTSIDE;
             candidate = 0;
         } else {
             o->sets &= ~violated;
             o->dropped = violated;
-            o->events |= MHE_SETS_DROPPED;
+            o->events |= MHE_ROWS_DROPPED;
         }
     }
 #endif

@@ -1,0 +1,211 @@
+"""The sets X, W and V as rows, one for each inequality at each stage (eq:constraints)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .._linalg import inverse
+from ..costs import Cost
+from ..model.sets import ConvexSet
+from ..model.system import System
+from .estimate import DroppedRow
+from .limits import FEASIBLE
+
+__all__ = ["Constraints", "Rows"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# A residual is a difference, whose rounding comes on top of the tolerance.
+_ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
+
+
+class Rows:
+    """Inequalities ``lower <= M s <= upper`` of one set, at all stages or at each.
+
+    Bounds of components come first, then the general inequalities.
+
+    Attributes
+    ----------
+    name : str
+        As in `DroppedRow`.
+    matrix : (r, d) array
+        M, of which the first ``bounds`` rows are unit vectors.
+    components : (bounds,) array
+        The components that these bound.
+    lower, upper : (r,) or (K, r) array
+        Sides, infinite where there is none.
+    scale : (r,) array
+        The width of a row, or the standard deviation of M s if that is less: what a miss is
+        measured by, so that no unit matters.
+    """
+
+    __slots__ = (
+        "_columns", "_sizes", "bounds", "components", "lower", "matrix", "name", "scale", "upper",
+    )
+
+    def __init__(self, name: str, convex_set: ConvexSet, covariance: Array) -> None:
+        d, components = convex_set.dimension, convex_set.bounded_components
+        self.name, self.components, self.bounds = name, components, components.size
+        self.matrix: Array = np.vstack((np.eye(d)[components], convex_set.matrix))
+        self.lower: Array = np.append(convex_set.lower[components], convex_set.row_lower)
+        self.upper: Array = np.append(convex_set.upper[components], convex_set.row_upper)
+        deviation = np.sqrt(np.einsum("ri,ij,rj->r", self.matrix, covariance, self.matrix))
+        width = self.upper - self.lower
+        self.scale: Array = np.where(width > 0.0, np.minimum(width, deviation), deviation)
+        self._sizes = np.abs(self.matrix).T
+        # Without general inequalities M s is a part of s, mostly the whole of it.
+        self._columns: slice | NDArray[np.intp] | None = None
+        if not convex_set.matrix.shape[0]:
+            self._columns = slice(None) if components.size == d else components
+
+    def values(self, points: Array) -> Array:
+        """M s at each point (K, r)."""
+        if self._columns is None:
+            return points @ self.matrix.T
+        chosen: Array = points[:, self._columns]
+        return chosen
+
+    def misses(self, points: Array, sizes: Array) -> Array | None:
+        """By how much points (K, d) miss each row (K, r), in its scale; None if none does.
+
+        ``sizes`` (K, d) are those of the numbers whose difference s is.
+        """
+        values = self.values(points)
+        missed = np.maximum(self.lower - values, values - self.upper)
+        if missed.max(initial=0.0) <= 0.0:
+            return None
+        missed -= _ROUNDING * (np.abs(sizes) @ self._sizes)
+        return np.asarray(np.maximum(missed, 0.0) / self.scale)
+
+    def without(self, left_out: Mask, points: Array | None = None) -> Rows:
+        """The rows without some at some stages (K, r): without both sides, or those that points miss.
+        """
+        other = self._copy()
+        lower, upper = left_out, left_out
+        if points is not None:
+            values = self.values(points)
+            lower, upper = left_out & (values < self.lower), left_out & (values > self.upper)
+        other.lower = np.where(lower, -np.inf, self.lower)
+        other.upper = np.where(upper, np.inf, self.upper)
+        return other
+
+    def touching(self, components: Mask) -> Mask:
+        """Which rows (K, r) have a nonzero coefficient on these components (K, d)."""
+        touched: Mask = (components @ (self._sizes != 0.0).astype(np.intp)) > 0
+        return touched
+
+    def _copy(self) -> Rows:
+        other = object.__new__(Rows)
+        for name in Rows.__slots__:
+            setattr(other, name, getattr(self, name))
+        return other
+
+
+class Constraints:
+    """The rows of X, W and V; immutable.
+
+    Attributes
+    ----------
+    states, disturbances, noises : Rows or None
+        The inequalities on x, w and v.
+    noise_free : (k,) array
+        Components whose disturbance is a constant, so that their states follow the model.
+    constant : (k,) array
+        These constants.
+    """
+
+    __slots__ = ("constant", "disturbances", "noise_free", "noises", "states")
+
+    def __init__(self, system: System, cost: Cost, prior_covariance: Array) -> None:
+        found = [
+            convex_set and Rows(name, convex_set, covariance)
+            for name, convex_set, covariance in (
+                ("states", system.states, prior_covariance),
+                ("disturbances", system.disturbances, inverse(cost.disturbance)),
+                ("noises", system.noises, inverse(cost.noise)),
+            )
+        ]
+        self.states, self.disturbances, self.noises = found
+        fixed = system.disturbances.fixed_components if system.disturbances else np.empty(0, int)
+        self.noise_free: NDArray[np.intp] = fixed
+        self.constant: Array = system.disturbances.lower[fixed] if system.disturbances else fixed
+
+    def __bool__(self) -> bool:
+        return any((self.states, self.disturbances, self.noises))
+
+    def _parts(
+        self, trajectory: Array, residuals: Array, measurements: Array
+    ) -> Iterator[tuple[Rows, Array, Array]]:
+        """Each set's rows, its points, and the sizes of what these are differences of."""
+        n = trajectory.shape[1]
+        if self.states is not None:
+            yield self.states, trajectory, trajectory
+        if self.disturbances is not None:
+            yield self.disturbances, residuals[:, :n], trajectory[1:]
+        if self.noises is not None:
+            yield self.noises, residuals[:, n:], measurements
+
+    def violation(self, trajectory: Array, residuals: Array, measurements: Array) -> float:
+        """The largest miss of a row in its scale; infinity where a number is not finite."""
+        worst = 0.0
+        for rows, points, sizes in self._parts(trajectory, residuals, measurements):
+            misses = rows.misses(points, sizes)
+            if misses is not None:
+                largest = float(misses.max())
+                # A NaN must not pass as a member.
+                worst = math.inf if math.isnan(largest) else max(worst, largest)
+        return worst
+
+    def observed(self, observed: Mask) -> Constraints:
+        """The constraints without rows of V on missing outputs, (K, p) bool."""
+        if self.noises is None:
+            return self
+        return self._replaced(noises=self.noises.without(self.noises.touching(~observed)))
+
+    def without_violated(
+        self, trajectory: Array, residuals: Array, measurements: Array
+    ) -> Constraints:
+        """The constraints without the rows that a trajectory misses, but for noise-free ones."""
+        left = {
+            rows.name: rows.without(self._droppable(rows, misses), points)
+            for rows, points, sizes in self._parts(trajectory, residuals, measurements)
+            if (misses := rows.misses(points, sizes)) is not None
+        }
+        return self._replaced(**left)
+
+    def missed_rows(
+        self, trajectory: Array, residuals: Array, measurements: Array, first: int
+    ) -> tuple[DroppedRow, ...]:
+        """The rows that a trajectory misses, whose first state is of this time."""
+        found = []
+        for rows, points, sizes in self._parts(trajectory, residuals, measurements):
+            misses = rows.misses(points, sizes)
+            if misses is None:
+                continue
+            names = np.append(
+                rows.components, rows.matrix.shape[1] + np.arange(len(rows.matrix) - rows.bounds)
+            )
+            below = rows.values(points) < rows.lower
+            found += [
+                DroppedRow(rows.name, int(names[r]), "lower" if below[k, r] else "upper", first + int(k))
+                for k, r in np.argwhere(misses > FEASIBLE)
+            ]
+        return tuple(found)
+
+    def _droppable(self, rows: Rows, misses: Array) -> Mask:
+        missed: Mask = misses > FEASIBLE
+        if rows is self.disturbances:
+            missed[:, : rows.bounds] &= ~np.isin(rows.components, self.noise_free)
+        return missed
+
+    def _replaced(self, **rows: Rows) -> Constraints:
+        other = object.__new__(Constraints)
+        for name in Constraints.__slots__:
+            setattr(other, name, rows.get(name, getattr(self, name)))
+        return other
+

@@ -1,0 +1,68 @@
+"""A watch on the observer: whether the estimates can rely on it for long."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .estimate import Status
+
+__all__ = ["ObserverWatch"]
+
+Array = NDArray[np.float64]
+
+# Standard deviations of the prior from which on the observer is far from an estimate.
+_FAR = 10.0
+
+
+class ObserverWatch:
+    """Counts for how many samples running the observer was far from the estimate, or rows dropped.
+
+    Parameters
+    ----------
+    horizon : int
+        So many samples running are long.
+    """
+
+    def __init__(self, horizon: int) -> None:
+        self._horizon = horizon
+        #: Samples running with the observer far away, and with rows dropped.
+        self.counts: tuple[int, int] = (0, 0)
+        self._warned = False
+
+    def note(self, offset: Array, prior_weight: Array, status: Status) -> Status:
+        """Count a sample; `Status.OBSERVER_FAR` if the observer has been far away for long.
+
+        Parameters
+        ----------
+        offset : (n,) array
+            The estimate minus the observer's state.
+        prior_weight : (n, n) array
+            Weight of an initial error of the observer.
+        status : Status
+            The sample's.
+        """
+        far, dropped = self.counts
+        # A comparison with NaN is false.
+        far = far + 1 if float(offset @ prior_weight @ offset) > _FAR**2 else 0
+        dropped = dropped + 1 if Status.ROWS_DROPPED in status else 0
+        self.counts = far, dropped
+        return Status.OBSERVER_FAR if far >= self._horizon else Status(0)
+
+    def warning(self) -> str | None:
+        """What to warn of, the first time that there is something; None otherwise."""
+        far, dropped = self.counts
+        if self._warned or max(far, dropped) < self._horizon:
+            return None
+        self._warned = True
+        if dropped >= self._horizon:
+            return (
+                f"inequalities were dropped in {dropped} samples running, because the observer's "
+                "candidate violates them and no better trajectory satisfies them all; see "
+                "estimate.dropped. Widen these sets, raise max_qps, or take another observer."
+            )
+        return (
+            f"the observer was far from the estimates in {far} samples running (more than "
+            f"{_FAR:g} standard deviations of the prior); take another gain or observer, or "
+            "candidate='reinitialized'."
+        )

@@ -1,0 +1,246 @@
+"""The observer kept in X: the nearest point of X in the observer's own metric."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .._checks import Array
+from .._linalg import inverse
+from ..model.sets import ConvexSet
+from .base import Observer, Sample
+
+__all__ = ["ErrorMetric", "NearestPoint", "Projected"]
+
+_EPS = float(np.finfo(np.float64).eps)
+
+# A row or a pair of rows whose variance is below this share of the largest possible one has none.
+_SINGULAR = 1e-12
+
+# Rows miss by at most this share of the terms that they sum up, or they are violated.
+_ROUNDING = 16.0 * _EPS
+
+# E^(2^k) of a stable matrix has vanished by then, unless its spectral radius rounds to 1.
+_DOUBLINGS = 60
+
+
+class Projected(NamedTuple):
+    """A point of X; ``reached`` says whether its metric alone led there."""
+
+    point: Array
+    reached: bool
+
+
+class NearestPoint:
+    r"""The point of a polyhedron nearest to another one, in the metric of a covariance P.
+
+    .. math::
+        \min_\xi |\xi - \bar z|_{P^{-1}} \quad \text{s.t.} \quad A \xi \le b
+
+    Its solution is :math:`\xi = \bar z - P A^\top \lambda`, in which P may be singular. The
+    dual active-set method of Goldfarb and Idnani finds it: each change of the active set
+    either raises the dual objective or removes a row, and their number is bounded.
+
+    Parameters
+    ----------
+    convex_set : ConvexSet
+        X, not empty.
+
+    References
+    ----------
+    Goldfarb and Idnani, A numerically stable dual method for solving strictly convex quadratic
+    programs, Mathematical Programming 27 (1983).
+    """
+
+    def __init__(self, convex_set: ConvexSet) -> None:
+        self._lower, self._upper = convex_set.lower, convex_set.upper
+        eye = np.eye(convex_set.dimension)
+        sides = (
+            (eye, convex_set.upper), (-eye, -convex_set.lower),
+            (convex_set.matrix, convex_set.row_upper), (-convex_set.matrix, -convex_set.row_lower),
+        )
+        finite = [np.isfinite(side) for _, side in sides]
+        self._rows = np.vstack([rows[keep] for (rows, _), keep in zip(sides, finite, strict=True)])
+        self._sides = np.concatenate([s[keep] for (_, s), keep in zip(sides, finite, strict=True)])
+        self._sizes, self._side_sizes = np.abs(self._rows), np.abs(self._sides)
+        self._has_rows = bool(convex_set.matrix.shape[0])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = np.where(self._sizes > 0.0, self._side_sizes[:, None] / self._sizes, 0.0)
+        self._largest = reach.max(axis=0, initial=0.0)  # sizes that the set gives its components
+
+    def contains(self, point: Array) -> bool:
+        """Whether a point is in the set, up to rounding in general inequalities."""
+        # Comparisons with NaN are false: a NaN is no member.
+        if not ((self._lower <= point).all() and (point <= self._upper).all()):
+            return False
+        return not self._has_rows or not (self._misses(point) > 0.0).any()
+
+    def _misses(self, point: Array) -> Array:
+        """By how much a point misses each row; 0 where only by rounding."""
+        missed: Array = self._rows @ point - self._sides
+        rounding = _ROUNDING * (self._sizes @ np.abs(point) + self._side_sizes)
+        return np.where(missed > rounding, missed, 0.0)
+
+    def __call__(self, point: Array, covariance: Array) -> Projected:
+        """The nearest point in the metric of a covariance (n, n), positive semidefinite.
+
+        Where a singular covariance leads to no point of the set, the sizes of the components
+        serve as standard deviations beside it.
+        """
+        found = self._nearest(point, covariance)
+        if found is not None:
+            return Projected(found, True)
+        sizes = np.maximum(np.abs(point), self._largest)
+        found = self._nearest(point, np.diag(sizes * sizes))
+        return Projected(np.clip(point if found is None else found, self._lower, self._upper), False)
+
+    def _nearest(self, point: Array, covariance: Array) -> Array | None:
+        rows = self._rows
+        spread: Array = covariance @ rows.T
+        variances = np.einsum("ij,ji->i", rows, spread)
+        # |a|' D |a| with D the diagonal is of the size that the variance of a row can have.
+        possible = (self._sizes**2) @ np.abs(covariance.diagonal())
+        usable = variances > _SINGULAR * possible
+        scale = np.sqrt(np.where(usable, variances, 1.0))
+        # In units of each row's standard deviation, so that no row's unit matters.
+        gram = (rows @ spread) / np.outer(scale, scale)
+        active: list[int] = []
+        multipliers = np.zeros(0)
+        current = point
+        for _ in range(50 + 10 * scale.size):
+            missed = self._misses(current) / scale
+            if active:
+                missed[active] = 0.0
+            worst = int(missed.argmax())
+            if not missed[worst] > 0.0:
+                clipped: Array = np.clip(current, self._lower, self._upper)
+                return clipped
+            if not usable[worst]:
+                return None
+            entering = self._enter(gram, worst, float(missed[worst]), active, multipliers)
+            if entering is None:
+                return None
+            multipliers = entering
+            current = point - spread[:, active] @ (multipliers / scale[active])
+        return None
+
+    @staticmethod
+    def _enter(
+        gram: Array, row: int, missed: float, active: list[int], multipliers: Array
+    ) -> Array | None:
+        """Make a violated row active, and others inactive where they have to; None if in vain."""
+        own = 0.0
+        while True:
+            exchange = np.linalg.solve(gram[np.ix_(active, active)], gram[active, row])
+            curvature = float(gram[row, row] - gram[row, active] @ exchange)
+            full = (missed / curvature) if curvature > _SINGULAR else np.inf
+            with np.errstate(divide="ignore", invalid="ignore"):
+                limits = np.where(exchange > 0.0, multipliers / exchange, np.inf)
+            blocking = int(limits.argmin()) if limits.size else -1
+            length = min(full, float(limits[blocking]) if limits.size else np.inf)
+            if not np.isfinite(length):
+                return None
+            multipliers = multipliers - length * exchange
+            own += length
+            missed -= length * max(curvature, 0.0)
+            if length == full:
+                active.append(row)
+                return np.append(multipliers, own)
+            del active[blocking]
+            multipliers = np.delete(multipliers, blocking)
+
+
+class ErrorMetric:
+    r"""The metric in which an observer without a covariance is projected onto X.
+
+    The observer's own `Observer.metric` where it has one. Otherwise the Lyapunov matrix of the
+    linearised error :math:`E = A - K C`,
+
+    .. math::
+        M = E^\top M E + \Gamma
+
+    at the first state at which E is stable; K is the constant gain or the slope of
+    :math:`L(z, \cdot)` at 0, and :math:`\Gamma` the cost's prior weight, so that no unit
+    matters. Parameters that the observer does not correct have an error that stays: they are
+    left out of E and keep their block of :math:`\Gamma`. Until a state makes E stable,
+    :math:`\Gamma` is the metric.
+
+    Parameters
+    ----------
+    observer : Observer
+        Without a covariance.
+    prior_weight : (n, n) array
+        :math:`\Gamma`.
+    noise_deviations : (p,) array
+        Standard deviations of the noise: the steps for the slope of L.
+    """
+
+    def __init__(self, observer: Observer, prior_weight: Array, noise_deviations: Array) -> None:
+        self._observer, self._deviations = observer, noise_deviations
+        self._prior_weight = prior_weight
+        self._scale = np.sqrt(prior_weight.diagonal())
+        own = observer.metric
+        #: Inverse of the metric (n, n).
+        self.covariance: Array = inverse(prior_weight if own is None else own)
+        #: Whether the metric is the final one.
+        self.settled: bool = own is not None
+
+    @property
+    def state(self) -> tuple[Array, bool]:
+        """The covariance, and whether it is the final one; settable."""
+        return self.covariance, self.settled
+
+    @state.setter
+    def state(self, state: tuple[Array, bool]) -> None:
+        self.covariance, self.settled = state
+
+    def settle(self, z: Array, a: Array, c: Array, sample: Sample) -> None:
+        """Take the Lyapunov matrix at z with the Jacobians a of f and c of h, if E is stable."""
+        gain = self._observer.constant_gain
+        if gain is None:
+            gain = self._slope(z, sample)
+        if not (np.isfinite(gain).all() and np.isfinite(a).all() and np.isfinite(c).all()):
+            return
+        # Scaled by the prior: numbers without units.
+        scale = self._scale
+        error = scale[:, None] * (a - gain @ c) / scale
+        weight = self._prior_weight / np.outer(scale, scale)
+        moving = np.ones(scale.size, np.bool_)
+        if not _stable(error):
+            moving = gain.any(axis=1) | (a != np.eye(scale.size)).any(axis=1)
+            error = error[np.ix_(moving, moving)]
+            if not (moving.any() and _stable(error)):
+                return
+        metric = np.where(moving[:, None] == moving, weight, 0.0)
+        block = np.ix_(moving, moving)
+        metric[block] = _lyapunov(error, weight[block])
+        covariance = inverse(metric) / np.outer(scale, scale)
+        if np.isfinite(covariance).all():
+            self.covariance, self.settled = covariance, True
+
+    def _slope(self, z: Array, sample: Sample) -> Array:
+        columns = []
+        for j, step in enumerate(self._deviations):
+            move = np.zeros(self._deviations.size)
+            move[j] = step
+            columns.append(self._observer.correct(z, move, sample)[0] / step)
+        return np.array(columns).T
+
+
+def _stable(error: Array) -> bool:
+    return float(np.abs(np.linalg.eigvals(error)).max()) < 1.0
+
+
+def _lyapunov(error: Array, weight: Array) -> Array:
+    """The sum over k of E'^k W E^k, by doubling: 2^j terms after j products."""
+    total, power = weight, error
+    for _ in range(_DOUBLINGS):
+        added = power.T @ total @ power
+        total = total + added
+        power = power @ power
+        if np.abs(added).max() <= _EPS * np.abs(total).max():
+            break
+    return 0.5 * (total + total.T)
+
