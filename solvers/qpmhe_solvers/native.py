@@ -108,8 +108,7 @@ class NativeSolver(Solver):
         layout.fill(gathered, voids)
         # Whatever raises from here on leaves the workspace out.
         if workspace.handle is None:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
+            with warnings.catch_warnings(action="ignore"):
                 workspace.handle = self._set_up(layout)
         else:
             self._update(workspace.handle, layout)
