@@ -188,13 +188,7 @@ class QP:
         return as_csc(pattern, numbers[pattern.data])
 
     def hessian_times(self, d: Array) -> Array:
-        """H d.
-
-        Parameters
-        ----------
-        d : (K, n) array
-            Increments.
-        """
+        """H d, (K, n), of increments ``d`` (K, n)."""
         from scipy.linalg.blas import dsbmv
 
         product: Array = dsbmv(
@@ -203,47 +197,23 @@ class QP:
         return product.reshape(self.stages, self.n)
 
     def rows_times(self, d: Array) -> Array:
-        """F_k d_k + G_k d_{k+1}, of shape (K, rows).
-
-        Parameters
-        ----------
-        d : (K, n) array
-            Increments.
-        """
+        """F_k d_k + G_k d_{k+1}, (K, rows), of increments ``d`` (K, n)."""
         value: Array = np.matmul(self.row_own, d[:, :, None])[:, :, 0]
         value[:-1] += np.matmul(self.row_next[:-1], d[1:, :, None])[:, :, 0]
         return value
 
     def rows_transposed_times(self, y: Array) -> Array:
-        """The adjoint of `rows_times`, of shape (K, n).
-
-        Parameters
-        ----------
-        y : (K, rows) array
-            Multipliers of the rows.
-        """
+        """The adjoint of `rows_times`, (K, n), of multipliers ``y`` (K, rows)."""
         value: Array = np.matmul(y[:, None, :], self.row_own)[:, 0]
         value[1:] += np.matmul(y[:-1, None, :], self.row_next[:-1])[:, 0]
         return value
 
     def objective(self, d: Array) -> float:
-        """The value of the objective.
-
-        Parameters
-        ----------
-        d : (K, n) array
-            Increments.
-        """
+        """The value of the objective at increments ``d`` (K, n)."""
         return float(np.vdot(d, 0.5 * self.hessian_times(d) + self.gradient))
 
     def violation(self, d: Array) -> float:
-        """The largest amount by which a bound or a row is missed.
-
-        Parameters
-        ----------
-        d : (K, n) array
-            Increments.
-        """
+        """The largest amount by which increments ``d`` (K, n) miss a bound or a row."""
         worst = 0.0
         if self.bounded:
             worst = float(np.maximum(self.lower - d, d - self.upper).max())
