@@ -1,55 +1,7 @@
 """The QP backends, as `qpmhe.solvers`: the public names of the package ``qpmhe_solvers``."""
 
-from qpmhe_solvers import (
-    QP,
-    Backend,
-    Capabilities,
-    Conformance,
-    Finding,
-    RawSolution,
-    Recording,
-    RecordingWarning,
-    Residuals,
-    Solution,
-    Solver,
-    SolverOptions,
-    SolveStatus,
-    StoredQP,
-    available,
-    backend,
-    backends,
-    check,
-    create,
-    dump,
-    load,
-    measure,
-    register,
-    unregister,
-)
+import qpmhe_solvers
+from qpmhe_solvers import *  # noqa: F403
 
-__all__ = [
-    "QP",
-    "Backend",
-    "Capabilities",
-    "Conformance",
-    "Finding",
-    "RawSolution",
-    "Recording",
-    "RecordingWarning",
-    "Residuals",
-    "Solution",
-    "SolveStatus",
-    "Solver",
-    "SolverOptions",
-    "StoredQP",
-    "available",
-    "backend",
-    "backends",
-    "check",
-    "create",
-    "dump",
-    "load",
-    "measure",
-    "register",
-    "unregister",
-]
+__all__ = []
+__all__ += qpmhe_solvers.__all__

@@ -32,7 +32,7 @@ from stopwatch import timed
 import qpmhe
 from qpmhe.models import batch_reactor, chain_of_masses, quadrotor
 from qpmhe_solvers import QP, Backend, RawSolution, Solution, Solver, SolverOptions, SolveStatus
-from qpmhe_solvers.native.workspace import NativeSolver
+from qpmhe_solvers.native import NativeSolver
 
 # The generic form that stands beside each native one; qpsolvers has one form of each solver.
 PAIRS = {

@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..costs import QuadraticCost
 from ..model.system import System
 from ..observers import Luenberger
-from .example import Example
-from .scenario import Scenario
+from .example import Example, make_example
 
 __all__ = ["batch_reactor", "casadi_output", "casadi_rate"]
 
@@ -92,12 +90,9 @@ def batch_reactor(method: str = "euler") -> Example:
         _rate, _output, dt=_DT, n=2, p=1, method=method,
         rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
     )
-    disturbance, noise = 0.1**2 * np.eye(2), 0.2**2 * np.eye(1)
-    scenario = Scenario(
-        system=system, initial_state=np.array([5.0, 2.0]), initial_estimate=np.array([3.0, 0.0]),
-        disturbance_covariance=disturbance, noise_covariance=noise, dt=_DT, horizon=10, steps=150,
+    return make_example(
+        system, Luenberger(_DT * np.array([[0.5], [0.5]])), prior=[1.0, 1.0],
+        disturbance=[0.1, 0.1], noise=[0.2], initial_state=[5.0, 2.0],
+        initial_estimate=[3.0, 0.0], dt=_DT, horizon=10, steps=150,
         labels=("x1 (A)", "x2 (B)"), settling_time=2.0, title="Batch reactor, 2A <-> B",
     )
-    observer = Luenberger(_DT * np.array([[0.5], [0.5]]))
-    cost = QuadraticCost.from_covariances(prior=np.eye(2), disturbance=disturbance, noise=noise)
-    return Example(system, observer, cost, scenario)

@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..costs import QuadraticCost
 from ..model.sets import Box
 from ..model.system import System
 from ..observers import Luenberger
-from .example import Example
-from .scenario import Scenario
+from .example import Example, make_example
 
 __all__ = ["battery_cell"]
 
@@ -109,16 +107,10 @@ def battery_cell(method: str = "rk4") -> Example:
         rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
         states=Box([0.0, -free, -free], [1.0, free, free]),
     )
-    disturbance = np.diag([0.0002**2, 0.001**2, 0.0005**2])
-    noise = np.diag([0.005**2])
-    scenario = Scenario(
-        system=system, initial_state=np.array([1.0, 0.0, 0.0]),
-        initial_estimate=np.array([0.5, 0.0, 0.0]), disturbance_covariance=disturbance,
-        noise_covariance=noise, dt=_DT, horizon=60, steps=400,
+    return make_example(
+        system, Luenberger([0.5, 0.0, 0.0]), prior=[0.3, 0.002, 0.0025],
+        disturbance=[0.0002, 0.001, 0.0005], noise=[0.005], initial_state=[1.0, 0.0, 0.0],
+        initial_estimate=[0.5, 0.0, 0.0], dt=_DT, horizon=60, steps=400,
         labels=("state of charge", "v1 (V)", "v2 (V)"), inputs=_current, settling_time=300.0,
         title="Battery cell, two RC elements",
     )
-    cost = QuadraticCost.from_covariances(
-        prior=np.diag([0.3**2, 0.002**2, 0.0025**2]), disturbance=disturbance, noise=noise
-    )
-    return Example(system, Luenberger([0.5, 0.0, 0.0]), cost, scenario)

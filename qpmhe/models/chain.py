@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import count
-from ..costs import QuadraticCost
 from ..errors import OptionError
 from ..model.system import System
 from ..observers import design_luenberger
-from .example import Example
-from .scenario import Scenario
+from .example import Example, make_example
 
 __all__ = ["casadi_output", "casadi_rate", "chain_of_masses"]
 
@@ -242,25 +240,23 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
         rate_jacobian=chain.rate_jacobian, h_jacobian=chain.output_jacobian,
     )
     rest = chain.rest()
-    disturbance = _diagonal(half, _POSITION_DISTURBANCE, _VELOCITY_DISTURBANCE)
-    noise = _NOISE**2 * np.eye(half)
+    disturbance = np.repeat([_POSITION_DISTURBANCE, _VELOCITY_DISTURBANCE], half)
+    noise = np.full(half, _NOISE)
+    observer = design_luenberger(
+        system, rest, disturbance=np.diag(disturbance**2), noise=np.diag(noise**2)
+    )
     shape = np.sin(np.pi * np.arange(1, masses + 1) / (masses + 1))
     displaced = rest.copy()
     displaced[:half] += _DISPLACEMENT * np.repeat(shape, dimension)
     axes = "xyz"[:dimension]
     names = [f"{axis}{i}" for i in range(1, masses + 1) for axis in axes]
-    scenario = Scenario(
-        system=system, initial_state=displaced, initial_estimate=rest,
-        disturbance_covariance=disturbance, noise_covariance=noise, dt=_DT, horizon=30, steps=120,
+    swing = _DISPLACEMENT * (_STIFFNESS / _MASS) ** 0.5
+    return make_example(
+        system, observer, prior=np.repeat([_DISPLACEMENT, swing], half), disturbance=disturbance,
+        noise=noise, initial_state=displaced, initial_estimate=rest, dt=_DT, horizon=30, steps=120,
         labels=(*(f"{name} (m)" for name in names), *(f"v{name} (m/s)" for name in names)),
         settling_time=1.5, title=f"Chain of {masses} mass{'es' * (masses > 1)} in {dimension} D",
     )
-    swing = _DISPLACEMENT * (_STIFFNESS / _MASS) ** 0.5
-    cost = QuadraticCost.from_covariances(
-        prior=_diagonal(half, _DISPLACEMENT, swing), disturbance=disturbance, noise=noise
-    )
-    observer = design_luenberger(system, rest, disturbance=disturbance, noise=noise)
-    return Example(system, observer, cost, scenario)
 
 
 def _checked(masses: Any, dimension: Any) -> tuple[int, int]:
@@ -270,8 +266,3 @@ def _checked(masses: Any, dimension: Any) -> tuple[int, int]:
     ):
         raise OptionError(f"dimension is {dimension!r}; expected 1, 2 or 3, the axes of space.")
     return masses, int(dimension)
-
-
-def _diagonal(half: int, position: float, velocity: float) -> Array:
-    """A covariance from the standard deviations of all positions and of all velocities."""
-    return np.diag(np.repeat([position**2, velocity**2], half))

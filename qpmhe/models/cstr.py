@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..costs import QuadraticCost
 from ..model.sets import Box
 from ..model.system import System
 from ..observers import design_luenberger
-from .example import Example
-from .scenario import Scenario
+from .example import Example, make_example
 
 __all__ = ["cstr"]
 
@@ -116,18 +114,12 @@ def cstr(method: str = "rk4") -> Example:
         rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
         states=Box([0.0, 250.0], [_FEED, 500.0]),
     )
-    disturbance, noise = np.diag([0.005**2, 0.3**2]), np.diag([0.5**2])
-    scenario = Scenario(
-        system=system, initial_state=np.array([0.5, 350.0]),
-        initial_estimate=np.array([0.65, 347.0]), disturbance_covariance=disturbance,
-        noise_covariance=noise, dt=_DT, horizon=20, steps=200, labels=("c (mol/L)", "T (K)"),
-        time_unit="min", inputs=_coolant, settling_time=1.0,
+    observer = design_luenberger(
+        system, [0.5, 350.0], [300.0], disturbance=np.diag([0.005**2, 1.0**2]), noise=[[0.5**2]]
+    )
+    return make_example(
+        system, observer, prior=[0.3, 5.0], disturbance=[0.005, 0.3], noise=[0.5],
+        initial_state=[0.5, 350.0], initial_estimate=[0.65, 347.0], dt=_DT, horizon=20, steps=200,
+        labels=("c (mol/L)", "T (K)"), time_unit="min", inputs=_coolant, settling_time=1.0,
         title="Continuous stirred tank reactor, exothermic A -> B",
     )
-    cost = QuadraticCost.from_covariances(
-        prior=np.diag([0.3**2, 5.0**2]), disturbance=disturbance, noise=noise
-    )
-    observer = design_luenberger(
-        system, [0.5, 350.0], [300.0], disturbance=np.diag([0.005**2, 1.0**2]), noise=noise
-    )
-    return Example(system, observer, cost, scenario)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from ..costs import QuadraticCost
 from ..model.system import System
 from ..observers import Observer
 from .scenario import Scenario
 
-__all__ = ["Example"]
+__all__ = ["Example", "make_example"]
 
 
 class Example(NamedTuple):
@@ -33,3 +36,14 @@ class Example(NamedTuple):
     observer: Observer
     cost: QuadraticCost
     scenario: Scenario
+
+
+def make_example(
+    system: System, observer: Observer, *, prior: ArrayLike, disturbance: ArrayLike,
+    noise: ArrayLike, **scenario: Any,
+) -> Example:
+    """An example from standard deviations, by which its cost weighs and its scenario draws."""
+    P, Q, R = (np.diag(np.square(one)) for one in (prior, disturbance, noise))
+    cost = QuadraticCost.from_covariances(prior=P, disturbance=Q, noise=R)
+    drawn = Scenario(system, disturbance_covariance=Q, noise_covariance=R, **scenario)
+    return Example(system, observer, cost, drawn)

@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from modulefinder import ModuleFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -273,41 +274,17 @@ def imported(place: str) -> tuple[ModuleType, str]:
 def _files(path: Path) -> list[Path]:
     """A file, first, and those of its folder that it imports, at whatever depth."""
     top = next(one for one in path.parents if not (one / "__init__.py").is_file())
-    found, waiting = [path], [path]
-    while waiting:
-        for candidate in _candidates(waiting.pop(), {path.parent, top}):
-            if (
-                candidate not in found
-                and candidate.is_relative_to(path.parent) and candidate.is_file()
-            ):
-                found.append(candidate)
-                waiting.append(candidate)
-    return found
-
-
-def _candidates(file: Path, roots: set[Path]) -> Iterator[Path]:
-    """Where the modules would be that a file imports."""
-    try:
-        nodes = list(ast.walk(ast.parse(file.read_bytes()))) if file.suffix == ".py" else []
-    except (SyntaxError, ValueError):  # the import reports it
-        return
-    for node in nodes:
-        bases = roots
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            names = [f"{node.module or ''}.{alias.name}" for alias in node.names]
-            if node.level:
-                bases = set(file.parents[node.level - 1 : node.level])
+    finder = ModuleFinder([str(top), str(path.parent)])
+    with contextlib.suppress(Exception):  # the import reports it
+        if top == path.parent:
+            finder.run_script(str(path))
         else:
-            continue
-        for base in bases:
-            for name in names:
-                place = base
-                for part in filter(None, name.split(".")):
-                    yield place / f"{part}.py"
-                    place /= part
-                    yield place / "__init__.py"
+            finder.import_hook(".".join(path.relative_to(top).with_suffix("").parts))
+    places = (getattr(one, "__file__", None) for one in finder.modules.values())
+    found = {Path(place).resolve() for place in places if place} - {path}
+    return [path, *(
+        one for one in found if one.suffix == ".py" and one.is_relative_to(path.parent)
+    )]
 
 
 def _forget(files: set[Path]) -> None:

@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..costs import QuadraticCost
 from ..model.system import System
 from ..observers import HighGain
-from .example import Example
-from .scenario import Scenario
+from .example import Example, make_example
 
 __all__ = ["pendulum"]
 
@@ -78,14 +76,9 @@ def pendulum(method: str = "rk4") -> Example:
         _rate, _output, dt=_DT, n=2, p=1, method=method,
         rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
     )
-    disturbance, noise = np.diag([0.001**2, 0.02**2]), np.diag([_COUNT**2 / 12.0])
-    scenario = Scenario(
-        system=system, initial_state=np.array([2.5, 0.0]), initial_estimate=np.zeros(2),
-        disturbance_covariance=disturbance, noise_covariance=noise, dt=_DT, horizon=30, steps=300,
-        labels=("angle (rad)", "speed (rad/s)"), settling_time=1.0,
-        title="Damped pendulum with encoder", resolution=np.array([_COUNT]),
+    return make_example(
+        system, HighGain(2, epsilon=0.1, dt=_DT), prior=[1.0, 5.0], disturbance=[0.001, 0.02],
+        noise=[_COUNT / 12.0**0.5], initial_state=[2.5, 0.0], initial_estimate=[0.0, 0.0], dt=_DT,
+        horizon=30, steps=300, labels=("angle (rad)", "speed (rad/s)"), settling_time=1.0,
+        title="Damped pendulum with encoder", resolution=[_COUNT],
     )
-    cost = QuadraticCost.from_covariances(
-        prior=np.diag([1.0**2, 5.0**2]), disturbance=disturbance, noise=noise
-    )
-    return Example(system, HighGain(2, epsilon=0.1, dt=_DT), cost, scenario)

@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..costs import QuadraticCost
 from ..model.system import System
 from ..observers import design_luenberger
-from .example import Example
-from .scenario import Scenario
+from .example import Example, make_example
 
 __all__ = ["quadrotor"]
 
@@ -160,31 +158,26 @@ def quadrotor(method: str = "rk4") -> Example:
         _rate, _output, dt=_DT, n=12, p=6, m=4, method=method,
         rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
     )
-    disturbance = _diagonal(0.002, 0.05, 0.002, 0.1)
-    noise = _diagonal(0.1, 0.02)
-    start = np.zeros(12)
+    disturbance, noise = _each(0.002, 0.05, 0.002, 0.1), _each(0.1, 0.02)
+    hover = np.array([_MASS * _GRAVITY, 0.0, 0.0, 0.0])
+    observer = design_luenberger(
+        system, np.zeros(12), hover, disturbance=9.0 * np.diag(disturbance**2),
+        noise=np.diag(noise**2),
+    )
+    start, estimate = np.zeros((2, 12))
     start[[0, 2, 4]] = 1.5, 2.0, 1.5
-    estimate = np.zeros(12)
     estimate[:3] = 1.0, 0.5, 1.5
-    scenario = Scenario(
-        system=system, initial_state=start, initial_estimate=estimate,
-        disturbance_covariance=disturbance, noise_covariance=noise, dt=_DT, horizon=20, steps=200,
+    return make_example(
+        system, observer, prior=_each(0.5, 1.0, 0.2, 0.5), disturbance=disturbance, noise=noise,
+        initial_state=start, initial_estimate=estimate, dt=_DT, horizon=20, steps=200,
         labels=(
             "x (m)", "y (m)", "z (m)", "vx (m/s)", "vy (m/s)", "vz (m/s)",
             "roll (rad)", "pitch (rad)", "yaw (rad)", "p (rad/s)", "q (rad/s)", "r (rad/s)",
         ),
         inputs=_fly, settling_time=2.0, title="Quadrotor",
     )
-    cost = QuadraticCost.from_covariances(
-        prior=_diagonal(0.5, 1.0, 0.2, 0.5), disturbance=disturbance, noise=noise
-    )
-    hover = np.array([_MASS * _GRAVITY, 0.0, 0.0, 0.0])
-    observer = design_luenberger(
-        system, np.zeros(12), hover, disturbance=9.0 * disturbance, noise=noise
-    )
-    return Example(system, observer, cost, scenario)
 
 
-def _diagonal(*deviations: float) -> Array:
-    """A covariance from standard deviations, each that of three components."""
-    return np.diag(np.repeat(np.square(deviations), 3))
+def _each(*deviations: float) -> Array:
+    """Standard deviations, each of three components."""
+    return np.repeat(deviations, 3)

@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..costs import QuadraticCost
 from ..model.system import System
 from ..observers import HighGain
-from .example import Example
-from .scenario import Scenario
+from .example import Example, make_example
 
 __all__ = ["van_der_pol"]
 
@@ -73,11 +71,8 @@ def van_der_pol(method: str = "rk4") -> Example:
         _rate, _output, dt=_DT, n=2, p=1, method=method,
         rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
     )
-    disturbance, noise = np.diag([0.02**2, 0.05**2]), np.diag([0.1**2])
-    scenario = Scenario(
-        system=system, initial_state=np.array([2.0, 0.0]), initial_estimate=np.zeros(2),
-        disturbance_covariance=disturbance, noise_covariance=noise, dt=_DT, horizon=20, steps=200,
-        labels=("x1", "x2"), settling_time=3.0, title="Van der Pol oscillator",
+    return make_example(
+        system, HighGain(2, epsilon=0.4, dt=_DT), prior=[1.0, 1.0], disturbance=[0.02, 0.05],
+        noise=[0.1], initial_state=[2.0, 0.0], initial_estimate=[0.0, 0.0], dt=_DT, horizon=20,
+        steps=200, labels=("x1", "x2"), settling_time=3.0, title="Van der Pol oscillator",
     )
-    cost = QuadraticCost.from_covariances(prior=np.eye(2), disturbance=disturbance, noise=noise)
-    return Example(system, HighGain(2, epsilon=0.4, dt=_DT), cost, scenario)

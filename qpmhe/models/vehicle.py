@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..costs import QuadraticCost
 from ..model.system import System
 from ..observers import OutputInjection
-from .example import Example
-from .scenario import Scenario
+from .example import Example, make_example
 
 __all__ = ["vehicle"]
 
@@ -117,16 +115,10 @@ def vehicle(method: str = "rk4") -> Example:
         _rate, _output, dt=_DT, n=3, p=4, m=2, method=method,
         rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
     )
-    disturbance = np.diag([0.02**2, 0.02**2, 0.02**2])
-    noise = np.diag(_ROOT_WEIGHTS**-2.0)
-    scenario = Scenario(
-        system=system, initial_state=np.array([0.0, 0.0, 0.8]),
-        initial_estimate=np.array([-1.0, 1.1, 0.3]), disturbance_covariance=disturbance,
-        noise_covariance=noise, dt=_DT, horizon=20, steps=250,
+    return make_example(
+        system, OutputInjection(_correction), prior=[1.0, 1.0, 0.5],
+        disturbance=[0.02, 0.02, 0.02], noise=1.0 / _ROOT_WEIGHTS, initial_state=[0.0, 0.0, 0.8],
+        initial_estimate=[-1.0, 1.1, 0.3], dt=_DT, horizon=20, steps=250,
         labels=("x (m)", "y (m)", "heading (rad)"), inputs=_drive, settling_time=5.0,
         title="Vehicle with ranges and bearings of two beacons",
     )
-    cost = QuadraticCost.from_covariances(
-        prior=np.diag([1.0**2, 1.0**2, 0.5**2]), disturbance=disturbance, noise=noise
-    )
-    return Example(system, OutputInjection(_correction), cost, scenario)

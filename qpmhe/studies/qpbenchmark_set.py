@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from qpmhe_solvers import QP
+from qpmhe_solvers.dispatch import qpsolvers_arguments
 from qpmhe_solvers.files import StoredQP, load, qp_files
-from qpmhe_solvers.matrices import QpsolversMatrices
-from qpmhe_solvers.qp import QP
+from qpmhe_solvers.gathered import GatheredQP
+from qpmhe_solvers.layout import Layout, Structure, Style
 
 from ..errors import InvalidInputError, OptionError
 
@@ -153,9 +155,11 @@ def _problem(qp: QP) -> qpsolvers.Problem:
 
     sides = [np.isfinite(side) for side in (qp.lower, qp.upper)]
     box = all(side.all() or not side.any() for side in sides)
-    form = QpsolversMatrices(qp, dense=True, box=box, needs_row=False, keep_empty=False)
-    form.fill(qp)
-    P, q, G, h, A, b, lower, upper = form.arguments
+    gathered = GatheredQP.of(qp)
+    style = Style("dense", bounds="box" if box else "rows", sides=1)
+    layout = Layout(style, Structure.of(gathered, exact=True), *gathered.sizes)
+    layout.fill(gathered, None)
+    P, q, G, h, A, b, lower, upper = qpsolvers_arguments(layout)
     return qpsolvers.Problem(
         P, q, G, h, A, b,
         lower if lower is not None and sides[0].all() else None,

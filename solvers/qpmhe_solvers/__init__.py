@@ -1,7 +1,6 @@
 """QP backends for trajectories: convex QPs in, judged solutions out, estimation unknown."""
 
-from .capabilities import Capabilities, measure
-from .conformance import Conformance, Finding, check
+from .conformance import Capabilities, Conformance, Finding, check, measure
 from .errors import BackendError, InvalidInputError, OptionError, QpmheError, ShapeError
 from .files import StoredQP, dump, load
 from .options import SolverOptions

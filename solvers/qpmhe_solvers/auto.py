@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from itertools import chain
 from time import perf_counter
 
 import numpy as np
@@ -64,20 +66,18 @@ class AutoSolver(Solver):
     def forget(self) -> None:
         """Let the QP solvers drop what they keep; see `Solver.forget`."""
         self._shifts = 0
-        for others in self._others.values():
-            for other in others:
-                other.forget()
+        for other in chain.from_iterable(self._others.values()):
+            other.forget()
 
     def shift(self) -> None:
         """Count, for the QP solvers, which most steps do not need; see `Solver.shift`."""
         self._shifts += 1
 
     def _pass_shifts_on(self, stages: int) -> None:
-        # After as many as there are stages, nothing that was kept belongs to any.
-        for _ in range(min(self._shifts, stages)):
-            for others in self._others.values():
-                for other in others:
-                    other.shift()
+        for other in chain.from_iterable(self._others.values()):
+            # After as many as there are stages, nothing that was kept belongs to any.
+            for _ in range(min(self._shifts, stages)):
+                other.shift()
         self._shifts = 0
 
     def prepare(self, size: int) -> None:
@@ -89,19 +89,15 @@ class AutoSolver(Solver):
 
     def _choose(self, small: bool) -> list[ContainedSolver]:
         """The two best solvers that can be made: the second where the first brings nothing."""
-        options, chosen = self.options, []
+        options = self.options
+        chosen: list[ContainedSolver] = []
         known = [NATIVE[name] for name in (_SMALL_ORDER if small else _LARGE_ORDER)]
         if options.time_limit is not None:
             known.sort(key=lambda backend: not backend.time_limit)
         for backend in known:
-            if options.max_iterations is not None and not backend.iterate_at_cap:
-                continue
-            if not backend.available:
-                continue
-            try:
-                chosen.append(ContainedSolver(make_solver(backend, options)))
-            except Exception:  # an installed package that does not work: the next will do
-                continue
-            if len(chosen) == 2:
-                break
+            fits = options.max_iterations is None or backend.iterate_at_cap
+            if len(chosen) < 2 and fits and backend.available:
+                # A package that is installed may not work: the next will do.
+                with suppress(Exception):
+                    chosen.append(ContainedSolver(make_solver(backend, options)))
         return chosen

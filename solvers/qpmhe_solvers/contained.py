@@ -49,8 +49,7 @@ class ContainedSolver:
             if self._is_trusted:
                 return solver.solve(qp, start)
             lent = None if start is None else start.copy()
-            with warnings.catch_warnings(), np.errstate(all="ignore"):
-                warnings.simplefilter("ignore")
+            with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
                 return _checked(solver.solve(qp.copy(), lent), qp)
         except KeyboardInterrupt:
             raise

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -10,18 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .gathered import GatheredQP
-from .matrices import QpsolversMatrices, pattern_of_limits
+from .layout import Layout, Structure, Style
+from .native import Answer, NativeSolver
 from .options import SolverOptions
-from .qp import QP
-from .solution import RawSolution
-from .solver import Solver
 
-__all__ = ["TRANSLATIONS", "DispatchSolver", "Translation"]
+__all__ = ["TRANSLATIONS", "DispatchSolver", "Translation", "qpsolvers_arguments"]
 
-Array = NDArray[np.float64]
-
-# Patterns of limits kept by one solver: with and without sets, at a few phases of sampling.
-_KEPT = 8
+Point = NDArray[np.float64] | None
 
 
 @dataclass(frozen=True)
@@ -101,65 +96,83 @@ TRANSLATIONS: Mapping[str, Translation] = {
 }
 
 
-class DispatchSolver(Solver):
-    """Hand the QP to one solver through ``qpsolvers.solve_problem``."""
+class DispatchSolver(NativeSolver):
+    """Hand the QP to one solver through ``qpsolvers.solve_problem``.
 
-    _keeps = False
+    Only the arrays are kept; a solver gets the limits that there are, and no others.
+    """
+
+    package = "qpsolvers"  # imports every solver that is installed
+    _keeps, _warns = False, True
 
     def __init__(self, name: str, options: SolverOptions) -> None:
-        import qpsolvers  # late: it imports every solver that is installed
-
         super().__init__(options)
         self.name = name
-        self._translation = TRANSLATIONS[name]
-        self._keywords = _keywords(self._translation, options)
-        self._problem: Callable[..., Any] = qpsolvers.Problem
-        self._solve_problem: Callable[..., Any] = qpsolvers.solve_problem
-        self._forms: dict[Hashable, tuple[QpsolversMatrices, Any]] = {}
+        self._translation = how = TRANSLATIONS[name]
+        self.style = Style(
+            how.matrices, bounds=how.bounds, sides=1, needs_row=how.needs_row,
+            objective=how.objective,
+        )
+        self._keywords = _keywords(how, options)
+        self._solve_problem: Callable[..., Any] = self._package.solve_problem
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_forms": {}}  # copies of arrays no longer share their numbers
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.name, self.options)
 
-    def prepare(self, size: int) -> None:
-        """Import what qpsolvers and the solver import at their first solve."""
-        self._rehearse()
-        self._forms.clear()
+    def structure(self, qp: GatheredQP) -> Structure:
+        """The limits of this QP."""
+        return Structure.of(qp, exact=True)
 
-    def _solve(self, qp: QP, start: Array | None) -> RawSolution:
-        qp = GatheredQP.of(qp)
-        form, problem = self._form(qp)
-        form.fill(qp)
-        initial = None
-        if start is not None and self._translation.start:
-            initial = np.ravel(start).copy()
-        words = self._keywords
-        if self.time_limit is not None and self._translation.time_limit is not None:
-            words[self._translation.time_limit] = self.time_limit
+    def _set_up(self, layout: Layout) -> Any:
+        return self._package.Problem(*qpsolvers_arguments(layout, self._translation.keep_empty))
+
+    def _limit(self, handle: Any, seconds: float) -> None:
+        if self._translation.time_limit is not None:
+            self._keywords[self._translation.time_limit] = seconds
+
+    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+        initial = start.copy() if start is not None and self._translation.start else None
         answer = self._solve_problem(
-            problem, self.name, initvals=initial, verbose=False, **words
+            handle, self.name, initvals=initial, verbose=False, **self._keywords
         )
-        bound_duals, row_duals = form.multipliers(answer)
         iterations, message = _report(answer.extras)
-        return RawSolution(
-            answer.x, bool(answer.found), iterations, bound_duals, row_duals, message
+        return Answer(
+            answer.x, _multipliers(layout, answer), bool(answer.found), True, iterations, message
         )
 
-    def _form(self, qp: QP) -> tuple[QpsolversMatrices, Any]:
-        """The layout for this QP's pattern of limits, and the problem made of its arrays."""
-        key = pattern_of_limits(qp)
-        made = self._forms.pop(key, None)
-        if made is None:
-            how = self._translation
-            form = QpsolversMatrices(
-                qp, dense=how.matrices == "dense", box=how.bounds == "box",
-                needs_row=how.needs_row, keep_empty=how.keep_empty,
-                objective=how.objective,
-            )
-            made = form, self._problem(*form.arguments)
-            if len(self._forms) == _KEPT:
-                del self._forms[next(iter(self._forms))]  # the longest unused
-        self._forms[key] = made
-        return made
+
+def qpsolvers_arguments(layout: Layout, keep_empty: bool = False) -> tuple[Any, ...]:
+    r"""P, q, G, h, A, b, l, u of a one-sided layout; None for what there is not.
+
+    .. math::
+        \min_x \tfrac12 x^\top P x + q^\top x \quad \text{s.t.} \quad
+        G x \le h, \quad A x = b, \quad l \le x \le u
+    """
+    rows = layout.matrix, layout.upper
+    level = layout.equality_matrix, layout.level
+    box = layout.box_lower, layout.box_upper
+    return (
+        layout.hessian, layout.gradient,
+        *(rows if keep_empty or layout.upper.size else (None, None)),
+        *(level if keep_empty or layout.level.size else (None, None)),
+        *(box if layout.boxed else (None, None)),
+    )
+
+
+def _multipliers(layout: Layout, answer: Any) -> Point:
+    """Multipliers of all constraints; None where some are missing."""
+    parts = []
+    for values, size in (
+        (answer.z, layout.upper.size), (answer.y, layout.level.size),
+        (answer.z_box, layout.box_upper.size),
+    ):
+        numbers = np.empty(0)
+        if size and values is not None:
+            numbers = np.asarray(values, np.float64).ravel()
+        if numbers.size < size:
+            return None
+        parts.append(numbers[:size])
+    return layout.duals(*parts)
 
 
 def _keywords(how: Translation, options: SolverOptions) -> dict[str, Any]:

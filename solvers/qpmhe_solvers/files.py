@@ -7,9 +7,8 @@ import json
 import os
 import platform
 import warnings
-import zipfile
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
 from importlib import metadata
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from .errors import InvalidInputError
 from .options import SolverOptions
-from .qp import QP
+from .qp import ARRAYS, QP
 from .registry import backends
 from .solution import Residuals, Solution, SolveStatus
 
@@ -42,24 +41,10 @@ _PROBLEM = (
 class StoredQP:
     """What a file of `dump` holds.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    qp : QP
-        The problem, to the last bit as it was.
-    solution : Solution or None
-        What the backend had answered.
-    backend : str
-        Its name, or an empty string.
-    options : SolverOptions or None
-        What it had been asked for.
-    start : (K, n) array or None
-        The point it was started from.
-    versions : mapping of str to str
-        Versions of Python, of this package, and of what solves QPs, where it was written.
-    written : str
-        When, in ISO 8601.
+    ``path`` is the file; ``qp`` the problem, to the last bit as it was; ``solution`` what the
+    ``backend`` answered (None, and an empty name, where nothing is stored), asked with ``options``
+    from ``start``, (K, n) or None; ``versions`` those of Python, of this package, and of what
+    solves QPs; and ``written`` when, in ISO 8601.
     """
 
     path: Path
@@ -117,8 +102,7 @@ def dump(
     ):
         if not isinstance(value, kind) and not (optional and value is None):
             raise InvalidInputError(f"{name} is {value!r}; expected a {kind.__name__}.")
-    arrays = {name: getattr(qp, name) for name in _shapes(qp.stages, qp.n, qp.rows)}
-    arrays["start"] = start
+    arrays = {name: getattr(qp, name) for name in ARRAYS} | {"start": start}
     answer = None
     if solution is not None:
         answer = {
@@ -127,16 +111,13 @@ def dump(
             "iterations": None if solution.iterations is None else int(solution.iterations),
             "message": str(solution.message),
         }
+        arrays |= {name: getattr(solution, name) for name in ("d", "bound_duals", "row_duals")}
         if solution.residuals is not None:
-            arrays["residuals"] = np.array(
-                [getattr(solution.residuals, name) for name in ("primal", "dual", "gap")]
-            )
-        for name in ("d", "bound_duals", "row_duals"):
-            arrays[name] = getattr(solution, name)
+            arrays["residuals"] = astuple(solution.residuals)
     header = {
         "format": _FORMAT, "version": _VERSION, "problem": _PROBLEM,
         "stages": qp.stages, "n": qp.n, "rows": qp.rows, "bounded": bool(qp.bounded),
-        "backend": backend, "options": None if options is None else _plain(options),
+        "backend": backend, "options": None if options is None else asdict(options),
         "answer": answer, "versions": _versions(),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
@@ -201,25 +182,18 @@ def qp_files(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
 
 
 def _shapes(stages: int, n: int, rows: int) -> dict[str, tuple[int, ...]]:
+    of_states, of_rows = (stages, n), (stages, rows)
     return {
-        "band": (stages, n, 2 * n), "gradient": (stages, n),
-        "lower": (stages, n), "upper": (stages, n),
+        "band": (stages, n, 2 * n), "gradient": of_states, "lower": of_states, "upper": of_states,
         "row_own": (stages, rows, n), "row_next": (stages, rows, n),
-        "row_lower": (stages, rows), "row_upper": (stages, rows),
-    }
-
-
-def _answer_shapes(stages: int, n: int, rows: int) -> dict[str, tuple[int, ...]]:
-    return {
-        "start": (stages, n), "d": (stages, n), "residuals": (3,),
-        "bound_duals": (stages * n,), "row_duals": (stages * rows,),
+        "row_lower": of_rows, "row_upper": of_rows, "start": of_states, "d": of_states,
+        "residuals": (3,), "bound_duals": (stages * n,), "row_duals": (stages * rows,),
     }
 
 
 def _in_shape(qp: QP, arrays: dict[str, Any]) -> dict[str, Array]:
     """The arrays that there are, each as it is to be found again."""
-    size = qp.stages, qp.n, qp.rows
-    shapes, shaped = _shapes(*size) | _answer_shapes(*size), {}
+    shapes, shaped = _shapes(qp.stages, qp.n, qp.rows), {}
     for name, values in arrays.items():
         if values is None:
             continue
@@ -230,14 +204,6 @@ def _in_shape(qp: QP, arrays: dict[str, Any]) -> dict[str, Array]:
                 f"{name} does not fit the QP ({error}); expected numbers of shape {shapes[name]}."
             ) from error
     return shaped
-
-
-def _plain(options: SolverOptions) -> dict[str, Any]:
-    # NumPy's numbers are no JSON.
-    return {
-        name: value.item() if isinstance(value, np.generic) else value
-        for name, value in asdict(options).items()
-    }
 
 
 @lru_cache(maxsize=1)
@@ -252,21 +218,20 @@ def _versions() -> dict[str, str]:
 
 def _stored(source: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> StoredQP:
     stages, n, rows = (header[name] for name in ("stages", "n", "rows"))
-    shapes = _shapes(stages, n, rows)
-    for name, expected in (shapes | _answer_shapes(stages, n, rows)).items():
+    for name, expected in _shapes(stages, n, rows).items():
         array = arrays.get(name)
         # Before the QP is made: it is as large as the header says.
         if array is not None and (array.shape != expected or array.dtype != np.float64):
             raise ValueError(f"{name} has shape {array.shape} and type {array.dtype}")
     qp = QP(stages, n, rows)
-    for name in shapes:
+    for name in ARRAYS:
         setattr(qp, name, np.ascontiguousarray(arrays[name]))
     if not isinstance(header["bounded"], bool):
         raise TypeError(f"bounded is {header['bounded']!r}")
     # The numbers have the last word: a promise that they break was made by mistake, for example
     # by QPs of earlier versions, which made it on their own.
-    qp.bounded = header["bounded"] or not (
-        bool((qp.lower == -np.inf).all()) and bool((qp.upper == np.inf).all())
+    qp.bounded = header["bounded"] or bool(
+        (qp.lower != -np.inf).any() or (qp.upper != np.inf).any()
     )
     options = header["options"]
     return StoredQP(
@@ -296,7 +261,8 @@ def _answer(stored: dict[str, Any] | None, arrays: dict[str, NDArray[Any]]) -> S
 
 def _write(target: Path, header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write header and arrays beside the target, then rename: it is there whole or not at all."""
-    members = {"header": np.array(json.dumps(header)), **arrays}
+    # NumPy's numbers are no JSON.
+    members = {"header": np.array(json.dumps(header, default=lambda one: one.item())), **arrays}
     unfinished = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         try:
@@ -327,12 +293,12 @@ def _read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     if not magic.startswith(b"PK"):
         raise _foreign(source)
     try:
-        with warnings.catch_warnings(), zipfile.ZipFile(source) as archive:
-            warnings.simplefilter("ignore")
-            if "header.npy" not in archive.namelist():
+        with (
+            warnings.catch_warnings(action="ignore"), source.open("rb") as file,
+            np.load(file, allow_pickle=False) as opened,
+        ):
+            if "header" not in opened.files:
                 raise _foreign(source)
-        with warnings.catch_warnings(), np.load(source, allow_pickle=False) as opened:
-            warnings.simplefilter("ignore")
             arrays = {name: opened[name] for name in opened.files}
         header = json.loads(str(arrays.pop("header")))
     except InvalidInputError:

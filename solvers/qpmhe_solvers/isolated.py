@@ -6,7 +6,6 @@ import importlib
 import os
 import pickle
 import signal
-import struct
 import subprocess
 import sys
 import threading
@@ -34,7 +33,6 @@ Array = NDArray[np.float64]
 _START = 120.0
 # Share of the time limit that a backend with a clock of its own may take beyond it.
 _GRACE = 0.25
-_LENGTH = struct.Struct("=Q")
 _PROGRAM = (
     "import sys; sys.path[:] = {path!r}; from qpmhe_solvers.isolated import serve; serve({parent})"
 )
@@ -192,7 +190,7 @@ class _Child:
             timer.start()
         try:
             self.send(message)
-            return _read(self._back)
+            return pickle.load(self._back)
         except (OSError, EOFError, pickle.UnpicklingError) as error:
             raise _DeadError(self._death()) from error
         finally:
@@ -226,7 +224,7 @@ def _begin(
     fault: str | None
     try:
         _write(out, message)
-        fault = str(_read(back))
+        fault = str(pickle.load(back))
     except (OSError, EOFError, ValueError, pickle.UnpicklingError):
         fault = None
     one = child()
@@ -270,20 +268,8 @@ def _packed(backend: Backend) -> bytes:
 
 
 def _write(pipe: IO[bytes], message: object) -> None:
-    content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
-    pipe.write(_LENGTH.pack(len(content)) + content)
+    pipe.write(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
     pipe.flush()
-
-
-def _read(pipe: IO[bytes]) -> object:
-    head = pipe.read(_LENGTH.size)
-    if len(head) < _LENGTH.size:
-        raise EOFError
-    (length,) = _LENGTH.unpack(head)
-    content = pipe.read(length)
-    if len(content) < length:
-        raise EOFError
-    return pickle.loads(content)
 
 
 def serve(parent: int) -> None:
@@ -297,7 +283,7 @@ def serve(parent: int) -> None:
     with suppress(EOFError, OSError):
         solver = _made(commands, back)
         while solver is not None:
-            what, *given = cast("tuple[Any, ...]", _read(commands))
+            what, *given = cast("tuple[Any, ...]", pickle.load(commands))
             answer = getattr(solver, what)(*given)
             if what in ("solve", "prepare"):
                 try:
@@ -308,7 +294,7 @@ def serve(parent: int) -> None:
 
 
 def _made(commands: IO[bytes], back: IO[bytes]) -> ContainedSolver | None:
-    sent, options, size = cast("tuple[bytes, SolverOptions, int]", _read(commands))
+    sent, options, size = cast("tuple[bytes, SolverOptions, int]", pickle.load(commands))
     try:
         importlib.import_module("scipy.linalg.blas")  # which the first QP would wait for
         solver = ContainedSolver(make_solver(pickle.loads(sent), options))

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import ShapeError
-from .patterns import Pattern, hessian_pattern, rows_pattern
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
-__all__ = ["ARRAYS", "QP", "band_index", "band_of"]
+__all__ = [
+    "ARRAYS", "QP", "as_csc", "band_index", "band_of", "hessian_pattern", "rows_pattern",
+]
 
 Array = NDArray[np.float64]
 
@@ -47,14 +48,50 @@ def band_of(block: Array) -> Array:
     return panel
 
 
-def _csc(pattern: Pattern, numbers: Array, height: int, width: int) -> csc_matrix:
-    # Solvers may sort or scale in place: every view gets indices of its own.
-    from scipy.sparse import csc_matrix
-
-    return csc_matrix(
-        (numbers[pattern.source], pattern.rows.copy(), pattern.indptr.copy()),
-        shape=(height, width),
+@lru_cache(maxsize=256)
+def hessian_pattern(stages: int, n: int) -> csc_matrix:
+    """H in full; its entries are the places of the numbers in the flat band panels."""
+    k, c, o = np.indices((stages, n, 2 * n))
+    column = k * n + c
+    row = column + o
+    source = np.flatnonzero((c + o < 2 * n) & (row < stages * n))
+    row, column = row.ravel()[source], column.ravel()[source]
+    below = row > column
+    return _csc(
+        np.append(source, source[below]), np.append(row, column[below]),
+        np.append(column, row[below]), (stages * n, stages * n),
     )
+
+
+@lru_cache(maxsize=256)
+def rows_pattern(stages: int, n: int, rows: int) -> csc_matrix:
+    """The general rows [F, G]; entries are places in the flat own rows, then the next rows."""
+    k, j, c = np.indices((stages, rows, n)).reshape(3, -1)
+    row, column = k * rows + j, k * n + c
+    source = np.arange(2 * row.size)
+    next_too = np.append(np.ones(row.size, np.bool_), k + 1 < stages)
+    return _csc(
+        source[next_too], np.append(row, row)[next_too],
+        np.append(column, column + n)[next_too], (stages * rows, stages * n),
+    )
+
+
+def _csc(
+    source: NDArray[np.intp], row: NDArray[np.intp], column: NDArray[np.intp],
+    shape: tuple[int, int],
+) -> csc_matrix:
+    from scipy.sparse import csc_matrix  # late: the banded solver does without
+
+    matrix = csc_matrix((source, (row, column)), shape)
+    matrix.sort_indices()
+    return matrix
+
+
+def as_csc(pattern: csc_matrix, values: Array) -> csc_matrix:
+    """A matrix of these values, with indices of its own: solvers may sort or scale in place."""
+    matrix = pattern.astype(np.float64)
+    matrix.data = values  # afterwards: of a view into a larger array scipy may make a copy
+    return matrix
 
 
 class QP:
@@ -101,21 +138,7 @@ class QP:
         If a size is not a positive integer.
     """
 
-    __slots__ = (
-        "band",
-        "bounded",
-        "gradient",
-        "lower",
-        "n",
-        "row_lower",
-        "row_next",
-        "row_own",
-        "row_upper",
-        "rows",
-        "size",
-        "stages",
-        "upper",
-    )
+    __slots__ = (*ARRAYS, "bounded", "n", "rows", "size", "stages")
 
     def __init__(self, stages: int, n: int, rows: int = 0) -> None:
         for name, value, least in (("stages", stages, 1), ("n", n, 1), ("rows", rows, 0)):
@@ -147,38 +170,25 @@ class QP:
 
     def dense(self) -> Array:
         """H as a full symmetric (K n, K n) array."""
-        pattern = hessian_pattern(self.stages, self.n)
-        full = np.zeros((self.size, self.size))
-        full[pattern.rows, pattern.columns] = self.band.ravel()[pattern.source]
-        return full
+        return self.csc().toarray()
 
     def csc(self) -> csc_matrix:
         """H as a full symmetric CSC matrix with sorted indices of its own."""
         pattern = hessian_pattern(self.stages, self.n)
-        return _csc(pattern, self.band.ravel(), self.size, self.size)
+        return as_csc(pattern, self.band.ravel()[pattern.data])
 
     def dense_rows(self) -> Array:
         """The general rows [F, G] as a (K rows, K n) array."""
-        pattern = rows_pattern(self.stages, self.n, self.rows)
-        full = np.zeros((self.stages * self.rows, self.size))
-        numbers = np.concatenate((self.row_own.ravel(), self.row_next.ravel()))
-        full[pattern.rows, pattern.columns] = numbers[pattern.source]
-        return full
+        return self.csc_rows().toarray()
 
     def csc_rows(self) -> csc_matrix:
         """The general rows [F, G] as a (K rows, K n) CSC matrix with sorted indices."""
         pattern = rows_pattern(self.stages, self.n, self.rows)
-        numbers = np.concatenate((self.row_own.ravel(), self.row_next.ravel()))
-        return _csc(pattern, numbers, self.stages * self.rows, self.size)
+        numbers = np.concatenate((self.row_own, self.row_next), axis=None)
+        return as_csc(pattern, numbers[pattern.data])
 
     def hessian_times(self, d: Array) -> Array:
-        """H d.
-
-        Parameters
-        ----------
-        d : (K, n) array
-            Increments.
-        """
+        """H d, (K, n), of increments ``d`` (K, n)."""
         from scipy.linalg.blas import dsbmv
 
         product: Array = dsbmv(
@@ -187,47 +197,23 @@ class QP:
         return product.reshape(self.stages, self.n)
 
     def rows_times(self, d: Array) -> Array:
-        """F_k d_k + G_k d_{k+1}, of shape (K, rows).
-
-        Parameters
-        ----------
-        d : (K, n) array
-            Increments.
-        """
+        """F_k d_k + G_k d_{k+1}, (K, rows), of increments ``d`` (K, n)."""
         value: Array = np.matmul(self.row_own, d[:, :, None])[:, :, 0]
         value[:-1] += np.matmul(self.row_next[:-1], d[1:, :, None])[:, :, 0]
         return value
 
     def rows_transposed_times(self, y: Array) -> Array:
-        """The adjoint of `rows_times`, of shape (K, n).
-
-        Parameters
-        ----------
-        y : (K, rows) array
-            Multipliers of the rows.
-        """
+        """The adjoint of `rows_times`, (K, n), of multipliers ``y`` (K, rows)."""
         value: Array = np.matmul(y[:, None, :], self.row_own)[:, 0]
         value[1:] += np.matmul(y[:-1, None, :], self.row_next[:-1])[:, 0]
         return value
 
     def objective(self, d: Array) -> float:
-        """The value of the objective.
-
-        Parameters
-        ----------
-        d : (K, n) array
-            Increments.
-        """
+        """The value of the objective at increments ``d`` (K, n)."""
         return float(np.vdot(d, 0.5 * self.hessian_times(d) + self.gradient))
 
     def violation(self, d: Array) -> float:
-        """The largest amount by which a bound or a row is missed.
-
-        Parameters
-        ----------
-        d : (K, n) array
-            Increments.
-        """
+        """The largest amount by which increments ``d`` (K, n) miss a bound or a row."""
         worst = 0.0
         if self.bounded:
             worst = float(np.maximum(self.lower - d, d - self.upper).max())
@@ -240,13 +226,8 @@ class QP:
 
     def finite(self) -> bool:
         """Whether H, g and the rows are free of NaN and infinities, and no bound is NaN."""
-        return bool(
-            np.isfinite(self.gradient).all()
-            and np.isfinite(self.band).all()
-            and np.isfinite(self.row_own).all()
-            and np.isfinite(self.row_next).all()
-            and not np.isnan(self.lower).any()
-            and not np.isnan(self.upper).any()
-            and not np.isnan(self.row_lower).any()
-            and not np.isnan(self.row_upper).any()
+        numbers = (self.gradient, self.band, self.row_own, self.row_next)
+        limits = (self.lower, self.upper, self.row_lower, self.row_upper)
+        return all(np.isfinite(one).all() for one in numbers) and not any(
+            np.isnan(one).any() for one in limits
         )

@@ -6,10 +6,12 @@ import os
 import re
 import threading
 import warnings
+from copy import deepcopy
 from dataclasses import replace
+from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,7 +106,7 @@ class Recording:
         self.files: list[Path] = []
         self.seen, self.wanted = 0, 0
         self._fault = ""
-        self._held: list[_Held] = []
+        self._held: list[tuple[int, QP, Array | None, Solution, SolverOptions]] = []
         self._name = ""
         self._lock = threading.Lock()
 
@@ -128,12 +130,10 @@ class Recording:
         with self._lock:
             if self._name:
                 raise InvalidInputError("the recording has begun already; make another one.")
-            taken, name, count = {one.name for one in backends()}, "", 1
-            while not name or name in taken:
-                name = f"recorded:{self._backend.name}" + (f":{count}" if count > 1 else "")
-                count += 1
-            register(replace(self._backend, name=name, factory=self._make))
-            self._name = name
+            taken, name = {one.name for one in backends()}, f"recorded:{self._backend.name}"
+            names = chain([name], (f"{name}:{number}" for number in count(2)))
+            self._name = next(name for name in names if name not in taken)
+            register(replace(self._backend, name=self._name, factory=self._make))
         return self
 
     def __exit__(
@@ -147,7 +147,7 @@ class Recording:
             self._name = ""
             held, self._held = self._held, []
             for one in held:
-                self._write(one)
+                self._write(*one)
             fault, self._fault = self._fault, ""
         if fault:
             warnings.warn(
@@ -178,11 +178,11 @@ class Recording:
                 self.wanted += 1
                 if self._fault or len(self.files) + len(self._held) >= self._limit:
                     return
-                one = _Held(self._offset + self.seen, qp, start, solution, options)
+                one = self._offset + self.seen, qp, start, solution, options
                 if options.time_limit is None:
-                    self._write(one)
-                else:
-                    self._held.append(one.copied())
+                    self._write(*one)
+                else:  # copied: arrays of problem and iterate are used again
+                    self._held.append(deepcopy(one))
         except Exception as error:  # nothing that goes wrong here is the caller's business
             self._fault = f"{type(error).__name__}: {error}"
 
@@ -198,38 +198,20 @@ class Recording:
             return self._backend.inequalities
         return status is SolveStatus.INACCURATE
 
-    def _write(self, one: _Held) -> None:
+    def _write(
+        self, number: int, qp: QP, start: Array | None, solution: Solution, options: SolverOptions
+    ) -> None:
         if self._fault:
             return
-        path = self._folder / f"qp-{one.number:06d}-{one.solution.status.name.lower()}.npz"
+        path = self._folder / f"qp-{number:06d}-{solution.status.name.lower()}.npz"
         try:
             dump(
-                one.qp, path, solution=one.solution, backend=self._backend.name,
-                options=one.options, start=one.start,
+                qp, path, solution=solution, backend=self._backend.name, options=options,
+                start=start,
             )
             self.files.append(path)
         except Exception as error:
             self._fault = str(error)
-
-
-class _Held(NamedTuple):
-    """A QP with all that goes into its file."""
-
-    number: int
-    qp: QP
-    start: Array | None
-    solution: Solution
-    options: SolverOptions
-
-    def copied(self) -> _Held:
-        """The same in arrays of its own: those of problem and iterate are used again."""
-        found = self.solution
-        d, start = (None if x is None else np.array(x) for x in (found.d, self.start))
-        solution = Solution(
-            d, found.status, found.iterations, found.residuals, found.bound_duals,
-            found.row_duals, found.message,
-        )
-        return self._replace(qp=self.qp.copy(), start=start, solution=solution)
 
 
 class _Recorder(Solver):

@@ -49,12 +49,7 @@ def register(backend: Backend) -> None:
 
 
 def unregister(name: str) -> None:
-    """Take a backend off the list.
-
-    Parameters
-    ----------
-    name : str
-        A registered name.
+    """Remove the backend registered as ``name``.
 
     Raises
     ------
@@ -78,12 +73,7 @@ def available() -> tuple[str, ...]:
 
 
 def backend(name: str) -> Backend:
-    """Look up a registered backend.
-
-    Parameters
-    ----------
-    name : str
-        A registered name.
+    """The backend registered as ``name``.
 
     Raises
     ------
@@ -153,8 +143,8 @@ def _look_for_plugins() -> None:
     for point in metadata.entry_points(group=_GROUP):
         try:
             given = point.load()
-            given = given if isinstance(given, Backend) else given()
-            for one in (given,) if isinstance(given, Backend) else tuple(given):
+            found = given if isinstance(given, Backend) else given()
+            for one in (found,) if isinstance(found, Backend) else tuple(found):
                 register(one)
         except (Exception, SystemExit) as error:  # a broken package must not break ours
             warnings.warn(

@@ -16,7 +16,7 @@ from .qp import QP
 if TYPE_CHECKING:
     from .scaling import Scale
 
-__all__ = ["Errors", "RawSolution", "Residuals", "Solution", "SolveStatus", "residuals"]
+__all__ = ["Errors", "RawSolution", "Residuals", "Solution", "SolveStatus"]
 
 Array = NDArray[np.float64]
 
@@ -95,34 +95,19 @@ class Residuals:
 
     @staticmethod
     def of(qp: QP, d: Array, bound_duals: Array | None, row_duals: Array | None) -> Residuals:
-        """Recompute the residuals of an iterate.
-
-        Parameters
-        ----------
-        qp : QP
-            The problem.
-        d : (K, n) array
-            The iterate.
-        bound_duals, row_duals : array or None
-            Its multipliers, as in `RawSolution`.
-        """
+        """Of ``d`` (K, n) in ``qp``; for ``bound_duals`` and ``row_duals`` see `RawSolution`."""
         duals = None
         if bound_duals is not None and row_duals is not None:
             duals = np.concatenate((bound_duals, row_duals), axis=None)
-        if not qp.bounded and not qp.rows:
-            return residuals(qp, d, duals, _NOTHING, _NOTHING)
-        lower = np.concatenate((qp.lower, qp.row_lower), axis=None)
-        upper = np.concatenate((qp.upper, qp.row_upper), axis=None)
-        return residuals(qp, d, duals, lower, upper)
-
-
-def residuals(qp: QP, d: Array, duals: Array | None, lower: Array, upper: Array) -> Residuals:
-    """Residuals of an iterate, with bounds and rows together in one array each."""
-    return Residuals(*Errors(qp, d, duals, lower, upper).largest())
+        lower = upper = _NOTHING
+        if qp.bounded or qp.rows:
+            lower = np.concatenate((qp.lower, qp.row_lower), axis=None)
+            upper = np.concatenate((qp.upper, qp.row_upper), axis=None)
+        return Residuals(*Errors(qp, d, duals, lower, upper).largest())
 
 
 class Errors:
-    """What an iterate misses optimality by, entry by entry, as in `residuals`.
+    """What an iterate misses optimality by, entry by entry; bounds and rows in one array each.
 
     Attributes
     ----------

@@ -146,8 +146,7 @@ class Solver(ABC):
             if not self._warns:
                 with np.errstate(all="ignore"):
                     return self._checked(qp, start)
-            with warnings.catch_warnings(), np.errstate(all="ignore"):
-                warnings.simplefilter("ignore")
+            with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
                 return self._checked(qp, start)
         except KeyboardInterrupt:
             raise

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 import qpmhe_solvers.auto
 import qpmhe_solvers.dispatch
-import qpmhe_solvers.native.workspace
+import qpmhe_solvers.native
 from qpmhe_solvers import QP, SolverOptions, SolveStatus, backend, create
 from qpmhe_solvers.qp import band_of
 
@@ -243,7 +243,7 @@ def no_solver_call(monkeypatch):
         pytest.fail("data that are not finite reached a solver")  # not an Exception: no wall
 
     monkeypatch.setattr(qpmhe_solvers.dispatch.DispatchSolver, "_solve", called)
-    monkeypatch.setattr(qpmhe_solvers.native.workspace.NativeSolver, "_solve", called)
+    monkeypatch.setattr(qpmhe_solvers.native.NativeSolver, "_solve", called)
 
 
 @pytest.mark.parametrize("name", EVERY)

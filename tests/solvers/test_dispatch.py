@@ -95,8 +95,9 @@ def test_nor_where_it_finds_no_solution(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_no_solver_holds_on_to_what_it_is_handed(name):
     solver, (qp, _) = create(name), make(**ALL_KINDS)
-    _, problem = solver._form(qp)
-    arrays = list(contents(problem).values())
+    solver.solve(qp)
+    (workspace,) = solver._workspaces.values()
+    arrays = list(contents(workspace.handle).values())
     before = [sys.getrefcount(array) for array in arrays]
     solver.solve(qp)
     gc.collect()
@@ -134,7 +135,8 @@ def test_sparse_matrices_are_made_once_for_a_pattern(name, case, monkeypatch):
     count.watch(solver)
     qp, _ = make(**CASES[case])
     solver.solve(qp)
-    assert (count.made > 0) == (solver._translation.matrices == "csc")
+    (workspace,) = solver._workspaces.values()
+    assert scipy.sparse.issparse(workspace.handle.P) == (solver._translation.matrices == "csc")
     count.made = 0
     for _ in range(3):
         qp.gradient[...] += 0.1
@@ -194,7 +196,7 @@ def test_our_part_of_a_solve_leaves_no_memory_behind(name):
     assert growth(solver, qps[:5]) < 2000  # two bytes a solve
     # Never a pattern that is kept. NumPy keeps some freed arrays; 240 forms take megabytes.
     assert growth(solver, qps, 240) < 100_000
-    assert len(solver._forms) < len(qps)
+    assert len(solver._workspaces) < len(qps)
 
 
 @pytest.mark.slow

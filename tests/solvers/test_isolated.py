@@ -212,11 +212,11 @@ def test_an_interrupt_leaves_a_solver_that_goes_on(monkeypatch):
     solver = isolated(Hostile)
     first = solver._child._process.pid
 
-    def interrupted(pipe):
+    def interrupted(child, message):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as context:
-        context.setattr(module, "_read", interrupted)
+        context.setattr(module._Child, "send", interrupted)
         with pytest.raises(KeyboardInterrupt):
             solver.solve(small())
     assert gone(first)

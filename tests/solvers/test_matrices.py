@@ -5,7 +5,9 @@ import pytest
 import scipy.sparse
 
 from qpmhe_solvers import QP
-from qpmhe_solvers.matrices import QpsolversMatrices, pattern_of_limits
+from qpmhe_solvers.dispatch import DispatchSolver, qpsolvers_arguments
+from qpmhe_solvers.gathered import GatheredQP
+from qpmhe_solvers.layout import Layout, Structure, Style
 
 from .problems import ARRAYS, CASES, make
 
@@ -19,6 +21,35 @@ forms = pytest.mark.parametrize(
     ],
     ids=lambda how: " ".join(key for key, value in how.items() if value) or "plain",
 )
+
+
+class Form:
+    """A layout in the form of qpsolvers, as `DispatchSolver` uses it."""
+
+    def __init__(self, qp, dense, box, needs_row, keep_empty):
+        gathered = GatheredQP.of(qp)
+        style = Style(
+            "dense" if dense else "csc", bounds="box" if box else "rows", sides=1,
+            needs_row=needs_row,
+        )
+        self.layout = Layout(style, Structure.of(gathered, exact=True), *gathered.sizes)
+        self.arguments = qpsolvers_arguments(self.layout, keep_empty)
+
+    def fill(self, qp):
+        self.layout.fill(GatheredQP.of(qp), None)
+
+    def multipliers(self, **given):
+        """Multipliers in an answer of qpsolvers, as the solver hands them on."""
+        solver = object.__new__(DispatchSolver)
+        solver.name, solver._keywords = "", {}
+        solver._translation = SimpleNamespace(start=False)
+        answer = SimpleNamespace(x=None, found=True, extras={}, **given)
+        solver._solve_problem = lambda *_, **__: answer
+        return solver._run(None, self.layout, None, None).duals
+
+
+def key(qp):
+    return qp.stages, qp.n, qp.rows, Structure.of(GatheredQP.of(qp), exact=True).key
 
 
 def expected(dense, box, needs_row, keep_empty):
@@ -78,7 +109,7 @@ def parts(arguments):
 def test_the_form_is_that_of_plain_loops(case, how):
     for seed in range(2):
         qp, dense = make(**CASES[case], seed=seed)
-        form = QpsolversMatrices(qp, **how)
+        form = Form(qp, **how)
         form.fill(qp)
         check_arguments(form, expected(dense, how["box"], how["needs_row"], how["keep_empty"])[0])
 
@@ -90,8 +121,8 @@ def test_filling_again_is_making_anew(case, how):
     other, _ = make(**CASES[case], seed=1)
     for name in ("lower", "upper", "row_lower", "row_upper"):  # the same pattern, other numbers
         getattr(other, name)[...] = 3.0 * getattr(qp, name)
-    assert pattern_of_limits(other) == pattern_of_limits(qp)
-    form, anew = QpsolversMatrices(qp, **how), QpsolversMatrices(other, **how)
+    assert key(other) == key(qp)
+    form, anew = Form(qp, **how), Form(other, **how)
     form.fill(qp)
     before = list(parts(form.arguments))
     form.fill(other)
@@ -108,7 +139,7 @@ def test_filling_again_is_making_anew(case, how):
 def test_matrices_are_what_the_solvers_can_take(case, box):
     qp, _ = make(**CASES[case])
     form, twin = (
-        QpsolversMatrices(qp, dense=False, box=box, needs_row=True, keep_empty=True)
+        Form(qp, dense=False, box=box, needs_row=True, keep_empty=True)
         for _ in range(2)
     )
     for matrix in form.arguments[0:6:2]:
@@ -131,7 +162,7 @@ def test_matrices_are_what_the_solvers_can_take(case, box):
 def test_multipliers_go_back_to_their_constraints(case, box):
     rng = np.random.default_rng(0)
     qp, dense = make(**CASES[case])
-    form = QpsolversMatrices(qp, dense=True, box=box, needs_row=True, keep_empty=False)
+    form = Form(qp, dense=True, box=box, needs_row=True, keep_empty=False)
     arguments, origins, level = expected(dense, box, True, False)
     z, y = (rng.standard_normal(0 if one is None else len(one)) for one in arguments[3:6:2])
     z_box = rng.standard_normal(0 if arguments[6] is None else qp.size)
@@ -141,33 +172,31 @@ def test_multipliers_go_back_to_their_constraints(case, box):
     wanted[level] += y
     wanted[: z_box.size] += z_box
     for _ in range(2):  # nothing is left over from the first time
-        bound_duals, row_duals = form.multipliers(SimpleNamespace(z=z, y=y, z_box=z_box))
-        np.testing.assert_array_equal(bound_duals, wanted[: qp.size])
-        np.testing.assert_array_equal(row_duals, wanted[qp.size :])
+        np.testing.assert_array_equal(form.multipliers(z=z, y=y, z_box=z_box), wanted)
 
 
 @pytest.mark.parametrize("missing", ["z", "y", "z_box"])
 @pytest.mark.parametrize("value", [None, np.zeros(1)], ids=["none", "too few"])
 def test_missing_multipliers_are_not_made_up(missing, value):
     qp, _ = make(**CASES["all kinds"])
-    form = QpsolversMatrices(qp, dense=True, box=True, needs_row=False, keep_empty=False)
+    form = Form(qp, dense=True, box=True, needs_row=False, keep_empty=False)
     told = {
         "z": np.ones(len(form.arguments[3])), "y": np.ones(len(form.arguments[5])),
         "z_box": np.ones(qp.size),
     }
-    assert form.multipliers(SimpleNamespace(**told))[0] is not None
+    assert form.multipliers(**told) is not None
     told[missing] = value
-    assert form.multipliers(SimpleNamespace(**told)) == (None, None)
+    assert form.multipliers(**told) is None
 
 
 def test_the_pattern_is_that_of_limits_and_sizes_only():
-    qp, seen = QP(2, 1, 1), [pattern_of_limits(QP(1, 2, 1)), pattern_of_limits(QP(2, 1, 1))]
+    qp, seen = QP(2, 1, 1), [key(QP(1, 2, 1)), key(QP(2, 1, 1))]
     for name, value in (
         ("lower", 0.0), ("upper", 0.0), ("row_lower", 1.0), ("row_upper", 2.0), ("row_upper", 1.0),
     ):
         getattr(qp, name)[1, 0] = value
-        seen.append(pattern_of_limits(qp))
+        seen.append(key(qp))
     assert len(set(seen)) == len(seen)
     for name in ARRAYS:
         getattr(qp, name)[...] += 0.5
-    assert pattern_of_limits(qp) == seen[-1]
+    assert key(qp) == seen[-1]

@@ -7,8 +7,8 @@ import scipy.sparse
 
 from qpmhe_solvers import QP, SolverOptions, SolveStatus, backends, create
 from qpmhe_solvers.gathered import GatheredQP
-from qpmhe_solvers.native.layout import Layout, Structure, Style
-from qpmhe_solvers.native.workspace import NativeSolver
+from qpmhe_solvers.layout import Layout, Structure, Style
+from qpmhe_solvers.native import NativeSolver
 from qpmhe_solvers.sample_qps import contradiction, sample
 
 from .problems import CASES, make, of_order_one
@@ -321,7 +321,7 @@ class Kept(NativeSolver):
         pass
 
     def _run(self, handle, layout, start, duals):
-        from qpmhe_solvers.native.workspace import Answer
+        from qpmhe_solvers.native import Answer
 
         self.starts.append(None if duals is None else duals.copy())
         told = np.arange(1.0, layout.count + 1.0)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gathered import GatheredQP
-from ..patterns import Pattern, chosen_rows, hessian_pattern
+from .gathered import GatheredQP
+from .qp import as_csc, hessian_pattern, rows_pattern
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
@@ -48,8 +48,8 @@ class Structure(NamedTuple):
     equal: Flags
 
     @staticmethod
-    def of(qp: GatheredQP) -> Structure:
-        """The structure that a QP needs."""
+    def of(qp: GatheredQP, *, exact: bool = False) -> Structure:
+        """The structure that a QP needs; with room for its own limits only, if exact."""
         stages, n, rows = qp.sizes
         size = stages * n
         equal = (qp.all_lower == qp.all_upper) & np.isfinite(qp.all_lower)
@@ -58,7 +58,7 @@ class Structure(NamedTuple):
         for limits in (qp.all_lower, qp.all_upper):
             finite = np.isfinite(limits) & ~equal
             for part in (finite[:size].reshape(stages, n), finite[size:].reshape(stages, rows)):
-                if stages > 1:
+                if stages > 1 and not exact:
                     part[:-1] = part[:-1].any(axis=0)
             sides.append(finite & ~equal)
         return Structure(sides[0], sides[1], equal)
@@ -113,12 +113,7 @@ class Layout:
         self.boxed = style.bounds == "box" and bool(
             structure.lower[:size].any() or structure.upper[:size].any()
         )
-        hessian = hessian_pattern(stages, n)
-        if style.triangle == "upper" and style.matrices == "csc":
-            hessian = _upper(hessian)
-        patterns = [hessian] + [
-            chosen_rows(stages, n, rows, chosen) for chosen in (self.constraints, self.equalities)
-        ]
+        patterns = _patterns(style, stages, n, rows, self.constraints, self.equalities)
         # Behind the limits of the constraints stands the upper limit of a void row: 0 x <= 1.
         lower = np.append(places.lower_at + np.arange(count), places.one_at)
         upper = np.append(places.upper_at + np.arange(count), places.one_at)
@@ -126,7 +121,7 @@ class Layout:
         above = np.where(self.signs > 0, upper[self.constraints], lower[self.constraints])
         below = lower[self.constraints] if style.sides == 2 else lower[:0]
         sources = [
-            hessian.source, *(places.own_at + pattern.source for pattern in patterns[1:]),
+            patterns[0].data, *(places.own_at + pattern.data for pattern in patterns[1:]),
             places.gradient_at + np.arange(size), upper[self.equalities],
             lower[box], below, upper[box], above,
         ]
@@ -139,26 +134,22 @@ class Layout:
         )
         self.all_lower = self._values[ends[4] : ends[6]]
         self.all_upper = self._values[ends[6] :]
-        self._entry_rows = patterns[1].rows
+        self._entry_rows = patterns[1].indices
         self._c_entries = views[1]
         self._negated = None
         if style.sides == 1:
             self._negated = self.signs[self._entry_rows]
         self._objective = (views[0], self.gradient) if style.objective != 1.0 else ()
         self._dense: list[tuple[Array, Index, Array]] = []
-        heights = (size, self.constraints.size, self.equalities.size)
-        self.hessian, self.matrix, self.equality_matrix = (
-            self._matrix(pattern, view, height)
-            for pattern, view, height in zip(patterns, views[:3], heights, strict=True)
-        )
+        self.hessian, self.matrix, self.equality_matrix = map(self._matrix, patterns, views[:3])
 
-    def _matrix(self, pattern: Pattern, values: Array, height: int) -> Any:
-        if self.style.matrices == "dense":
-            full = np.zeros((height, self.size))
-            places = pattern.rows.astype(np.intp) * self.size + pattern.columns
-            self._dense.append((full.reshape(-1), places, values))
-            return full
-        return _csc(pattern, values, height, self.size)
+    def _matrix(self, pattern: csc_matrix, values: Array) -> Any:
+        if self.style.matrices == "csc":
+            return as_csc(pattern, values)
+        full, entries = np.zeros(pattern.shape), pattern.tocoo()
+        places = np.ravel_multi_index((entries.row, entries.col), full.shape)
+        self._dense.append((full.reshape(-1), places, values))
+        return full
 
     def voids(self, qp: GatheredQP) -> Voids | None:
         """The rows of C without a limit in this QP, as far as the solver cannot have such."""
@@ -228,22 +219,17 @@ def _rows(style: Style, structure: Structure, size: int) -> tuple[Index, Index, 
     return equal[:0], constraints, np.concatenate((np.ones(equal.size), signs))
 
 
-def _upper(pattern: Pattern) -> Pattern:
-    """The entries on and above the diagonal."""
-    chosen = pattern.rows <= pattern.columns
-    counts = np.bincount(pattern.columns[chosen], minlength=pattern.indptr.size - 1)
-    return Pattern(
-        pattern.source[chosen], pattern.rows[chosen], pattern.columns[chosen],
-        np.concatenate(([0], np.cumsum(counts))).astype(np.int32),
-    )
+def _patterns(
+    style: Style, stages: int, n: int, rows: int, constraints: Index, equalities: Index
+) -> list[csc_matrix]:
+    """P, C and A; the entries of the latter are places in own rows, next rows, and a 1."""
+    from scipy.sparse import csc_matrix, triu, vstack
 
-
-def _csc(pattern: Pattern, values: Array, height: int, width: int) -> csc_matrix:
-    from scipy.sparse import csc_matrix
-
-    # Indices of its own: those of the patterns are shared, and solvers may sort in place.
-    matrix = csc_matrix(
-        (values.copy(), pattern.rows.copy(), pattern.indptr.copy()), shape=(height, width)
-    )
-    matrix.data = values  # afterwards: of a view into a larger array scipy may make a copy
-    return matrix
+    hessian, general = hessian_pattern(stages, n), rows_pattern(stages, n, rows)
+    if style.triangle == "upper" and style.matrices == "csc":
+        hessian = triu(hessian, format="csc")
+    unit = np.arange(stages * n)
+    ones = csc_matrix((np.full(unit.size, 2 * stages * rows * n), (unit, unit)))
+    void = csc_matrix((1, unit.size), dtype=np.intp)
+    every = vstack((ones, general, void), format="csr")
+    return [hessian, *(every[chosen].tocsc() for chosen in (constraints, equalities))]

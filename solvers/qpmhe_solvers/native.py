@@ -1,0 +1,534 @@
+"""Solvers called directly, with a workspace that is updated from QP to QP."""
+
+from __future__ import annotations
+
+import warnings
+from abc import abstractmethod
+from collections.abc import Hashable, Mapping
+from importlib import import_module
+from time import perf_counter
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .backend import Backend
+from .gathered import GatheredQP
+from .layout import Layout, Structure, Style, Voids
+from .options import SolverOptions
+from .qp import QP
+from .solution import RawSolution
+from .solver import Solver
+
+__all__ = ["NATIVE", "Answer", "NativeSolver"]
+
+Array = NDArray[np.float64]
+Point = Array | None
+
+# Workspaces kept by one solver: a window of full length needs one, or one for each structure
+# that its sets have; those of a growing window are used once.
+_KEPT = 4
+# Patterns of limits whose workspace is known without looking at their structure.
+_KNOWN = 64
+
+
+class Answer(NamedTuple):
+    """What a solver said."""
+
+    x: Array | None
+    duals: Array | None
+    solved: bool
+    sound: bool
+    iterations: int | None
+    message: str
+
+
+class _Workspace:
+    """A solver that is set up, its arrays, and the multipliers that it found last."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        self.handle: Any = None
+        self.duals: Array | None = None
+        self.shifts = 0
+
+
+class NativeSolver(Solver):
+    """A solver with workspaces, one for each structure and size of QPs; few are kept."""
+
+    #: The module of the solver, and how it wants its QPs.
+    package: ClassVar[str]
+    style: Style
+    _warns = False
+
+    def __init__(self, options: SolverOptions) -> None:
+        super().__init__(options)
+        self._package: Any = import_module(self.package)  # late: solvers are optional
+        self._shifts = 0
+        self._workspaces: dict[Hashable, _Workspace] = {}
+        self._known: dict[Hashable, tuple[Hashable, Voids | None]] = {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.options,)
+
+    def structure(self, qp: GatheredQP) -> Structure:
+        """The limits that a layout for this QP has room for."""
+        return Structure.of(qp)
+
+    def shift(self) -> None:
+        """Move what is kept by one stage; see `Solver.shift`."""
+        self._shifts += 1
+
+    def forget(self) -> None:
+        """Drop the workspaces; see `Solver.forget`."""
+        self._workspaces.clear()
+
+    def prepare(self, size: int) -> None:
+        """Import what the first solve imports; see `Solver.prepare`."""
+        self._rehearse()
+
+    @abstractmethod
+    def _set_up(self, layout: Layout) -> Any:
+        """A solver for the arrays of a layout, which are filled."""
+
+    def _update(self, handle: Any, layout: Layout) -> None:
+        """Hand the arrays, filled anew, to the solver; nothing where it reads them itself."""
+
+    def _limit(self, handle: Any, seconds: float) -> None:
+        """Set the time limit of the next solve; nothing for a solver without a clock."""
+
+    @abstractmethod
+    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+        """Solve, from an increment (K n,) and multipliers (K n + K rows,); None for zero."""
+
+    def _solve(self, qp: QP, start: Array | None) -> RawSolution:
+        gathered = GatheredQP.of(qp)
+        key, workspace, voids = self._taken(gathered)
+        layout = workspace.layout
+        layout.fill(gathered, voids)
+        # Whatever raises from here on leaves the workspace out.
+        if workspace.handle is None:
+            with warnings.catch_warnings(action="ignore"):
+                workspace.handle = self._set_up(layout)
+        else:
+            self._update(workspace.handle, layout)
+        if self.time_limit is not None:
+            self._limit(workspace.handle, self.time_limit)
+        point = None if start is None else np.ravel(start)
+        answer = self._run(workspace.handle, layout, point, self._kept_duals(workspace, gathered))
+        if answer.sound and _finite(answer.x) and _finite(answer.duals):
+            workspace.duals, workspace.shifts = answer.duals, self._shifts
+            if len(self._workspaces) == _KEPT:
+                del self._workspaces[next(iter(self._workspaces))]  # the longest unused
+            self._workspaces[key] = workspace
+        bounds = rows = None
+        if answer.duals is not None:
+            bounds, rows = answer.duals[: layout.size], answer.duals[layout.size :]
+        return RawSolution(
+            answer.x, answer.solved, answer.iterations, bounds, rows, answer.message
+        )
+
+    def _taken(self, qp: GatheredQP) -> tuple[Hashable, _Workspace, Voids | None]:
+        """The workspace for a QP, taken off the shelf, its key, and the QP's void rows."""
+        pattern = (
+            qp.sizes, np.isfinite(qp.limits).tobytes(), (qp.all_lower == qp.all_upper).tobytes()
+        )
+        known = self._known.get(pattern)
+        kind = self.structure(qp).key if known is None else known[0]
+        # QPs of another scale, such as projections into the sets between those of the
+        # estimation, have a workspace of their own: a solver's step sizes, and multipliers,
+        # are of no use from one to the other, and do harm.
+        key = qp.sizes, kind, qp.key if self._keeps else 0
+        workspace = self._workspaces.pop(key, None)
+        if workspace is None:
+            workspace = _Workspace(Layout(self.style, self.structure(qp), *qp.sizes))
+        if known is None:
+            if len(self._known) == _KNOWN:
+                del self._known[next(iter(self._known))]
+            known = self._known[pattern] = kind, workspace.layout.voids(qp)
+        return key, workspace, known[1]
+
+    def _kept_duals(self, workspace: _Workspace, qp: GatheredQP) -> Array | None:
+        """Multipliers of the workspace's last solve, moved with the trajectory."""
+        duals = workspace.duals
+        if duals is None or not (self._keeps and self.options.warm_start):
+            return None
+        moved = self._shifts - workspace.shifts
+        if moved == 0:
+            return duals
+        stages, n, rows = qp.sizes
+        if moved >= stages:
+            return None
+        shifted = np.zeros_like(duals)  # nothing is known of new stages
+        for part, width in ((slice(stages * n), n), (slice(stages * n, None), rows)):
+            old, new = duals[part], shifted[part]
+            new[: new.size - moved * width] = old[moved * width :]
+        return shifted
+
+
+def _finite(values: Array | None) -> bool:
+    return values is None or bool(np.isfinite(values).all())
+
+
+class ClarabelSolver(NativeSolver):
+    """Solve by Clarabel.
+
+    It knows no start: it begins anew each time.
+    """
+
+    package = "clarabel"
+    style = Style(
+        "csc", triangle="upper", bounds="rows", equalities="among", sides=1, infinite=False
+    )
+
+    def _set_up(self, layout: Layout) -> Any:
+        options, settings = self.options, self._package.DefaultSettings()
+        settings.verbose = False
+        settings.presolve_enable = False  # its data could not be updated
+        settings.max_threads = 1
+        settings.tol_gap_abs = settings.tol_feas = options.absolute_tolerance
+        settings.tol_gap_rel = options.relative_tolerance
+        if options.max_iterations is not None:
+            settings.max_iter = int(options.max_iterations)
+        equal = int(layout.structure.equal.sum())
+        cones = [
+            kind(count)
+            for kind, count in (
+                (self._package.ZeroConeT, equal),
+                (self._package.NonnegativeConeT, layout.constraints.size - equal),
+            )
+            if count
+        ]
+        return self._package.DefaultSolver(
+            layout.hessian, layout.gradient, layout.matrix, layout.upper, cones, settings
+        )
+
+    def _update(self, handle: Any, layout: Layout) -> None:
+        handle.update(
+            P=layout.hessian.data, q=layout.gradient, A=layout.matrix.data, b=layout.upper
+        )
+
+    def _limit(self, handle: Any, seconds: float) -> None:
+        settings = handle.get_settings()
+        settings.time_limit = seconds
+        handle.update(settings=settings)
+
+    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+        solution = handle.solve()
+        status = str(solution.status)
+        solved = status == "Solved"
+        return Answer(
+            np.array(solution.x), layout.duals(np.array(solution.z), None, None), solved,
+            solved or status in ("MaxIterations", "MaxTime"), int(solution.iterations), status,
+        )
+
+
+Index = NDArray[np.intc]
+
+# Bits of a constraint's sense.
+_ACTIVE, _LOWER, _EQUALITY = 1, 2, 5
+# A start this near to a limit, relative to it, counts as at the limit.
+_AT = 1e-6
+_WORDS = {
+    1: "solved", 2: "solved, soft constraints used", -1: "infeasible", -2: "cycling",
+    -3: "unbounded", -4: "iteration limit", -5: "not convex", -6: "overdetermined start",
+    -7: "time limit",
+}
+_AT_CAP = -4
+_STOPPED = (_AT_CAP, -7)
+
+
+class DaqpSolver(NativeSolver):
+    """Solve by DAQP.
+
+    It starts with the limits that the start lies on, or those that were active last, as
+    active; where it stops at a cap or time limit, there is no iterate.
+    """
+
+    package = "daqp"
+    style = Style("dense", equalities="among")
+
+    def _set_up(self, layout: Layout) -> Any:
+        options, handle = self.options, self._package.Model()
+        settings = {
+            "primal_tol": options.absolute_tolerance, "dual_tol": options.absolute_tolerance
+        }
+        if options.max_iterations is not None:
+            # Its loop ends before the iteration of that number.
+            settings["iter_limit"] = int(options.max_iterations) + 1
+        handle.settings = handle.settings | settings
+        flag, _ = handle.setup(
+            layout.hessian, layout.gradient, layout.matrix, layout.all_upper, layout.all_lower,
+            self._sense(layout, None, None),
+        )
+        if flag < 0:
+            raise RuntimeError(f"daqp: {_WORDS.get(flag, flag)}")
+        return handle
+
+    def _limit(self, handle: Any, seconds: float) -> None:
+        handle.settings = handle.settings | {"time_limit": seconds}
+
+    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+        began, limit = perf_counter(), self.time_limit
+        sense = self._sense(layout, start, duals)
+        answer = self._from(handle, layout, sense)
+        if not answer.sound and (start is not None or duals is not None):
+            # A start whose active rows depend on each other: it divides by zero, or gives up.
+            if limit is not None:
+                remaining = limit - (perf_counter() - began)
+                if remaining <= 0.0:
+                    return answer
+                self._limit(handle, remaining)
+            answer = self._from(handle, layout, self._sense(layout, None, None))
+        return answer
+
+    def _from(self, handle: Any, layout: Layout, sense: Index) -> Answer:
+        """Solve from an active set."""
+        # Without rows it must be given none: it would look at the first one.
+        rows = {"A": layout.matrix} if layout.matrix.size else {}
+        if sense.size:
+            rows |= {"bupper": layout.all_upper, "blower": layout.all_lower, "sense": sense}
+        flag = handle.update(H=layout.hessian, f=layout.gradient, **rows)
+        if flag < 0:
+            return Answer(None, None, False, False, None, _WORDS.get(flag, str(flag)))
+        x, _, flag, info = handle.solve()
+        count, words = int(info["iterations"]), _WORDS.get(flag, str(flag))
+        if flag == _AT_CAP:
+            count -= 1  # the one that it did not begin
+        if flag != 1:
+            return Answer(None, None, False, flag in _STOPPED, count, words)
+        bounds = layout.size if layout.boxed else 0
+        duals = layout.duals(info["lam"][bounds:], None, info["lam"][:bounds])
+        return Answer(x, duals, True, bool(np.isfinite(x).all()), count, words)
+
+    def _sense(self, layout: Layout, start: Array | None, duals: Array | None) -> Index:
+        """What each limit of the box, then each row, is to begin as."""
+        sense = np.zeros(layout.all_upper.size, np.intc)
+        bounds = layout.size if layout.boxed else 0
+        sense[bounds : bounds + np.count_nonzero(layout.structure.equal)] = _EQUALITY
+        if start is not None:
+            value = np.concatenate((start[:bounds], layout.matrix @ start))
+            near = _AT * (1.0 + np.abs(value))
+            above, below = value >= layout.all_upper - near, value <= layout.all_lower + near
+        elif duals is not None:
+            known = np.concatenate((duals[:bounds], duals[layout.constraints]))
+            above, below = known > 0.0, known < 0.0
+        else:
+            return sense
+        sense |= (above | below) * np.intc(_ACTIVE)
+        sense |= (below & ~above) * np.intc(_LOWER)
+        return sense
+
+
+# OSQP looks whether it is done at every so many iterations; at a low cap it should each time.
+_CHECKED = 25
+_RHO = 0.1
+
+
+class OsqpSolver(NativeSolver):
+    """Solve by OSQP."""
+
+    package = "osqp"
+    style = Style("csc", triangle="upper", bounds="rows", equalities="among")
+
+    def __init__(self, options: SolverOptions) -> None:
+        super().__init__(options)
+        cap = options.max_iterations
+        self._settings: dict[str, Any] = {
+            "eps_abs": options.absolute_tolerance, "eps_rel": options.relative_tolerance,
+            "verbose": False, "rho": _RHO,
+            "eps_dual_inf": 1e-12,  # H is positive definite: there is always a minimiser
+        }
+        if cap is not None:
+            self._settings["max_iter"] = int(cap)
+            if cap < _CHECKED:
+                self._settings["check_termination"] = 1
+
+    def _set_up(self, layout: Layout) -> Any:
+        handle = self._package.OSQP()
+        handle.setup(
+            layout.hessian, layout.gradient, layout.matrix, layout.lower, layout.upper,
+            **self._settings,
+        )
+        return handle
+
+    def _update(self, handle: Any, layout: Layout) -> None:
+        if not self.options.warm_start:
+            handle.update_settings(rho=_RHO)  # adapted by the solves before
+        handle.update(
+            q=layout.gradient, l=layout.lower, u=layout.upper,
+            Px=layout.hessian.data, Ax=layout.matrix.data,
+        )
+
+    def _limit(self, handle: Any, seconds: float) -> None:
+        handle.update_settings(time_limit=seconds)
+
+    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+        handle.warm_start(
+            x=np.zeros(layout.size) if start is None else start,
+            y=np.zeros(layout.constraints.size) if duals is None else duals[layout.constraints],
+        )
+        result = handle.solve(raise_error=False)
+        status = result.info.status
+        # Anything else comes without an iterate, or with a certificate in its place.
+        stopped = status.startswith(("solved", "maximum", "run time"))
+        return Answer(
+            result.x, layout.duals(result.y, None, None), status == "solved", stopped,
+            int(result.info.iter), status,
+        )
+
+
+class PiqpSolver(NativeSolver):
+    """Solve by PIQP's sparse solver, which factorises stage by stage.
+
+    Its multistage factorisation wants the unknowns in the order of the stages, as they are.
+    PIQP knows no start: it begins anew each time.
+    """
+
+    package = "piqp"
+    style = Style("csc", triangle="upper", infinite=False)
+
+    def _made(self) -> Any:
+        handle = self._package.SparseSolver()
+        handle.settings.kkt_solver = self._package.KKTSolver.sparse_multistage
+        return handle
+
+    def _set_up(self, layout: Layout) -> Any:
+        handle, options = self._made(), self.options
+        settings = handle.settings
+        settings.eps_abs = settings.eps_duality_gap_abs = options.absolute_tolerance
+        settings.eps_rel = settings.eps_duality_gap_rel = options.relative_tolerance
+        if hasattr(settings, "eps_dual_inf"):  # PIQP 0.6.1 has no such limit
+            settings.eps_dual_inf = 1e-12  # H is positive definite: there is always a minimiser
+        if options.max_iterations is not None:
+            settings.max_iter = int(options.max_iterations)
+        handle.setup(layout.hessian, layout.gradient, *self._others(layout))
+        return handle
+
+    def _update(self, handle: Any, layout: Layout) -> None:
+        handle.update(layout.hessian, layout.gradient, *self._others(layout))
+
+    def _others(self, layout: Layout) -> tuple[Any, ...]:
+        """A, b, G, lower and upper limits, lower and upper bounds."""
+        box = (layout.box_lower, layout.box_upper) if layout.boxed else (None, None)
+        return (
+            layout.equality_matrix, layout.level, layout.matrix, layout.lower, layout.upper, *box
+        )
+
+    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+        status = handle.solve()
+        result, kinds = handle.result, self._package.Status
+        box = result.z_bu - result.z_bl if layout.boxed else None
+        return Answer(
+            result.x, layout.duals(result.z_u - result.z_l, result.y, box),
+            status == kinds.PIQP_SOLVED,
+            status in (kinds.PIQP_SOLVED, kinds.PIQP_MAX_ITER_REACHED),
+            int(result.info.iter), status.name,
+        )
+
+
+class PiqpDenseSolver(PiqpSolver):
+    """Solve by PIQP with dense matrices."""
+
+    style = Style("dense", infinite=False)
+
+    def _made(self) -> Any:
+        return self._package.DenseSolver()
+
+
+# Outer iterations where no cap is asked for: of its own accord it takes 10000, for minutes.
+_CAP = 200
+
+
+class ProxqpSolver(NativeSolver):
+    """Solve by ProxQP's dense solver.
+
+    It begins at the minimiser under the equality rows each time: starts with the multipliers
+    of the last solve took as many iterations or more, and longer.
+    """
+
+    package = "proxsuite"
+    style = Style("dense")
+
+    def _made(self, layout: Layout) -> Any:
+        return self._package.proxqp.dense.QP(
+            layout.size, layout.equalities.size, layout.constraints.size, layout.boxed
+        )
+
+    def _set_up(self, layout: Layout) -> Any:
+        handle, options = self._made(layout), self.options
+        settings = handle.settings
+        settings.eps_abs = settings.eps_duality_gap_abs = options.absolute_tolerance
+        settings.eps_rel = settings.eps_duality_gap_rel = options.relative_tolerance
+        settings.check_duality_gap = True
+        settings.eps_dual_inf = 0.0  # H is positive definite: there is always a minimiser
+        settings.max_iter = _CAP if options.max_iterations is None else int(options.max_iterations)
+        handle.init(**self._parts(layout))
+        return handle
+
+    def _update(self, handle: Any, layout: Layout) -> None:
+        handle.update(**self._parts(layout), update_preconditioner=True)
+
+    def _parts(self, layout: Layout) -> dict[str, Any]:
+        parts = {
+            "H": layout.hessian, "g": layout.gradient, "A": layout.equality_matrix,
+            "b": layout.level, "C": layout.matrix, "l": layout.lower, "u": layout.upper,
+        }
+        if layout.boxed:
+            parts |= {"l_box": layout.box_lower, "u_box": layout.box_upper}
+        return parts
+
+    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+        handle.solve()
+        results, count = handle.results, layout.constraints.size
+        status, z = results.info.status.name, results.z
+        solved = status == "PROXQP_SOLVED"
+        return Answer(
+            results.x,
+            layout.duals(z[:count], results.y, z[count:] if layout.boxed else None),
+            solved, solved or status == "PROXQP_MAX_ITER_REACHED",
+            int(results.info.iter_ext), status,
+        )
+
+
+class ProxqpSparseSolver(ProxqpSolver):
+    """Solve by ProxQP with sparse matrices.
+
+    It begins at the minimiser under the equality rows each time, like the dense one.
+    """
+
+    style = Style("csc", bounds="rows")
+
+    def _made(self, layout: Layout) -> Any:
+        return self._package.proxqp.sparse.QP(
+            layout.size, layout.equalities.size, layout.constraints.size
+        )
+
+
+def _native(
+    kind: type[NativeSolver], name: str, method: str, *, iterate_at_cap: bool = True,
+    starts: bool = False, time_limit: bool = False,
+) -> Backend:
+    return Backend(
+        name, kind, method, kind.package, kind.package, kind.style.matrices, iteration_cap=True,
+        iterate_at_cap=iterate_at_cap, warm_start=starts, time_limit=time_limit,
+        keeps_duals=starts, reports_infeasibility=True, keeps_workspace=True,
+    )
+
+
+#: The backends of this module, by name.
+NATIVE: Mapping[str, Backend] = {
+    backend.name: backend
+    for backend in (
+        _native(ClarabelSolver, "clarabel", "interior point", time_limit=True),
+        _native(
+            DaqpSolver, "daqp", "dual active set", iterate_at_cap=False, starts=True,
+            time_limit=True,
+        ),
+        _native(OsqpSolver, "osqp", "ADMM", starts=True, time_limit=True),
+        _native(PiqpSolver, "piqp", "interior point"),
+        _native(PiqpDenseSolver, "piqp_dense", "interior point"),
+        _native(ProxqpSolver, "proxqp", "augmented Lagrangian"),
+        _native(ProxqpSparseSolver, "proxqp_sparse", "augmented Lagrangian"),
+    )
+}
