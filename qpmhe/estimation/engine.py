@@ -141,8 +141,10 @@ class PythonEngine:
             status |= outcome.events
         if missing:
             status |= Status.MISSING
+        message = outcome.message
         if model_failed or jacobian_failed:
             status |= Status.MODEL_FAILED
+            message = f"{window.failure} {message}".strip()
         elif not math.isfinite(reference.cost):
             status |= Status.FAILED_STAGE
         if not math.isfinite(reference.cost):
@@ -161,7 +163,7 @@ class PythonEngine:
             reference.trajectory.copy(),
             reference.cost,
             status,
-            outcome.message,
+            message,
             outcome.qps,
             outcome.solver_iterations,
             outcome.solve_time,

@@ -119,7 +119,8 @@ class Estimate:
     status : Status
         Outcome and events.
     message : str
-        Message of the QP solver if it failed.
+        What the model, the observer or the cost raised where it failed, and at which state;
+        the QP solver's message where that failed.
     qps, corrections : int
         QPs solved, and second-order corrections solved beside them.
     solver_iterations : int or None

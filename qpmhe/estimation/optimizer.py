@@ -127,6 +127,7 @@ class Optimizer:
                 qp = self._subproblem.at(problem, outcome.trial)
             if qp is None:
                 outcome.events |= Status.MODEL_FAILED
+                outcome.message = self._subproblem.failure
                 break
             if not self._step(problem, qp, outcome):
                 break
@@ -213,6 +214,7 @@ class Optimizer:
             else:
                 stalled = solved and predicted <= STALLED * negligible
                 outcome.events |= Status.CONVERGED if stalled else Status.NO_DECREASE
+                outcome.message = problem.failure(trial)
                 return False
         return self._accept(outcome, trial, solved, negligible)
 

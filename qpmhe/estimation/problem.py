@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from qpmhe_solvers.qp import band_of
 
 from ..costs import Cost, ObserverPrior
-from ..model.functions import contained
+from ..model.functions import contained, raised_along
 from ..model.sets import ConvexSet
 from ..model.system import System
 from .limits import FEASIBLE
@@ -44,6 +44,8 @@ class Trial:
         J, or infinity if a constraint is violated or the model fails.
     violation : float
         The largest violation of a constraint, 0 for the candidate, infinity if the model fails.
+    error : Exception or None
+        What the model or the cost raised.
     """
 
     trajectory: Array
@@ -51,6 +53,7 @@ class Trial:
     weights: Array
     cost: float
     violation: float = 0.0
+    error: Exception | None = None
 
 
 class Problem:
@@ -141,9 +144,9 @@ class Problem:
             else:
                 prior_cost = self._prior_cost(offset, self.prior_weight)
             cost += prior_cost if self.discounts is None else float(self.discounts[0]) * prior_cost
-        except Exception:  # a model function outside its domain, or a user's loss
+        except Exception as error:  # a model function outside its domain, or a user's loss
             residuals = np.full((trajectory.shape[0] - 1, self._q), np.nan)
-            return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf)
+            return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf, error)
         if not math.isfinite(cost):
             return Trial(trajectory, residuals, weights, math.inf, math.inf)
         if not self.constrained:
@@ -152,6 +155,13 @@ class Problem:
         if violation > FEASIBLE:
             cost = math.inf
         return Trial(trajectory, residuals, weights, cost, violation)
+
+    def failure(self, trial: Trial) -> str:
+        """What the model or the cost raised at a trial, as a message; blank if nothing."""
+        if trial.error is None:
+            return ""
+        functions = {"f": self.model.f, "h": self.model.h}
+        return raised_along(trial.error, functions, trial.trajectory[:-1], self.inputs)
 
     def _rolled_out(self, trajectory: Array) -> Array:
         """Set each noise-free component j, with W_j = {c}, to f_j(x_i) + c, stage by stage."""

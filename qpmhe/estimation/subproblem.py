@@ -11,6 +11,7 @@ from qpmhe_solvers import QP
 from qpmhe_solvers.qp import band_of
 
 from ..costs import Cost
+from ..model.functions import raised_along
 from ..model.sets import ConvexSet
 from ..model.system import System
 from .limits import BEYOND
@@ -52,6 +53,8 @@ class Subproblem:
         ends = np.cumsum([0, *(len(rows) for rows in (self._w_rows, self._v_rows, self._x_rows))])
         self._w, self._v, self._x = (slice(a, b) for a, b in pairwise(ends))
         self._qp: QP | None = None
+        #: Why `at` found no QP the last time.
+        self.failure = ""
         # Added to the stages' panels: the band of the prior's weight, then the band of each Q_i.
         self._added_bands: Array
         # What they hold: whether one Q for all stages, and which band of the prior.
@@ -66,16 +69,23 @@ class Subproblem:
         return self._assemble(problem, trial, Span(self._scaled, 0, window.length), True)
 
     def at(self, problem: Problem, trial: Trial) -> QP | None:
-        """The QP around any trajectory; None where the model has no Jacobians there."""
+        """The QP around any trajectory; None, and `failure`, where it has no Jacobians there."""
         states, terms, n = trial.trajectory[:-1], self._terms, self._n
         count = states.shape[0]
         model, linear = problem.model, terms.linear[:count]
         try:
             np.negative(model.f_jacobian.batch(states, problem.inputs), out=linear[:, :n, 1:])
             np.negative(model.h_jacobian.batch(states, problem.inputs), out=linear[:, n:, 1:])
-        except Exception:  # a user's Jacobian outside its domain
+        except Exception as error:  # a user's Jacobian outside its domain
+            self.failure = raised_along(
+                error,
+                {"the Jacobian of f": model.f_jacobian, "the Jacobian of h": model.h_jacobian},
+                states,
+                problem.inputs,
+            )
             return None
         if not np.isfinite(linear).all():
+            self.failure = "the Jacobian of f or h is not finite along the trajectory."
             return None
         linear[:, :, 0] = trial.residuals
         terms.set_all(count, trial.weights)

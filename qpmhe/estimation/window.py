@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
-from ..model.functions import contained
+from ..model.functions import contained, raised
 from ..model.system import Function, System
 from ..observers import Observer, Sample
 from .limits import LARGEST
@@ -56,6 +56,8 @@ class Window(Stages):
         self._functions = system.f.direct, system.h.direct
         self._jacobian_functions = system.f_jacobian.direct, system.h_jacobian.direct
         self._jacobians_finite = True  # of the stage computed last
+        #: Why the model failed at the stage computed last; blank if it did not.
+        self.failure = ""
         self._minus_stand_in = -np.eye(n + p, n)  # -G where the model has no Jacobians
         self._ones = np.ones(horizon)
         # gamma^N for the prior of a full window, then gamma^(N-1), ..., gamma^0 for its stages.
@@ -128,6 +130,7 @@ class Window(Stages):
             self._set_weight(k, time)
         elif self.unusual and not self._observed[k].all():
             observed = self._observed[k]
+        self.failure = ""
         cost = self._evaluate_stage(k, time, observed)
         if not math.isfinite(cost) and observed is None:
             small = np.abs(y) < LARGEST
@@ -140,6 +143,9 @@ class Window(Stages):
             self._fill_failed(k)
         self._stage_costs[k] = cost
         jacobian_failed = not model_failed and self._with_terms and not self._jacobians_finite
+        if (model_failed or jacobian_failed) and not self.failure:
+            what = "the model, the observer or the cost" if model_failed else "a Jacobian"
+            self.failure = f"{what} is not finite at x = {self._stage_views[k].z.tolist()}."
         return observed is not None, model_failed, jacobian_failed
 
     def _set_weight(self, k: int, time: int) -> None:
@@ -163,6 +169,7 @@ class Window(Stages):
         view = self._stage_views[k]
         z, z_next, u, terms = view.z, view.z_next, view.u, view.terms
         model, error, sample = self._system, terms.noise, self._sample
+        running = "the model"
         try:
             if self.unusual and self._irregular[k]:
                 model, u = self._system.timed, self._u[k]
@@ -171,6 +178,7 @@ class Window(Stages):
                 usual = model is self._system
                 arguments = view.arguments if usual else (view.arguments[0], u)
                 f, h = self._functions if usual else (model.f, model.h)
+                running = "h"
                 # Used at once: the functions may return the same array at each call.
                 np.subtract(view.y, h(*arguments), error)
                 if self._with_jacobians:
@@ -192,10 +200,13 @@ class Window(Stages):
                 sample.noise_weight = self._own_noise.get(time)
             if self._read_only_covariances is not None:
                 sample.covariance = self._read_only_covariances[k]
+            running = "the observer's correction"
             correction, posterior = self._correct(view.arguments[0], view.error, sample)
             terms.disturbance[...] = correction
+            running = "f"
             np.add(f(*arguments) if kernel is None else predicted, correction, z_next)
-        except Exception:  # a model function outside its domain: bad luck, not bad input
+        except Exception as raising:  # a model function outside its domain: not bad input
+            self.failure = raised(running, raising, z)
             return math.inf
         if self._covariances is not None:
             if posterior is None or not np.isfinite(posterior).all():
@@ -211,15 +222,17 @@ class Window(Stages):
                 return cost
         return self._cost_and_terms(k)
 
-    @staticmethod
     def _differentiate(
-        terms: Stage, jacobians: tuple[Function, Function], arguments: tuple[Array, ...]
+        self, terms: Stage, jacobians: tuple[Function, Function], arguments: tuple[Array, ...]
     ) -> None:
         f_jacobian, h_jacobian = jacobians
+        running = "the Jacobian of f"
         try:
             np.negative(f_jacobian(*arguments), terms.minus_a)
+            running = "the Jacobian of h"
             np.negative(h_jacobian(*arguments), terms.minus_c)
-        except Exception:  # a user's Jacobian outside its domain
+        except Exception as raising:  # a user's Jacobian outside its domain
+            self.failure = raised(running, raising, arguments[0])
             # An observer without Jacobians goes on; `_cost_and_terms` finds the NaN.
             terms.linear[:, 1:] = np.nan
 
@@ -234,7 +247,8 @@ class Window(Stages):
             if self._with_terms and not self._quadratic:
                 self._majorising_weights[k] = self._majorise(residual[None], weight)[0]
                 weight = self._majorising_weights[k]
-        except Exception:  # a user's loss
+        except Exception as error:  # a user's loss
+            self.failure = raised("the cost", error, self._stage_views[k].z)
             return math.inf
         if self._with_terms:
             jacobian = stage.linear[:, 1:].ravel()

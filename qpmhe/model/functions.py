@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 from ..errors import ModelError, QpmheError
 from .tracing import trace
 
-__all__ = ["BatchedFunction", "Trusted", "check_inputs", "contained", "takes_input"]
+__all__ = [
+    "BatchedFunction", "Trusted", "check_inputs", "contained", "raised", "raised_along",
+    "takes_input",
+]
 
 Array = NDArray[Any]
 Probes = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -46,6 +49,33 @@ def contained(function: Callable[..., Any]) -> Callable[..., Any]:
             raise EvaluationError(f"{type(error).__name__}: {error}") from error
 
     return call
+
+
+def raised(what: str, error: Exception, x: Array) -> str:
+    """An exception of the model, the observer or the cost at a state, as a message."""
+    kind = type(error).__name__
+    try:
+        text = f"{kind}: {error}" if str(error) else kind
+        if isinstance(error, EvaluationError):
+            if error.__cause__ is None:  # a wrong value: the text says whose
+                return f"{error} at x = {x.tolist()}."
+            text = str(error)
+    except Exception:  # its text raises, too
+        text = kind
+    return f"{what} raised {text} at x = {x.tolist()}."
+
+
+def raised_along(
+    error: Exception, functions: Mapping[str, Callable[..., Any]], states: Array, inputs: Array
+) -> str:
+    """An exception of functions on a trajectory: evaluates them again to find out where."""
+    for x, u in zip(states, inputs, strict=False):
+        for what, function in functions.items():
+            try:
+                function(x, u)
+            except Exception as found:
+                return raised(what, found, x)
+    return raised("the model or the cost", error, states[0])
 
 
 class BatchedFunction:
