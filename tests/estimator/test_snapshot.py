@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.codegen.compiler import find_compiler
+from qpmhe.models.batch_reactor import casadi_output, casadi_rate
 
 OPTIONS = {
     "plain": {},
@@ -17,8 +19,9 @@ OPTIONS = {
 }
 
 
-def make(**options):
-    system, observer, cost, scenario = qpmhe.models.batch_reactor()
+def make(system=None, **options):
+    numpy_system, observer, cost, scenario = qpmhe.models.batch_reactor()
+    system = system or numpy_system
     return qpmhe.MovingHorizonEstimator(
         system, observer, cost, horizon=6, initial_state=scenario.initial_estimate, **options
     )
@@ -46,6 +49,7 @@ def assert_equal(ours, theirs):
         assert one.trajectory.tolist() == other.trajectory.tolist()
         assert (one.cost, one.status, one.time) == (other.cost, other.status, other.time)
         assert one.candidate.tolist() == other.candidate.tolist()
+        assert one.candidate_cost == other.candidate_cost
         np.testing.assert_array_equal(one.noises, other.noises)
 
 
@@ -63,6 +67,49 @@ def test_a_restored_estimator_continues_bit_for_bit(name, stop):
     assert_equal(feed(restored, rest, stop), expected)
     assert_equal(feed(loaded, rest, stop), expected)
     assert whole.covariances().tolist() == restored.covariances().tolist()
+
+
+class Rounding:
+    """A model's fused calls, whose last digits no other way of calling it has."""
+
+    def __init__(self, kernel):
+        self.kernel, self.factor = kernel, 1.0 + 4.0 * np.finfo(float).eps
+        self.prepare = kernel.prepare
+
+    def stage(self, x, u):
+        return tuple(self.factor * value for value in self.kernel.stage(x, u))
+
+    def residuals(self, trajectory, y, u):
+        return self.factor * self.kernel.residuals(trajectory, y, u)
+
+
+@pytest.mark.parametrize("fused", ["interpreted", "compiled", "other digits"])
+@pytest.mark.parametrize("bounds", [None, qpmhe.Box([0.0, 0.0], [np.inf, np.inf])])
+@pytest.mark.parametrize("name", OPTIONS)
+def test_fused_calls_of_a_model_continue_bit_for_bit(name, bounds, fused):
+    """CasADi evaluates a stage, or all residuals of a window, in one call."""
+    pytest.importorskip("casadi")
+    if fused == "compiled" and find_compiler() is None:
+        pytest.skip("no C compiler")
+    system = qpmhe.from_casadi(
+        casadi_rate, casadi_output, n=2, dt=0.1, method="euler", states=bounds,
+        compiled=fused == "compiled",
+    )
+    if fused == "other digits":
+        system.kernel = Rounding(system.kernel)
+    options, measurements = OPTIONS[name], record(60)
+    regular = [y for y in measurements if np.isfinite(y).all()]
+    # All samples alike; or a missing one, irregular steps, noises of their own, a late one.
+    for taken, first, stops in ((regular, 100, (1, 20)), (measurements, 0, (5, 10, 12))):
+        for stop in stops:
+            whole, loaded = make(system, **options), make(system, **options)
+            feed(whole, taken[:stop], first)
+            loaded.load_state_dict(whole.state_dict())
+            restored = pickle.loads(pickle.dumps(whole)) if fused != "other digits" else None
+            expected = feed(whole, taken[stop:], first + stop)
+            for one in filter(None, (loaded, restored)):
+                assert_equal(feed(one, taken[stop:], first + stop), expected)
+                assert whole.covariances().tolist() == one.covariances().tolist()
 
 
 @pytest.mark.parametrize("stop", [1, 8, 12, 60, 75])

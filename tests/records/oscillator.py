@@ -34,6 +34,17 @@ def continuous(bounded=True):
     return system, *_rest()
 
 
+def fused():
+    """A model that is evaluated over a whole window in one call."""
+    import casadi as ca
+
+    system = qpmhe.from_casadi(
+        lambda x, u: ca.vertcat(x[1], -x[0] - 0.5 * x[1] + u[0]), lambda x: x[0] + 0.1 * x[0] ** 3,
+        n=2, m=1, dt=DT,
+    )
+    return system, *_rest()
+
+
 def discrete(dt=None):
     """Equal steps, two outputs, no inputs, nothing optional but what is needed."""
     system = qpmhe.System(lambda x: x @ A.T, lambda x: x, n=2, p=2)

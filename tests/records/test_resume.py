@@ -13,7 +13,7 @@ from qpmhe.records import CheckpointError, RecordError, estimate_record
 from qpmhe.records.checkpoints import load
 
 from . import process
-from .conftest import CONTINUOUS, DISCRETE
+from .conftest import CONTINUOUS, DISCRETE, FUSED
 from .oscillator import lines
 
 OPTIONS = {"step_time": False, "checkpoint_every": 20, "checkpoint_seconds": 0.0}
@@ -101,6 +101,21 @@ def test_with_every_way_of_starting_warm(here, backend):
         put("record.csv", text)
         told = estimate_record(CONTINUOUS, "record.csv", "out.csv", resume=True, **options)
         assert told.before == 20 * ((cut - 2) // 20)
+        assert Path("out.csv").read_bytes() == Path("whole.csv").read_bytes()
+
+
+@pytest.mark.parametrize("irregular", [True, False])
+def test_with_a_model_of_fused_calls(here, irregular):
+    pytest.importorskip("casadi")
+    text = lines(90, irregular=irregular, gaps=0.03 if irregular else 0.0)
+    put("record.csv", text)
+    estimate_record(FUSED, "record.csv", "whole.csv", **OPTIONS)
+    for cut in (25, 48, 61):
+        put("record.csv", [*text[:cut], "0.0,what"])
+        with pytest.raises(RecordError, match="resume"):
+            estimate_record(FUSED, "record.csv", "out.csv", overwrite=True, **OPTIONS)
+        put("record.csv", text)
+        assert estimate_record(FUSED, "record.csv", "out.csv", resume=True, **OPTIONS).before >= 20
         assert Path("out.csv").read_bytes() == Path("whole.csv").read_bytes()
 
 
