@@ -135,13 +135,12 @@ def _filled(
     layout: Layout, system: System, observer: Observer, cost: Cost, settings: Settings
 ) -> NDArray[Any]:
     record = np.zeros((), layout.settings_type())
-    gain = observer.constant_gain
+    gain, form = observer.constant_gain, cost.c_form
     assert gain is not None
-    record["gain"] = gain.ravel()
-    record["prior_weight"] = np.asarray(cost.prior).ravel()
-    record["disturbance_weight"] = cost.disturbance.ravel()
-    record["noise_weight"] = cost.noise.ravel()
-    record["discount"] = cost.discount
+    assert form is not None
+    record["gain"], record["discount"] = gain.ravel(), form.discount
+    for name in ("prior", "disturbance", "noise"):
+        record[f"{name}_weight"] = getattr(form, name).ravel()
     record["sample_time"] = system.dt or 0.0
     single = layout.real == "float"
     # Single precision distinguishes less.

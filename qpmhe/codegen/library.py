@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from ..costs import Cost, QuadraticCost
+from ..costs import Cost
 from ..errors import CompilationError, OptionError
 from ..estimation.limits import FEASIBLE
 from ..estimation.settings import Settings
@@ -36,10 +36,10 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             f"{type(observer).__name__} has no C form; take an observer with constant gain "
             "(Luenberger, SteadyStateKalman, HighGain)."
         )
-    if type(cost) is not QuadraticCost:
+    if cost.c_form is None:
+        if cost.quadratic and cost.observer_prior is not None:
+            return "a prior weight from the observer has no C form; take a constant one."
         return f"{type(cost).__name__} has no C form; take a QuadraticCost."
-    if cost.observer_prior is not None:
-        return "a prior weight from the observer has no C form; take a constant one."
     for name in SET_NAMES:
         one = getattr(system, name)
         if one is not None and _is_flat(one):

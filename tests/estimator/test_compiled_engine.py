@@ -180,6 +180,10 @@ class OwnGain(qpmhe.Luenberger):
         return 2.0 * super().correct(z, v, sample)[0], None
 
 
+class OwnCost(qpmhe.QuadraticCost):
+    """May weigh in another way."""
+
+
 def equality():
     return qpmhe.Box(-1.0, 1.0) & qpmhe.model.sets.ConvexSet(
         np.array([-INF]), np.array([INF]), np.eye(1), np.zeros(1), np.zeros(1)
@@ -195,6 +199,7 @@ def equality():
          {"observer": lambda: qpmhe.OutputInjection(lambda z, v: 0.3 * v)}),
         ("take a QuadraticCost",
          {"cost": lambda: qpmhe.RobustCost(**(ONES | {"noise": qpmhe.Huber(1.0, 1.0)}))}),
+        ("OwnCost has no C form; take a QuadraticCost", {"cost": lambda: OwnCost(**ONES)}),
         ("take a constant one",
          {"cost": lambda: qpmhe.QuadraticCost(**(ONES | {"prior": qpmhe.ObserverPrior()})),
           "observer": lambda: qpmhe.SteadyStateKalman(
