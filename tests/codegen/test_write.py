@@ -20,8 +20,8 @@ pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no 
 
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror"]
 WATCHED = ["-std=c99", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover"]
-PUBLIC = ["amend", "default_settings", "reset", "run", "sizes", "update", "update_members",
-          "update_special", "update_undoable"]
+PUBLIC = ["amend", "default_settings", "recompute", "reset", "run", "sizes", "update",
+          "update_members", "update_special", "update_undoable"]
 
 # Reads options and commands as doubles: 0 update, 1 special update, 2 amend, 3 run.
 PROGRAM = r"""

@@ -204,6 +204,10 @@ void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspac
 void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *workspace,
              int64_t samples, const mhe_real *y, const mhe_real *u, const mhe_log *log);
 
+/* Compute the stages of the window again, each from its own state and sample, to check an
+ * estimator that was saved. `reached`: MHE_HORIZON states, the one behind each stage. */
+void mhe_recompute(mhe_estimator *estimator, mhe_real *reached);
+
 /* Sizes of the structures above: estimator, workspace, estimate, settings. */
 void mhe_sizes(int64_t *sizes);
 
