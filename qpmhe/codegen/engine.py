@@ -18,7 +18,6 @@ from ..estimation.problem import Problem
 from ..estimation.run import Run
 from ..estimation.settings import Settings
 from ..estimation.snapshot import (
-    SET_NAMES,
     check_description,
     checked_array,
     described,
@@ -29,6 +28,7 @@ from ..estimation.snapshot import (
 from ..model.system import System
 from ..observers import Observer
 from .estimate import CompiledEstimate, dropped_names
+from .layout import SET_NAMES
 from .library import EstimatorLibrary
 
 __all__ = ["CompiledEngine"]

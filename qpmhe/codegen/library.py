@@ -31,6 +31,11 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     """Why an estimator has no C form, with the remedy; empty if it has one."""
     if system.symbolic is None:
         return "the system has no CasADi form; make it with qpmhe.from_casadi."
+    if system.states is not None:
+        return (
+            "engine='compiled' does not yet project the observer onto X; take engine='python', or "
+            "leave states out."
+        )
     if observer.constant_gain is None:
         return (
             f"{type(observer).__name__} has no C form; take an observer with constant gain "
