@@ -36,24 +36,23 @@ Index = NDArray[np.intp]
 class BatchEstimator:
     """K independent estimators of one system, for Monte Carlo studies and fleets.
 
-    Each member gives what a `qpmhe.MovingHorizonEstimator` with the same arguments gives for
-    its record. With ``engine="compiled"`` threads share the members; otherwise the members take
-    turns. A member whose model fails or whose measurement is missing falls back by itself.
+    Each member estimates as a `qpmhe.MovingHorizonEstimator` with the same arguments does, and
+    falls back by itself. With ``engine="compiled"`` threads share the members; otherwise the
+    members take turns.
 
     Parameters
     ----------
     system, observer, cost
-        As for `qpmhe.MovingHorizonEstimator`; all members share them.
+        Of all members.
     members : int
         K >= 1.
     initial_states : (n,) or (K, n) array_like
-        Initial estimate of all members, or of each; within the state set.
+        Initial estimate of all members, or of each.
     threads : int, optional
-        How many threads share the members where ``engine="compiled"``; one for each
-        processor if left out.
+        Number of threads with ``engine="compiled"``; one for each processor if left out.
     **options
-        As for `qpmhe.MovingHorizonEstimator`, such as the horizon. Each member has the whole
-        time budget.
+        Of `qpmhe.MovingHorizonEstimator`, such as the horizon; each member has the whole time
+        budget.
 
     Raises
     ------
@@ -76,8 +75,6 @@ class BatchEstimator:
         self, system: System, observer: Observer, cost: Cost, *, members: int,
         initial_states: ArrayLike, threads: int | None = None, **options: Any,
     ) -> None:
-        if "initial_state" in options:
-            raise UnknownOptionError("unknown option 'initial_state'; expected initial_states.")
         self.members = count("members", members, 1)
         if not isinstance(system, System):
             raise InvalidInputError(f"system is {system!r}; expected a qpmhe.System.")
@@ -150,17 +147,13 @@ class BatchEstimator:
         return self.settings.horizon
 
     def reset(self, initial_states: ArrayLike | None = None) -> None:
-        """Forget all measurements and start again.
+        """Forget all measurements and start again, at the former initial states if none are given.
 
         Parameters
         ----------
         initial_states : (n,) or (K, n) array_like, optional
-            New initial estimates; the former ones if left out.
-
-        Raises
-        ------
-        InvalidInputError
-            If they do not fit; the estimator is left as it was.
+            New initial estimates. If they do not fit, an `InvalidInputError` is raised and the
+            estimator left as it was.
         """
         before = states = self._initial_states
         if initial_states is not None:
@@ -178,15 +171,17 @@ class BatchEstimator:
         return self._initial_states.copy()
 
     def update(self, Y: ArrayLike | None, U: ArrayLike | None = None) -> BatchEstimate:
-        """Take the measurements y(t) and inputs u(t) of all members in, and estimate x(t+1).
+        """Take the measurements y(t) and inputs u(t) of all members, and estimate x(t+1).
+
+        See `MovingHorizonEstimator.update`. An interrupted update (Ctrl+C) has taken the samples
+        of no member; in compiled code, of all or of none: see ``time``.
 
         Parameters
         ----------
         Y : (K, p) array_like
-            y(t) of each member; what is not finite (or so large that its square is not) or
-            None is missing, of that member alone. (K,) will do where p is 1.
+            y(t) of each member, a row of None where a member has none; (K,) if p is 1.
         U : (K, m) or (m,) array_like, optional
-            u(t) of each member, or of all. Needed exactly if the system has inputs.
+            u(t) of each member, or of all.
 
         Returns
         -------
@@ -197,11 +192,6 @@ class BatchEstimator:
         ------
         ShapeError, InvalidInputError
             If an argument does not fit; the estimator is left as it was.
-
-        Notes
-        -----
-        An update that is interrupted (Ctrl+C) has taken the samples of no member; in compiled
-        code, of all or of none: see ``time``.
         """
         y = _measurements(Y, self.members, self.system.p)
         return self._step(y, _inputs(U, (self.members, self.system.m), "update(Y, U)"))
@@ -212,13 +202,13 @@ class BatchEstimator:
         return BatchEstimate(**self._engine.step(y, u), delay=self.settings.delay)
 
     def run(self, Y: ArrayLike, U: ArrayLike | None = None) -> BatchRun:
-        """Take whole records, sample by sample, going on from the present states.
+        """Take whole records, starting at the present states.
 
         Parameters
         ----------
         Y : (K, T, p) array_like
-            y(t), ..., y(t+T-1) of each member; (K, T) will do where p is 1. Shorter records
-            are filled up with NaN.
+            y(t), ..., y(t+T-1) of each member; (K, T) if p is 1. Fill up shorter records with
+            NaN.
         U : (K, T, m) or (T, m) array_like, optional
             The inputs of the same times, of each member or of all.
 
@@ -230,7 +220,7 @@ class BatchEstimator:
         Raises
         ------
         ShapeError, InvalidInputError
-            If an argument does not fit; no sample has been taken then.
+            If an argument does not fit, before any sample is taken.
         """
         ys = _record(Y, self.members, self.system.p)
         shape, n = ys.shape[:2], self.system.n
@@ -334,24 +324,20 @@ class _Looped:
 
 @dataclass(eq=False, repr=False)
 class BatchEstimate:
-    """The results of one `BatchEstimator.update`, after the measurements y(t) of K members.
-
-    With N_t = min(t + 1, N) stages in the windows, the trajectories hold the estimates of
-    x(t+1-N_t), ..., x(t+1).
+    """The results of one `BatchEstimator.update`: those of `Estimate`, with an axis of members.
 
     Attributes
     ----------
     time : int
         t, the index of the newest measurements; the first is 0.
     trajectories, candidates : (K, N_t + 1, n) array
-        Estimates of all states in the windows; the observers' trajectories, or their
-        projections onto the sets.
+        Estimates of all states in the windows, and the candidates.
     costs, candidate_costs : (K,) array
-        True cost J of both; costs <= candidate_costs.
+        True cost J of both.
     flags, qps : (K,) int array
-        Outcome and events as values of `Status`; QPs solved.
+        Values of the statuses, and QPs solved.
     delayed : (K, n) array or None
-        Estimates of x(t+1-k) for the estimator's delay k; None until the windows reach it.
+        Estimates of x(t+1-k) for the estimator's delay k.
     """
 
     time: int
@@ -369,12 +355,12 @@ class BatchEstimate:
 
     @property
     def states(self) -> Array:
-        """Estimates of x(t+1), (K, n): predictions one step ahead of the measurements."""
+        """Estimates of x(t+1), (K, n)."""
         return self.trajectories[:, -1]
 
     @property
     def filtered(self) -> Array:
-        """Estimates of x(t), (K, n), the last measured time."""
+        """Estimates of x(t), (K, n)."""
         return self.trajectories[:, -2]
 
     @cached_property
@@ -399,21 +385,18 @@ class BatchEstimate:
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class BatchRun:
-    """Results of T consecutive updates of K members, as arrays.
+    """Results of T consecutive updates of K members: those of `Run`, with an axis of members.
 
     Attributes
     ----------
     states : (K, T + 1, n) array
-        Estimates of x(0), ..., x(T), each made before y of its own time: the first is the
-        start.
-    filtered : (K, T, n) array
-        Estimates of x(0), ..., x(T-1), each made with y of its own time.
-    delayed : (K, T, n) array
-        Estimates with the estimator's delay, NaN where the windows did not reach that far.
+        Estimates of x(0), ..., x(T), each made before y of its own time.
+    filtered, delayed : (K, T, n) array
+        Estimates with y of their own time; delayed ones, NaN until the windows reach the delay.
     costs, candidate_costs : (K, T) array
         True cost J of estimates and candidates.
     statuses, qps : (K, T) int array
-        Outcome and events of each step, from which ``Status(value)`` makes a flag; QPs solved.
+        Values of the statuses (``Status(value)`` makes a flag), and QPs solved.
     """
 
     states: Array

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array, record, vector
-from ..costs import Cost, CostConstants, ObserverPrior, QuadraticCost
+from ..costs import Cost, CostConstants
 from ..errors import InvalidInputError, ModelError, ShapeError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
@@ -175,11 +175,11 @@ def _cost_finding(cost: Cost) -> tuple[CostConstants | None, Finding]:
         )
         return None, found(False, Evidence.PROVED, f"the cost has no constants: {why}", None)
     evidence = Evidence.ASSUMED
-    if isinstance(cost, QuadraticCost):
-        evidence = Evidence.PROVED
+    if cost.quadratic:
+        evidence, (low, high) = Evidence.PROVED, constants.prior
         prior = (
-            (cost.prior.minimum * (1.0 - 1e-12), cost.prior.maximum * (1.0 + 1e-12))
-            if isinstance(cost.prior, ObserverPrior) else eigenvalue_bounds(cost.prior)
+            eigenvalue_bounds(cost.least_prior) if cost.observer_prior is None
+            else (low * (1.0 - 1e-12), high * (1.0 + 1e-12))
         )
         constants = CostConstants(
             constants.exponent, prior, eigenvalue_bounds(cost.disturbance),

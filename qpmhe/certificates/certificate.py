@@ -37,8 +37,8 @@ ASSUMED = (
     "the true state stays in the region, and follows the model",
     "the bounds on disturbances and noises that are passed are true",
 )
-# A window without all its measurements, or with another candidate, has another cost.
-_BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE | Status.PROJECTED
+# A window without all its measurements has another cost.
+_BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
 
 
 @runtime_checkable

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..costs import Cost, CostConstants, QuadraticCost
+from ..costs import Cost, CostConstants
 from ..errors import OptionError
 from .decay import DecayingSums
 from .inequalities import Matrices
@@ -106,7 +106,7 @@ def bounds_for(
             summed.append((window_level(bound, sizes), bound))
             tried.note("summed", (i, j), summed[-1][0])
     weighted: list[tuple[float, WeightedBound]] = []
-    if isinstance(cost, QuadraticCost) and cost.discount == 1.0:
+    if cost.quadratic and cost.discount == 1.0:
         for i, j in tried.of("weighted", every):
             sharper = _weighted(cost, detectabilities[i], observers[j], lipschitz, horizon, output)
             if sharper is not None:
@@ -120,7 +120,7 @@ def bounds_for(
 
 
 def _weighted(
-    cost: QuadraticCost, detectability: Detectability, observer: ObserverStability,
+    cost: Cost, detectability: Detectability, observer: ObserverStability,
     lipschitz: float, horizon: int, output: Matrices | None,
 ) -> WeightedBound | None:
     P, V, O, gain = detectability.P, detectability.V, observer.P, observer.gain  # noqa: E741

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .._checks import Array, count, record
-from ..costs import ObserverPrior
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
@@ -317,7 +316,7 @@ def monitor(
     usual = bool(((u >= low) & (u <= high)).all())
     return Hypotheses(
         cost_decrease=cheaper, complete=complete,
-        observer_candidate=observed and Status.PROJECTED not in estimate.status, kappa=bounded,
+        observer_candidate=observed, kappa=bounded,
         candidate_in_region=usual and bool(region.contains(estimate.candidate[:-1]).all()),
         estimate_in_region=usual and bool(region.contains(estimate.trajectory[:-1]).all()),
         candidate_in_sets=_in_sets(system, estimate.candidate, corrections, fit),
@@ -369,14 +368,9 @@ def _costs(
 ) -> bool:
     """Whether a trajectory has the stated cost, or no less where the prior's weight varies."""
     cost, offset = certificate.cost, states[0] - estimate.candidate[0]
-    varies = isinstance(cost.prior, ObserverPrior)
-    weight = (
-        cost.prior.minimum * np.eye(offset.size) if isinstance(cost.prior, ObserverPrior)
-        else cost.prior
-    )
     stages = cost.stage_costs(np.hstack((w, v)), cost.stage_weight)
-    total = cost.prior_cost(offset, weight) + float(np.sum(stages))
-    missed = total - stated if varies else abs(total - stated)
+    total = cost.prior_cost(offset, cost.least_prior) + float(np.sum(stages))
+    missed = abs(total - stated) if cost.observer_prior is None else total - stated
     return bool(missed <= _RELATIVE * (abs(stated) + 1e-9))
 
 

@@ -11,7 +11,7 @@ from .._checks import Array
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
-from ..observers import Luenberger, Observer, OutputInjection
+from ..observers import Luenberger, Observer
 from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
 from .decay import checked_rate
 from .evidence import CertificateError, NotCertifiedError
@@ -40,9 +40,9 @@ def constant_gain(observer: Observer, system: System) -> Array:
         return gain
     kind = type(observer).__name__
     reason = (
-        "its correction is a function of the state as well"
-        if isinstance(observer, OutputInjection)
-        else "its gain follows from what was measured before"
+        "its gain follows from what was measured before"
+        if observer.needs_jacobians or observer.initial_covariance() is not None
+        else "its correction is a function of the state as well"
     )
     raise CertificateError(
         f"{kind} has no constant gain: {reason}. Detectability can be certified nevertheless; "

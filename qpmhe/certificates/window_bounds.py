@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from .._checks import Array, count, numbers, positive, positive_definite
-from ..costs import ObserverPrior, QuadraticCost
+from ..costs import Cost
 from ..errors import OptionError, ShapeError
 from .decay import DecayingSums, checked_length, decaying_sums
 from .theorem import TheoremConstants
@@ -310,7 +310,7 @@ class WeightedBound(WindowBound):
     """
 
     def __init__(
-        self, cost: QuadraticCost, *, horizon: int, P: ArrayLike, eta: float,
+        self, cost: Cost, *, horizon: int, P: ArrayLike, eta: float,
         noise_weight: ArrayLike, observer_norm: ArrayLike, rho: float, gain: ArrayLike,
         slope: float,
     ) -> None:
@@ -322,11 +322,8 @@ class WeightedBound(WindowBound):
             raise ShapeError(f"noise_weight has shape {self._V.shape}; expected {(p, p)}.")
         self._fit = fit_weight(cost, gain)
         self.gain = numbers("gain", gain)
-        prior = (
-            cost.prior.minimum * np.eye(n) if isinstance(cost.prior, ObserverPrior) else cost.prior
-        )
         self._shares = (
-            largest(self.P, prior), largest(self.P, cost.disturbance),
+            largest(self.P, cost.least_prior), largest(self.P, cost.disturbance),
             largest(self._V, cost.noise),
         )
         inverse = np.linalg.inv(self.P)
@@ -360,9 +357,9 @@ class WeightedBound(WindowBound):
         )
 
 
-def fit_weight(cost: QuadraticCost, gain: ArrayLike) -> Array:
+def fit_weight(cost: Cost, gain: ArrayLike) -> Array:
     """The weight M = K^T Q K + R that the candidate's cost puts on fitting errors."""
-    if not isinstance(cost, QuadraticCost) or cost.discount < 1.0:
+    if not isinstance(cost, Cost) or not cost.quadratic or cost.discount < 1.0:
         raise OptionError(
             "the weighted bound needs a QuadraticCost without discount; the theorem's own "
             "constants and the summed bound do with any cost that has constants."

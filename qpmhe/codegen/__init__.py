@@ -44,8 +44,8 @@ def write(
     Parameters
     ----------
     estimator : MovingHorizonEstimator
-        What to write: a system made with `qpmhe.from_casadi`, an observer of constant gain, a
-        quadratic cost. Its measurements so far are not written.
+        What to write: a system made with `qpmhe.from_casadi` that has no set of states, an
+        observer of constant gain, a quadratic cost. Its measurements so far are not written.
     directory : str or path
         Where; made if need be.
     name : str

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..costs import QuadraticCost
 from ..estimation.estimate import Status
 from ..estimation.limits import LARGEST
 from ..model.sets import ConvexSet
 from .evaluation import fixed_call
-from .expressions import CasadiModel
+from .expressions import CasadiModel, import_casadi
 
 if TYPE_CHECKING:
     from .library import EstimatorLibrary
@@ -50,83 +51,45 @@ class Interpreter:
     """A model by CasADi's virtual machine; NaN where it breaks off."""
 
     def __init__(self, model: CasadiModel) -> None:
-        self.model, n = model, model.n
-        self._x, self._u, self._dt = np.zeros(n), np.zeros(max(model.m, 1)), np.zeros(1)
-        self._input = self._u[: model.m]
-        values = {"f": np.zeros(n), "h": np.zeros(model.p)}
-        self._values = {
-            "f": fixed_call(model.step(), (self._x, self._u, self._dt), (values["f"],)),
-            "h": fixed_call(model.h, (self._x, self._u), (values["h"],)),
+        ca, self.model = import_casadi(), model
+        n, p, step = model.n, model.p, model.step()
+        kind = ca.SX if step.is_a("SXFunction") and model.h.is_a("SXFunction") else ca.MX
+        x, u, dt = kind.sym("x", n), kind.sym("u", model.m), kind.sym("dt")
+        f, h = step(x, u, dt), model.h(x, u)
+        # Transposed: CasADi stores by columns, NumPy by rows.
+        values = {
+            "f": (f, (n,)), "h": (h, (p,)), "f_jacobian": (ca.jacobian(f, x).T, (n, n)),
+            "h_jacobian": (ca.jacobian(h, x).T, (p, n)),
         }
-        self._found = values
-        self._slopes: dict[str, tuple[Callable[[], bool], Array, Array, Array, Array]] = {}
-        for which, value in values.items():
-            function, places = model.with_jacobian(which)
-            value, nonzeros = np.zeros(len(value)), np.zeros(max(len(places), 1))
-            self._slopes[which] = (
-                fixed_call(function, (self._x, self._u), (value, nonzeros)), value,
-                nonzeros[: len(places)], np.array(places, np.intp), np.zeros((len(value), n)),
-            )
+        self._at = np.zeros(n), np.zeros(max(model.m, 1)), np.zeros(1)
+        self._calls: dict[str, tuple[Callable[[], bool], Array]] = {}
+        for name, (value, shape) in values.items():
+            function, result = ca.Function(name, [x, u, dt], [ca.densify(value)]), np.zeros(shape)
+            self._calls[name] = fixed_call(function, self._at, (result,)), result
         # Relative changes without a pattern: equal ones would leave differences as they are.
         self._nudge = 1 + _NUDGE * np.random.default_rng(0).uniform(-1.0, 1.0, n)
 
-    def _value(self, which: str, x: Array, u: Array, out: Array) -> None:
-        self._x[:], self._input[:] = x, u
-        out[:] = self._found[which] if self._values[which]() else np.nan
-
-    def _slope(self, which: str, x: Array, u: Array) -> tuple[Array, Array]:
-        self._x[:], self._input[:] = x, u
-        call, value, nonzeros, places, dense = self._slopes[which]
+    def value(self, name: str, x: Array, u: Array, dt: float) -> Array:
+        """The map f, h or the Jacobian of either, at one state; good until the next call."""
+        at, inputs, step = self._at
+        at[:], inputs[: u.size], step[0] = x, u, dt
+        call, result = self._calls[name]
         if not call():
-            return np.full_like(value, np.nan), np.full_like(dense, np.nan)
-        dense.reshape(-1)[places] = nonzeros
-        return value.copy(), dense.copy()
-
-    def f(self, x: Array, u: Array, dt: float, out: Array) -> None:
-        """The discrete-time map at one state."""
-        self._dt[0] = dt
-        self._value("f", x, u, out)
-
-    def h(self, x: Array, u: Array, out: Array) -> None:
-        """The outputs at one state."""
-        self._value("h", x, u, out)
-
-    def f_jacobian(self, x: Array, u: Array, dt: float) -> Array:
-        """The Jacobian of `f`."""
-        method, one = self.model.method, np.eye(self.model.n)
-        k, first = self._slope("f", x, u)
-        if method is None:
-            return first
-        if method == "euler":
-            return one + dt * first
-        slopes = [first]
-        for step in (dt / 2, dt / 2, dt):
-            k, slope = self._slope("f", x + step * k, u)
-            slopes.append(slope @ (one + step * slopes[-1]))
-        return one + dt / 6 * (slopes[0] + 2 * (slopes[1] + slopes[2]) + slopes[3])
-
-    def h_jacobian(self, x: Array, u: Array) -> Array:
-        """The Jacobian of `h`."""
-        return self._slope("h", x, u)[1]
+            result[...] = np.nan
+        return result
 
     def stages(self, xs: Array, us: Array, steps: Array, jacobians: bool) -> dict[str, Array]:
         """All at many states, and under ``spread_f`` etc. how far rounding may spread."""
-        count, n, p = len(xs), self.model.n, self.model.p
-        shapes = {"f": (n,), "h": (p,), "f_jacobian": (n, n), "h_jacobian": (p, n)}
-        names = _ALL if jacobians else _ALL[:2]
-        near = xs, xs * self._nudge
-        values = {name: np.zeros((len(near), count, *shapes[name])) for name in names}
-        for i, states in enumerate(near):
-            for k, (x, u, dt) in enumerate(zip(states, us, steps, strict=True)):
-                self.f(x, u, dt, values["f"][i, k])
-                self.h(x, u, values["h"][i, k])
-                if jacobians:
-                    values["f_jacobian"][i, k] = self.f_jacobian(x, u, dt)
-                    values["h_jacobian"][i, k] = self.h_jacobian(x, u)
-        found = {name: value[0] for name, value in values.items()}
-        for name, (middle, other) in values.items():
-            spread = abs(other - middle)
-            found[f"spread_{name}"] = _WEIGHT * np.nan_to_num(spread, posinf=0.0)
+        found = {}
+        for name in _ALL if jacobians else _ALL[:2]:
+            middle, other = (
+                np.array([
+                    self.value(name, *one).copy() for one in zip(states, us, steps, strict=True)
+                ]).reshape(len(xs), *self._calls[name][1].shape)
+                for states in (xs, xs * self._nudge)
+            )
+            found[name] = middle
+            found[f"spread_{name}"] = _WEIGHT * np.nan_to_num(abs(other - middle), posinf=0.0)
         return found
 
 
@@ -245,9 +208,7 @@ def _residual_fault(
     return ""
 
 
-def estimator_fault(
-    interpreter: Interpreter, library: EstimatorLibrary, states: ConvexSet | None
-) -> str:
+def estimator_fault(interpreter: Interpreter, library: EstimatorLibrary) -> str:
     """Where a compiled estimator differs from the interpreter; empty where it does not.
 
     Short records are run through all of its functions. Costs, residuals and the candidate's
@@ -258,11 +219,10 @@ def estimator_fault(
     other["discount"] = 1.0 if given["discount"] < 1.0 else 0.95
     other["start_at_best"] = not given["start_at_best"]
     other["reinitialize"] = not given["reinitialize"]
-    for is_wild, settings in ((False, given), (True, other)):
-        fault = _Rehearsal(interpreter, library, settings, states, is_wild).fault()
-        if fault:
-            return fault
-    return ""
+    return (
+        _Rehearsal(interpreter, library, given, False).fault()
+        or _Rehearsal(interpreter, library, other, True).fault()
+    )
 
 
 class _Rehearsal:
@@ -274,119 +234,116 @@ class _Rehearsal:
 
     def __init__(
         self, interpreter: Interpreter, library: EstimatorLibrary, settings: NDArray[Any],
-        states: ConvexSet | None, is_wild: bool,
+        is_wild: bool,
     ) -> None:
-        model = interpreter.model
-        n, p = model.n, model.p
-        generator = np.random.default_rng(int(is_wild))
-        first, _, _, values = next(points(interpreter, states, int(is_wild)))
-        first, output = first[0], values["h"][0]
+        n, p = interpreter.model.n, interpreter.model.p
+        self._interpreter, self._library, self._settings = interpreter, library, settings
+        self._generator = np.random.default_rng(int(is_wild))
+        first, _, _, values = next(points(interpreter, None, int(is_wild)))
+        state, output = first[0], values["h"][0]
+        noise = settings["noise_weight"].reshape(p, p)
         if is_wild:
             for name in ("prior_weight", "disturbance_weight"):
-                small = 1e-2 * output @ settings["noise_weight"].reshape(p, p) @ output
-                share = small / (first @ settings[name].reshape(n, n) @ first)
-                if share > 0 and np.isfinite(share):
+                small = 1e-2 * output @ noise @ output
+                share = small / (state @ settings[name].reshape(n, n) @ state)
+                if 1e-100 < share < 1e100:
                     settings[name] *= share
-        self._interpreter, self._library, self._settings = interpreter, library, settings
         self._gain = settings["gain"].reshape(n, p)
-        self._prior = settings["prior_weight"].reshape(n, n)
-        self._disturbance = settings["disturbance_weight"].reshape(n, n)
-        noise = settings["noise_weight"].reshape(p, p)
+        self._cost = QuadraticCost(
+            prior=settings["prior_weight"].reshape(n, n),
+            disturbance=settings["disturbance_weight"].reshape(n, n), noise=noise,
+            discount=float(settings["discount"]),
+        )
+        self._own_noise = 2.0 * noise
+        self._start = state * (1 + 0.1 * self._generator.uniform(-1.0, 1.0, n))
         most = _SAMPLES if n <= _MANY_STATES else _FEW_SAMPLES
-        count = min(library.layout.horizon + _BY_RUN + _BY_MEMBERS, most)
-        self._start = _within(states, first * (1 + 0.1 * generator.uniform(-1.0, 1.0, n)))
-        x, scale, following = first, abs(first).max(), np.zeros(n)
+        self._make_record(state, min(library.layout.horizon + _BY_RUN + _BY_MEMBERS, most), is_wild)
+
+    def _make_record(self, first: Array, count: int, is_wild: bool) -> None:
+        """Measurements, inputs, steps and weights along noisy states that stay near the first."""
+        interpreter, model, generator = self._interpreter, self._interpreter.model, self._generator
+        n, p = model.n, model.p
+        x = first
         self._us = generator.uniform(0.2, 1.0, (count, model.m))
         self._steps = np.full(count, model.dt or 0.0)
-        self._ys, self._weights = np.zeros((count, p)), np.zeros((count, p, p))
+        self._ys, self._weights = np.zeros((count, p)), np.zeros((count, n + p, n + p))
         for t in range(count):
-            special = t >= _BY_RUN + _BY_MEMBERS and t % 6 == 0
+            y, special = self._ys[t], t >= _BY_RUN + _BY_MEMBERS and t % 6 == 0
             if special:
                 self._steps[t] *= 0.75
-            interpreter.h(x, self._us[t], self._ys[t])
-            self._ys[t] *= (
+            y[:] = interpreter.value("h", x, self._us[t], 0.0) * (
                 generator.uniform(-2.0, 2.0, p) if is_wild
                 else 1 + 0.1 * generator.standard_normal(p)
             )
-            self._ys[t, ~(abs(self._ys[t]) < LARGEST)] = np.nan
+            y[~(abs(y) < LARGEST)] = np.nan
             if t % 5 == 3:
-                self._ys[t, t % p] = np.nan
+                y[t % p] = np.nan
             if t % 11 == 7:
-                self._ys[t] = np.nan
-            self._weights[t] = _observed_weight(
-                2.0 * noise if special else noise, np.isfinite(self._ys[t])
-            )
-            interpreter.f(x, self._us[t], self._steps[t], following)
-            x = following * (1 + 0.05 * generator.standard_normal(n))
-            x = _within(states, x)
-            if not abs(x).max() <= 1e3 * scale:  # NaN, too
+                y[:] = np.nan
+            own = self._own_noise if special else None
+            self._weights[t] = self._cost.partial_weight(np.isfinite(y), own)
+            x = interpreter.value("f", x, self._us[t], self._steps[t])
+            x = x * (1 + 0.05 * generator.standard_normal(n))
+            if not abs(x).max() <= 1e3 * abs(first).max():  # NaN, too
                 x = first
-        self._own_noise = 2.0 * noise
 
     def fault(self) -> str:
         """What is wrong; empty if nothing is."""
-        library, n = self._library, self._interpreter.model.n
-        memory = library.estimators(self._start[None])
-        before = np.empty_like(memory)
-        workspace, out = library.workspace(), np.zeros(1, library.estimate_type)
+        library, usual = self._library, self._interpreter.model.dt or 0.0
+        memory, workspace = library.estimators(self._start[None]), library.workspace()
+        before, out = np.empty_like(memory), np.zeros(1, library.estimate_type)
         library.reset(memory.ctypes.data, self._settings.ctypes.data, self._start.ctypes.data)
-        ys, us = np.ascontiguousarray(self._ys), np.ascontiguousarray(self._us)
-        numbers, flags = np.zeros((3 * n + 2, _BY_RUN)), np.zeros((3, _BY_RUN), np.int32)
-        log = (ctypes.c_void_p * 8)(
-            *(numbers[i * n :].ctypes.data for i in range(3)),
-            *(numbers[3 * n + i :].ctypes.data for i in range(2)),
-            *(row.ctypes.data for row in flags),
+        count = min(_BY_RUN, len(self._ys))
+        log = library.log((count,))
+        library.run(
+            memory.ctypes.data, 1, workspace.ctypes.data, count, self._ys.ctypes.data,
+            self._us.ctypes.data if self._us.size else None, log.pointers(0),
         )
-        count = min(_BY_RUN, len(ys))
-        library.run(memory.ctypes.data, 1, workspace.ctypes.data, count, ys.ctypes.data,
-                    us.ctypes.data if us.size else None, log)
-        stages = self._window(memory[0])
+        record, last = memory[0], count - 1
+        stages = self._window(record)
         fault = self._step_fault(
-            count - 1, memory[0], np.vstack((stages["z"], memory[0]["z_end"])),
-            memory[0]["trajectory"][: len(stages) + 1],
-            numbers[3 * n, count - 1], numbers[3 * n + 1, count - 1], int(flags[0, count - 1]),
+            last, stages["z"][0], np.vstack((stages["z"], record["z_end"])),
+            record["trajectory"][: len(stages) + 1], log.costs[last], log.candidate_costs[last],
+            Status(int(log.flags[last])),
         )
-        for t in range(count, len(ys)):
+        for t in range(count, len(self._ys)):
             if fault:
                 return fault
-            y, u = ys[t : t + 1], us[t : t + 1]
             at = [
-                ctypes.c_void_p(one.ctypes.data) for one in (memory, before, workspace, y, u, out)
+                ctypes.c_void_p(one.ctypes.data)
+                for one in (memory, before, workspace, self._ys[t], self._us[t], out)
             ]
-            usual = self._steps[t] == (self._interpreter.model.dt or 0.0)
             if t < _BY_RUN + _BY_MEMBERS:
                 library.update_members(at[0], 1, *at[2:])
             else:
+                step = 0.0 if self._steps[t] == usual else self._steps[t]
                 weight = None if t % 6 else ctypes.c_void_p(self._own_noise.ctypes.data)
-                step = ctypes.c_double(0.0 if usual else self._steps[t])
-                library.update(*at[:5], step, weight, at[5])
+                library.update(*at[:5], ctypes.c_double(step), weight, at[5])
             if t > count + 4 and t % 3:
                 continue
             found = out[0]
             length = int(found["length"])
             fault = self._step_fault(
-                t, memory[0], found["candidate"][: length + 1],
+                t, self._window(record)["z"][0], found["candidate"][: length + 1],
                 found["trajectory"][: length + 1], found["cost"], found["candidate_cost"],
-                int(found["status"]), found["disturbances"][:length], found["noises"][:length],
+                Status(int(found["status"])),
+                np.hstack((found["disturbances"][:length], found["noises"][:length])),
             )
         return fault
 
     def _window(self, record: Any) -> Any:
-        length = int(record["length"])
-        return record["stages"][
-            (record["first"] + np.arange(length)) % self._library.layout.horizon
-        ]
+        at = record["first"] + np.arange(int(record["length"]))
+        return record["stages"][at % self._library.layout.horizon]
 
     def _step_fault(
-        self, t: int, record: Any, candidate: Array, trajectory: Array, cost: float,
-        candidate_cost: float, status: int, w: Array | None = None, v: Array | None = None,
+        self, t: int, prior: Array, candidate: Array, trajectory: Array, cost: float,
+        candidate_cost: float, status: Status, residuals: Array | None = None,
     ) -> str:
-        projected = bool(status & Status.CANDIDATE_OUTSIDE.value)
-        prior = self._window(record)["z"][0]
-        reference = self._judge(t, candidate, prior, not projected)
-        best = self._judge(t, trajectory, prior, False)
+        projected = Status.CANDIDATE_OUTSIDE in status
+        reference = self._judged(t, prior, candidate, not projected)
+        best = self._judged(t, prior, trajectory, False)
         judged = [("the estimate", cost, best)]
-        if not (projected and w is None):  # whole records do not say where it was projected to
+        if not (projected and residuals is None):  # whole records do not say where to
             judged.append(("the candidate", candidate_cost, reference))
         for name, told, one in judged:
             # NaN and infinity are the same: not a cost.
@@ -394,121 +351,90 @@ class _Rehearsal:
                 # C takes for infinite what has no finite square.
                 if np.isinf(told) and not one.has_squares:
                     continue
-                if not abs(told - one.cost) <= one.allowed:
+                if not abs(told - one.cost) <= one.allowed_cost:
                     return f"J of {name} is {told:.6g}, by CasADi's interpreter {one.cost:.6g}"
-            elif np.isfinite(told) and not (one is best and best.same(reference)):
+            elif np.isfinite(told) and not (one is best and (best.xs == reference.xs).all()):
                 return f"J of {name} is {told:.6g}, but CasADi's interpreter has no number"
         if np.isfinite(candidate_cost) and not cost <= candidate_cost:
             return f"J of the estimate, {cost:.6g}, is above the candidate's {candidate_cost:.6g}"
-        if not projected and reference.moved(candidate):
+        if not projected and reference.moved():
             return "the candidate does not follow f + K v of CasADi's interpreter"
         # The candidate's disturbances are L, which is known itself.
-        own = best if projected or status & Status.IMPROVED.value else reference
-        if w is not None and v is not None and own.has_squares and (
-            differs(w, own.w, own.allowed_w)
-            or differs(v[own.observed], own.v[own.observed], own.allowed_v[own.observed])
-        ):
-            return "the residuals differ from those of CasADi's interpreter"
+        own = best if projected or Status.IMPROVED in status else reference
+        if residuals is not None and own.has_squares:
+            seen = own.observed
+            if differs(residuals[seen], own.residuals[seen], own.allowed[seen]):
+                return "the residuals differ from those of CasADi's interpreter"
         if (
-            status & Status.MODEL_FAILED.value and not projected and reference.has_squares
+            Status.MODEL_FAILED in status and not projected and reference.has_squares
             and best.has_squares and self._is_sound(t, candidate, trajectory)
         ):
             return "it says that the model failed where CasADi's interpreter does not"
         return ""
 
-    def _is_sound(self, t: int, *trajectories: Array) -> bool:
-        for xs in trajectories:
-            window = slice(t + 2 - len(xs), t + 1)
-            found = self._interpreter.stages(
-                xs[:-1], self._us[window], self._steps[window], True
-            )
-            # As in C, by the sum of squares.
-            if not all(np.isfinite((one**2).sum()) for one in found.values()):
-                return False
-        return True
+    def _along(self, t: int, xs: Array, jacobians: bool) -> tuple[slice, dict[str, Array]]:
+        """The samples of a trajectory that ends at t + 1, and the model's values along it."""
+        at = slice(t + 2 - len(xs), t + 1)
+        return at, self._interpreter.stages(xs[:-1], self._us[at], self._steps[at], jacobians)
 
-    def _judge(self, t: int, xs: Array, prior: Array, is_candidate: bool) -> _Judged:
-        window = slice(t + 2 - len(xs), t + 1)
-        found = self._interpreter.stages(xs[:-1], self._us[window], self._steps[window], False)
+    def _is_sound(self, t: int, *trajectories: Array) -> bool:
+        """Whether all values and Jacobians have finite squares, as C asks."""
+        return all(
+            np.isfinite((one**2).sum())
+            for xs in trajectories for one in self._along(t, xs, True)[1].values()
+        )
+
+    def _judged(self, t: int, prior: Array, xs: Array, is_candidate: bool) -> _Judged:
+        at, found = self._along(t, xs, False)
         return _Judged(
-            xs, found, self._ys[window], self._weights[window], self._gain, self._disturbance,
-            self._prior, prior, float(self._settings["discount"]), is_candidate,
+            xs, found, self._ys[at], self._weights[at], self._gain, self._cost, xs[0] - prior,
+            is_candidate,
         )
 
 
 class _Judged:
-    """Residuals and J of a trajectory in NumPy, and how far rounding may move them."""
+    """Residuals and J of a trajectory, and how far rounding may move them."""
 
     def __init__(
         self, xs: Array, found: dict[str, Array], ys: Array, weights: Array, gain: Array,
-        disturbance: Array, prior_weight: Array, prior: Array, discount: float, is_candidate: bool,
+        cost: QuadraticCost, offset: Array, is_candidate: bool,
     ) -> None:
-        self.xs, self._f, self.observed = xs, found["f"], np.isfinite(ys)
-        count = len(ys)
-        self._allowed_f = ROUNDING * (abs(xs[1:]) + abs(self._f)) + found["spread_f"]
-        self.v = ys - found["h"]
-        self.allowed_v = ROUNDING * (abs(ys) + abs(found["h"])) + found["spread_h"]
-        self.w, self.allowed_w = xs[1:] - self._f, self._allowed_f
-        v, allowed_v = self.v.copy(), self.allowed_v.copy()
-        v[~self.observed] = allowed_v[~self.observed] = 0.0
-        self._correction = v @ gain.T
-        self._allowed_correction = (allowed_v + ROUNDING * abs(v)) @ abs(gain).T
+        n, count, f, h = xs.shape[1], len(ys), found["f"], found["h"]
+        self.xs, observed = xs, np.isfinite(ys)
+        self.observed = np.hstack((np.ones_like(f, np.bool_), observed))
+        self.residuals = np.hstack((xs[1:] - f, ys - h))
+        sizes = np.hstack((abs(xs[1:]) + abs(f), abs(ys) + abs(h)))
+        self.allowed = ROUNDING * sizes + np.hstack((found["spread_f"], found["spread_h"]))
+        v, allowed_v = (
+            np.where(observed, one[:, n:], 0.0) for one in (self.residuals, self.allowed)
+        )
+        correction = v @ gain.T
+        self._following = f + correction
+        allowed_correction = (allowed_v + ROUNDING * abs(v)) @ abs(gain).T
+        self._allowed_following = self.allowed[:, :n] + allowed_correction
         if is_candidate:
-            self.w, self.allowed_w = self._correction, self._allowed_correction
-        else:  # an output that is not finite fails the model, measured or not
-            v[~np.isfinite(found["h"])] = np.nan
-        age = discount ** np.arange(count - 1, -1, -1.0)
-        self.cost = self.allowed = 0.0
-        squares = (self._f**2).sum(axis=1)
-        for rows, allowed, factors, weight in (
-            ((xs[0] - prior)[None], np.zeros((1, len(prior))), np.array([discount**count]),
-             prior_weight[None]),
-            (self.w, self.allowed_w, age, disturbance[None]),
-            (v, allowed_v, age, weights),
-        ):
-            heavy = abs(weight)
-            weighted = np.matmul(weight, rows[:, :, None])[:, :, 0]
-            each = (rows * weighted).sum(axis=1)
-            squares = squares + each
-            self.cost += float(factors @ each)
-            # |(r + d)' W (r + d) - r' W r| for |d| <= allowed, and the sums' own rounding.
-            most = abs(rows) + allowed
-            spread = np.matmul(heavy, allowed[:, :, None])[:, :, 0]
-            whole = np.matmul(heavy, most[:, :, None])[:, :, 0]
-            self.allowed += float(factors @ (
-                2 * abs(weighted) * allowed + allowed * spread + ROUNDING * most * whole
-            ).sum(axis=1))
-        # A stage without these fails in C, and the candidate goes on elsewhere.
-        following = self._f + self._correction
-        self._has_squares = np.isfinite(squares + (following**2).sum(axis=1))
-        self.has_squares = bool(self._has_squares.all())
-        if is_candidate and not np.isfinite(self._f).all():
+            self.residuals[:, :n], self.allowed[:, :n] = correction, allowed_correction
+        # Of a trial, an output that is not finite fails the model, measured or not.
+        known = observed if is_candidate else observed | ~np.isfinite(h)
+        r = np.hstack((self.residuals[:, :n], np.where(known, self.residuals[:, n:], 0.0)))
+        allowed = np.hstack((self.allowed[:, :n], allowed_v))
+        age = cost.discount ** np.arange(count, -1, -1.0)
+        stages, prior = cost.stage_costs(r, weights), cost.prior_cost(offset, cost.least_prior)
+        self.cost = float(age[1:] @ stages + age[0] * prior)
+        # |(r + d)' W (r + d) - r' W r| for |d| <= allowed, and the sums' own rounding.
+        heavy = abs(weights)
+        least, most = (cost.stage_costs(abs(r) + d, heavy) for d in (0.0, allowed))
+        rounding = cost.prior_cost(abs(offset), abs(cost.least_prior))
+        self.allowed_cost = float(
+            age[1:] @ (most - least + ROUNDING * most) + age[0] * ROUNDING * rounding
+        )
+        if is_candidate and not np.isfinite(f).all():
             self.cost = np.inf
+        # A stage without finite squares fails in C, and the candidate goes on elsewhere.
+        self._has_squares = np.isfinite(stages + (f**2 + self._following**2).sum(axis=1))
+        self.has_squares = bool(self._has_squares.all() and np.isfinite(prior))
 
-    def same(self, other: _Judged) -> bool:
-        """Whether this is the other's trajectory."""
-        return bool((self.xs == other.xs).all())
-
-    def moved(self, candidate: Array) -> bool:
+    def moved(self) -> bool:
         """Whether states do not follow f + K v where these are finite."""
-        following = self._f + self._correction
-        finite = self._has_squares
-        allowed = self._allowed_f + self._allowed_correction
-        return bool((abs(candidate[1:] - following)[finite] > allowed[finite]).any())
-
-
-def _within(states: ConvexSet | None, x: Array) -> Array:
-    return x if states is None else np.clip(x, states.lower, states.upper)
-
-
-def _observed_weight(weight: Array, observed: NDArray[np.bool_]) -> Array:
-    """The inverse of the covariance's block of what was observed, zero elsewhere."""
-    full = np.zeros_like(weight)
-    if observed.any():
-        inside = np.ix_(observed, observed)
-        missing = ~observed
-        full[inside] = weight[inside]
-        if missing.any():
-            across = weight[np.ix_(observed, missing)]
-            full[inside] -= across @ np.linalg.solve(weight[np.ix_(missing, missing)], across.T)
-    return full
+        missed = abs(self.xs[1:] - self._following) > self._allowed_following
+        return bool(missed[self._has_squares].any())

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
-from contextlib import suppress
 from time import perf_counter
 from typing import Any
 
@@ -19,7 +17,6 @@ from ..estimation.estimate import Estimate
 from ..estimation.run import Run
 from ..estimation.settings import Settings
 from ..estimation.snapshot import (
-    SET_NAMES,
     check_description,
     checked_array,
     described,
@@ -30,32 +27,15 @@ from ..estimation.snapshot import (
 from ..model.system import System
 from ..observers import Observer
 from .estimate import CompiledEstimate
+from .layout import SET_NAMES
 from .library import EstimatorLibrary
 
-__all__ = ["CompiledEngine", "RunLog"]
+__all__ = ["CompiledEngine"]
 
 Array = NDArray[np.float64]
 
 # So that a long record can be interrupted, and its times are means of pieces.
 _PIECE = 256
-
-
-class RunLog:
-    """Arrays for what `mhe_run` writes, and the structure that points to them."""
-
-    def __init__(self, shape: tuple[int, ...], n: int) -> None:
-        self.states, self.filtered, self.delayed = (np.empty((*shape, n)) for _ in range(3))
-        self.costs, self.candidate_costs = np.empty(shape), np.empty(shape)
-        self.flags, self.qps, self.iterations = (np.empty(shape, np.int32) for _ in range(3))
-
-    def pointers(self, first: int) -> Any:
-        """The C structure of pointers to the entries from an index on."""
-        arrays = (
-            self.states, self.filtered, self.delayed, self.costs, self.candidate_costs,
-            self.flags, self.qps, self.iterations,
-        )
-        addresses = [array.ctypes.data + first * array.strides[0] for array in arrays]
-        return (ctypes.c_void_p * len(addresses))(*addresses)
 
 
 class CompiledEngine:
@@ -172,8 +152,8 @@ class CompiledEngine:
 
     def run(self, ys: Array, us: Array | None) -> Run:
         """Take a whole record in without leaving C; times are means over some samples."""
-        samples, n = len(ys), self._sizes[0]
-        log, start = RunLog((samples,), n), self.state
+        samples = len(ys)
+        log, start = self._library.log((samples,)), self.state
         times = np.empty(samples)
         ys = np.ascontiguousarray(ys)
         us = None if us is None else np.ascontiguousarray(us)
@@ -248,138 +228,102 @@ class CompiledEngine:
             memory = memory.view(self._memory.dtype)
             if not isinstance(linearized, bool):
                 raise TypeError(f"linearized is {linearized!r}")
+            memory["settings"] = self._library.settings.ctypes.data
             with np.errstate(all="ignore"):
-                self._check(memory[0], linearized)
-        memory["settings"] = self._library.settings.ctypes.data
+                self._check(memory, linearized)
         self._replace(memory)
 
-    def _check(self, record: Any, linearized: bool) -> None:
+    def _check(self, memory: NDArray[Any], linearized: bool) -> None:
         """Refuse a window that is impossible, or whose stages the model does not reproduce."""
-        horizon, system, settings = self._sizes[2], self._system, self._library.settings
-        time, length = int(record["time"]), int(record["length"])
-        sets = sum(1 << k for k, name in enumerate(SET_NAMES) if getattr(system, name))
+        record, n, horizon = memory[0], self._sizes[0], self._sizes[2]
+        time, length, first = (int(record[name]) for name in ("time", "length", "first"))
+        sets = sum(1 << k for k, name in enumerate(SET_NAMES) if getattr(self._system, name))
         if not (
-            0 <= record["first"] < (horizon if length == horizon else 1)
+            0 <= first < (horizon if length == horizon else 1)
             and 0 <= length == min(horizon, time)
             and record["newest"] == time % (horizon + 1)
             and record["has_trajectory"] == (time > 0)
             and record["dropped"] & ~sets == 0
         ):
             raise ValueError("its window is impossible")
-        places = (int(record["first"]) + np.arange(length)) % horizon
-        stages = record["stages"]
-        z = np.vstack((stages["z"][places], record["z_end"]))
         trajectory, history = record["trajectory"][: length + 1], record["history"][: time + 1]
+        places = (first + np.arange(length)) % horizon
+        z = np.vstack((record["stages"]["z"][places], record["z_end"]))
         if not all(np.isfinite(x).all() for x in (z, trajectory, history, record["last_good"])):
             raise ValueError("a state is not finite")
         if time and not np.array_equal(trajectory[-1], history[record["newest"]]):
             raise ValueError("history does not end where the trajectory does")
+        for stage in record["stages"][places]:
+            self._check_flags(stage)
+        again, reached = memory.copy(), np.zeros((horizon, n))
+        self._library.recompute(again.ctypes.data, reached.ctypes.data)
         sizes, wanted = np.abs(z).max(axis=0), self._settings.qp_limit > 0
         for k, place in enumerate(places):
-            stage = stages[place]
-            if not stage["is_irregular"] and stage["step"] != settings["sample_time"]:
-                raise ValueError("a step's length is impossible")
-            self._check_weight(stage)
-            a, c = self._check_stage(stage, z[k + 1], sizes)
-            terms = _terms(self._cost, stage, a, c)
-            if linearized == wanted:
-                if wanted:
-                    self._check_terms(stage, terms, sizes)
+            stage, fresh = record["stages"][place], again[0]["stages"][place]
+            self._check_stage(stage, fresh, z[k + 1], reached[k], sizes)
+            if linearized == wanted and wanted:
+                self._check_terms(stage, fresh, sizes)
             else:
-                for name, value in terms.items():
-                    stage["terms"][name] = value
+                stage["terms"] = fresh["terms"]
 
-    def _check_weight(self, stage: Any) -> None:
+    def _check_flags(self, stage: Any) -> None:
+        """Refuse a stage whose sample is impossible."""
         flags = [int(stage[name]) for name in ("has_own_noise", "is_irregular", "is_complete")]
-        observed = stage["is_observed"]
+        observed, step, p = stage["is_observed"], stage["step"], self._sizes[1]
         if not (
             np.isin([*flags, *observed], (0, 1)).all() and flags[2] == observed.all()
-            and np.isfinite(stage["y"]).all() and stage["cost"] >= 0.0
+            and np.isfinite(stage["y"]).all()
         ):
             raise ValueError("a stage is impossible")
-        if flags[1] and not (0.0 < stage["step"] < np.inf and self._system.dt):
+        if not (
+            0.0 < step < np.inf and self._system.dt if flags[1]
+            else step == self._library.settings["sample_time"]
+        ):
             raise ValueError("a step's length is impossible")
-        p, weight = self._sizes[1], self._cost.noise
         if flags[0]:
-            weight = positive_definite("noise_weight", stage["own_noise_weight"].reshape(p, p))
-        if not flags[2]:
-            weight = self._cost.partial_weight(observed != 0, weight)[-p:, -p:]
-        if not near(stage["noise_weight"].reshape(p, p), weight, np.abs(weight).max()):
-            raise mismatch("weight of the stages' cost")
+            positive_definite("noise_weight", stage["own_noise_weight"].reshape(p, p))
 
-    def _check_stage(self, stage: Any, following: Array, sizes: Array) -> tuple[Array, Array]:
-        """Compare a stage with what the model makes of it; its Jacobians."""
-        n, p, _ = self._sizes
-        m, system = self._system.m, self._system
-        x, u, seen = stage["z"], stage["u"][:m], stage["is_observed"] != 0
-        if stage["is_irregular"]:
-            system, u = system.timed, np.append(u, stage["step"])
-        values = [np.full(size, np.nan) for size in (n, p, (n, n), (p, n))]
-        functions: tuple[Callable[..., Any], ...] = (
-            system.f, system.h, system.f_jacobian, system.h_jacobian
-        )
-        for value, function in zip(values, functions, strict=True):
-            with suppress(Exception):  # outside of the model's domain: NaN, as in C
-                value[...] = function(x, u)
-        ahead, output, a, c = values
-        error = np.where(seen, stage["y"] - output, 0.0)
-        correction = self._library.settings["gain"].reshape(n, p).dot(error)
-        reached, weights = ahead + correction, (self._cost.disturbance, stage["noise_weight"])
-        weights = weights[0], weights[1].reshape(p, p)
-        cost = sum(r.dot(w).dot(r) for r, w in zip((correction, error), weights, strict=True))
-        size = sum(
-            np.abs(r).dot(np.abs(w)).dot(np.abs(r))
-            for r, w in zip((correction, error), weights, strict=True)
-        )
-        held = not np.isfinite(stage["cost"])
-        if held != (not np.isfinite([reached.dot(reached), cost]).all()):
+    def _check_stage(
+        self, stage: Any, fresh: Any, following: Array, reached: Array, sizes: Array
+    ) -> None:
+        """Compare a stage with what the model makes of it now."""
+        weight = fresh["noise_weight"]
+        if not near(stage["noise_weight"], weight, np.abs(weight).max()):
+            raise mismatch("weight of the stages' cost")
+        if np.isfinite(stage["cost"]) != np.isfinite(fresh["cost"]):
             raise mismatch("model")
-        if held:
-            if stage["w"].any() or stage["v"].any():
-                raise ValueError("a failed stage has residuals")
-            return np.eye(n), np.zeros((p, n))
+        w, v = stage["w"], stage["v"]
+        sizes = np.maximum(sizes, np.abs(fresh["w"]))
         # Residuals that cancel are rounded as their terms are.
-        error_size = np.abs(stage["y"]) + np.abs(error)
-        sizes = np.maximum(sizes, np.abs(correction))
-        if not near(stage["v"], error, error_size):
+        if not near(v, fresh["v"], np.abs(stage["y"]) + np.abs(fresh["v"])):
             raise mismatch("model (h)")
-        if not near(stage["w"], correction, sizes):
+        if not near(w, fresh["w"], sizes):
             raise mismatch("observer")
+        if not np.isfinite(stage["cost"]):
+            return  # the observer may have been restarted behind it
         if not near(following, reached, sizes):
             raise mismatch("model (f)")
-        w, v = stage["w"], stage["v"]
-        kept = w.dot(weights[0]).dot(w) + v.dot(weights[1]).dot(v)
-        if not near(stage["cost"], kept, size):
+        r, joint = np.append(w, v), self._cost.joint_weight(stage["noise_weight"])
+        size = np.abs(r) @ np.abs(joint) @ np.abs(r)
+        if not near(stage["cost"], r @ joint @ r, size):
             raise mismatch("cost")
-        finite = np.isfinite(a).all() and np.isfinite(c).all()
-        return (a, c) if finite else (np.eye(n), np.zeros((p, n)))
 
-    def _check_terms(self, stage: Any, terms: dict[str, Array], sizes: Array) -> None:
-        found = stage["terms"]
+    def _check_terms(self, stage: Any, fresh: Any, sizes: Array) -> None:
+        """Compare Jacobians and terms with what the model makes of them now."""
+        n, found, expected = self._sizes[0], stage["terms"], fresh["terms"]
         for name in ("f_jacobian", "h_jacobian"):
-            steepest = np.abs(terms[name]).max(axis=1, keepdims=True)
-            if not near(found[name].reshape(terms[name].shape), terms[name], steepest):
+            if not near(found[name], expected[name], np.abs(expected[name]).max(1, keepdims=True)):
                 raise mismatch("model (its Jacobians)")
-        a, c = (found[name].reshape(terms[name].shape) for name in ("f_jacobian", "h_jacobian"))
-        exact = _terms(self._cost, stage, a, c)
-        bound = _terms(self._cost, stage, a, c, np.abs)
-        for name in ("hessian", "coupling", "own", "following"):
-            if not near(found[name], exact[name], np.abs(bound[name])):
+        sizes = np.append(np.maximum(sizes, np.abs(stage["w"])), np.abs(stage["y"]))
+        sizes[n:] += np.abs(stage["v"])
+        weight = np.abs(self._cost.joint_weight(stage["noise_weight"]))
+        slopes = np.abs(np.vstack((expected["f_jacobian"], expected["h_jacobian"])))
+        bounds = {
+            "hessian": slopes.T @ weight @ slopes, "coupling": slopes.T @ weight[:, :n],
+            "own": slopes.T @ weight @ sizes, "following": weight[:n] @ sizes,
+        }
+        for name, bound in bounds.items():
+            if not near(found[name], expected[name], bound):
                 raise mismatch("weight of the stages' cost")
 
-
-def _terms(
-    cost: Cost, stage: Any, a: Array, c: Array, turned: Callable[[Array], Array] = np.asarray
-) -> dict[str, Array]:
-    """Jacobians and terms of a stage as C keeps them (`mhe_terms`), or bounds on them."""
-    p, n = c.shape
-    q, r = turned(cost.disturbance), turned(stage["noise_weight"].reshape(p, p))
-    w, v, aa, cc = (turned(one) for one in (stage["w"], stage["v"], a, c))
-    hessian = aa.T @ q @ aa + cc.T @ r @ cc
-    # C fills a row from the register on that its diagonal is in.
-    hessian[np.arange(n)[None] < (np.arange(n) & ~3)[:, None]] = 0.0
-    return {
-        "f_jacobian": a, "h_jacobian": c, "hessian": hessian, "coupling": -(aa.T @ q),
-        "own": -(aa.T @ q @ w + cc.T @ r @ v), "following": q @ w,
-    }
 

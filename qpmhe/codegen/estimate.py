@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.estimate import DroppedRow, Estimate, Status
-from .layout import SET_NAMES
 
-__all__ = ["CompiledEstimate", "dropped_names"]
+__all__ = ["CompiledEstimate"]
 
 Array = NDArray[np.float64]
 

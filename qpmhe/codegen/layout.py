@@ -19,7 +19,7 @@ from ..observers import Observer
 
 __all__ = ["SET_NAMES", "Layout", "settings_record"]
 
-SET_NAMES = ("states", "disturbances", "noises")
+SET_NAMES = ("disturbances", "noises")
 
 _MOST = int(np.iinfo(np.int32).max)
 _POLICIES = ("drop", "project", "keep")
@@ -42,7 +42,7 @@ class Layout:
         """The sizes of an estimator of a system."""
         sets = tuple(
             (one is not None, 0 if one is None else one.matrix.shape[0])
-            for one in (system.states, system.disturbances, system.noises)
+            for one in (system.disturbances, system.noises)
         )
         return cls(system.n, system.p, system.m, horizon, sets, continuous, real)
 
@@ -59,7 +59,7 @@ class Layout:
             "continuous": self.continuous, "real": self.real,
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
-        for letter, (there, rows) in zip("xwv", self.sets, strict=True):
+        for letter, (there, rows) in zip("wv", self.sets, strict=True):
             values[f"{letter}_set"] = int(there)
             values[f"{letter}_rows"] = rows
         return values
@@ -72,7 +72,7 @@ class Layout:
             ("noise_weight", r, p * p), ("discount", r), ("sample_time", r), ("tolerance", r),
             ("solver_tolerance", r),
         ]
-        for name, size, (_, rows) in zip(SET_NAMES, (n, n, p), self.sets, strict=True):
+        for name, size, (_, rows) in zip(SET_NAMES, (n, p), self.sets, strict=True):
             space = max(rows, 1)
             fields.append((name, _struct([
                 ("lower", r, size), ("upper", r, size), ("rows", r, space * size),
@@ -135,13 +135,12 @@ def _filled(
     layout: Layout, system: System, observer: Observer, cost: Cost, settings: Settings
 ) -> NDArray[Any]:
     record = np.zeros((), layout.settings_type())
-    gain = observer.constant_gain
+    gain, form = observer.constant_gain, cost.c_form
     assert gain is not None
-    record["gain"] = gain.ravel()
-    record["prior_weight"] = np.asarray(cost.prior).ravel()
-    record["disturbance_weight"] = cost.disturbance.ravel()
-    record["noise_weight"] = cost.noise.ravel()
-    record["discount"] = cost.discount
+    assert form is not None
+    record["gain"], record["discount"] = gain.ravel(), form.discount
+    for name in ("prior", "disturbance", "noise"):
+        record[f"{name}_weight"] = getattr(form, name).ravel()
     record["sample_time"] = system.dt or 0.0
     single = layout.real == "float"
     # Single precision distinguishes less.

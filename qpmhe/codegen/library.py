@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from ..costs import Cost, QuadraticCost
+from ..costs import Cost
 from ..errors import CompilationError, OptionError
 from ..estimation.limits import FEASIBLE
 from ..estimation.settings import Settings
@@ -21,7 +21,7 @@ from .compiler import compiled_library
 from .layout import SET_NAMES, Layout, settings_record
 from .source import CONTINUOUS, estimator_files
 
-__all__ = ["EstimatorLibrary", "generated", "uncovered"]
+__all__ = ["EstimatorLibrary", "RunLog", "generated", "uncovered"]
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
 _MOST_BYTES = 2**31 - 1
@@ -31,15 +31,20 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     """Why an estimator has no C form, with the remedy; empty if it has one."""
     if system.symbolic is None:
         return "the system has no CasADi form; make it with qpmhe.from_casadi."
+    if system.states is not None:
+        return (
+            "engine='compiled' does not yet project the observer onto X; take engine='python', or "
+            "leave states out."
+        )
     if observer.constant_gain is None:
         return (
             f"{type(observer).__name__} has no C form; take an observer with constant gain "
             "(Luenberger, SteadyStateKalman, HighGain)."
         )
-    if type(cost) is not QuadraticCost:
+    if cost.c_form is None:
+        if cost.quadratic and cost.observer_prior is not None:
+            return "a prior weight from the observer has no C form; take a constant one."
         return f"{type(cost).__name__} has no C form; take a QuadraticCost."
-    if cost.observer_prior is not None:
-        return "a prior weight from the observer has no C form; take a constant one."
     for name in SET_NAMES:
         if getattr(system, name) is not None:
             return (
@@ -117,12 +122,30 @@ def generated(
     return files, structure, layout, record
 
 
+class RunLog:
+    """Arrays for what `mhe_run` writes, and the structure that points to them."""
+
+    def __init__(self, shape: tuple[int, ...], n: int) -> None:
+        self.states, self.filtered, self.delayed = (np.empty((*shape, n)) for _ in range(3))
+        self.costs, self.candidate_costs = np.empty(shape), np.empty(shape)
+        self.flags, self.qps, self.iterations = (np.empty(shape, np.int32) for _ in range(3))
+
+    def pointers(self, first: int) -> Any:
+        """The C structure of pointers to the entries from an index on."""
+        arrays = (
+            self.states, self.filtered, self.delayed, self.costs, self.candidate_costs,
+            self.flags, self.qps, self.iterations,
+        )
+        addresses = [array.ctypes.data + first * array.strides[0] for array in arrays]
+        return (ctypes.c_void_p * len(addresses))(*addresses)
+
+
 class EstimatorLibrary:
     """Functions and structures of one compiled estimator.
 
     ``settings``, the ``mhe_settings`` in use, must outlive all estimators that point to it.
-    ``update``, ``update_members``, ``amend``, ``reset`` and ``run`` are the C functions of these
-    names; `update` is ``mhe_update_undoable``.
+    ``update``, ``update_members``, ``amend``, ``reset``, ``run`` and ``recompute`` are the C
+    functions of these names; `update` is ``mhe_update_undoable``.
     """
 
     def __init__(
@@ -132,14 +155,14 @@ class EstimatorLibrary:
         self.layout, self.settings = layout, record
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         assert system.symbolic is not None
-        model, states = system.symbolic, system.states
+        model = system.symbolic
         made: list[Interpreter] = []  # only where there is something to check
 
         @np.errstate(all="ignore")
         def fault(library: ctypes.CDLL) -> str:
             self._bind(library)
             made[:] = made or [Interpreter(model)]
-            return estimator_fault(made[0], self, states)
+            return estimator_fault(made[0], self)
 
         self._bind(compiled_library(files, "mhe.c", structure, fault))
 
@@ -150,13 +173,15 @@ class EstimatorLibrary:
         pointer, integer = ctypes.c_void_p, ctypes.c_int64
         self.update = quick.mhe_update_undoable
         self.amend, self.reset, self.run = quick.mhe_amend, quick.mhe_reset, library.mhe_run
+        self.recompute = quick.mhe_recompute
         self.update_members = library.mhe_update_members
         for function in (
-            self.update, self.reset, self.run, self.update_members
+            self.update, self.reset, self.run, self.update_members, self.recompute
         ):
             function.restype = None
         self.amend.argtypes = [pointer, pointer, integer, pointer, pointer]
         self.reset.argtypes = [pointer, pointer, pointer]
+        self.recompute.argtypes = [pointer, pointer]
         self.update_members.argtypes = [pointer, integer, pointer, pointer, pointer, pointer]
         self.run.argtypes = [pointer, integer, pointer, integer, pointer, pointer, pointer]
 
@@ -189,3 +214,7 @@ class EstimatorLibrary:
         for i, state in enumerate(np.ascontiguousarray(states)):
             self.reset(base + i * size, self.settings.ctypes.data, state.ctypes.data)
         return memory
+
+    def log(self, shape: tuple[int, ...]) -> RunLog:
+        """Where `run` is to write of so many samples."""
+        return RunLog(shape, self.layout.nx)

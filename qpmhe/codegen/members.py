@@ -16,7 +16,6 @@ from ..costs import Cost
 from ..estimation.settings import Settings
 from ..model.system import System
 from ..observers import Observer
-from .engine import RunLog
 from .library import EstimatorLibrary
 
 __all__ = ["CompiledMembers"]
@@ -35,7 +34,7 @@ class CompiledMembers:
         threads: int | None,
     ) -> None:
         self._library = library = EstimatorLibrary(system, observer, cost, settings)
-        self._m, self._n = system.m, system.n
+        self._m = system.m
         count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         wanted = min(threads or count or 1, max(1, len(states) // _LEAST))
         ends = np.linspace(0, len(states), wanted + 1).astype(int).tolist()
@@ -96,7 +95,7 @@ class CompiledMembers:
         """Take records (K, T, p) and (K, T, m) in without leaving C."""
         ys, us, start = np.ascontiguousarray(y), np.ascontiguousarray(u), self.states
         samples = ys.shape[1]
-        log = RunLog(ys.shape[:2], self._n)
+        log = self._library.log(ys.shape[:2])
 
         def work(part: slice, workspace: NDArray[np.uint8]) -> None:
             self._library.run(

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .._checks import Array
 from ..errors import OptionError
 
-__all__ = ["Cost", "CostConstants", "ObserverPrior", "quadratic_form"]
+__all__ = ["Cost", "CostConstants", "CostForm", "ObserverPrior", "quadratic_form"]
 
 Mask = NDArray[np.bool_]
 
@@ -40,6 +40,23 @@ class CostConstants:
     prior: tuple[float, float]
     disturbance: tuple[float, float]
     noise: tuple[float, float]
+
+
+class CostForm(NamedTuple):
+    """The matrices and the factor by which the step in C computes a cost.
+
+    Parameters
+    ----------
+    prior, disturbance, noise : array
+        Weights of the initial error (n, n), of w (n, n) and of v (p, p).
+    discount : float
+        gamma.
+    """
+
+    prior: Array
+    disturbance: Array
+    noise: Array
+    discount: float
 
 
 class ObserverPrior:
@@ -120,6 +137,17 @@ class Cost(ABC):
     def observer_prior(self) -> ObserverPrior | None:
         """The rule by which the observer's covariance gives the prior weight, if there is one."""
         return self.prior if isinstance(self.prior, ObserverPrior) else None
+
+    @property
+    def least_prior(self) -> Array:
+        """The prior weight (n, n); the least one where the observer's covariance gives it."""
+        rule = self.prior
+        return rule.minimum * np.eye(self.n) if isinstance(rule, ObserverPrior) else rule
+
+    @property
+    def c_form(self) -> CostForm | None:
+        """What the step in C needs of the cost; None for a cost that it cannot compute."""
+        return None
 
     @property
     @abstractmethod

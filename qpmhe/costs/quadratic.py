@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import Array, positive_definite
-from .base import Cost, CostConstants, ObserverPrior, quadratic_form
+from .base import Cost, CostConstants, CostForm, ObserverPrior, quadratic_form
 
 __all__ = ["QuadraticCost"]
 
@@ -72,6 +72,13 @@ class QuadraticCost(Cost):
             noise=_inverse("noise covariance", noise),
             discount=discount,
         )
+
+    @property
+    def c_form(self) -> CostForm | None:
+        """The weights, unless the prior's varies or a derived class computes another cost."""
+        if isinstance(self.prior, ObserverPrior) or type(self) is not QuadraticCost:
+            return None
+        return CostForm(self.prior, self.disturbance, self.noise, self.discount)
 
     @property
     def constants(self) -> CostConstants | None:

@@ -83,8 +83,7 @@ class Rows:
         return np.asarray(np.maximum(missed, 0.0) / self.scale)
 
     def without(self, left_out: Mask, points: Array | None = None) -> Rows:
-        """The rows without some at some stages (K, r): without both sides, or those that points miss.
-        """
+        """The rows without some at some stages (K, r): both sides, or those that points miss."""
         other = self._copy()
         lower, upper = left_out, left_out
         if points is not None:
@@ -122,18 +121,15 @@ class Constraints:
     __slots__ = ("constant", "disturbances", "noise_free", "noises", "states")
 
     def __init__(self, system: System, cost: Cost, prior_covariance: Array) -> None:
-        found = [
-            convex_set and Rows(name, convex_set, covariance)
-            for name, convex_set, covariance in (
-                ("states", system.states, prior_covariance),
-                ("disturbances", system.disturbances, inverse(cost.disturbance)),
-                ("noises", system.noises, inverse(cost.noise)),
-            )
-        ]
-        self.states, self.disturbances, self.noises = found
-        fixed = system.disturbances.fixed_components if system.disturbances else np.empty(0, int)
-        self.noise_free: NDArray[np.intp] = fixed
-        self.constant: Array = system.disturbances.lower[fixed] if system.disturbances else fixed
+        self.states = _rows("states", system.states, prior_covariance)
+        self.disturbances = _rows("disturbances", system.disturbances, inverse(cost.disturbance))
+        self.noises = _rows("noises", system.noises, inverse(cost.noise))
+        disturbances = system.disturbances
+        self.noise_free: NDArray[np.intp] = np.empty(0, np.intp)
+        self.constant: Array = np.empty(0)
+        if disturbances is not None:
+            self.noise_free = disturbances.fixed_components
+            self.constant = disturbances.lower[self.noise_free]
 
     def __bool__(self) -> bool:
         return any((self.states, self.disturbances, self.noises))
@@ -192,7 +188,9 @@ class Constraints:
             )
             below = rows.values(points) < rows.lower
             found += [
-                DroppedRow(rows.name, int(names[r]), "lower" if below[k, r] else "upper", first + int(k))
+                DroppedRow(
+                    rows.name, int(names[r]), "lower" if below[k, r] else "upper", first + int(k)
+                )
                 for k, r in np.argwhere(misses > FEASIBLE)
             ]
         return tuple(found)
@@ -209,3 +207,6 @@ class Constraints:
             setattr(other, name, rows.get(name, getattr(self, name)))
         return other
 
+
+def _rows(name: str, convex_set: ConvexSet | None, covariance: Array) -> Rows | None:
+    return None if convex_set is None else Rows(name, convex_set, covariance)

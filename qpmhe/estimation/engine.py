@@ -341,7 +341,10 @@ class PythonEngine:
                 raise ValueError("history does not end where the trajectory does")
         same_terms = with_terms == self._with_terms
         recomputed.check_stages(loaded, same_terms)
-        far, dropped = (check_size("watched", k, lambda c: 0 <= c <= loaded.time) for k in state["watched"])
+        far, dropped = (
+            check_size("watched", found, lambda count: 0 <= count <= loaded.time)
+            for found in state["watched"]
+        )
         return loaded if same_terms else recomputed, trajectory, (far, dropped), history
 
     def _checked_modes(

@@ -14,8 +14,8 @@ from qpmhe_solvers import Solver
 from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import positive, positive_definite, record, vector
-from ..costs import Cost
 from .._linalg import inverse
+from ..costs import Cost
 from ..errors import InvalidInputError, ModelError, ObserverWarning, OptionError, ShapeError
 from ..model.system import System
 from ..observers import Observer
@@ -143,7 +143,8 @@ class MovingHorizonEstimator:
     ) -> None:
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
-            engine, project_observer, infeasible, warm_start, candidate, time_budget, delay, isolated,
+            engine, project_observer, infeasible, warm_start, candidate, time_budget, delay,
+            isolated,
         )
         self.system, self.observer, self.cost = system, observer, cost
         _require(system, System, "system", "qpmhe.System")

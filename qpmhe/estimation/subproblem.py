@@ -38,7 +38,9 @@ class Subproblem:
     There is one QP, of the present window length; each use overwrites it.
     """
 
-    def __init__(self, system: System, cost: Cost, constraints: Constraints, horizon: int) -> None:
+    def __init__(
+        self, system: System, cost: Cost, constraints: Constraints, horizon: int
+    ) -> None:
         n, p = system.n, system.p
         self._n, self._p = n, p
         self._terms = StageTerms(horizon, n, p)
@@ -68,7 +70,7 @@ class Subproblem:
         """
         if trial.trajectory is problem.candidate.trajectory:
             span = problem.span
-            if self._scaled is not None:
+            if self._scaled is not None and problem.discounts is not None:
                 count = len(span.panel)
                 self._scaled.copy_scaled(span, problem.discounts[1:])
                 span = Span(self._scaled, 0, count)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .._checks import Array, positive_definite
+from .._linalg import inverse
 from ..errors import ShapeError
 from ..model.system import System
 
@@ -129,4 +130,4 @@ class KalmanType(Observer):
         """The covariance of this sample's noise."""
         if sample.noise_weight is None:
             return self._noise
-        return np.asarray(np.linalg.inv(sample.noise_weight), np.float64)
+        return inverse(sample.noise_weight)

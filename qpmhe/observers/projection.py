@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._checks import Array
 from .._linalg import inverse
@@ -94,7 +93,9 @@ class NearestPoint:
             return Projected(found, True)
         sizes = np.maximum(np.abs(point), self._largest)
         found = self._nearest(point, np.diag(sizes * sizes))
-        return Projected(np.clip(point if found is None else found, self._lower, self._upper), False)
+        if found is None:
+            found = np.clip(point, self._lower, self._upper)
+        return Projected(found, False)
 
     def _nearest(self, point: Array, covariance: Array) -> Array | None:
         rows = self._rows

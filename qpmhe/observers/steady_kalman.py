@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array, positive_definite
+from .._linalg import inverse
 from ..errors import ShapeError
 from ..model.system import System
 from .base import Observer, Sample
@@ -87,7 +88,7 @@ class SteadyStateKalman(Observer):
             self._a, self._c, self._disturbance, self._noise, point
         )
         cross = self.covariance @ self._c.T
-        self._filter_gain = np.linalg.solve(self._c @ cross + self._noise, cross.T).T
+        self._filter_gain: Array = np.linalg.solve(self._c @ cross + self._noise, cross.T).T
         self._prior = self.covariance
         if prior is not None:
             self._prior = positive_definite("prior covariance", prior, system.n)
@@ -141,4 +142,4 @@ class SteadyStateKalman(Observer):
         if sample.observed is not None:
             gain = np.where(sample.observed, gain, 0.0)
         weight = sample.noise_weight
-        return gain, self._noise if weight is None else np.linalg.inv(weight)
+        return gain, self._noise if weight is None else inverse(weight)

@@ -46,9 +46,9 @@ class UnscentedKalman(KalmanType):
     Linear in v, so that (eq:kappa) holds with the largest :math:`|K(t)|` met. The model is
     evaluated at 2n + 1 states in each step. Where X has bounds, the two sigma points of a
     direction are drawn nearer to z, with a larger weight, so far that they satisfy the
-    bounds (but not nearer than a thousandth; where z is on a bound, both lie inside); where f or h cannot be evaluated at a sigma
-    point, the stage fails as it does where they cannot be evaluated at z. Steps of unusual
-    length and missing outputs are taken as they are.
+    bounds, but not nearer than a thousandth; where z is on a bound, both lie inside of it.
+    Where f or h cannot be evaluated at a sigma point, the stage fails as it does where they
+    cannot be evaluated at z. Steps of unusual length and missing outputs are taken as they are.
 
     Parameters
     ----------
@@ -141,4 +141,5 @@ def _inside(z: Array, moves: Array, states: ConvexSet) -> tuple[Array, Array]:
     signs = np.where(on_bound, inwards, np.array([[1.0], [-1.0]]))
     share = np.tile(np.clip(np.where(on_bound, farther, nearer), _CLOSEST, 1.0), 2)
     ahead = moves[: z.size]
-    return np.concatenate((signs[0, :, None] * ahead, signs[1, :, None] * ahead)) * share[:, None], share
+    both = np.concatenate((signs[0, :, None] * ahead, signs[1, :, None] * ahead))
+    return both * share[:, None], share

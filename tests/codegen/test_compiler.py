@@ -64,7 +64,7 @@ def estimator(factor=0.9, weight=1.0, sets=None, **options):
     x = ca.SX.sym("x", 2)
     system = qpmhe.from_casadi(
         ca.Function("f", [x], [factor * x]), ca.Function("h", [x], [x[0]]), compiled=False,
-        states=sets,
+        disturbances=sets,
     )
     cost = qpmhe.QuadraticCost(prior=weight * np.eye(2), disturbance=np.eye(2), noise=weight)
     return qpmhe.MovingHorizonEstimator(

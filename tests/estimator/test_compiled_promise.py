@@ -100,7 +100,7 @@ def test_whatever_the_system_and_the_options(data):
     draw = data.draw
     sets = {
         name: box(draw, rows) for name, rows in (
-            ("states", [1.0, -1.0]), ("disturbances", [1.0, 2.0]), ("noises", [0.5, 1.0])
+            ("disturbances", [1.0, 2.0]), ("noises", [0.5, 1.0])
         )
     }
     system = system_of(**any_system(), **sets)
@@ -146,8 +146,7 @@ def consistent(estimate, sets, options):
         assert estimate.cost < estimate.candidate_cost
         # The model itself is in the engine: x, and w and v as it tells them.
         for name, points in (
-            ("states", estimate.trajectory), ("disturbances", estimate.disturbances),
-            ("noises", np.nan_to_num(estimate.noises)),
+            ("disturbances", estimate.disturbances), ("noises", np.nan_to_num(estimate.noises)),
         ):
             if name not in estimate.dropped:
                 known = np.isfinite(estimate.noises) if name == "noises" else None

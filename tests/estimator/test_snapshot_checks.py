@@ -75,7 +75,9 @@ def others(engine):
         "cost.noise": made(cost=cost_of(noise=1.001 * np.eye(1))),
         "cost.discount": made(cost=cost_of(discount=0.9)),
         "observer.gain": made(observer=qpmhe.Luenberger([0.3, 0.41])),
-        "set of states": made(system_of(engine, box)),
+        f"set of {'disturbances' if engine == 'compiled' else 'states'}": made(
+            system_of(engine, box)
+        ),
         "model": made(other_model(engine, f=1.001)),
         "(h)": made(other_model(engine, h=0.1001)),
         "candidate": made(candidate="reinitialized"),

@@ -60,8 +60,8 @@ class Case:
         self.writing = writing or one_of(rng, WRITINGS[self.source])
         self.model = model = Model(rng, self.source, self.writing)
         self.start = np.clip(0.5 * rng.standard_normal(model.n), -0.15, 2.0)
-        self._set_up_sets()
         self.engine = engine
+        self._set_up_sets()
         self.levels = ()
         if self.writing == "compiled":
             # The code is checked when it is loaded: what is wrong is optimised less.
@@ -86,7 +86,7 @@ class Case:
             region.low, region.high = np.full(model.n, -0.2), np.full(model.n, np.inf)
             region.rows = None
             self.regions["states"] = region
-        elif rng.random() < 0.25:
+        elif rng.random() < 0.25 and self.engine != "compiled":
             self.regions["states"] = Region(rng, model.n, 3.0)
         if rng.random() < 0.25:
             if rng.random() < 0.4:
@@ -103,8 +103,9 @@ class Case:
         engine = self.engine
         if engine is None:
             engine = "python"
-            # Not for components of w without noise: documented, and refused.
-            if self.writing == "compiled" and not self.fixed and rng.random() < 0.6:
+            # Not for components of w without noise, nor for X: documented, and refused.
+            free = not self.fixed and "states" not in self.regions
+            if self.writing == "compiled" and free and rng.random() < 0.6:
                 engine = "compiled"
         kinds = ["luenberger", "luenberger", "injection"]
         if model.kind in SMOOTH:

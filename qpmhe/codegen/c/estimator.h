@@ -33,11 +33,9 @@ typedef $real mhe_real;
 #define MHE_NY $ny       /* outputs */
 #define MHE_NU $nu       /* inputs */
 #define MHE_HORIZON $horizon /* most samples in the window */
-#define MHE_X_SET $x_set   /* whether there is a set of states, disturbances, noises */
-#define MHE_W_SET $w_set
+#define MHE_W_SET $w_set   /* whether there is a set of disturbances, noises */
 #define MHE_V_SET $v_set
-#define MHE_X_ROWS $x_rows  /* general inequalities in each */
-#define MHE_W_ROWS $w_rows
+#define MHE_W_ROWS $w_rows  /* general inequalities in each */
 #define MHE_V_ROWS $v_rows
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
@@ -46,8 +44,7 @@ $limits
 
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
-    (MHE_X_SET * (MHE_NX + MHE_X_ROWS) + MHE_W_SET * (MHE_NX + MHE_W_ROWS) + \
-     MHE_V_SET * (MHE_NY + MHE_V_ROWS))
+    (MHE_W_SET * (MHE_NX + MHE_W_ROWS) + MHE_V_SET * (MHE_NY + MHE_V_ROWS))
 /* Length of a panel's rows, for whole registers. */
 #define MHE_PANEL_WIDTH (MHE_NX < 24 ? (2 * MHE_NX + 3) / 4 * 4 : (2 * MHE_NX + 31) / 32 * 32)
 
@@ -60,12 +57,6 @@ $status
 enum { MHE_DROP = 0, MHE_PROJECT = 1, MHE_KEEP = 2 };
 
 /* A convex set: lower <= s <= upper, row_lower <= rows s <= row_upper. */
-typedef struct {
-    mhe_real lower[MHE_NX], upper[MHE_NX];
-    mhe_real rows[MHE_SIZE(MHE_X_ROWS) * MHE_NX];
-    mhe_real row_lower[MHE_SIZE(MHE_X_ROWS)], row_upper[MHE_SIZE(MHE_X_ROWS)];
-} mhe_x_set;
-
 typedef struct {
     mhe_real lower[MHE_NX], upper[MHE_NX];
     mhe_real rows[MHE_SIZE(MHE_W_ROWS) * MHE_NX];
@@ -88,7 +79,6 @@ typedef struct {
     mhe_real sample_time;      /* of the rate; 0 where f is a map */
     mhe_real tolerance;        /* relative decrease of the cost that counts as converged */
     mhe_real solver_tolerance; /* residuals of a constrained QP that is solved */
-    mhe_x_set states;
     mhe_w_set disturbances;
     mhe_v_set noises;
     int32_t max_qps;           /* QPs for each sample */
@@ -164,7 +154,7 @@ typedef struct {
     mhe_real gradient[(MHE_HORIZON + 1) * MHE_NX], step[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real residual[(MHE_HORIZON + 1) * MHE_NX], direction[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real product[(MHE_HORIZON + 1) * MHE_NX];
-    mhe_row rows[(MHE_HORIZON + 1) * MHE_SIZE(MHE_STAGE_ROWS)];
+    mhe_row rows[MHE_HORIZON * MHE_SIZE(MHE_STAGE_ROWS)];
 } mhe_workspace;
 
 /* Where mhe_run writes; a null pointer leaves out. One entry for each sample. */
@@ -203,6 +193,10 @@ void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspac
 /* Take whole records in: `members` estimators one after the other, `samples` each. */
 void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *workspace,
              int64_t samples, const mhe_real *y, const mhe_real *u, const mhe_log *log);
+
+/* Compute the stages of the window again, each from its own state and sample, to check an
+ * estimator that was saved. `reached`: MHE_HORIZON states, the one behind each stage. */
+void mhe_recompute(mhe_estimator *estimator, mhe_real *reached);
 
 /* Sizes of the structures above: estimator, workspace, estimate, settings. */
 void mhe_sizes(int64_t *sizes);

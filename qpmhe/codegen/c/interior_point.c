@@ -3,20 +3,16 @@
  *
  *     min d'H d / 2 + g'd   s.t.   low <= c(d) <= high
  *
- * The rows c of stage i are those of X (on d(i)), of W (on d(i+1) - A d(i)) and of V (on
- * -C d(i)): each set's components first, then its general inequalities. */
+ * The rows c of stage i are those of W (on d(i+1) - A d(i)) and of V (on -C d(i)): each set's
+ * components first, then its general inequalities. */
 
 enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED };
 
 #if CONSTRAINED
 
 #define ROWS MHE_STAGE_ROWS
-#define X_COUNT (MHE_X_SET * (NX + MHE_X_ROWS))
 #define W_COUNT (MHE_W_SET * (NX + MHE_W_ROWS))
 #define V_COUNT (MHE_V_SET * (NY + MHE_V_ROWS))
-
-/* Rows that stage i has: the last state has no disturbance and no noise. */
-static int mhe_rows_at(const mhe_estimator *e, int i) { return i < e->length ? ROWS : X_COUNT; }
 
 /* Limits of the rows of one set about the point q where the QP is built. */
 static void mhe_limit(int n, int count, const real *q, const real *lower, const real *upper,
@@ -43,17 +39,12 @@ static void mhe_limit(int n, int count, const real *q, const real *lower, const 
               (set).row_upper, known, active, out)
 
 /* Limits of all rows about a trajectory with residuals w and v. */
-static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, int sets, const real *x,
-                           const real *w, const real *v)
+static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, int sets, const real *w,
+                           const real *v)
 {
     const mhe_settings *s = e->settings;
-    for (int i = 0; i <= e->length; i++) {
+    for (int i = 0; i < e->length; i++) {
         mhe_row *rows = k->rows + i * ROWS;
-#if MHE_X_SET
-        LIMIT(s->states, NX, MHE_X_ROWS, x + i * NX, 0, sets & STATES, rows);
-        rows += X_COUNT;
-#endif
-        if (i == e->length) break;
 #if MHE_W_SET
         LIMIT(s->disturbances, NX, MHE_W_ROWS, w + i * NX, 0, sets & DISTURBANCES, rows);
         rows += W_COUNT;
@@ -64,7 +55,7 @@ static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, int sets, const r
               sets & NOISES, rows);
 #endif
     }
-    (void)x; (void)w; (void)v;
+    (void)w; (void)v;
 }
 
 static void mhe_values_of(int n, int count, const real *q, const real *rows, mhe_row *out)
@@ -77,14 +68,9 @@ static void mhe_values_of(int n, int count, const real *q, const real *rows, mhe
 static void mhe_rows_times(const mhe_estimator *e, mhe_workspace *k, const real *d)
 {
     const mhe_settings *s = e->settings;
-    for (int i = 0; i <= e->length; i++) {
+    for (int i = 0; i < e->length; i++) {
         mhe_row *rows = k->rows + i * ROWS;
         const real *own = d + i * NX;
-#if MHE_X_SET
-        mhe_values_of(NX, MHE_X_ROWS, own, s->states.rows, rows);
-        rows += X_COUNT;
-#endif
-        if (i == e->length) break;
 #if MHE_W_SET
         real q[NX];
         for (int j = 0; j < NX; j++)
@@ -112,16 +98,9 @@ static void mhe_loads_of(int n, int count, const real *rows, const mhe_row *in, 
 static void mhe_add_loads(const mhe_estimator *e, const mhe_workspace *k, real *out)
 {
     const mhe_settings *s = e->settings;
-    for (int i = 0; i <= e->length; i++) {
+    for (int i = 0; i < e->length; i++) {
         const mhe_row *rows = k->rows + i * ROWS;
         real *own = out + i * NX;
-#if MHE_X_SET
-        real x[NX];
-        mhe_loads_of(NX, MHE_X_ROWS, s->states.rows, rows, x);
-        for (int j = 0; j < NX; j++) own[j] += x[j];
-        rows += X_COUNT;
-#endif
-        if (i == e->length) break;
 #if MHE_W_SET
         real w[NX];
         const real *A = k->at[i]->f_jacobian;
@@ -157,16 +136,9 @@ static void mhe_add_square(real *panel, real weight, const real *a)
 static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
 {
     const mhe_settings *s = e->settings;
-    for (int i = 0; i <= e->length; i++) {
+    for (int i = 0; i < e->length; i++) {
         const mhe_row *rows = k->rows + i * ROWS;
         real *panel = k->panels + i * NX * WIDTH;
-#if MHE_X_SET
-        for (int j = 0; j < NX; j++) panel[j * WIDTH + j] += rows[j].weight;
-        for (int r = 0; r < MHE_X_ROWS; r++)
-            mhe_add_square(panel, rows[NX + r].weight, s->states.rows + r * NX);
-        rows += X_COUNT;
-#endif
-        if (i == e->length) break;
 #if MHE_W_SET
         const real *A = k->at[i]->f_jacobian;
         real *next = panel + NX * WIDTH;
@@ -217,8 +189,8 @@ static real mhe_row_violation(const mhe_estimator *e, mhe_workspace *k, const re
 {
     real worst = 0;
     mhe_rows_times(e, k, d);
-    for (int i = 0; i <= e->length; i++)
-        for (int r = 0; r < mhe_rows_at(e, i); r++) {
+    for (int i = 0; i < e->length; i++)
+        for (int r = 0; r < ROWS; r++) {
             const mhe_row *row = k->rows + i * ROWS + r;
             worst = fmax(worst, fmax(row->low - row->value, row->value - row->high));
         }
@@ -261,8 +233,8 @@ static void mhe_meet(mhe_ratio *worst, real variable, real change)
 /* Right-hand side of the Newton equations for a target of the complementarity products. */
 static void mhe_set_loads(const mhe_estimator *e, mhe_workspace *k, real target)
 {
-    for (int i = 0; i <= e->length; i++)
-        for (int r = 0; r < mhe_rows_at(e, i); r++) {
+    for (int i = 0; i < e->length; i++)
+        for (int r = 0; r < ROWS; r++) {
             mhe_row *q = k->rows + i * ROWS + r;
             q->load = 0;
             if (q->dual_low > 0)
@@ -304,8 +276,8 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
     const real primal_tolerance = s->solver_tolerance / 100;
     real steepest = 0, products = 0;
     int sides = 0;
-    for (int i = 0; i <= count; i++)
-        for (int r = 0; r < mhe_rows_at(e, i); r++) {
+    for (int i = 0; i < count; i++)
+        for (int r = 0; r < ROWS; r++) {
             mhe_row *q = k->rows + i * ROWS + r;
             q->dual_low = q->dual_high = 0;
             q->slack_low = q->slack_high = 1;
@@ -316,8 +288,8 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
     if (!sides) return SOLVED;
     /* Generous products: from smaller ones it creeps on some QPs. */
     const real start = fmax(scale, EPSILON * EPSILON);
-    for (int i = 0; i <= count; i++)
-        for (int r = 0; r < mhe_rows_at(e, i); r++) {
+    for (int i = 0; i < count; i++)
+        for (int r = 0; r < ROWS; r++) {
             mhe_row *q = k->rows + i * ROWS + r;
             if (isfinite(q->low)) q->dual_low = start / q->slack_low;
             if (isfinite(q->high)) q->dual_high = start / q->slack_high;
@@ -329,8 +301,8 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
         mhe_hessian_times(k, count, k->step, k->product);
         mhe_rows_times(e, k, k->step);
         products = 0;
-        for (int i = 0; i <= count; i++)
-            for (int r = 0; r < mhe_rows_at(e, i); r++) {
+        for (int i = 0; i < count; i++)
+            for (int r = 0; r < ROWS; r++) {
                 mhe_row *q = k->rows + i * ROWS + r;
                 q->correction_low = q->correction_high = 0;
                 q->weight = 0;
@@ -368,8 +340,8 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
             if (!mhe_solve(k, count, k->direction)) return *iterations ? STOPPED : FAILED;
             mhe_rows_times(e, k, k->direction);
             mhe_ratio worst = {1, 1};
-            for (int i = 0; i <= count; i++)
-                for (int r = 0; r < mhe_rows_at(e, i); r++) {
+            for (int i = 0; i < count; i++)
+                for (int r = 0; r < ROWS; r++) {
                     const mhe_row *q = k->rows + i * ROWS + r;
                     real change[4];
                     mhe_changes(q, target, change);
@@ -381,8 +353,8 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
             length = worst.variable / worst.decrease;
             if (corrector) break;
             after = 0;
-            for (int i = 0; i <= count; i++)
-                for (int r = 0; r < mhe_rows_at(e, i); r++) {
+            for (int i = 0; i < count; i++)
+                for (int r = 0; r < ROWS; r++) {
                     mhe_row *q = k->rows + i * ROWS + r;
                     real change[4];
                     mhe_changes(q, target, change);
@@ -403,8 +375,8 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
         length *= (real)0.995;
         if (!(length > 1e-10)) return STOPPED;
         for (int j = 0; j < size; j++) k->step[j] += length * k->direction[j];
-        for (int i = 0; i <= count; i++)
-            for (int r = 0; r < mhe_rows_at(e, i); r++) {
+        for (int i = 0; i < count; i++)
+            for (int r = 0; r < ROWS; r++) {
                 mhe_row *q = k->rows + i * ROWS + r;
                 real change[4];
                 mhe_changes(q, target, change);

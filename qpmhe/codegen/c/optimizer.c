@@ -1,7 +1,5 @@
 /* The sequence of QPs; only what the true cost approves is accepted. */
 
-#define HAS_ROWS (MHE_W_SET || MHE_V_SET || MHE_X_ROWS)
-
 static const real mhe_lengths[] = MHE_LENGTHS;
 
 typedef struct {
@@ -14,28 +12,11 @@ static real mhe_target(const mhe_trial *best)
     return isfinite(best->cost) ? best->cost - MHE_ROUNDING * best->cost : INFINITY;
 }
 
-static void mhe_clip(const mhe_estimator *e, int sets, real *x)
-{
-#if MHE_X_SET
-    if (!(sets & STATES)) return;
-    for (int i = 0; i <= e->length; i++)
-        for (int j = 0; j < NX; j++) {
-            const real low = e->settings->states.lower[j], high = e->settings->states.upper[j];
-            real *value = x + i * NX + j;
-            if (*value < low) *value = low;
-            if (*value > high) *value = high;
-        }
-#else
-    (void)e; (void)sets; (void)x;
-#endif
-}
-
 /* Judge best + length * step. */
 static void mhe_try(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o, real length)
 {
     for (int j = 0; j < (e->length + 1) * NX; j++)
         o->spare->x[j] = o->best->x[j] + length * k->step[j];
-    mhe_clip(e, o->sets, o->spare->x);
     mhe_evaluate(e, k->factors, o->sets, o->spare);
 }
 
@@ -94,7 +75,7 @@ static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, cons
     return SOLVED;
 }
 
-#if HAS_ROWS
+#if CONSTRAINED
 /* Shift the limits by what the linearisation missed at the spare trial, and a little beyond:
  * a second-order correction. */
 static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
@@ -118,52 +99,42 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
             v[at] = o->best->v[at] + (o->spare->v[at] - linear);
         }
     }
-    mhe_set_limits(e, k, o->sets, o->best->x, w, v);
-    for (int i = 0; i <= count; i++) {
+    mhe_set_limits(e, k, o->sets, w, v);
+    for (int i = 0; i < count; i++) {
         mhe_row *rows = k->rows + i * ROWS;
-        for (int r = 0; r < mhe_rows_at(e, i); r++) rows[r].load = missed;
+        for (int r = 0; r < ROWS; r++) rows[r].load = missed;
 #if MHE_W_SET
-        if (i < count) {
-            real bent[NX];
-            for (int j = 0; j < NX; j++) bent[j] = w[i * NX + j] - o->best->w[i * NX + j];
-            mhe_values_of(NX, MHE_W_ROWS, bent, e->settings->disturbances.rows, rows + X_COUNT);
-            for (int r = 0; r < W_COUNT; r++)
-                rows[X_COUNT + r].load += MHE_BEYOND * fabs(rows[X_COUNT + r].value);
-        }
+        real disturbance[NX];
+        for (int j = 0; j < NX; j++) disturbance[j] = w[i * NX + j] - o->best->w[i * NX + j];
+        mhe_values_of(NX, MHE_W_ROWS, disturbance, e->settings->disturbances.rows, rows);
+        for (int r = 0; r < W_COUNT; r++) rows[r].load += MHE_BEYOND * fabs(rows[r].value);
 #endif
 #if MHE_V_SET
-        if (i < count) {
-            mhe_row *own = rows + X_COUNT + W_COUNT;
-            real bent[NY];
-            for (int j = 0; j < NY; j++) bent[j] = v[i * NY + j] - o->best->v[i * NY + j];
-            mhe_values_of(NY, MHE_V_ROWS, bent, e->settings->noises.rows, own);
-            for (int r = 0; r < V_COUNT; r++) own[r].load += MHE_BEYOND * fabs(own[r].value);
-        }
+        mhe_row *own = rows + W_COUNT;
+        real noise[NY];
+        for (int j = 0; j < NY; j++) noise[j] = v[i * NY + j] - o->best->v[i * NY + j];
+        mhe_values_of(NY, MHE_V_ROWS, noise, e->settings->noises.rows, own);
+        for (int r = 0; r < V_COUNT; r++) own[r].load += MHE_BEYOND * fabs(own[r].value);
 #endif
-        /* Bounds on single states are not bent: they hold for every trial. */
-        for (int r = MHE_X_SET * NX; r < mhe_rows_at(e, i); r++)
+        for (int r = 0; r < ROWS; r++)
             if (rows[r].high - rows[r].low > 4 * rows[r].load) {
                 rows[r].low += rows[r].load;
                 rows[r].high -= rows[r].load;
             }
     }
 }
-#endif
 
-#if CONSTRAINED
 /* The nearest trajectory that satisfies the linearised sets; whether it does the true ones. */
 static int mhe_project(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, const real *offset)
 {
     mhe_linearize(e, k, o, 1);
-    mhe_set_limits(e, k, o->sets, o->best->x, o->best->w, o->best->v);
+    mhe_set_limits(e, k, o->sets, o->best->w, o->best->v);
     for (int attempt = 0;; attempt++) {
         if (mhe_solve_qp(e, k, o, offset, 1) == FAILED) return 0;
         mhe_try(e, k, o, 1);
         if (isfinite(o->spare->cost)) return 1;
         if (!isfinite(o->spare->violation) || attempt == MHE_CORRECTIONS) return 0;
-#if HAS_ROWS
         mhe_bend(e, k, o);
-#endif
         o->corrections++;
     }
 }
@@ -181,7 +152,7 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, 
     }
     for (int j = 0; j < NX; j++) offset[j] = o->best->x[j] - prior[j];
 #if CONSTRAINED
-    mhe_set_limits(e, k, o->sets, o->best->x, o->best->w, o->best->v);
+    mhe_set_limits(e, k, o->sets, o->best->w, o->best->v);
 #endif
     const int status = mhe_solve_qp(e, k, o, offset, 0);
     o->qps++;
@@ -196,7 +167,7 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, 
     if (!solved) o->events |= MHE_SOLVER_STOPPED;
     const real promised = fabs(mhe_dot((e->length + 1) * NX, k->gradient, k->step));
     mhe_try(e, k, o, 1);
-#if HAS_ROWS
+#if CONSTRAINED
     if (!(o->spare->cost < target) && o->spare->violation > 0 &&
         isfinite(o->spare->violation)) {
         int bend = 1;
@@ -272,7 +243,6 @@ static int mhe_shift(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int bef
     real *x = o->spare->x;
     memcpy(x, e->trajectory + skipped * NX, sizeof(real) * (size_t)count * NX);
     mhe_f(x + (count - 1) * NX, last->u, last->step, x + count * NX);
-    mhe_clip(e, o->sets, x);
     mhe_evaluate(e, k->factors, o->sets, o->spare);
     return o->spare->cost < mhe_target(o->best);
 }

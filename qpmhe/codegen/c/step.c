@@ -155,6 +155,18 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64
     }
 }
 
+void mhe_recompute(mhe_estimator *e, mhe_real *reached)
+{
+    for (int i = 0; i < e->length; i++) {
+        real *next = i + 1 < e->length ? mhe_stage_at(e, i + 1)->z : e->z_end, kept[NX];
+        memcpy(kept, next, sizeof kept);
+        mhe_set_noise_weight(e->settings, mhe_stage_at(e, i));
+        mhe_enter(e, i);
+        memcpy(reached + i * NX, next, sizeof kept);
+        memcpy(next, kept, sizeof kept);
+    }
+}
+
 void mhe_sizes(int64_t *sizes)
 {
     sizes[0] = (int64_t)sizeof(mhe_estimator);

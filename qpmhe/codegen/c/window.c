@@ -192,9 +192,9 @@ static int mhe_push(mhe_estimator *e, const real *y, const real *u, real step,
     return outcome;
 }
 
-enum { STATES = 1, DISTURBANCES = 2, NOISES = 4, ALL_SETS = 7 };
+enum { DISTURBANCES = 1, NOISES = 2, ALL_SETS = 3 };
 
-#define CONSTRAINED (MHE_X_SET || MHE_W_SET || MHE_V_SET)
+#define CONSTRAINED (MHE_W_SET || MHE_V_SET)
 
 #if CONSTRAINED
 /* The largest amount by which s leaves a set, less the rounding of a box's component. */
@@ -236,29 +236,22 @@ static real mhe_missed(int n, int count, const real *point, const real *lower,
 static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, int sets, int *violated)
 {
     const mhe_settings *s = e->settings;
-    real worst[3] = {0, 0, 0};
-    for (int i = 0; i <= e->length; i++) {
-        const real *x = trial->x + i * NX;
-        (void)x;
-#if MHE_X_SET
-        if (sets & STATES)
-            worst[0] = fmax(worst[0], MISSED(s->states, NX, MHE_X_ROWS, x, 0, 0));
-#endif
-        if (i == e->length) break;
+    real worst[2] = {0, 0};
+    for (int i = 0; i < e->length; i++) {
 #if MHE_W_SET
         if (sets & DISTURBANCES) {
             real rounding = 0;
-            for (int j = 0; j < NX; j++) rounding = fmax(rounding, fabs(x[NX + j]));
+            for (int j = 0; j < NX; j++) rounding = fmax(rounding, fabs(trial->x[(i + 1) * NX + j]));
             /* Of a candidate L is known itself, not as a difference of states. */
             rounding *= violated ? 0 : 8 * EPSILON;
-            worst[1] = fmax(worst[1], MISSED(s->disturbances, NX, MHE_W_ROWS,
+            worst[0] = fmax(worst[0], MISSED(s->disturbances, NX, MHE_W_ROWS,
                                              trial->w + i * NX, 0, rounding));
         }
 #endif
 #if MHE_V_SET
         if (sets & NOISES) {
             const mhe_stage *stage = mhe_stage_at(e, i);
-            worst[2] = fmax(worst[2],
+            worst[1] = fmax(worst[1],
                             MISSED(s->noises, NY, MHE_V_ROWS, trial->v + i * NY,
                                    stage->is_complete ? 0 : stage->is_observed, 0));
         }
@@ -266,10 +259,10 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, int sets, in
     }
     if (violated) {
         *violated = 0;
-        for (int i = 0; i < 3; i++)
+        for (int i = 0; i < 2; i++)
             if (worst[i] > MHE_FEASIBLE) *violated |= 1 << i;
     }
-    return fmax(worst[0], fmax(worst[1], worst[2]));
+    return fmax(worst[0], worst[1]);
 }
 #endif
 
