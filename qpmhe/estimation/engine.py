@@ -152,11 +152,10 @@ class PythonEngine:
             if Status.MODEL_FAILED not in status:
                 status |= Status.FAILED_STAGE
         trajectory, residuals, filtered = trial.trajectory, trial.residuals, None
-        far = self._watch.note(
-            trajectory[-1] - candidate.trajectory[-1], problem.prior_weight, status
-        )
-        if far:
-            status |= far
+        if self._watch.note(
+            trajectory[-1] - candidate.trajectory[-1], problem.prior_weight, bool(outcome.dropped)
+        ):
+            status |= Status.OBSERVER_FAR
         if not outcome.improved:
             # They are views of the window.
             trajectory, residuals = trajectory.copy(), residuals.copy()

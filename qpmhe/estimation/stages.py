@@ -244,6 +244,7 @@ class Stages:
         stages = slice(self.start, self.end)
         points = slice(self.start, self.end + 1)
         earlier, covariance = self._last_good(self.start)
+        metric = None if self.metric is None else self.metric.state
         return {
             "earlier": earlier.copy(),
             "earlier_covariance": None if covariance is None else covariance.copy(),
@@ -255,7 +256,7 @@ class Stages:
             "own_noise": {time: weight.copy() for time, weight in self._own_noise.items()},
             "last_special": self._last_special,
             "last_irregular": self._last_irregular,
-            "metric": None if self.metric is None else self.metric.state,
+            "metric": metric and (metric[0].copy(), metric[1]),
         }
 
     def load_state_dict(self, state: dict[str, Any], may_be_irregular: bool) -> None:

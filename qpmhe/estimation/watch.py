@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .estimate import Status
-
 __all__ = ["ObserverWatch"]
 
 Array = NDArray[np.float64]
@@ -30,8 +28,8 @@ class ObserverWatch:
         self.counts: tuple[int, int] = (0, 0)
         self._warned = False
 
-    def note(self, offset: Array, prior_weight: Array, status: Status) -> Status:
-        """Count a sample; `Status.OBSERVER_FAR` if the observer has been far away for long.
+    def note(self, offset: Array, prior_weight: Array, dropped_rows: bool) -> bool:
+        """Count a sample; return whether the observer has been far away for long.
 
         Parameters
         ----------
@@ -39,15 +37,14 @@ class ObserverWatch:
             The estimate minus the observer's state.
         prior_weight : (n, n) array
             Weight of an initial error of the observer.
-        status : Status
-            The sample's.
+        dropped_rows : bool
+            Whether the estimate violates inequalities.
         """
         far, dropped = self.counts
         # A comparison with NaN is false.
-        far = far + 1 if float(offset @ prior_weight @ offset) > _FAR**2 else 0
-        dropped = dropped + 1 if Status.ROWS_DROPPED in status else 0
-        self.counts = far, dropped
-        return Status.OBSERVER_FAR if far >= self._horizon else Status(0)
+        far = far + 1 if offset.dot(prior_weight).dot(offset) > _FAR**2 else 0
+        self.counts = far, (dropped + 1 if dropped_rows else 0)
+        return far >= self._horizon
 
     def warning(self) -> str | None:
         """What to warn of, the first time that there is something; None otherwise."""

@@ -88,7 +88,9 @@ class SteadyStateKalman(Observer):
             self._a, self._c, self._disturbance, self._noise, point
         )
         cross = self.covariance @ self._c.T
-        self._filter_gain: Array = np.linalg.solve(self._c @ cross + self._noise, cross.T).T
+        self._filter_gain = np.asarray(
+            np.linalg.solve(self._c @ cross + self._noise, cross.T).T, np.float64
+        )
         self._prior = self.covariance
         if prior is not None:
             self._prior = positive_definite("prior covariance", prior, system.n)
