@@ -115,7 +115,7 @@ def recorded(name: str, example: Any, horizon: int, width: float, samples: int) 
     )
     qpmhe.solvers.register(Backend(name, make, "recorder"))
     mhe = qpmhe.MovingHorizonEstimator(
-        system, example.observer, example.cost, horizon=horizon, outside="project", max_qps=2,
+        system, example.observer, example.cost, horizon=horizon, max_qps=2,
         initial_state=scenario.initial_estimate, backend=name,
     )
     record = scenario.simulate(0, horizon + samples)

@@ -100,7 +100,7 @@ def main() -> None:
         "PIQP multistage": {"backend": "multistage"}, "compiled": {"engine": "compiled"}
     }.items():
         mhe = qpmhe.MovingHorizonEstimator(
-            system, plain.observer, plain.cost, horizon=HORIZON, outside="project",
+            system, plain.observer, plain.cost, horizon=HORIZON,
             initial_state=scenario.initial_estimate, **options,  # type: ignore[arg-type]
         )
         runs[name] = [mhe.update(y) for y in

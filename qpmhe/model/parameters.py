@@ -46,7 +46,7 @@ def augment_parameters(
     which they were named. Their disturbance is {0}: they are constant along every estimated
     trajectory, to the last bit. So an observer fits that does not correct them, with zeros in
     their rows of the gain; where another one is used, its candidate is outside of W, and the
-    estimator's ``outside`` decides (``"drop"`` leaves {0} out as well).
+    estimator looks for a trajectory with constant parameters that costs no more.
 
     Parameters
     ----------

@@ -60,8 +60,7 @@ _NUMBERS: tuple[tuple[str, str, float | None], ...] = (
 _WHY = {
     "CONVERGED": "converged", "NO_DECREASE": "no decrease", "SOLVER_STOPPED": "solver stopped",
     "SOLVER_FAILED": "solver failed", "MODEL_FAILED": "model failed", "TIME_UP": "time up",
-    "SETS_DROPPED": "sets dropped", "PROJECTED": "projected",
-    "CANDIDATE_OUTSIDE": "candidate outside",
+    "ROWS_DROPPED": "rows dropped", "CANDIDATE_OUTSIDE": "candidate outside",
 }
 
 
