@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import warnings
 from time import perf_counter
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -163,6 +163,7 @@ class MovingHorizonEstimator:
             )
         # A copy, because this estimator may change how the model is called.
         self._own_system = system.copy()
+        self._own_system.use_scales(cost.prior_deviations(observer.initial_covariance()))
         self._initial_state: Array = self._checked_start(initial_state)
         self._no_input = np.zeros(system.m)
         try:
@@ -300,6 +301,7 @@ class MovingHorizonEstimator:
         """Check once, before a sample is taken, that the model takes step lengths."""
         if "timed" not in self._own_system.__dict__:
             timed = self.system.timed.copy()
+            timed.use_scales(cast(Array, self._own_system.scales))
             timed.check(self._initial_state, np.append(self._no_input, dt))
             self._own_system.__dict__["timed"] = timed
 
