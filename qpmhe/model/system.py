@@ -266,8 +266,14 @@ class System:
             )
         return self.make_timed()
 
-    def copy(self) -> System:
-        """The same system for one estimator, which may change how its functions are called."""
+    def copy(self, scales: ArrayLike | None = None) -> System:
+        """The same system for one estimator, which may change how its functions are called.
+
+        Parameters
+        ----------
+        scales : (n,) array_like, optional
+            As for `use_scales`.
+        """
         other = object.__new__(type(self))  # `copy.copy` would make the model again, as pickle does
         other.__dict__.update(self.__dict__)
         other.f, other.h = self.f.copy(), self.h.copy()
@@ -277,14 +283,9 @@ class System:
             other.rate_jacobian = self.rate_jacobian.copy(self.rate_jacobian.function)
         other.__dict__.pop("timed", None)
         if self.make_timed is not None:
-
-            def timed() -> System:
-                made = self.timed.copy()
-                if other.scales is not None:
-                    made.use_scales(other.scales)
-                return made
-
-            other.make_timed = timed
+            other.make_timed = lambda: self.timed.copy(other.scales)
+        if scales is not None:
+            other.use_scales(scales)
         return other
 
     def use_scales(self, scales: ArrayLike) -> None:
