@@ -417,7 +417,7 @@ class BatchRun:
         return float(has.mean()) if has.size else 0.0
 
 
-def _scales(cost: Cost, observer: Observer) -> Array | None:
+def _scales(cost: object, observer: Observer) -> Array | None:
     """What a single estimator's copy of the system has for `System.scales`."""
     if not isinstance(cost, Cost):  # which the single estimator refuses
         return None
