@@ -61,15 +61,21 @@ def positive_definite(name: str, value: ArrayLike, size: int | None = None) -> A
         raise ShapeError(f"{name} has shape {matrix.shape}; expected a square matrix.")
     if size is not None and matrix.shape != (size, size):
         raise ShapeError(f"{name} has shape {matrix.shape}; expected ({size}, {size}).")
-    asymmetry = float(np.abs(matrix - matrix.T).max())
-    if asymmetry > 1e-10 * float(np.abs(matrix).max()):
+    # Rows may be in units of any size: each entry has its own, and so has the definiteness.
+    difference, entries = np.abs(matrix - matrix.T), np.abs(matrix)
+    sizes = np.sqrt(np.abs(matrix.diagonal()))
+    allowed = 1e-10 * np.maximum(np.maximum(entries, entries.T), np.multiply.outer(sizes, sizes))
+    if (difference > allowed).any():
         raise WeightError(
-            f"{name} is not symmetric: it differs from its transpose by {asymmetry:.3g}. "
+            f"{name} is not symmetric: it differs from its transpose by {difference.max():.3g}. "
             "Pass (M + M.T) / 2 if that is what is meant."
         )
     matrix = 0.5 * (matrix + matrix.T)
-    smallest = float(np.linalg.eigvalsh(matrix)[0])
+    with np.errstate(all="ignore"):
+        correlations = matrix / np.multiply.outer(sizes, sizes)
+    smallest = float(np.linalg.eigvalsh(correlations)[0]) if sizes.all() else 0.0
     if smallest <= 0.0:
+        smallest = min(smallest, float(np.linalg.eigvalsh(matrix)[0]))
         raise WeightError(
             f"{name} has the eigenvalue {smallest:.3g}; expected a positive definite matrix. "
             "A direction without noise belongs into the sets, not into a singular matrix."

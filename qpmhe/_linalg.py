@@ -1,22 +1,47 @@
-"""Linear algebra whose results do not depend on the units of the components."""
+"""Linear algebra whose results do not depend on the units of the components.
+
+Pivots depend on units. So a positive definite matrix is first scaled by powers of two to a
+diagonal of order one: a change of units, or of the whole, by powers of two then changes no
+digit of a result.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["inverse"]
+__all__ = ["inverse", "solve", "unit_diagonal"]
 
 Array = NDArray[np.float64]
+Exponents = NDArray[np.int32]
+
+
+def unit_diagonal(matrix: Array) -> tuple[Array, Exponents, int]:
+    """The matrix, scaled to a diagonal between 1/2 and 4, and the exponents that scale it back.
+
+    ``matrix[i, j] = 2**(whole + units[i] + units[j]) * scaled[i, j]``, without rounding.
+    """
+    exponents = np.frexp(matrix.diagonal())[1]
+    # The first component's unit takes the square root of the whole's: an odd power is left.
+    whole = int(exponents[0]) % 2
+    units: Exponents = (exponents - whole) // 2
+    scaled: Array = np.ldexp(matrix, -whole - units[:, None] - units)
+    return scaled, units, whole
 
 
 def inverse(matrix: Array) -> Array:
-    """The inverse of a symmetric positive definite matrix.
+    """The inverse of a symmetric positive definite matrix (d, d), exactly symmetric."""
+    scaled, units, whole = unit_diagonal(matrix)
+    found = np.linalg.inv(scaled)
+    result: Array = np.ldexp(0.5 * (found + found.T), -whole - units[:, None] - units)
+    return result
 
-    Scaled to a unit diagonal first: pivots then do not depend on units, and the results for
-    units that differ by powers of two differ by these powers exactly.
-    """
-    scale = np.sqrt(matrix.diagonal())
-    outer = np.outer(scale, scale)
-    found = np.linalg.inv(matrix / outer)
-    return np.asarray(0.5 * (found + found.T) / outer)
+
+def solve(matrix: Array, side: Array) -> Array:
+    """The solution (d, k) of ``matrix X = side``, for a symmetric positive definite matrix."""
+    if matrix.shape[0] == 1:
+        return np.asarray(side / matrix[0, 0])
+    scaled, units, whole = unit_diagonal(matrix)
+    found = np.linalg.solve(scaled, np.ldexp(side, -whole - units[:, None]))
+    result: Array = np.ldexp(found, -units[:, None])
+    return result

@@ -87,7 +87,9 @@ def from_casadi(
     if not (compiled is None or isinstance(compiled, bool)):
         raise OptionError(f"compiled is {compiled!r}; expected True, False or None.")
     model = casadi_model(f, h, n=n, p=p, m=m, dt=dt, method=method)
-    sets = {"states": states, "disturbances": disturbances, "noises": noises}
+    sets: dict[str, Any] = {
+        "states": states, "disturbances": disturbances, "noises": noises
+    }
     library: ctypes.PyDLL | None = None
     if compiled or (compiled is None and find_compiler() is not None):
         library = _library(model, states, compiled is True)

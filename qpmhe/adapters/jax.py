@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import count, positive
-from ..errors import ModelError
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System, checked_set, probe_points
@@ -134,19 +133,14 @@ def from_jax(
 
 def _assembled(model: _Model, m: int, sets: dict[str, Any]) -> System:
     f, h, f_jacobian, h_jacobian = (Trusted(partial(model.evaluate, part)) for part in range(4))
-    try:
-        system = System(
-            f, h, n=model.n, p=model.p, m=m, f_jacobian=f_jacobian, h_jacobian=h_jacobian, **sets
+    system = System(
+        f, h, n=model.n, p=model.p, m=m, f_jacobian=f_jacobian, h_jacobian=h_jacobian, **sets
+    )
+    for name, jacobian in (("f", system.f_jacobian), ("h", system.h_jacobian)):
+        jacobian.method = "jax"
+        jacobian.remedy = (
+            f"It is JAX's: look for stop_gradient or a custom derivative within {name}."
         )
-    except ModelError as error:
-        name, jacobian, _ = str(error).partition("_jacobian")
-        if not jacobian:
-            raise
-        raise ModelError(
-            f"{error} Here it is JAX's: look for single precision, stop_gradient or a "
-            f"custom derivative within {name}."
-        ) from error
-    system.f_jacobian.method = system.h_jacobian.method = "jax"
     system.kernel = model
     return system
 

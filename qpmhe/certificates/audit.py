@@ -171,6 +171,8 @@ def _cost_finding(cost: Cost) -> tuple[CostConstants | None, Finding]:
         why = (
             f"the discount {cost.discount:.6g} makes the lower bounds shrink with a stage's age"
             if cost.discount < 1.0
+            else "its ObserverPrior has no bounds; give it some, ObserverPrior(minimum, maximum)"
+            if cost.observer_prior is not None and cost.observer_prior.bounds is None
             else "its terms are not bounded by powers with one exponent, above and below"
         )
         return None, found(False, Evidence.PROVED, f"the cost has no constants: {why}", None)

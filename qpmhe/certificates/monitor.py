@@ -24,6 +24,7 @@ __all__ = [
 ]
 
 _RELATIVE = 1e-6
+_ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 _FEASIBLE = 1e-8  # what the estimator itself takes for rounding on the sets' boundary
 _BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
 
@@ -298,8 +299,10 @@ def monitor(
         # What is missing is reported as that alone: the observer takes it for a fit.
         known = np.nan_to_num(fit, nan=0.0)
         allowed = kappa * np.linalg.norm(known, axis=1) * (1.0 + _RELATIVE)
-        rounding = 1e-12 * (1.0 + float(np.abs(estimate.candidate).max()))
-        bounded = bool((np.linalg.norm(corrections, axis=1) <= allowed + rounding).all())
+        rounding = 1e-12 * np.abs(estimate.candidate).max(axis=0)
+        bounded = bool(
+            (np.linalg.norm(corrections, axis=1) <= allowed + np.linalg.norm(rounding)).all()
+        )
         gain = certificate.gain
         observed = gain is None or not complete or bool(
             (np.abs(corrections - known @ gain.T)
@@ -307,9 +310,9 @@ def monitor(
         )
         cheaper = estimate.cost <= estimate.candidate_cost and (
             not complete
-            or (_costs(certificate, estimate.trajectory, estimate, w, estimate.noises,
-                      estimate.cost)
-            and _costs(certificate, estimate.candidate, estimate, corrections, fit,
+            or (_costs(certificate, estimate.trajectory, estimate, w, estimate.noises, y,
+                       estimate.cost)
+            and _costs(certificate, estimate.candidate, estimate, corrections, fit, y,
                        estimate.candidate_cost))
         )
     low, high = region.lower[region.n :], region.upper[region.n :]
@@ -364,14 +367,19 @@ def _along(system: System, states: Array, u: Array) -> tuple[Array, Array]:
 
 
 def _costs(
-    certificate: Certificate, states: Array, estimate: Estimate, w: Array, v: Array, stated: float
+    certificate: Certificate, states: Array, estimate: Estimate, w: Array, v: Array, y: Array,
+    stated: float,
 ) -> bool:
     """Whether a trajectory has the stated cost, or no less where the prior's weight varies."""
     cost, offset = certificate.cost, states[0] - estimate.candidate[0]
-    stages = cost.stage_costs(np.hstack((w, v)), cost.stage_weight)
-    total = cost.prior_cost(offset, cost.least_prior) + float(np.sum(stages))
+    total = float(np.sum(cost.stage_costs(np.hstack((w, v)), cost.stage_weight)))
+    total += cost.prior_cost(offset, cost.least_prior)
+    # Residuals are differences of numbers of these sizes.
+    sizes = np.hstack((np.abs(states[1:]) + np.abs(w), np.abs(y) + np.abs(v)))
+    each = np.diag(cost.stage_weight.diagonal())
+    rounding = float(np.sum(cost.stage_costs(_ROUNDING * sizes, each)))
     missed = abs(total - stated) if cost.observer_prior is None else total - stated
-    return bool(missed <= _RELATIVE * (abs(stated) + 1e-9))
+    return bool(missed <= _RELATIVE * abs(stated) + rounding / _RELATIVE)
 
 
 def _in_sets(system: System, states: Array, w: Array, v: Array) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import Array
+from .._linalg import inverse
 from ..errors import OptionError
 
 __all__ = ["Cost", "CostConstants", "CostForm", "ObserverPrior", "quadratic_form"]
@@ -22,6 +23,10 @@ Mask = NDArray[np.bool_]
 # Weights for patterns of missing components are kept up to so many bytes, and a few in any case.
 _KEPT_BYTES = 2**22
 _KEPT_LEAST = 8
+# Eigenvalues of correlations below this are rounding.
+_LEAST_EIGENVALUE = 1e-12
+# In place of a variance of zero: its weight acts as infinity, and its square does not overflow.
+_NO_VARIANCE = 2.0**-500
 
 
 @dataclass(frozen=True)
@@ -63,35 +68,68 @@ class ObserverPrior:
     r"""Weigh the prior z(t-N) with the inverse of the observer's own covariance at t-N.
 
     With a Kalman-type observer on a linear system, the estimator then equals the Kalman
-    filter for every horizon. The eigenvalues of the weight are clipped to stated bounds,
-    so that (eq:cond0) holds with :math:`\underline c_p` and :math:`\overline c_p` equal
-    to them.
+    filter for every horizon. With D the standard deviations and C the correlations of the
+    covariance, the weight is
+
+    .. math::
+        D^{-1} C^{-1} D^{-1}, \qquad P = D\, C\, D
+
+    where eigenvalues of C below 1e-12, which are rounding, count as 1e-12.
 
     Parameters
     ----------
-    minimum, maximum : float
-        Bounds on the eigenvalues of the prior weight (inverse of squared state units); an
-        `OptionError` is raised unless 0 < minimum < maximum < infinity.
+    minimum, maximum : float, optional
+        Bounds on the eigenvalues of the prior weight (inverse of squared state units), to which
+        they are clipped, so that (eq:cond0) holds with :math:`\underline c_p` and
+        :math:`\overline c_p` equal to them: a certificate needs them. Left out, nothing is
+        clipped, and the cost has no `Cost.constants`. An `OptionError` is raised unless both
+        are left out or 0 < minimum < maximum < infinity.
     """
 
     __slots__ = ("maximum", "minimum")
 
-    def __init__(self, minimum: float = 1e-12, maximum: float = 1e12) -> None:
-        if not _number(minimum) or not _number(maximum) or not 0 < minimum < maximum:
+    def __init__(self, minimum: float | None = None, maximum: float | None = None) -> None:
+        self.minimum: float | None = None
+        self.maximum: float | None = None
+        if minimum is None and maximum is None:
+            return
+        if (
+            minimum is None or maximum is None or not _number(minimum) or not _number(maximum)
+            or not 0 < minimum < maximum
+        ):
             raise OptionError(
                 f"minimum is {minimum!r} and maximum {maximum!r}; "
-                "expected finite numbers with 0 < minimum < maximum."
+                "expected finite numbers with 0 < minimum < maximum, or neither of them."
             )
         self.minimum, self.maximum = float(minimum), float(maximum)
 
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """Minimum and maximum; None if they were left out."""
+        if self.minimum is None or self.maximum is None:
+            return None
+        return self.minimum, self.maximum
+
     def weight(self, covariance: Array) -> Array:
-        """The clipped inverse of a covariance (n, n)."""
+        """The inverse of a covariance (n, n), clipped if bounds were given."""
+        bounds = self.bounds
+        if bounds is None:
+            return _relative_inverse(covariance)
         values, vectors = np.linalg.eigh(covariance)
         with np.errstate(divide="ignore"):
-            inverse = np.where(values > 0.0, 1.0 / values, self.maximum)
-        clipped = np.clip(inverse, self.minimum, self.maximum)
+            clipped = np.clip(np.where(values > 0.0, 1.0 / values, bounds[1]), *bounds)
         weight: Array = (vectors * clipped) @ vectors.T
         return weight
+
+
+def _relative_inverse(covariance: Array) -> Array:
+    """The inverse by standard deviations and correlations, whatever the units."""
+    variances = covariance.diagonal()
+    deviations = np.sqrt(np.maximum(variances, _NO_VARIANCE))
+    products = np.multiply.outer(deviations, deviations)
+    values, vectors = np.linalg.eigh(covariance / products)
+    weight: Array = (vectors / np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T
+    return weight / products
 
 
 class Cost(ABC):
@@ -140,14 +178,34 @@ class Cost(ABC):
 
     @property
     def least_prior(self) -> Array:
-        """The prior weight (n, n); the least one where the observer's covariance gives it."""
-        rule = self.prior
-        return rule.minimum * np.eye(self.n) if isinstance(rule, ObserverPrior) else rule
+        """A weight (n, n) that the initial error's never falls below: zero if none is known."""
+        if not isinstance(self.prior, ObserverPrior):
+            return self.prior
+        return (self.prior.minimum or 0.0) * np.eye(self.n)
 
     @property
     def c_form(self) -> CostForm | None:
         """What the step in C needs of the cost; None for a cost that it cannot compute."""
         return None
+
+    def prior_deviations(self, covariance: Array | None) -> Array:
+        """Standard deviations (n,) of the initial error: typical magnitudes of the states.
+
+        Where that of the disturbance w is larger, or an observer knows no initial error, they
+        are those of w.
+
+        Parameters
+        ----------
+        covariance : (n, n) array or None
+            The observer's covariance of the initial error, for an `ObserverPrior`.
+        """
+        variances: Array = inverse(self.disturbance).diagonal()
+        if not isinstance(self.prior, ObserverPrior):
+            covariance = inverse(self.prior)
+        if covariance is not None and covariance.shape == self.disturbance.shape:
+            initial = covariance.diagonal()
+            variances = np.where(np.isfinite(initial), np.fmax(variances, initial), variances)
+        return np.sqrt(variances)
 
     @property
     @abstractmethod
@@ -214,8 +272,8 @@ class Cost(ABC):
         reduced = np.zeros_like(weight)
         there = np.flatnonzero(observed)
         if there.size:
-            block = np.linalg.inv(weight)[np.ix_(there, there)]
-            reduced[np.ix_(there, there)] = np.linalg.inv(block)
+            block = inverse(weight)[np.ix_(there, there)]
+            reduced[np.ix_(there, there)] = inverse(block)
         return self.joint_weight(reduced)
 
 

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import Array, positive_definite
+from .._linalg import inverse
 from .base import Cost, CostConstants, CostForm, ObserverPrior, quadratic_form
 
 __all__ = ["QuadraticCost"]
@@ -84,14 +85,16 @@ class QuadraticCost(Cost):
     def constants(self) -> CostConstants | None:
         """Constants of (eq:exp_bounds): extreme eigenvalues of the weights, a = 2.
 
-        None with a discount: the bounds then shrink with the age of a stage.
+        None with a discount: the bounds then shrink with the age of a stage. None with an
+        `ObserverPrior` without bounds: its weight may be anything.
         """
         if self.discount < 1.0:
             return None
-        if isinstance(self.prior, ObserverPrior):
-            prior = (self.prior.minimum, self.prior.maximum)
-        else:
-            prior = _extremes(self.prior)
+        prior = (
+            self.prior.bounds if isinstance(self.prior, ObserverPrior) else _extremes(self.prior)
+        )
+        if prior is None:
+            return None
         return CostConstants(2.0, prior, _extremes(self.disturbance), _extremes(self.noise))
 
     def stage_costs(self, residuals: Array, weights: Array) -> Array:
@@ -112,8 +115,7 @@ class QuadraticCost(Cost):
 
 
 def _inverse(name: str, covariance: ArrayLike) -> Array:
-    inverse = np.linalg.inv(positive_definite(name, covariance))
-    return np.asarray(0.5 * (inverse + inverse.T))
+    return inverse(positive_definite(name, covariance))
 
 
 def _extremes(weight: Array) -> tuple[float, float]:

@@ -69,7 +69,7 @@ class RobustCost(Cost):
             return None
         prior, disturbance, noise = (loss.constants() for loss in losses)
         if isinstance(self.prior, ObserverPrior):
-            prior = (self.prior.minimum, self.prior.maximum)
+            prior = self.prior.bounds
         if prior is None or disturbance is None or noise is None:
             return None
         return CostConstants(exponent, prior, disturbance, noise)

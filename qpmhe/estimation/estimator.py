@@ -162,7 +162,7 @@ class MovingHorizonEstimator:
                 "or give a constant weight."
             )
         # A copy, because this estimator may change how the model is called.
-        self._own_system = system.copy()
+        self._own_system = system.copy(cost.prior_deviations(observer.initial_covariance()))
         self._initial_state: Array = self._checked_start(initial_state)
         self._no_input = np.zeros(system.m)
         try:
@@ -299,7 +299,7 @@ class MovingHorizonEstimator:
     def _check_step_length(self, dt: float) -> None:
         """Check once, before a sample is taken, that the model takes step lengths."""
         if "timed" not in self._own_system.__dict__:
-            timed = self.system.timed.copy()
+            timed = self.system.timed.copy(self._own_system.scales)
             timed.check(self._initial_state, np.append(self._no_input, dt))
             self._own_system.__dict__["timed"] = timed
 

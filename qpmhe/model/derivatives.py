@@ -13,23 +13,39 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError
 from .functions import BatchedFunction, Probes, Trusted
+from .sets import ConvexSet
 
 __all__ = ["Jacobian"]
 
 Array = NDArray[Any]
 
-_COMPLEX_STEP = 1e-30  # no subtraction, hence no cancellation: any tiny step is exact
+# Of a state's magnitude. No subtraction, hence no cancellation: any tiny step is exact.
+_COMPLEX_STEP = 2.0**-100
 _DIFFERENCE_STEP = float(np.finfo(np.float64).eps) ** (1 / 3)
+# Accuracy of differences: of each entry, of an entry beside the largest of its row, and of one
+# beside the function's value, where it is rounding.
+_ENTRY, _ROW, _VALUE = 1e-5, 1e-7, 1e-9
+# A Jacobian is wrong where it is further off than differences with these many times the error.
+_SLACK = 10.0
+# How often, and by how much, a step is shortened at most where differences curve within it.
+_SHORTER = [2.0 ** (-4 * k) for k in range(11)]
 
 
 class Jacobian:
     """The Jacobian with respect to x of a `BatchedFunction` with vector values.
 
+    Steps are shares of the states' magnitudes, which are 1 until `use_scales` says better; a
+    given Jacobian is compared with differences only from then on.
+
     Attributes
     ----------
     method : str
         ``given``, ``complex step`` or ``finite differences``.
+    remedy : str
+        What to do about a given Jacobian that is wrong.
     """
+
+    remedy = "Correct it, or leave it out to have it computed."
 
     def __init__(
         self,
@@ -37,19 +53,24 @@ class Jacobian:
         given: Callable[..., Any] | Trusted | None,
         inputs: int,
         probes: Probes,
+        states: ConvexSet | None = None,
     ) -> None:
-        self._function, self._inputs = function, inputs
+        self.function, self._inputs = function, inputs
+        n = probes[0][0].size
+        self._eye: Array = np.eye(n)
+        self._bounds = None if states is None else (states.lower, states.upper)
+        self._outputs: Array = np.zeros(function.shape)
+        self._scales: Array | None = None
+        self._set_scales(np.ones(n))
         self.method = "finite differences"
         self.batch: Callable[[Array, Array], Array] = self._differences
         self._given: BatchedFunction | None = None
-        n = probes[0][0].size
         if given is not None:
             name = f"{function.name}_jacobian"
             self._given = BatchedFunction(name, given, (*function.shape, n), inputs, probes)
-            self._compare(self._given, probes)
             self.method, self.batch = "given", self._given.batch
-        elif self._complex_step_works(probes):
-            self.method, self.batch = "complex step", self._complex
+        else:
+            self._choose(probes)
 
     def __call__(self, x: Array, u: Array) -> Array:
         """The Jacobian (d, n) at one state."""
@@ -65,52 +86,135 @@ class Jacobian:
             return self._given.direct
         return self if self._inputs else partial(self, u=np.zeros(0))
 
+    def use_scales(self, scales: Array, outputs: Array | None, probes: Probes) -> None:
+        """Take these magnitudes of states, and values if known; choose or compare anew.
+
+        The probes must be of these magnitudes.
+        """
+        self._scales = scales
+        if outputs is not None:
+            self._outputs = outputs
+        self._set_scales(scales)
+        if self._given is None:
+            self._choose(probes)
+        else:
+            self._given.try_again(probes)
+            self._compare(probes)
+
+    def _set_scales(self, scales: Array) -> None:
+        # Powers of two: what a step divides by then costs no rounding, and depends on no other
+        # digits of the scales.
+        self._sizes = np.ldexp(1.0, np.frexp(scales)[1] - 1)
+        self._complex_steps = _COMPLEX_STEP * self._sizes
+        self._complex_moves = 1j * self._complex_steps * self._eye
+
     def _complex(self, x: Array, u: Array) -> Array:
-        n = x.shape[-1]
-        moved = x[..., None, :] + (1j * _COMPLEX_STEP) * np.eye(n)
+        moved = x[..., None, :] + self._complex_moves
         u_all = np.broadcast_to(u[..., None, :], (*moved.shape[:-1], u.shape[-1]))
-        values = np.asarray(self._function.batch(moved, u_all))
-        return np.swapaxes(values.imag, -1, -2) / _COMPLEX_STEP
+        values = np.asarray(self.function.batch(moved, u_all))
+        slope: Array = np.swapaxes(values.imag, -1, -2) / self._complex_steps
+        return slope
 
     def _differences(self, x: Array, u: Array) -> Array:
-        n = x.shape[-1]
-        step = _DIFFERENCE_STEP * np.maximum(1.0, np.abs(x))
-        moves = step[..., None, :] * np.eye(n)
+        step = _DIFFERENCE_STEP * np.maximum(self._sizes, np.abs(x))
+        return self._quotients(x, u, step, slice(None))
+
+    def _quotients(self, x: Array, u: Array, step: Array, columns: slice) -> Array:
+        """Columns of the Jacobian by central differences, or inward ones at a bound."""
+        side, length = self._side(x, step), step[..., columns, None]
+        moves, at = length * self._eye[columns], x[..., None, :]
         u_all = np.broadcast_to(u[..., None, :], (*moves.shape[:-1], u.shape[-1]))
-        # A copy: a function may return one and the same array every time.
-        ahead = np.array(self._function.batch(x[..., None, :] + moves, u_all))
-        behind = np.asarray(self._function.batch(x[..., None, :] - moves, u_all))
-        return np.swapaxes((ahead - behind) / (2 * step[..., :, None]), -1, -2)
+        # Copies: a function may return one and the same array every time.
+        if side is None:
+            ahead = np.array(self.function.batch(at + moves, u_all))
+            behind = np.asarray(self.function.batch(at - moves, u_all))
+            return np.swapaxes((ahead - behind) / (2 * length), -1, -2)
+        side = side[..., columns, None]
+        central = side == 0.0
+        value = np.array(self.function.batch(x, u))[..., None, :]
+        near = np.array(self.function.batch(at + np.where(central, 1.0, side) * moves, u_all))
+        far = np.asarray(
+            self.function.batch(at + np.where(central, -1.0, 2.0 * side) * moves, u_all)
+        )
+        rise = np.where(central, near - far, side * (4.0 * near - far - 3.0 * value))
+        return np.swapaxes(rise / (2 * length), -1, -2)
 
-    def _one_sided(self, x: Array, u: Array, value: Array) -> tuple[Array, Array]:
-        """The smaller and the larger of forward and backward differences."""
-        step = _DIFFERENCE_STEP * np.maximum(1.0, np.abs(x))
-        moves = step[:, None] * np.eye(x.size)
-        with np.errstate(all="ignore"):
-            ahead, behind = (
-                np.array([self._function(x + sign * move, u) for move in moves]).T
-                for sign in (1.0, -1.0)
-            )
-        sides = (ahead - value[:, None]) / step, (value[:, None] - behind) / step
-        return np.minimum(*sides), np.maximum(*sides)
+    def _side(self, x: Array, step: Array) -> Array | None:
+        """1 or -1 where a central difference would leave the bounds and this side has room."""
+        if self._bounds is None:
+            return None
+        lower, upper = self._bounds
+        below, above = x - step < lower, x + step > upper
+        if not (below.any() or above.any()):
+            return None
+        side: Array = np.where(below & (x + 2.0 * step <= upper), 1.0, 0.0)
+        side -= above & (x - 2.0 * step >= lower)
+        return side
 
-    def _at_probes(self, probes: Probes) -> list[tuple[Array, Array, Array, Array]]:
-        """The probes with the function's value and its finite differences there."""
-        usable = []
-        for x, u in probes:
+    def _measured(self, x: Array, u: Array) -> tuple[Array, Array, Array] | None:
+        """Value (d,), differences (d, n) and sizes (n,) of the states at one state.
+
+        A step that the function curves within is shortened, down to the state's own size. A
+        column whose differences do not settle is NaN, its size the usual one. None where the
+        function cannot be evaluated.
+        """
+        try:
+            with np.errstate(all="ignore"):
+                value = np.array(self.function(x, u), np.float64)
+        except Exception:  # outside the function's domain
+            return None
+        if not np.isfinite(value).all():
+            return None
+        slope, sizes = np.full((*value.shape, x.size), np.nan), self._sizes.copy()
+        pending = list(range(x.size))
+        for share in _SHORTER:
+            trial = share * self._sizes
+            found = self._settled(x, u, value, np.maximum(trial, np.abs(x)), pending)
+            for j, column in found.items():
+                slope[:, j], sizes[j] = column, trial[j]
+            pending = [j for j in pending if j not in found and trial[j] > abs(x[j])]
+            if not pending:
+                break
+        return value, slope, sizes
+
+    def _settled(
+        self, x: Array, u: Array, value: Array, size: Array, columns: list[int]
+    ) -> dict[int, Array]:
+        """The columns that steps of this size and half of it agree on."""
+        step = _DIFFERENCE_STEP * size
+        found = {}
+        for j in columns:
             try:
                 with np.errstate(all="ignore"):
-                    value = np.asarray(self._function(x, u))
-                    slope = self._differences(x[None], u[None])[0]
+                    whole, half = (
+                        self._quotients(x[None], u[None], length, slice(j, j + 1))[0, :, 0]
+                        for length in (step[None], 0.5 * step[None])
+                    )
             except Exception:  # outside the function's domain
                 continue
-            if np.isfinite(slope).all():
-                usable.append((x, u, value, slope))
-        return usable
+            found[j] = whole, half
+        if not found:
+            return {}
+        row = np.max([np.abs(half) * size[j] for j, (_, half) in found.items()], axis=0)
+        floor = _ROW * row + _VALUE * np.maximum(np.abs(value), self._outputs)
+        return {
+            j: whole for j, (whole, half) in found.items()
+            if np.all(np.abs(whole - half) * size[j] <= _ENTRY * np.abs(half) * size[j] + floor)
+        }
 
-    def _complex_step_works(self, probes: Probes) -> bool:
-        usable = self._at_probes(probes)
-        for x, u, value, expected in usable:
+    def _choose(self, probes: Probes) -> None:
+        works = self._complex_step_works(probes)
+        self._undecided = works is None
+        self.use("complex step" if works else "finite differences")
+
+    def _complex_step_works(self, probes: Probes) -> bool | None:
+        """Whether it agrees with differences at all probes; None if none can be used."""
+        usable = None
+        for x, u in probes:
+            measured = self._measured(x, u)
+            if measured is None or np.isnan(measured[1]).all():
+                continue
+            usable = True
             try:
                 # A function that throws the imaginary part away warns, which raises here.
                 with np.errstate(all="ignore"), warnings.catch_warnings():
@@ -118,21 +222,31 @@ class Jacobian:
                     found = self._complex(x[None], u[None])[0]
             except Exception:  # comparisons, math.sin and the like do not take complex numbers
                 return False
-            if not _close(found, expected, value).all():
+            if not np.isfinite(found).all() or self._wrong(found, x, *measured).any():
                 return False
-        return bool(usable)
+        return usable
 
     def check(self, x: Array, u: Array) -> None:
-        """Try the method again at a state that will be used."""
+        """Try the method again at a state that will be used, and find the steps there."""
         if self._given is not None:
-            self._compare(self._given, [(x, u)])
-        elif self.method == "complex step" and not self._complex_step_works([(x, u)]):
+            if self._scales is not None:
+                self._compare([(x, u)])
+            return
+        works = self._complex_step_works([(x, u)])
+        if self.method == "complex step" and not works:
             self.use("finite differences")
+        elif self._undecided and works:
+            self.use("complex step")
+        if self.method == "finite differences" and self._scales is not None:
+            self._set_scales(self._scales)
+            measured = self._measured(x, u)
+            if measured is not None:
+                self._set_scales(measured[2])
 
     def copy(self, function: BatchedFunction) -> Jacobian:
         """The same Jacobian, of a copy of its function; its method can change independently."""
         other = copy(self)
-        other._function = function
+        other.function = function
         if self._given is None:
             other.use(self.method)
         else:
@@ -146,30 +260,59 @@ class Jacobian:
             self.method = method
             self.batch = self._complex if method == "complex step" else self._differences
 
-    def _compare(self, given: BatchedFunction, probes: Probes) -> None:
-        for x, u, value, expected in self._at_probes(probes):
+    def _compare(self, probes: Probes) -> None:
+        """Raise where a given Jacobian is not the derivative."""
+        given = self._given
+        if given is None:
+            return
+        for x, u in probes:
+            measured = self._measured(x, u)
+            if measured is None:
+                continue
             try:
                 with np.errstate(all="ignore"):
                     found = np.asarray(given(x, u), dtype=np.float64)
             except Exception:  # outside its domain
                 continue
-            wrong = ~_close(found, expected, value)
+            wrong = self._wrong(found, x, *measured)
             if wrong.any():  # at a kink, any slope between those of the two sides will do
-                low, high = self._one_sided(x, u, value)
-                slack = 1e-4 * np.abs(found) + 1e-6
-                wrong &= ~((low - slack <= found) & (found <= high + slack))
+                wrong &= ~self._between(found, x, u, *measured)
             if np.isfinite(found).all() and wrong.any():
                 i, j = np.argwhere(wrong)[0]
                 raise ModelError(
                     f"{given.name}[{i}, {j}] is {found[i, j]:.6g} at x = {x.tolist()}, but the "
-                    f"derivative of the function there is {expected[i, j]:.6g}. Correct it, or "
-                    "leave it out to have it computed."
+                    f"derivative of the function there is {measured[1][i, j]:.6g}. {self.remedy}"
                 )
 
+    def _errors(self, slope: Array, x: Array, value: Array, sizes: Array) -> tuple[Array, Array]:
+        """Accuracy of differences (d, n), times the states' sizes, and these (n,)."""
+        size = np.maximum(sizes, np.abs(x))
+        scaled = np.abs(np.nan_to_num(slope)) * size
+        magnitude = np.maximum(np.abs(value), self._outputs)[:, None]
+        row = scaled.max(axis=1, keepdims=True)
+        return _SLACK * (_ENTRY * scaled + _ROW * row) + _VALUE * magnitude, size
 
-def _close(found: Array, expected: Array, value: Array) -> Array:
-    """Entry by entry, up to the accuracy of differences of functions with these values."""
-    row = np.abs(expected).max(axis=1, keepdims=True)
-    floor = 1e-6 * (1.0 + row) + 1e-9 * np.abs(value).reshape(-1, 1)
-    close: Array = np.abs(found - expected) <= 1e-4 * np.abs(expected) + floor
-    return close
+    def _wrong(self, found: Array, x: Array, value: Array, slope: Array, sizes: Array) -> Array:
+        """Which entries (d, n) are not those of the differences."""
+        allowed, size = self._errors(slope, x, value, sizes)
+        wrong: Array = np.abs(found - slope) * size > allowed
+        return wrong  # False where the differences are NaN
+
+    def _between(
+        self, found: Array, x: Array, u: Array, value: Array, slope: Array, sizes: Array
+    ) -> Array:
+        """Which entries lie between the forward and the backward difference."""
+        allowed, size = self._errors(slope, x, value, sizes)
+        sides = []
+        for sign in (1.0, -1.0):
+            side = np.full(slope.shape, np.nan)
+            for j, step in enumerate(sign * _DIFFERENCE_STEP * size):
+                try:
+                    with np.errstate(all="ignore"):
+                        side[:, j] = (self.function(x + step * self._eye[j], u) - value) / step
+                except Exception:  # outside the function's domain
+                    continue
+            sides.append(side)
+        slack = np.maximum(allowed, _SLACK * _ENTRY * np.abs(found) * size) / size
+        between: Array = (np.fmin(*sides) - slack <= found) & (found <= np.fmax(*sides) + slack)
+        return between

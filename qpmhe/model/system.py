@@ -7,12 +7,12 @@ from functools import cached_property, partial
 from typing import Any, NoReturn, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers.errors import report_unknown_options
 
-from .._checks import count, positive
-from ..errors import InvalidInputError, ModelError, SetError
+from .._checks import count, positive, vector
+from ..errors import InvalidInputError, ModelError, OptionError, SetError
 from .derivatives import Jacobian
 from .discretize import discretize
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
@@ -75,10 +75,15 @@ class System:
         Number of known inputs; 0 for none.
     f_jacobian, h_jacobian : callable, optional
         Derivatives with respect to x, of shapes (n, n) and (p, n), same arguments. Left out,
-        they are computed: by the complex step where the function allows it, else by central
-        differences; see ``derivatives``.
+        they are computed: by the complex step where the function allows it, else by
+        differences, central ones or, at a bound of X, inward ones; see ``derivatives``.
     states, disturbances, noises : Box or Polytope, optional
         The sets X, W and V; the whole space if left out.
+    scales : (n,) array_like, optional
+        Typical magnitudes of the states, above zero, in their units: difference steps are
+        shares of them, and a given Jacobian is compared with differences where they are known.
+        Left out, an estimator takes the standard deviations of its prior; a system alone takes
+        1 for its steps and compares nothing.
 
     Raises
     ------
@@ -87,6 +92,8 @@ class System:
         not the derivative.
     SetError
         If a set has the wrong dimension.
+    OptionError, ShapeError
+        If a scale is not above zero, or there is not one for each state.
 
     Examples
     --------
@@ -110,8 +117,12 @@ class System:
         states: ConvexSet | None = None,
         disturbances: ConvexSet | None = None,
         noises: ConvexSet | None = None,
+        scales: ArrayLike | None = None,
     ) -> None:
         self.n, self.p, self.m = count("n", n, 1), count("p", p, 1), count("m", m, 0)
+        #: Typical magnitudes of the states, (n,); None if they are not known.
+        self.scales: Array | None = None
+        self._scales_given = False
         self.states = checked_set("states", states, self.n)
         self.disturbances = checked_set("disturbances", disturbances, self.n)
         self.noises = checked_set("noises", noises, self.p)
@@ -119,8 +130,12 @@ class System:
         self.f = BatchedFunction("f", f, (self.n,), self.m, probes)
         self.h = BatchedFunction("h", h, (self.p,), self.m, probes)
         check_inputs(self.m, f=self.f.takes_input, h=self.h.takes_input)
-        self.f_jacobian = Jacobian(self.f, f_jacobian, self.m, probes)
-        self.h_jacobian = Jacobian(self.h, h_jacobian, self.m, probes)
+        self.f_jacobian = Jacobian(self.f, f_jacobian, self.m, probes, self.states)
+        self.h_jacobian = Jacobian(self.h, h_jacobian, self.m, probes, self.states)
+        #: The Jacobian of the rate of a discretised ODE, where the user gave it.
+        self.rate_jacobian: Jacobian | None = None
+        if scales is not None:
+            self._give_scales(scales)
         # What follows is set by the functions that make systems: `from_ode` and the adapters.
         #: Sampling time of a discretised ODE; None for a discrete-time model.
         self.dt: float | None = None
@@ -137,6 +152,7 @@ class System:
                 "f": f, "h": h, "n": n, "p": p, "m": m,
                 "f_jacobian": f_jacobian, "h_jacobian": h_jacobian,
                 "states": states, "disturbances": disturbances, "noises": noises,
+                "scales": scales,
             },
         )
 
@@ -156,6 +172,7 @@ class System:
         states: ConvexSet | None = None,
         disturbances: ConvexSet | None = None,
         noises: ConvexSet | None = None,
+        scales: ArrayLike | None = None,
     ) -> System:
         r"""Discretise :math:`\dot x = f_c(x, u)` with a fixed step; u is held over the step.
 
@@ -165,7 +182,7 @@ class System:
         ----------
         rate : callable
             f_c(x) or f_c(x, u), in units of x per unit of time.
-        h, n, p, m, h_jacobian, states, disturbances, noises
+        h, n, p, m, h_jacobian, states, disturbances, noises, scales
             As for `System`.
         dt : float
             Sampling time, in the time unit of the rate.
@@ -184,9 +201,9 @@ class System:
         n, m = count("n", n, 1), count("m", m, 0)
         probes = probe_points(checked_set("states", states, n), n, m)
         batched = BatchedFunction("rate", rate, (n,), m, probes)
-        given = None
+        given = compared = None
         if rate_jacobian is not None:
-            Jacobian(batched, rate_jacobian, m, probes)  # compares it with differences
+            compared = Jacobian(batched, rate_jacobian, m, probes, states)
             given = BatchedFunction("rate_jacobian", rate_jacobian, (n, n), m, probes)
         step, step_jacobian = discretize(
             _over_leading(batched), given and _over_leading(given), method
@@ -201,12 +218,14 @@ class System:
             h_jacobian=h_jacobian, **sets,
         )
         check_inputs(m, rate=batched.takes_input, h=system.h.takes_input)
-        system.dt = length
+        system.dt, system.rate_jacobian = length, compared
+        if scales is not None:
+            system._give_scales(scales)
         system.recipe = (
             cls.from_ode,
             {
                 "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": method,
-                "rate_jacobian": rate_jacobian, "h_jacobian": h_jacobian, **sets,
+                "rate_jacobian": rate_jacobian, "h_jacobian": h_jacobian, "scales": scales, **sets,
             },
         )
 
@@ -215,7 +234,8 @@ class System:
                 Trusted(_timed_by_input(step, m)), Trusted(_without_last(system.h.batch, m)),
                 n=n, p=p, m=m + 1,
                 f_jacobian=step_jacobian and Trusted(_timed_by_input(step_jacobian, m)),
-                h_jacobian=Trusted(_without_last(system.h_jacobian.batch, m)), **sets,
+                h_jacobian=Trusted(_without_last(system.h_jacobian.batch, m)),
+                scales=scales, **sets,
             )
 
         system.make_timed = timed
@@ -246,17 +266,63 @@ class System:
             )
         return self.make_timed()
 
-    def copy(self) -> System:
-        """The same system for one estimator, which may change how its functions are called."""
+    def copy(self, scales: ArrayLike | None = None) -> System:
+        """The same system for one estimator, which may change how its functions are called.
+
+        Parameters
+        ----------
+        scales : (n,) array_like, optional
+            As for `use_scales`.
+        """
         other = object.__new__(type(self))  # `copy.copy` would make the model again, as pickle does
         other.__dict__.update(self.__dict__)
         other.f, other.h = self.f.copy(), self.h.copy()
         other.f_jacobian = self.f_jacobian.copy(other.f)
         other.h_jacobian = self.h_jacobian.copy(other.h)
+        if self.rate_jacobian is not None:
+            other.rate_jacobian = self.rate_jacobian.copy(self.rate_jacobian.function)
         other.__dict__.pop("timed", None)
         if self.make_timed is not None:
-            other.make_timed = lambda: self.timed.copy()
+            other.make_timed = lambda: self.timed.copy(other.scales)
+        if scales is not None:
+            other.use_scales(scales)
         return other
+
+    def use_scales(self, scales: ArrayLike) -> None:
+        """Take typical magnitudes of the states, unless the user gave them with the system.
+
+        Steps of numerical derivatives are shares of them, and Jacobians that the user gave are
+        compared with differences. An estimator calls this on its copy of the system, with the
+        standard deviations of its prior.
+
+        Parameters
+        ----------
+        scales : (n,) array_like
+            Magnitudes in the states' units, finite and above zero.
+
+        Raises
+        ------
+        OptionError, ShapeError
+            If they are not.
+        ModelError
+            If a given Jacobian is not the derivative at points of these magnitudes.
+        """
+        if not self._scales_given:
+            self._take_scales(_checked_scales(scales, self.n))
+
+    def _give_scales(self, scales: ArrayLike) -> None:
+        self._take_scales(_checked_scales(scales, self.n))
+        self._scales_given = True
+
+    def _take_scales(self, scales: Array) -> None:
+        self.scales = scales
+        probes = probe_points(self.states, self.n, self.m, scales)
+        for function in (self.f, self.h):
+            function.try_again(probes)
+        if self.rate_jacobian is not None:  # first, to be named if it is wrong
+            self.rate_jacobian.use_scales(scales, None, probes)
+        self.f_jacobian.use_scales(scales, scales, probes)
+        self.h_jacobian.use_scales(scales, None, probes)
 
     def call_modes(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Modes of f and h and methods of their Jacobians; then those of `timed`, if it exists."""
@@ -300,7 +366,8 @@ class System:
         ModelError
             If one is not.
         """
-        for function in (self.f, self.h, self.f_jacobian, self.h_jacobian):
+        rate = () if self.rate_jacobian is None else (self.rate_jacobian,)
+        for function in (self.f, self.h, *rate, self.f_jacobian, self.h_jacobian):
             try:
                 function.check(x, u)
             except ModelError:
@@ -328,13 +395,25 @@ def checked_set(name: str, value: ConvexSet | None, dimension: int) -> ConvexSet
     return value
 
 
-def probe_points(states: ConvexSet | None, n: int, m: int) -> Probes:
+def _checked_scales(given: ArrayLike, n: int) -> Array:
+    scales = vector("scales", given, n)
+    if not (scales > 0.0).all():
+        raise OptionError(
+            f"scales is {scales.tolist()}; expected a number > 0 for each state: its typical "
+            "magnitude, in its unit. Leave scales out if they are not known."
+        )
+    return scales
+
+
+def probe_points(
+    states: ConvexSet | None, n: int, m: int, scales: Array | float = 1.0
+) -> Probes:
     """A few irregular points (x, u) within the state bounds, at which functions are tried."""
     generator = np.random.default_rng(20210829)
     probes: Probes = []
     # Positive ones first, where most models are defined; then all signs, where branches part.
     for scale, least in ((1.0, 0.2), (0.3, 0.2), (3.0, 0.2), (1.0, -1.0), (10.0, -1.0)):
-        x = scale * generator.uniform(least, 1.0, n)
+        x = scales * (scale * generator.uniform(least, 1.0, n))
         if states is not None:
             low, high = states.lower, states.upper
             both = np.isfinite(low) & np.isfinite(high)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .._checks import Array
+from .._linalg import solve
 from .base import KalmanType, Sample
 
 __all__ = ["ExtendedKalman"]
@@ -46,7 +47,7 @@ class ExtendedKalman(KalmanType):
         a, c, covariance = _given(sample)
         c, r, v = self._seen(c, v, sample)
         cross = a @ covariance @ c.T
-        gain = np.linalg.solve(c @ covariance @ c.T + r, cross.T).T if v.size else cross
+        gain = solve(c @ covariance @ c.T + r, cross.T).T if v.size else cross
         # Joseph's form: symmetric, and positive semidefinite by construction.
         closed = a - gain @ c
         following = closed @ covariance @ closed.T + gain @ r @ gain.T + self._disturbance
@@ -59,7 +60,7 @@ class ExtendedKalman(KalmanType):
         if not v.size:
             return z, covariance
         cross = covariance @ c.T
-        gain = np.linalg.solve(c @ cross + r, cross.T).T
+        gain = solve(c @ cross + r, cross.T).T
         closed = np.eye(z.size) - gain @ c
         return z + gain @ v, closed @ covariance @ closed.T + gain @ r @ gain.T
 

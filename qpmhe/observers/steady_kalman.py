@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array, positive_definite
-from .._linalg import inverse
+from .._linalg import inverse, solve
 from ..errors import ShapeError
 from ..model.system import System
 from .base import Observer, Sample
@@ -88,9 +88,7 @@ class SteadyStateKalman(Observer):
             self._a, self._c, self._disturbance, self._noise, point
         )
         cross = self.covariance @ self._c.T
-        self._filter_gain = np.asarray(
-            np.linalg.solve(self._c @ cross + self._noise, cross.T).T, np.float64
-        )
+        self._filter_gain = solve(self._c @ cross + self._noise, cross.T).T
         self._prior = self.covariance
         if prior is not None:
             self._prior = positive_definite("prior covariance", prior, system.n)

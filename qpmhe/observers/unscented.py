@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array, positive
+from .._linalg import solve
 from ..model.sets import ConvexSet
 from .base import KalmanType, Sample
 
@@ -87,7 +88,7 @@ class UnscentedKalman(KalmanType):
         seen, r, v = self._seen(points, inputs, roots, v, sample)
         if v.size == 0:
             return np.zeros_like(z), ahead.T @ ahead + self._disturbance
-        gain = np.linalg.solve(seen.T @ seen + r, seen.T @ ahead).T
+        gain = solve(seen.T @ seen + r, seen.T @ ahead).T
         left = ahead - seen @ gain.T
         following = left.T @ left + gain @ r @ gain.T + self._disturbance
         return gain @ v, 0.5 * (following + following.T)
@@ -99,7 +100,7 @@ class UnscentedKalman(KalmanType):
         seen, r, v = self._seen(points, inputs, roots, v, sample)
         if v.size == 0:
             return z, around.T @ around
-        gain = np.linalg.solve(seen.T @ seen + r, seen.T @ around).T
+        gain = solve(seen.T @ seen + r, seen.T @ around).T
         left = around - seen @ gain.T
         return z + gain @ v, left.T @ left + gain @ r @ gain.T
 

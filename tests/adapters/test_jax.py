@@ -617,10 +617,10 @@ def test_a_wrong_derivative_is_refused():
         return x**2
 
     squared.defjvp(lambda x, dx: (x[0] ** 2, 3.0 * x[0] * dx[0]))
-    with pytest.raises(ModelError, match=r"f_jacobian\[0, 0\] is .* Here it is JAX's: look for"):
-        from_jax(squared, lambda x: x, n=1, p=1)
+    with pytest.raises(ModelError, match=r"f_jacobian\[0, 0\] is .* It is JAX's: look for"):
+        from_jax(squared, lambda x: x, n=1, p=1).use_scales([1.0])
     with pytest.raises(ModelError, match=r"h_jacobian.* custom derivative within h"):
-        from_jax(lambda x: x, lambda x: x.astype(jnp.float32).astype(float), n=1, p=1)
+        from_jax(lambda x: x, squared, n=1, p=1).use_scales([1.0])
 
 
 @pytest.mark.parametrize(

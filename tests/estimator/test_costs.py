@@ -276,3 +276,83 @@ def test_bounds_of_the_observer_prior_out_of_range(minimum, maximum):
 def test_bounds_of_the_observer_prior_may_be_any_number(kind):
     rule = qpmhe.ObserverPrior(minimum=kind(1), maximum=kind(8))
     assert (rule.minimum, rule.maximum) == (1.0, 8.0)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e-6, 1e6, 1e9])
+def test_an_observer_prior_without_bounds_is_the_inverse_in_any_unit(unit):
+    generator = np.random.default_rng(10)
+    units = unit ** np.array([1.0, 0.0, -1.0])
+    covariance = spd(generator, 3)
+    weight = qpmhe.ObserverPrior().weight(covariance * np.outer(units, units))
+    np.testing.assert_allclose(
+        weight * np.outer(units, units), np.linalg.inv(covariance), rtol=1e-9
+    )
+
+
+def test_an_observer_prior_without_bounds_is_equivariant_to_the_bit():
+    generator = np.random.default_rng(11)
+    for n in (1, 2, 5):
+        covariance = spd(generator, n)
+        units = 2.0 ** generator.integers(-40, 41, n)
+        found = qpmhe.ObserverPrior().weight(covariance * np.outer(units, units))
+        np.testing.assert_array_equal(
+            found * np.outer(units, units), qpmhe.ObserverPrior().weight(covariance)
+        )
+
+
+def test_an_observer_prior_without_bounds_bears_singular_covariances():
+    flat = np.outer([1.0, 1e6], [1.0, 1e6])
+    weight = qpmhe.ObserverPrior().weight(flat)
+    assert np.isfinite(weight).all()
+    assert np.linalg.eigvalsh(weight * np.outer([1.0, 1e6], [1.0, 1e6]))[-1] > 1e11
+    known = qpmhe.ObserverPrior().weight(np.diag([0.0, 4.0]))
+    assert np.isfinite(known).all()
+    assert known[0, 0] > 1e100
+    assert known[1, 1] == pytest.approx(0.25)
+
+
+def test_an_observer_prior_without_bounds_has_no_constants():
+    for cost in (qpmhe.QuadraticCost, qpmhe.RobustCost):
+        made = cost(prior=qpmhe.ObserverPrior(), disturbance=np.eye(2), noise=1.0)
+        assert made.constants is None
+        assert not made.least_prior.any()
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_inverses_and_solutions_are_equivariant_to_the_bit(size):
+    from qpmhe._linalg import inverse, solve
+
+    generator = np.random.default_rng(size)
+    for _ in range(20):
+        matrix, side = spd(generator, size), generator.standard_normal((size, 3))
+        units = 2.0 ** generator.integers(-40, 41, size)
+        columns, whole = 2.0 ** generator.integers(-40, 41, 3), 2.0 ** generator.integers(-9, 9)
+        other = whole * matrix * np.outer(units, units)
+        np.testing.assert_allclose(inverse(matrix) @ matrix, np.eye(size), atol=1e-9)
+        np.testing.assert_array_equal(
+            inverse(other) * np.outer(units, units) * whole, inverse(matrix)
+        )
+        np.testing.assert_array_equal(
+            solve(other, side * np.outer(units, columns)) * whole,
+            solve(matrix, side) * np.outer(1.0 / units, columns),
+        )
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_weights_of_rows_in_any_unit_are_weights(unit):
+    matrix = spd(np.random.default_rng(12), 3)
+    units = np.array([1.0, unit, unit**2])
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=matrix * np.outer(units, units), disturbance=matrix * np.outer(units, units), noise=1
+    )
+    np.testing.assert_allclose(
+        cost.prior * np.outer(units, units), np.linalg.inv(matrix), rtol=1e-9
+    )
+    wrong = matrix * np.outer(units, units)
+    wrong[0, 1] *= 1.001
+    with pytest.raises(qpmhe.errors.WeightError, match="not symmetric"):
+        qpmhe.QuadraticCost.from_covariances(prior=wrong, disturbance=matrix, noise=1.0)
+    negative = matrix * np.outer(units, units)
+    negative[0] = negative[:, 0] = 3.0 * negative[:, 1] * units[0] / units[1]
+    with pytest.raises(qpmhe.errors.WeightError, match="positive definite"):
+        qpmhe.QuadraticCost.from_covariances(prior=negative, disturbance=matrix, noise=1.0)

@@ -14,6 +14,7 @@ LINEAR = np.array([[1.0, 0.1], [-0.2, 0.9]])
 
 
 def system_of(f, n=2, **options):
+    options.setdefault("scales", np.ones(n))
     return qpmhe.System(f, lambda x: x[..., :1], n=n, p=1, **options)
 
 
@@ -47,7 +48,7 @@ def test_a_wrong_entry_of_the_output_jacobian_is_named():
     with pytest.raises(ModelError, match=r"h_jacobian\[1, 0\] is 3 "):
         qpmhe.System(
             spiral, lambda x: x * np.array([1.0, 2.0]), n=2, p=2,
-            h_jacobian=lambda x: np.array([[1.0, 0.0], [3.0, 2.0]]),
+            h_jacobian=lambda x: np.array([[1.0, 0.0], [3.0, 2.0]]), scales=[1.0, 1.0],
         )
 
 
@@ -56,6 +57,7 @@ def test_a_wrong_entry_of_the_rate_jacobian_is_named():
         qpmhe.System.from_ode(
             spiral, lambda x: x[..., :1], dt=1e-6, n=2, p=1,
             rate_jacobian=lambda x: spiral_jacobian(x) + np.array([[0.0, 1.0], [0.0, 0.0]]),
+            scales=[1.0, 1.0],
         )
 
 
@@ -167,14 +169,14 @@ def test_at_a_kink_any_slope_between_the_sides_is_a_derivative():
 
     for slope in (0.3, 0.6, 0.9):
         system = qpmhe.System(
-            kinked, lambda x: x, n=1, p=1,
+            kinked, lambda x: x, n=1, p=1, scales=[1.0],
             f_jacobian=lambda x, slope=slope: np.where(
                 x > 0, 0.9, np.where(x < 0, 0.3, slope)
             )[..., None],
         )
         system.check(np.zeros(1), np.zeros(0))
     wrong = qpmhe.System(
-        kinked, lambda x: x, n=1, p=1,
+        kinked, lambda x: x, n=1, p=1, scales=[1.0],
         f_jacobian=lambda x: np.where(x > 0, 0.9, np.where(x < 0, 0.3, 1.2))[..., None],
     )
     with pytest.raises(qpmhe.errors.ModelError, match=r"is 1\.2 at"):
