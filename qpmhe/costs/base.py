@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from qpmhe_solvers.values import finite, shown
 
 from .._checks import Array
 from ..errors import OptionError
@@ -60,12 +60,13 @@ class ObserverPrior:
     __slots__ = ("maximum", "minimum")
 
     def __init__(self, minimum: float = 1e-12, maximum: float = 1e12) -> None:
-        if not _number(minimum) or not _number(maximum) or not 0 < minimum < maximum:
+        low, high = finite(minimum), finite(maximum)
+        if low is None or high is None or not 0.0 < low < high:
             raise OptionError(
-                f"minimum is {minimum!r} and maximum {maximum!r}; "
+                f"minimum is {shown(minimum)} and maximum {shown(maximum)}; "
                 "expected finite numbers with 0 < minimum < maximum."
             )
-        self.minimum, self.maximum = float(minimum), float(maximum)
+        self.minimum, self.maximum = low, high
 
     def weight(self, covariance: Array) -> Array:
         """The clipped inverse of a covariance (n, n)."""
@@ -105,9 +106,10 @@ class Cost(ABC):
     def __init__(
         self, prior: Array | ObserverPrior, disturbance: Array, noise: Array, discount: float
     ) -> None:
-        if not _number(discount) or not 0.0 < discount <= 1.0:
-            raise OptionError(f"discount is {discount!r}; expected a number in (0, 1].")
-        self.discount = float(discount)
+        factor = finite(discount)
+        if factor is None or not 0.0 < factor <= 1.0:
+            raise OptionError(f"discount is {shown(discount)}; expected a number in (0, 1].")
+        self.discount = factor
         self.prior, self.disturbance, self.noise = prior, disturbance, noise
         self.n, self.p = disturbance.shape[0], noise.shape[0]
         self.stage_weight = self.joint_weight(noise)
@@ -192,8 +194,3 @@ def quadratic_form(residuals: Array, weights: Array) -> Array:
     else:
         form = np.einsum("ki,kij,kj->k", residuals, weights, residuals)
     return form
-
-
-def _number(value: Any) -> bool:
-    kinds = (int, float, np.integer, np.floating)
-    return isinstance(value, kinds) and not isinstance(value, bool) and math.isfinite(value)

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from qpmhe_solvers.values import shown
+
 from .._checks import Array
 from ..errors import ModelError
 from ..model.system import System
@@ -28,7 +30,9 @@ class OutputInjection(Observer):
 
     def __init__(self, correction: Callable[[Array, Array], Any]) -> None:
         if not callable(correction):
-            raise ModelError(f"correction is {correction!r}; expected a function of z and v.")
+            raise ModelError(
+                f"correction is {shown(correction)}; expected a function of z and v."
+            )
         self._correction = correction
 
     def check(self, system: System, initial_state: Array) -> None:
