@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import math
+import sys
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -11,27 +12,66 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qpmhe_solvers.values import finite, integer, shown
+
 from .errors import InvalidInputError, OptionError, ShapeError, WeightError
 
 Array = NDArray[np.float64]
 
 
+# The largest index, which counts, sizes and seeds must not exceed.
+_MOST = 2**63 - 1
+
+
 def numbers(name: str, value: ArrayLike, *, finite: bool = True) -> Array:
-    """A float copy of value; real, and finite unless told otherwise."""
+    """A float copy of value; real, and finite unless told otherwise.
+
+    NaN stands for None, pandas' NA and NaT, and what is masked.
+    """
     try:
-        array = np.ma.filled(np.ma.asarray(value, np.float64), np.nan) if isinstance(
-            value, np.ma.MaskedArray
-        ) else np.array(value)
-        if np.iscomplexobj(array):
-            raise TypeError("complex numbers")
-        array = array.astype(np.float64)
+        array = _floats(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise InvalidInputError(
-            f"{name} is {value!r}, which is not an array of real numbers ({error})."
+            f"{name} is {shown(value)}, which is not an array of real numbers ({error})."
         ) from error
     if finite and not np.isfinite(array).all():
         raise InvalidInputError(f"{name} is {array.tolist()}; expected finite numbers only.")
     return array
+
+
+def _floats(value: ArrayLike) -> Array:
+    masked = isinstance(value, np.ma.MaskedArray)
+    array: NDArray[Any] = np.ma.asarray(value) if masked else np.array(value)
+    if array.dtype == np.object_:
+        array = array.copy()
+        for place, item in np.ndenumerate(np.ma.getdata(array)):
+            if _is_missing(item):
+                array[place] = np.nan
+            elif isinstance(item, (np.datetime64, np.timedelta64)):
+                raise TypeError(_TIMES)
+    elif array.dtype.kind in "mM":
+        if not (np.isnat(np.ma.getdata(array)) | np.ma.getmaskarray(array)).all():
+            raise TypeError(_TIMES)
+        return np.full(array.shape, np.nan)
+    elif array.dtype.kind == "c":
+        raise TypeError("complex numbers")
+    floats = array.astype(np.float64)
+    return np.ma.filled(floats, np.nan) if masked else floats
+
+
+_TIMES = "dates or durations; for seconds, give (t - t[0]) / numpy.timedelta64(1, 's')"
+
+
+def _is_missing(item: Any) -> bool:
+    """Whether it is None, a NaT, or pandas' NA, which exist only where pandas has been imported."""
+    if item is None:
+        return True
+    if isinstance(item, (np.datetime64, np.timedelta64)):
+        return bool(np.isnat(item))
+    pandas = sys.modules.get("pandas")
+    return pandas is not None and any(
+        item is getattr(pandas, name, None) for name in ("NA", "NaT")
+    )
 
 
 def vector(name: str, value: ArrayLike, size: int, *, finite: bool = True) -> Array:
@@ -83,23 +123,44 @@ def positive_definite(name: str, value: ArrayLike, size: int | None = None) -> A
     return matrix
 
 
-def count(name: str, value: Any, least: int, remedy: str = "") -> int:
+def count(name: str, value: Any, least: int, remedy: str = "", most: int = _MOST) -> int:
     """An integer no less than least."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise OptionError(f"{name} is {value!r}; expected an integer >= {least}.{remedy}")
-    return int(value)
+    found = integer(value)
+    if found is None or found < least:
+        raise OptionError(f"{name} is {shown(value)}; expected an integer >= {least}.{remedy}")
+    if found > most:
+        raise OptionError(
+            f"{name} is {shown(value)}; expected an integer >= {least} and <= {most}.{remedy}"
+        )
+    return found
+
+
+def dimension(name: str, value: Any, least: int) -> int:
+    """A length of arrays."""
+    return count(name, value, least, most=2**31 - 1)
 
 
 def positive(name: str, value: Any) -> float:
     """A finite number above zero."""
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, (int, float, np.integer, np.floating))
-        or not math.isfinite(value)
-        or value <= 0
-    ):
-        raise OptionError(f"{name} is {value!r}; expected a finite number > 0.")
-    return float(value)
+    number = finite(value)
+    if number is None or number <= 0.0:
+        raise OptionError(f"{name} is {shown(value)}; expected a finite number > 0.")
+    return number
+
+
+def flag(name: str, value: Any) -> bool:
+    """True or False."""
+    if not isinstance(value, bool):
+        raise OptionError(f"{name} is {shown(value)}; expected True or False.")
+    return value
+
+
+def choice(name: str, value: Any, known: Sequence[str]) -> str:
+    """One of the known words."""
+    if not (isinstance(value, str) and value in known):
+        words = ", ".join(repr(one) for one in known)
+        raise OptionError(f"{name} is {shown(value)}; expected one of {words}.")
+    return value
 
 
 def check_problem(state: Any, mine: tuple[int, ...]) -> None:

@@ -13,14 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers import Solver
 
-from ._checks import count, numbers
+from ._checks import dimension, numbers
 from .costs import Cost
 from .errors import InvalidInputError, OptionError, ShapeError, UnknownOptionError
 from .estimation.engine import PythonEngine
 from .estimation.estimate import Status
 from .estimation.estimator import MovingHorizonEstimator, check_start
 from .estimation.settings import Settings
-from .model.system import System
+from .model.system import System, checked_system
 from .observers import Observer
 
 if TYPE_CHECKING:
@@ -75,15 +75,14 @@ class BatchEstimator:
         self, system: System, observer: Observer, cost: Cost, *, members: int,
         initial_states: ArrayLike, threads: int | None = None, **options: Any,
     ) -> None:
-        self.members = count("members", members, 1)
-        if not isinstance(system, System):
-            raise InvalidInputError(f"system is {system!r}; expected a qpmhe.System.")
+        self.members = dimension("members", members, 1)
+        checked_system(system)
         if isinstance(options.get("backend"), Solver):
             raise OptionError(
                 f"backend is {options['backend']!r}; expected the name of a backend, since each "
                 "member of a batch has its own solver."
             )
-        self._threads = None if threads is None else count("threads", threads, 1)
+        self._threads = None if threads is None else dimension("threads", threads, 1)
         if "initial_state" in options:
             raise UnknownOptionError(
                 "BatchEstimator has no option 'initial_state'; pass initial_states, one for all "

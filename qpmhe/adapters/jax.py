@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import count, positive
+from .._checks import dimension, positive
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System, checked_set, probe_points
@@ -115,7 +115,7 @@ def from_jax(
     >>> system.derivatives
     {'f': 'jax', 'h': 'jax'}
     """
-    n, p, m = count("n", n, 1), count("p", p, 1), count("m", m, 0)
+    n, p, m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m, 0)
     length = None if dt is None else positive("dt", dt)
     probes = probe_points(checked_set("states", states, n), n, m)
     programs = Programs(f, h, n, p, m, method, length is not None, probes)

@@ -14,7 +14,7 @@ from .._checks import Array, record, vector
 from ..costs import Cost, CostConstants
 from ..errors import InvalidInputError, ModelError, ShapeError
 from ..model.sets import Box, ConvexSet
-from ..model.system import System
+from ..model.system import System, checked_system
 from ..models.scenario import Record
 from ..observers import Observer, Sample
 from .branch_and_bound import output_lipschitz
@@ -23,7 +23,7 @@ from .evaluation import evaluated
 from .evidence import Evidence
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
 from .observer import gain_if_constant
-from .regions import Region, bounded_region, checked_system
+from .regions import Region, bounded_region
 
 __all__ = ["Audit", "Finding", "audit", "checked_ingredients"]
 

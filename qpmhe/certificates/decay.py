@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from qpmhe_solvers.values import finite, shown
+
 from .._checks import Array, numbers, positive
 from ..errors import OptionError, ShapeError
 
@@ -157,14 +159,13 @@ def lengths(
 
 def checked_length(name: str, value: Any) -> float:
     """A finite number >= 0, checked."""
-    kinds = (int, float, np.integer, np.floating)
-    if isinstance(value, np.ndarray) and value.ndim == 0:
-        value = value.item()
-    if isinstance(value, bool) or not isinstance(value, kinds) or not 0.0 <= value < math.inf:
+    length = finite(value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value)
+    if length is None or length < 0.0:
         raise OptionError(
-            f"{name} is {value!r}; expected a finite number >= 0, which bounds a Euclidean length."
+            f"{name} is {shown(value)}; expected a finite number >= 0, which bounds a Euclidean "
+            "length."
         )
-    return float(value)
+    return length
 
 
 def checked_rate(name: str, value: float) -> float:

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from .._checks import choice
 from ..costs import Cost, CostConstants
 from ..errors import OptionError
 from .decay import DecayingSums
@@ -150,8 +151,7 @@ def window_level(bound: WindowBound, sizes: Sizes) -> float:
 
 def window_bound(chosen: HorizonBounds, kind: Kind, kinds: Sequence[Kind]) -> WindowBound:
     """The bound beyond the paper that a kind asks for."""
-    if kind not in get_args(Kind):
-        raise OptionError(f"kind is {kind!r}; expected one of {list(get_args(Kind))}.")
+    choice("kind", kind, get_args(Kind))
     bound: WindowBound | None = chosen.sharpest() if kind == "measured" else (
         chosen.weighted if kind == "weighted" else chosen.summed
     )

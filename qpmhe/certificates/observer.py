@@ -7,17 +7,17 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from .._checks import Array
-from ..errors import InvalidInputError, OptionError, ShapeError
+from .._checks import Array, choice
+from ..errors import InvalidInputError, ShapeError
 from ..model.sets import Box, ConvexSet
-from ..model.system import System
+from ..model.system import System, checked_system
 from ..observers import Luenberger, Observer
 from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
 from .decay import checked_rate
 from .evidence import CertificateError, NotCertifiedError
 from .inequalities import ErrorContraction, Matrices, euclidean_constants, norm_bound
 from .properties import ObserverStability, sealed
-from .regions import Region, bounded_region, checked_system
+from .regions import Region, bounded_region
 from .sdp import started
 from .search import Found, Search, checked_weights
 
@@ -229,11 +229,7 @@ def synthesise_gain(
     NotCertifiedError
         If there is no such gain, or none was found.
     """
-    if criterion not in get_args(Criterion):
-        raise OptionError(
-            f"criterion is {criterion!r}; expected one of "
-            f"{', '.join(map(repr, get_args(Criterion)))}."
-        )
+    choice("criterion", criterion, get_args(Criterion))
     if rho is not None:
         checked_rate("rho", rho)
     first, second = checked_weights(weights)

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .._checks import Array, numbers
-from ..errors import ModelError, SetError
+from ..errors import SetError
 from ..model.sets import Box, ConvexSet
-from ..model.system import System
+from ..model.system import System, checked_system
 
-__all__ = ["Region", "beyond", "bounded_region", "checked_system", "stated_region"]
+__all__ = ["Region", "beyond", "bounded_region", "stated_region"]
 
 # Of a polytope's vertices and corners, as starting points of searches; more add little.
 _MOST_CORNERS = 256
@@ -112,13 +112,6 @@ class Region:
         points = centre + _shares(self.states, centre, points) * (points - centre)
         points = points[self.contains(points[:, : self.n])]
         return np.vstack((centre, points[: len(corners) + count]))
-
-
-def checked_system(system: Any) -> System:
-    """The argument, if it is a System."""
-    if not isinstance(system, System):
-        raise ModelError(f"system is {system!r}; expected a qpmhe.System.")
-    return system
 
 
 def bounded_region(

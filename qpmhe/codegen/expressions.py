@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from .._checks import count, need, positive
-from ..errors import InvalidInputError, ModelError, OptionError
+from .._checks import choice, dimension, need, positive
+from ..errors import InvalidInputError, ModelError
 from ..model.discretize import METHODS
 from ..model.functions import check_inputs, takes_input
 
@@ -79,11 +79,10 @@ def casadi_model(
 ) -> CasadiModel:
     """Check the arguments of `qpmhe.from_casadi`, and bring the model to the common form."""
     ca = import_casadi()
-    if method not in METHODS:
-        raise OptionError(f"method is {method!r}; expected one of {', '.join(METHODS)}.")
+    choice("method", method, METHODS)
     for name, size, least in (("n", n, 1), ("p", p, 1), ("m", m, 0)):
         if size is not None:
-            count(name, size, least)
+            dimension(name, size, least)
     if isinstance(f, ca.Function):
         _check_arguments("f", f)
         n = _agreed("n", n, f.numel_in(0))
@@ -93,7 +92,7 @@ def casadi_model(
             m = _agreed("m", m, known[0].numel_in(1) if known else 0)
     elif n is None:
         raise InvalidInputError("n is missing: f is no casadi.Function, which would state it.")
-    n, m = count("n", n, 1), count("m", 0 if m is None else m, 0)
+    n, m = dimension("n", n, 1), dimension("m", 0 if m is None else m, 0)
     made_f = _canonical(ca, "f", f, n, m)
     made_h = _canonical(ca, "h", h, n, m)
     check_inputs(m, **{

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from qpmhe_solvers.values import finite, shown
 
 from .._checks import Array
 from .._linalg import inverse
@@ -93,15 +94,13 @@ class ObserverPrior:
         self.maximum: float | None = None
         if minimum is None and maximum is None:
             return
-        if (
-            minimum is None or maximum is None or not _number(minimum) or not _number(maximum)
-            or not 0 < minimum < maximum
-        ):
+        low, high = finite(minimum), finite(maximum)
+        if low is None or high is None or not 0.0 < low < high:
             raise OptionError(
-                f"minimum is {minimum!r} and maximum {maximum!r}; "
+                f"minimum is {shown(minimum)} and maximum {shown(maximum)}; "
                 "expected finite numbers with 0 < minimum < maximum, or neither of them."
             )
-        self.minimum, self.maximum = float(minimum), float(maximum)
+        self.minimum, self.maximum = low, high
 
     @property
     def bounds(self) -> tuple[float, float] | None:
@@ -160,9 +159,10 @@ class Cost(ABC):
     def __init__(
         self, prior: Array | ObserverPrior, disturbance: Array, noise: Array, discount: float
     ) -> None:
-        if not _number(discount) or not 0.0 < discount <= 1.0:
-            raise OptionError(f"discount is {discount!r}; expected a number in (0, 1].")
-        self.discount = float(discount)
+        factor = finite(discount)
+        if factor is None or not 0.0 < factor <= 1.0:
+            raise OptionError(f"discount is {shown(discount)}; expected a number in (0, 1].")
+        self.discount = factor
         self.prior, self.disturbance, self.noise = prior, disturbance, noise
         self.n, self.p = disturbance.shape[0], noise.shape[0]
         self.stage_weight = self.joint_weight(noise)
@@ -284,8 +284,3 @@ def quadratic_form(residuals: Array, weights: Array) -> Array:
     else:
         form = np.einsum("ki,kij,kj->k", residuals, weights, residuals)
     return form
-
-
-def _number(value: Any) -> bool:
-    kinds = (int, float, np.integer, np.floating)
-    return isinstance(value, kinds) and not isinstance(value, bool) and math.isfinite(value)

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array, positive, positive_definite
+from .._checks import Array, flag, positive, positive_definite
 from ..errors import OptionError, WeightError
 from .base import quadratic_form
 
@@ -34,7 +34,7 @@ class Loss(ABC):
     def __init__(self, weight: ArrayLike, per_component: bool = False) -> None:
         self.weight = positive_definite("weight", weight)
         self.dimension = self.weight.shape[0]
-        self.per_component = bool(per_component)
+        self.per_component = flag("per_component", per_component)
         self.check_weight(self.weight)
 
     def check_weight(self, weight: Array) -> None:

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers import Solver
 from qpmhe_solvers.errors import report_unknown_options
+from qpmhe_solvers.values import integer, shown
 
-from .._checks import positive, positive_definite, record, vector
+from .._checks import flag, positive, positive_definite, record, vector
 from .._linalg import inverse
 from ..costs import Cost
 from ..errors import InvalidInputError, ModelError, ObserverWarning, OptionError, ShapeError
@@ -245,8 +246,8 @@ class MovingHorizonEstimator:
         Parameters
         ----------
         y : (p,) array_like
-            y(t); components that are not finite (or so large that their square is not), None or
-            masked are missing. A scalar if p is 1.
+            y(t); components that are not finite (or so large that their square is not), None,
+            pandas' NA, NaT or masked are missing. A scalar if p is 1.
         u : (m,) array_like, optional
             u(t), the input that acts from t to t+1 (and on y(t), if h depends on it), and any
             known parameters of that time. Required exactly if the system has inputs.
@@ -284,8 +285,6 @@ class MovingHorizonEstimator:
             return y
         if y is None:
             return np.full(p, np.nan)
-        if isinstance(y, (list, tuple)):
-            y = [np.nan if item is None else item for item in y]
         return vector("y", y, p, finite=False)
 
     def _input(self, u: ArrayLike | None) -> Array:
@@ -326,15 +325,16 @@ class MovingHorizonEstimator:
         """
         oldest, newest = self.time - self._engine.length, self.time - 1
         if newest < 0:
-            raise InvalidInputError(f"time is {time!r}, but there is no sample yet; update first.")
-        if isinstance(time, bool) or not isinstance(time, (int, np.integer)) or not (
-            oldest <= time <= newest
-        ):
             raise InvalidInputError(
-                f"time is {time!r}; expected an integer from {oldest} to {newest}, the samples "
-                "in the window. Take a longer horizon for later measurements."
+                f"time is {shown(time)}, but there is no sample yet; update first."
             )
-        return self._engine.amend(int(time), self._measurement(y))
+        index = integer(time)
+        if index is None or not oldest <= index <= newest:
+            raise InvalidInputError(
+                f"time is {shown(time)}; expected an integer from {oldest} to {newest}, the "
+                "samples in the window. Take a longer horizon for later measurements."
+            )
+        return self._engine.amend(index, self._measurement(y))
 
     def run(
         self,
@@ -366,6 +366,7 @@ class MovingHorizonEstimator:
             If a shape is wrong; the estimator is left as it was.
         """
         ys = record("measurements", measurements, self.system.p)
+        flag("covariances", covariances)
         us = None
         if inputs is not None:
             us = record("inputs", inputs, self.system.m)
@@ -476,7 +477,7 @@ class MovingHorizonEstimator:
 
 def _require(value: object, kind: type, name: str, expected: str) -> None:
     if not isinstance(value, kind):
-        raise InvalidInputError(f"{name} is {value!r}; expected a {expected}.")
+        raise InvalidInputError(f"{name} is {shown(value)}; expected a {expected}.")
 
 
 def check_start(

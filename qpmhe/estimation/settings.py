@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from qpmhe_solvers import Solver, SolverOptions
 
-from .._checks import count, positive
+from .._checks import choice, count, dimension, flag, positive
 from ..errors import BackendError, OptionError
 
 __all__ = ["Candidate", "Engine", "Infeasible", "Settings"]
@@ -42,7 +42,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         # As Python's int: not everything that gets them accepts NumPy's integers.
-        object.__setattr__(self, "horizon", count("horizon", self.horizon, 1))
+        object.__setattr__(self, "horizon", dimension("horizon", self.horizon, 1))
         if self.max_qps is not None:
             count("max_qps", self.max_qps, 0, " None stands for convergence.")
         if self.max_solver_iterations is not None:
@@ -61,18 +61,13 @@ class Settings:
                 "states are not in the window."
             )
         for name in ("project_observer", "warm_start", "isolated"):
-            flag = getattr(self, name)
-            if not isinstance(flag, bool):
-                raise OptionError(f"{name} is {flag!r}; expected True or False.")
+            flag(name, getattr(self, name))
         for name, choices in (
             ("engine", get_args(Engine)),
             ("infeasible", get_args(Infeasible)),
             ("candidate", get_args(Candidate)),
         ):
-            value = getattr(self, name)
-            if value not in choices:
-                known = ", ".join(repr(choice) for choice in choices)
-                raise OptionError(f"{name} is {value!r}; expected one of {known}.")
+            choice(name, getattr(self, name), choices)
         if self.isolated and self.engine == "compiled":
             raise OptionError(
                 "isolated is True, but engine='compiled' solves its QPs itself, without a "

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionError
+from .._checks import choice
 
 __all__ = ["METHODS", "Method", "discretize"]
 
@@ -23,8 +23,7 @@ def discretize(
     rate: Function, jacobian: Function | None, method: str
 ) -> tuple[Function, Function | None]:
     r"""Turn :math:`\dot x = f_c(x, u)` into :math:`x^+ = f(x, u)` with u held over the step."""
-    if method not in METHODS:
-        raise OptionError(f"method is {method!r}; expected one of {', '.join(METHODS)}.")
+    choice("method", method, METHODS)
     if method == "euler":
         return _euler(rate), jacobian and _euler_jacobian(jacobian)
     return _rk4(rate), jacobian and _rk4_jacobian(rate, jacobian)

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from qpmhe_solvers.values import shown
+
 from ..errors import ModelError, QpmheError
 from .tracing import trace
 
@@ -109,7 +111,7 @@ class BatchedFunction:
         if isinstance(function, Trusted):
             function = function.function
         if not callable(function):
-            raise ModelError(f"{name} is {function!r}; expected a function of the state.")
+            raise ModelError(f"{name} is {shown(function)}; expected a function of the state.")
         self.name, self.shape = name, shape
         self._inputs = inputs
         self.takes_input = takes_input(name, function, inputs)

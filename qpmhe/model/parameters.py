@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import count, numbers
+from .._checks import dimension, numbers
 from ..errors import InvalidInputError, ModelError, SetError, ShapeError
 from .functions import BatchedFunction, Probes, Trusted
 from .sets import Box, ConvexSet
@@ -103,12 +103,12 @@ def augment_parameters(
     ...     system, qpmhe.Luenberger([0.4, 0.0]), cost, horizon=10,
     ...     initial_state=[0.0, 0.5], max_qps=None)
     """
-    n, p, m = count("n", n, 1), count("p", p, 1), count("m", m, 0)
+    n, p, m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m, 0)
     values = _nominal(nominal)
     chosen = _chosen(estimated, values.size)
     k = chosen.size
-    for name, one, dimension in (("states", states, n), ("disturbances", disturbances, n)):
-        _check_set(name, one, dimension, "the dimension of x alone: the parameters are added here")
+    for name, one, size in (("states", states, n), ("disturbances", disturbances, n)):
+        _check_set(name, one, size, "the dimension of x alone: the parameters are added here")
     if parameter_bounds is not None and k == 0:
         raise SetError("parameter_bounds was given, but no parameter is estimated; leave it out.")
     _check_set("parameter_bounds", parameter_bounds, k, "the number of estimated parameters")

@@ -10,15 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers.errors import report_unknown_options
+from qpmhe_solvers.values import shown
 
-from .._checks import count, positive, vector
+from .._checks import dimension, positive, vector
 from ..errors import InvalidInputError, ModelError, OptionError, SetError
 from .derivatives import Jacobian
 from .discretize import discretize
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .sets import ConvexSet
 
-__all__ = ["ModelKernel", "System", "checked_set", "probe_points"]
+__all__ = ["ModelKernel", "System", "checked_set", "checked_system", "probe_points"]
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
@@ -119,7 +120,7 @@ class System:
         noises: ConvexSet | None = None,
         scales: ArrayLike | None = None,
     ) -> None:
-        self.n, self.p, self.m = count("n", n, 1), count("p", p, 1), count("m", m, 0)
+        self.n, self.p, self.m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m, 0)
         #: Typical magnitudes of the states, (n,); None if they are not known.
         self.scales: Array | None = None
         self._scales_given = False
@@ -198,7 +199,7 @@ class System:
         ModelError, SetError
             As for `System`.
         """
-        n, m = count("n", n, 1), count("m", m, 0)
+        n, m = dimension("n", n, 1), dimension("m", m, 0)
         probes = probe_points(checked_set("states", states, n), n, m)
         batched = BatchedFunction("rate", rate, (n,), m, probes)
         given = compared = None
@@ -389,9 +390,18 @@ def checked_set(name: str, value: ConvexSet | None, dimension: int) -> ConvexSet
     if value is None:
         return None
     if not isinstance(value, ConvexSet):
-        raise SetError(f"{name} is {value!r}; expected a qpmhe.Box, a qpmhe.Polytope or None.")
+        raise SetError(
+            f"{name} is {shown(value)}; expected a qpmhe.Box, a qpmhe.Polytope or None."
+        )
     if value.dimension != dimension:
         raise SetError(f"{name} has dimension {value.dimension}; expected {dimension}.")
+    return value
+
+
+def checked_system(value: Any) -> System:
+    """The argument, if it is a System."""
+    if not isinstance(value, System):
+        raise ModelError(f"system is {shown(value)}; expected a qpmhe.System.")
     return value
 
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from .._checks import Array, count, positive, positive_definite, vector
+from qpmhe_solvers.values import finite, shown
+
+from .._checks import Array, count, dimension, positive, positive_definite, vector
 from ..errors import InvalidInputError, ModelError, OptionError
 from ..model.sets import ConvexSet
-from ..model.system import System
+from ..model.system import System, checked_system
 
 __all__ = ["Record", "Scenario"]
 
@@ -103,6 +104,7 @@ class Scenario:
     resolution: Array | None = None
 
     def __post_init__(self) -> None:
+        checked_system(self.system)
         n, p = self.system.n, self.system.p
         for name in ("initial_state", "initial_estimate"):
             state = vector(name, getattr(self, name), n)
@@ -112,18 +114,19 @@ class Scenario:
             matrix = positive_definite(name.replace("_", " "), getattr(self, name), size)
             object.__setattr__(self, name, matrix)
         positive("dt", self.dt)
-        count("horizon", self.horizon, 1)
-        count("steps", self.steps, 1)
-        if len(self.labels) != n:
-            raise OptionError(f"labels has {len(self.labels)} names; expected {n}, one a state.")
-        if not 0.0 <= self.settling_time < math.inf:
+        dimension("horizon", self.horizon, 1)
+        dimension("steps", self.steps, 1)
+        if not isinstance(self.labels, (tuple, list)) or len(self.labels) != n:
+            raise OptionError(f"labels is {shown(self.labels)}; expected {n} names, one a state.")
+        settling = finite(self.settling_time)
+        if settling is None or settling < 0.0:
             raise OptionError(
-                f"settling_time is {self.settling_time!r}; expected a finite number >= 0."
+                f"settling_time is {shown(self.settling_time)}; expected a finite number >= 0."
             )
         if (self.inputs is None) != (self.system.m == 0):
             raise OptionError(
-                f"inputs is {self.inputs!r}, and the system has {self.system.m} inputs; expected "
-                "a function of time and state exactly if there are any."
+                f"inputs is {shown(self.inputs)}, and the system has {self.system.m} inputs; "
+                "expected a function of time and state exactly if there are any."
             )
         if self.resolution is not None:
             step = vector("resolution", self.resolution, p)
@@ -149,7 +152,7 @@ class Scenario:
             If no disturbance that is drawn keeps the state in its set, or it is not finite.
         """
         generator = np.random.default_rng(count("seed", seed, 0))
-        total = self.steps if steps is None else count("steps", steps, 0)
+        total = self.steps if steps is None else dimension("steps", steps, 0)
         system = self.system
         spread_w = _factor(self.disturbance_covariance)
         spread_v = _factor(self.noise_covariance)

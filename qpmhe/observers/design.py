@@ -8,9 +8,11 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qpmhe_solvers.values import shown
+
 from .._checks import Array, positive_definite, vector
 from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
-from ..model.system import System
+from ..model.system import System, checked_system
 from .luenberger import Luenberger
 
 __all__ = ["design_luenberger"]
@@ -87,6 +89,7 @@ def design_luenberger(
     >>> observer.gain.round(6).tolist()
     [[0.9], [2.0]]
     """
+    checked_system(system)
     if poles is not None and disturbance is None and noise is None:
         a, c, point = linearize(system, at, u)
         return Luenberger(_placed(a, c, _checked_poles(poles, system.n), point))
@@ -247,8 +250,8 @@ def _place_poles(a: Array, c: Array, poles: ComplexArray) -> Array:
 def _checked_poles(poles: ArrayLike, n: int) -> ComplexArray:
     try:
         given = np.atleast_1d(np.array(poles, dtype=np.complex128))
-    except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"poles is {poles!r}, not an array of numbers.") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InvalidInputError(f"poles is {shown(poles)}, not an array of numbers.") from error
     if given.shape != (n,):
         raise ShapeError(f"poles has shape {given.shape}; expected (n,) = ({n},).")
     outside = given[~(np.abs(given) < 1.0)]

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import Array, count, positive, vector
+from .._checks import Array, choice, dimension, positive, vector
 from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
 from ..model.system import System
 from .design import ackermann, linearize, spectral_radius
@@ -100,13 +100,9 @@ class HighGain(Luenberger):
         self, n: int, *, epsilon: float, dt: float, coefficients: ArrayLike | None = None,
         sampling: Sampling = "exact",
     ) -> None:
-        n = count("n", n, 1)
+        n = dimension("n", n, 1)
         self.epsilon, self.dt = positive("epsilon", epsilon), positive("dt", dt)
-        if sampling not in get_args(Sampling):
-            raise OptionError(
-                f"sampling is {sampling!r}; expected one of "
-                f"{', '.join(map(repr, get_args(Sampling)))}."
-            )
+        choice("sampling", sampling, get_args(Sampling))
         roots = -np.ones(n) if coefficients is None else _roots(coefficients, n)
         # In the coordinates x_i dt^(i-1) the sampled chain does not depend on dt.
         shift = np.eye(n, k=1)

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from qpmhe_solvers.values import shown
+
 from .._checks import Array, positive_definite
 from ..errors import ModelError
 from ..model.system import System
@@ -33,7 +35,9 @@ class OutputInjection(Observer):
         self, correction: Callable[[Array, Array], Any], metric: ArrayLike | None = None
     ) -> None:
         if not callable(correction):
-            raise ModelError(f"correction is {correction!r}; expected a function of z and v.")
+            raise ModelError(
+                f"correction is {shown(correction)}; expected a function of z and v."
+            )
         self._correction = correction
         self._metric = None if metric is None else positive_definite("metric", metric)
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from .._checks import Array, positive_definite
 from .._linalg import inverse, solve
 from ..errors import ShapeError
-from ..model.system import System
+from ..model.system import System, checked_system
 from .base import Observer, Sample
 from .design import linearize, stationary
 
@@ -81,7 +81,7 @@ class SteadyStateKalman(Observer):
         self, system: System, at: ArrayLike, u: ArrayLike | None = None, *, disturbance: ArrayLike,
         noise: ArrayLike, prior: ArrayLike | None = None,
     ) -> None:
-        self._a, self._c, point = linearize(system, at, u)
+        self._a, self._c, point = linearize(checked_system(system), at, u)
         self._disturbance = positive_definite("disturbance covariance", disturbance, system.n)
         self._noise = positive_definite("noise covariance", noise, system.p)
         self.gain, self.covariance = stationary(

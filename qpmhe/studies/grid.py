@@ -18,8 +18,9 @@ from typing import Any, Literal, get_args
 
 from qpmhe_solvers import available, backend
 from qpmhe_solvers.errors import report_unknown_options
+from qpmhe_solvers.values import integer, shown
 
-from .._checks import count, positive
+from .._checks import count, dimension, positive
 from ..errors import BackendError, InvalidInputError
 from ..models.loading import ModelSource, find, load
 from .cell import OBSERVER, Cell
@@ -102,6 +103,10 @@ class Study:
     def __post_init__(self) -> None:
         for name, check in _CHECKS.items():
             object.__setattr__(self, name, check(getattr(self, name)))
+        if not (self.folder is None or isinstance(self.folder, (str, Path))):
+            raise StudyError(
+                f"folder is {shown(self.folder)}; expected the name of a folder, or None."
+            )
         folder = None if self.folder is None else Path(self.folder)
         sources = _distinct(find(text, folder) for text in self.models)
         for source in sources:
@@ -202,10 +207,10 @@ def _check_items(path: Path, lines: list[str], key: str, value: Any) -> None:
             if key == "models":
                 load(find(item, path.parent))
         except InvalidInputError as error:
-            shown = str(error)
+            words = str(error)
             if key in WORDS:
-                shown = shown.replace(" None ", f' "{WORDS[key]}" ')
-            raise StudyError(f"{_place(path, lines, key, item)}: {shown}") from error
+                words = words.replace(" None ", f' "{WORDS[key]}" ')
+            raise StudyError(f"{_place(path, lines, key, item)}: {words}") from error
 
 
 def _place(path: Path, lines: list[str], key: str, item: Any = None) -> str:
@@ -230,12 +235,21 @@ def _distinct(values: Iterable[Any]) -> tuple[Any, ...]:
 
 
 def _several(name: str, value: Any, known: str) -> list[Any]:
-    if isinstance(value, str) or not isinstance(value, Iterable):
-        value = [value]
-    found = list(value)
+    try:
+        found = [value] if isinstance(value, str) else list(value)
+    except TypeError:  # no sequence: one item
+        found = [value]
     if not found:
         raise StudyError(f"{name} is empty, and so is the grid; {known}.")
     return found
+
+
+def _models(value: Any) -> tuple[str, ...]:
+    names = _several("models", value, "name at least one model")
+    for name in names:
+        if not isinstance(name, str):
+            raise StudyError(f"models has {shown(name)}; expected the name of a model.")
+    return _distinct(names)
 
 
 def _backends(value: Any) -> tuple[str, ...]:
@@ -270,36 +284,36 @@ def _starts(value: Any) -> tuple[str, ...]:
 
 
 def _seeds(value: Any) -> tuple[int, ...]:
-    if isinstance(value, Iterable) and not isinstance(value, str):
-        items = _several("seeds", value, "give a number of seeds, or some of them")
-        return _distinct(count("seeds", item, 0) for item in items)
-    return tuple(range(count("seeds", value, 1)))
+    if integer(value) is not None or isinstance(value, str):
+        return tuple(range(dimension("seeds", value, 1)))
+    items = _several("seeds", value, "give a number of seeds, or some of them")
+    return _distinct(count("seeds", item, 0) for item in items)
 
 
 def _one_of(name: str, value: Any, known: Sequence[str]) -> str:
-    if value not in known:
+    if not (isinstance(value, str) and value in known):
         raise StudyError(
-            f"{name} is {value!r}; expected one of {', '.join(repr(item) for item in known)}."
+            f"{name} is {shown(value)}; expected one of {', '.join(repr(item) for item in known)}."
         )
     return str(value)
 
 
 def _switch(value: Any) -> bool:
     if not isinstance(value, bool):
-        raise StudyError(f"covariances is {value!r}; expected True or False.")
+        raise StudyError(f"covariances is {shown(value)}; expected True or False.")
     return value
 
 
 # The check of each option, in order; each returns the value in its standard form.
 _CHECKS: dict[str, Callable[[Any], Any]] = {
-    "models": lambda value: _distinct(_several("models", value, "name at least one model")),
+    "models": _models,
     "backends": _backends,
     "qps": _numbers("qps", 0, " None stands for convergence."),
     "solver_iterations": _numbers("solver_iterations", 1, " None leaves the solver's default."),
     "horizons": _numbers("horizons", 1, " None takes the model's."),
     "starts": _starts,
     "seeds": _seeds,
-    "steps": lambda value: None if value is None else count("steps", value, 1),
+    "steps": lambda value: None if value is None else dimension("steps", value, 1),
     "measure": lambda value: _one_of("measure", value, get_args(Measure)),
     "deadline": lambda value: None if value is None else positive("deadline", value),
     "covariances": _switch,

@@ -23,8 +23,9 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from qpmhe_solvers import backend
+from qpmhe_solvers.values import shown
 
-from .._checks import count, need
+from .._checks import dimension, flag, need
 from ..errors import OptionError
 from .cell import OBSERVER, Result, Task, compute, failure
 from .environment import environment, revision
@@ -91,11 +92,16 @@ def run(
         If an argument does not fit, or a package is missing.
     """
     if not isinstance(study, Study):
-        raise StudyError(f"the study is {study!r}; expected a qpmhe.studies.Study.")
+        raise StudyError(f"the study is {shown(study)}; expected a qpmhe.studies.Study.")
     if jobs is not None:
-        count("jobs", jobs, 1)
+        dimension("jobs", jobs, 1)
         if scheduler is not None:
             raise OptionError("jobs is for this machine; with a scheduler, leave it out.")
+    flag("retry_failed", retry_failed)
+    if not isinstance(progress, bool) and not hasattr(progress, "print"):
+        raise OptionError(
+            f"progress is {shown(progress)}; expected True, False or a rich.console.Console."
+        )
     target = store if isinstance(store, Store) else Store(store)
     alone = study.measure == "time"  # other cells would share the cores
     made = (

@@ -14,6 +14,8 @@ from urllib.parse import quote
 
 import numpy as np
 
+from qpmhe_solvers.values import shown
+
 from .._checks import need
 from ..errors import InvalidInputError, OptionError
 from .errors import StoreError
@@ -93,7 +95,7 @@ class Store:
 
     def __init__(self, path: str | Path) -> None:
         if not isinstance(path, (str, Path)):
-            raise InvalidInputError(f"the store is {path!r}; expected the name of a file.")
+            raise InvalidInputError(f"the store is {shown(path)}; expected the name of a file.")
         self.path = Path(path)
 
     def __repr__(self) -> str:

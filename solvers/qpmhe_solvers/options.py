@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from numbers import Integral
 
 from .errors import OptionError, report_unknown_options
+from .values import finite, integer, shown
 
 __all__ = ["SolverOptions"]
+
+# What every solver's own integer takes.
+_MOST_ITERATIONS = 2**31 - 1
 
 
 @report_unknown_options
@@ -54,10 +56,11 @@ class SolverOptions:
     warm_start: bool = True
 
     def __post_init__(self) -> None:
-        cap: object = self.max_iterations
-        if cap is not None and (isinstance(cap, bool) or not isinstance(cap, Integral) or cap < 1):
+        cap = integer(self.max_iterations)
+        if self.max_iterations is not None and (cap is None or not 1 <= cap <= _MOST_ITERATIONS):
             raise OptionError(
-                f"max_iterations is {cap!r}; expected an integer >= 1 or None. "
+                f"max_iterations is {shown(self.max_iterations)}; expected an integer >= 1 or "
+                f"None{f', at most {_MOST_ITERATIONS}' if cap and cap > 1 else ''}. "
                 "To skip the QP altogether, ask the estimator for max_qps=0."
             )
         _positive("absolute_tolerance", self.absolute_tolerance, zero=False)
@@ -65,15 +68,11 @@ class SolverOptions:
         if self.time_limit is not None:
             _positive("time_limit", self.time_limit, zero=False)
         if not isinstance(self.warm_start, bool):
-            raise OptionError(f"warm_start is {self.warm_start!r}; expected True or False.")
+            raise OptionError(f"warm_start is {shown(self.warm_start)}; expected True or False.")
 
 
 def _positive(name: str, value: object, *, zero: bool) -> None:
-    bound = ">= 0" if zero else "> 0"
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, (int, float))
-        or not 0 <= value < math.inf
-        or (value == 0 and not zero)
-    ):
-        raise OptionError(f"{name} is {value!r}; expected a finite number {bound}.")
+    number = finite(value)
+    if number is None or number < 0.0 or (number == 0.0 and not zero):
+        bound = ">= 0" if zero else "> 0"
+        raise OptionError(f"{name} is {shown(value)}; expected a finite number {bound}.")

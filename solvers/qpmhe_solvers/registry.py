@@ -10,6 +10,7 @@ from .builtin import builtin_backends
 from .errors import BackendError, OptionError
 from .options import SolverOptions
 from .solver import Solver
+from .values import shown
 
 __all__ = ["Backend", "available", "backend", "backends", "create", "register", "unregister"]
 
@@ -84,7 +85,7 @@ def backend(name: str) -> Backend:
     found = _REGISTRY.get(name) if isinstance(name, str) else None
     if found is None:
         raise BackendError(
-            f"backend {name!r} is not known; expected one of {', '.join(_REGISTRY)}."
+            f"backend {shown(name)} is not known; expected one of {', '.join(_REGISTRY)}."
         )
     return found
 
@@ -113,11 +114,11 @@ def create(
         If ``options`` is something else.
     """
     if not isinstance(isolated, bool):
-        raise OptionError(f"isolated is {isolated!r}; expected True or False.")
+        raise OptionError(f"isolated is {shown(isolated)}; expected True or False.")
     found = backend(name)
     if options is not None and not isinstance(options, SolverOptions):
         raise OptionError(
-            f"options is {options!r}; expected qpmhe.solvers.SolverOptions, such as "
+            f"options is {shown(options)}; expected qpmhe.solvers.SolverOptions, such as "
             "SolverOptions(max_iterations=5), or None."
         )
     if not found.available:

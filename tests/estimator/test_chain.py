@@ -241,5 +241,5 @@ def test_sizes_that_are_none(maker, options, named):
 
 
 def test_an_unknown_method():
-    with pytest.raises(qpmhe.errors.OptionError, match="method is 'heun'; expected one of euler"):
+    with pytest.raises(qpmhe.errors.OptionError, match="method is 'heun'; expected one of 'euler'"):
         chain_of_masses(method="heun")

@@ -172,7 +172,7 @@ def test_sampling_times(dt):
 @pytest.mark.parametrize("method", ["rk45", "RK4", "", None, 4])
 def test_discretisations(method):
     check(
-        OptionError, [f"method is {method!r}", "euler, rk4"],
+        OptionError, [f"method is {method!r}", "'euler', 'rk4'"],
         lambda: qpmhe.System.from_ode(
             lambda x: -x, lambda x: x, dt=0.1, n=1, p=1, method=method
         ),

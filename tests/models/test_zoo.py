@@ -278,5 +278,5 @@ def test_a_pickled_example_is_the_same(name):
 
 @each_model
 def test_an_unknown_method(name):
-    with pytest.raises(qpmhe.errors.OptionError, match="method is 'heun'; expected one of euler"):
+    with pytest.raises(qpmhe.errors.OptionError, match="method is 'heun'; expected one of 'euler'"):
         MODELS[name](method="heun")

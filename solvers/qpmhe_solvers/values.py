@@ -1,0 +1,45 @@
+"""What a caller's value is: a number or none, and how an error text shows it."""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import Any
+
+import numpy as np
+
+__all__ = ["finite", "integer", "shown"]
+
+# Longer texts are shown by their beginning and end.
+_LONGEST = 600
+
+
+def finite(value: Any) -> float | None:
+    """The finite real number that a value is; None for all else, booleans and arrays included."""
+    if isinstance(value, (bool, np.timedelta64)):  # NumPy's durations pass for integers
+        return None
+    if not isinstance(value, (int, float, np.integer, np.floating)):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:  # an integer beyond all floats
+        return None
+    return number if math.isfinite(number) else None
+
+
+def integer(value: Any) -> int | None:
+    """The integer that a value is; None for all else, booleans and arrays included."""
+    if isinstance(value, (bool, np.timedelta64)) or not isinstance(value, (int, np.integer)):
+        return None
+    return operator.index(value)
+
+
+def shown(value: Any) -> str:
+    """A value as an error text shows it; never raises."""
+    try:
+        text = repr(value)
+    except Exception:  # a user's __repr__, or an integer of more digits than Python writes
+        return f"a {type(value).__name__} that cannot be shown"
+    if len(text) <= _LONGEST:
+        return text
+    return f"{text[:60]}...{text[-20:]} ({len(text)} characters)"

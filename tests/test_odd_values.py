@@ -1,0 +1,146 @@
+"""Whatever is given for an option: it is taken, or one of our own errors says why not."""
+
+import datetime
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import qpmhe
+from qpmhe.errors import InvalidInputError, OptionError, QpmheError
+from qpmhe.studies import Study, run
+
+
+class UnshownError(Exception):
+    pass
+
+
+class Unshown:
+    def __repr__(self):
+        raise UnshownError
+
+
+VALUES = {
+    "huge": 10**400, "less": -(10**400), "vast": 10**5000, "words": np.array(["python", "auto"]),
+    "word": np.array("python"), "numbers": np.array([1.0, 2.0]), "number": np.array(1.0),
+    "flags": np.array([True, False]), "objects": np.array([object()], object),
+    "object": object(), "unshown": Unshown(), "None": None, "list": [], "dict": {}, "NaN": np.nan,
+    "blank": "", "bytes": b"x", "complex": 1j, "ragged": [[1.0], 2.0], "huge list": [10**400],
+    "NA": pd.NA, "NaT": pd.NaT, "date": np.datetime64("2026-01-01"),
+    "duration": np.timedelta64(5, "s"), "durations": np.array([5], "m8[s]"),
+    "Timestamp": pd.Timestamp("2026-01-01"), "Timedelta": pd.Timedelta(5, "s"),
+    "timedelta": datetime.timedelta(1), "series": pd.Series(["a", "b"]),
+    "frame": pd.DataFrame({"a": [1, 2]}),
+}
+REACTOR = qpmhe.models.batch_reactor()
+SYSTEM, OBSERVER, COST, SCENARIO = REACTOR
+EYE = np.eye(2)
+COVARIANCES = {"disturbance": EYE, "noise": [[1.0]]}
+WEIGHTS = {"prior": EYE, **COVARIANCES}
+
+
+def made(kind, usual):
+    """A call of ``kind`` that works, but for the options given."""
+    return lambda **options: kind(**(usual | options))
+
+
+def estimator(system=SYSTEM, observer=OBSERVER, cost=COST, **options):
+    usual = {"horizon": 3, "initial_state": [3.0, 0.0]}
+    return qpmhe.MovingHorizonEstimator(system, observer, cost, **(usual | options))
+
+
+def system(f=lambda x: x, h=lambda x: x[..., :1], kind=qpmhe.System, **options):
+    return kind(f, h, **({"n": 2, "p": 1} | options))
+
+
+def amended(**options):
+    mhe = estimator()
+    mhe.update([1.0])
+    return mhe.amend(**({"time": 0, "y": [1.0]} | options))
+
+
+CALLS = [
+    (estimator, "system observer cost horizon initial_state backend max_qps max_solver_iterations "
+     "solver_tolerance tolerance engine warm_start candidate time_budget delay isolated"),
+    (lambda **options: estimator().update(**({"y": [1.0]} | options)), "y u dt noise_weight"),
+    (amended, "time y"),
+    (lambda **options: estimator().run(**({"measurements": [[1.0]]} | options)),
+     "measurements inputs covariances"),
+    (system, "f h n p m f_jacobian h_jacobian states disturbances noises"),
+    (made(system, {"kind": qpmhe.System.from_ode, "dt": 0.1}), "f h n p m dt method states"),
+    (made(qpmhe.QuadraticCost, WEIGHTS), "prior disturbance noise discount"),
+    (made(qpmhe.QuadraticCost.from_covariances, WEIGHTS), "prior disturbance noise discount"),
+    (made(qpmhe.RobustCost, WEIGHTS), "prior disturbance noise discount"),
+    (made(qpmhe.Huber, {"weight": EYE}), "weight threshold per_component"),
+    (made(qpmhe.Power, {"weight": EYE, "exponent": 1.5}), "weight exponent per_component"),
+    (qpmhe.ObserverPrior, "minimum maximum"),
+    (qpmhe.Luenberger, "gain"),
+    (qpmhe.OutputInjection, "correction"),
+    (made(qpmhe.ExtendedKalman, WEIGHTS), "prior disturbance noise"),
+    (made(qpmhe.UnscentedKalman, WEIGHTS), "prior disturbance noise spread"),
+    (made(qpmhe.SteadyStateKalman, {"system": SYSTEM, "at": [3.0, 1.0], **COVARIANCES}),
+     "system at u disturbance noise prior"),
+    (made(qpmhe.HighGain, {"n": 2, "dt": 0.1, "epsilon": 0.5}),
+     "n dt epsilon coefficients sampling"),
+    (made(qpmhe.design_luenberger, {"system": SYSTEM, "at": [3.0, 1.0], "poles": [0.5, 0.6]}),
+     "system at u poles disturbance noise"),
+    (made(qpmhe.design_luenberger, {"system": SYSTEM, "at": [3.0, 1.0], **COVARIANCES}),
+     "system at u poles disturbance noise"),
+    (made(qpmhe.Box, {"lower": [0.0], "upper": [1.0]}), "lower upper"),
+    (made(qpmhe.Polytope, {"matrix": EYE, "bound": [1.0, 1.0]}), "matrix bound"),
+    (qpmhe.solvers.SolverOptions,
+     "max_iterations absolute_tolerance relative_tolerance time_limit warm_start"),
+    (made(qpmhe.solvers.create, {"name": "auto"}), "name options isolated"),
+    (made(qpmhe.BatchEstimator, {
+        "system": SYSTEM, "observer": OBSERVER, "cost": COST, "members": 2, "horizon": 3,
+        "initial_states": [3.0, 0.0],
+    }), "system observer cost members initial_states threads horizon engine"),
+    (made(Study, {"backends": ["banded"], "qps": [1], "seeds": 1}),
+     "models backends qps solver_iterations horizons starts seeds steps measure deadline "
+     "covariances cell_timeout folder"),
+    (lambda **options: Study(**{name: [value] for name, value in options.items()}),
+     "models backends qps solver_iterations horizons starts seeds"),
+    (made(run, {"study": Study(backends=["banded"], qps=[1], seeds=1, steps=2), "store": ""}),
+     "study store jobs progress retry_failed"),
+    (lambda **options: replace(SCENARIO, **options),
+     "system initial_state initial_estimate disturbance_covariance noise_covariance dt horizon "
+     "steps labels inputs settling_time resolution"),
+    (made(SCENARIO.simulate, {"seed": 0, "steps": 3}), "seed steps"),
+]
+
+
+@pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
+def test_only_our_own_errors(value, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for call, names in CALLS:
+        for name in names.split():
+            with suppress(QpmheError):
+                call(**{name: value})
+
+
+@pytest.mark.parametrize("option", ["engine", "candidate"])
+@pytest.mark.parametrize("value", [np.array(["python", "observer"]), np.array("python")])
+def test_an_array_is_no_word(option, value):
+    with pytest.raises(OptionError, match=rf"{option} is array\(.*expected one of 'python'|'obs"):
+        estimator(**{option: value})
+
+
+@pytest.mark.parametrize("value", [10**400, -(10**400)])
+def test_integers_beyond_all_floats(value):
+    with pytest.raises(OptionError, match=r"tolerance is -?100000.*; expected a finite number > 0"):
+        estimator(tolerance=value)
+    with pytest.raises(OptionError, match=r"horizon is -?10000.*; expected an integer >= 1"):
+        estimator(horizon=value)
+    with pytest.raises(OptionError, match=r"discount is -?10000.*; expected a number in \(0, 1\]"):
+        qpmhe.QuadraticCost(**WEIGHTS, discount=value)
+    with pytest.raises(OptionError, match=r"max_iterations is -?10000"):
+        qpmhe.solvers.SolverOptions(max_iterations=value)
+
+
+@pytest.mark.parametrize("system", [None, "batch_reactor", REACTOR, OBSERVER], ids=type)
+def test_gains_for_what_is_no_system(system):
+    for design in (qpmhe.design_luenberger, qpmhe.SteadyStateKalman):
+        with pytest.raises(InvalidInputError, match=r"(?s)system is .*; expected a qpmhe\.System"):
+            design(system, [3.0, 1.0], **COVARIANCES)
