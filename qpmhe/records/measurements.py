@@ -11,8 +11,8 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..errors import InvalidInputError, OptionError
 from .tables import RecordError, Row, open_table
 
@@ -20,8 +20,6 @@ __all__ = [
     "ColumnNames", "Columns", "FieldReader", "Measurement", "RecordReader", "Time",
     "seconds_between",
 ]
-
-Array = NDArray[np.float64]
 
 _TIMES = ("time", "t", "timestamp", "datetime", "date_time")
 # "Voltage (V)", "Voltage [V]", "Voltage / V"

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..costs import Cost
 from ..errors import ModelError, OptionError, QpmheError
 from ..estimation.estimate import Estimate, Status
@@ -22,8 +22,6 @@ from ..models.loading import build, code_place, find
 from ..observers import Observer
 
 __all__ = ["ModelFailures", "RecordModel", "load_record_model"]
-
-Array = NDArray[np.float64]
 
 _PARTS = ((System, "system"), (Observer, "observer"), (Cost, "cost"))
 _SIZES = {"states": "n", "outputs": "p", "inputs": "m"}

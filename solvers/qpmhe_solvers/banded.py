@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .options import SolverOptions
-from .qp import QP
+from .qp import QP, Array
 from .solution import Residuals, Solution, SolveStatus
 from .solver import Solver
 
 __all__ = ["BandedSolver"]
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 # How far equality rows may be missed after a solve, in scaled numbers.

@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .qp import QP
+from .qp import QP, Array
 
 __all__ = ["GatheredQP"]
-
-Array = NDArray[np.float64]
 
 _ONE = np.ones(1)
 _peaks, _all = np.maximum.reduceat, np.logical_and.reduce

@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .gathered import GatheredQP
-from .qp import as_csc, hessian_pattern, rows_pattern
+from .qp import Array, as_csc, hessian_pattern, rows_pattern
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
 __all__ = ["Layout", "Structure", "Style", "Voids"]
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Index = NDArray[np.intp]
 

@@ -16,13 +16,12 @@ from .backend import Backend
 from .gathered import GatheredQP
 from .layout import Layout, Structure, Style, Voids
 from .options import SolverOptions
-from .qp import QP
+from .qp import QP, Array
 from .solution import RawSolution
 from .solver import Solver
 
 __all__ = ["NATIVE", "Answer", "NativeSolver"]
 
-Array = NDArray[np.float64]
 Point = Array | None
 
 # Workspaces kept by one solver: a window of full length needs one, or one for each structure

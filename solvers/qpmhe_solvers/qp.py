@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
 __all__ = [
-    "ARRAYS", "QP", "as_csc", "band_index", "band_of", "hessian_pattern", "rows_pattern",
+    "ARRAYS", "QP", "Array", "as_csc", "band_index", "band_of", "hessian_pattern", "rows_pattern",
 ]
 
 Array = NDArray[np.float64]

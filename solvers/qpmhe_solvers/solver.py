@@ -10,19 +10,16 @@ from functools import partial, wraps
 from typing import Any, ClassVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .errors import InvalidInputError
 from .gathered import GatheredQP
 from .options import SolverOptions
-from .qp import ARRAYS, QP
+from .qp import ARRAYS, QP, Array
 from .sample_qps import sample
 from .scaling import Scale, Scaling
 from .solution import Errors, RawSolution, Solution, SolveStatus
 
 __all__ = ["Solver", "as_count", "as_iterate", "as_multipliers", "expect_qp", "failure"]
-
-Array = NDArray[np.float64]
 
 # A claim of success is believed while the recomputed residuals stay below this many times the
 # tolerance, since solvers measure in scaled norms of their own, but not beyond the loosest.
