@@ -54,7 +54,7 @@ class BandedSolver(Solver):
 
     def _solve_scaled(self, qp: QP) -> Solution:
         """Solve with equality rows; pivots, unlike a Cholesky factor, depend on units."""
-        scale, scaled = self._scale(self._gather(qp))
+        scale, scaled = self._scale(qp)
         step, multipliers = self._with_equalities(scaled)
         if step is None:
             message = "the factorisation failed: H is not positive definite, or not finite"
