@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import sys
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +13,7 @@ from rich.console import Console
 from .._checks import make_folder
 from ..errors import OptionError
 from ..studies import Store, Study, StudyError, run
-from ..studies.grid import WORDS
+from ..studies.grid import WORDS, Measure
 from .report import show_report
 
 __all__ = ["compare", "study"]
@@ -22,14 +21,6 @@ __all__ = ["compare", "study"]
 _JOBS = typer.Option(min=1, help="Cells at a time; all cores if left out. Times want 1.")
 _SCHEDULER = typer.Option(help="Address of a Dask scheduler whose workers run the cells.")
 _RETRY = typer.Option("--retry-failed", help="Run cells that failed before once more.")
-
-
-class Measure(StrEnum):
-    """Values of --measure."""
-
-    BOTH = "both"
-    ACCURACY = "accuracy"
-    TIME = "time"
 
 
 def compare(
@@ -62,7 +53,7 @@ def compare(
     ] = None,
     measure: Annotated[
         Measure, typer.Option(help="What to measure; times alone run one cell at a time.")
-    ] = Measure.BOTH,
+    ] = "both",
     deadline: Annotated[
         float | None, typer.Option(help="Seconds for a step; shows the share that takes longer.")
     ] = None,
@@ -88,7 +79,7 @@ def compare(
         qps=_numbers("qps", qps),
         solver_iterations=_numbers("solver_iterations", solver_iterations),
         horizons=_numbers("horizons", horizons),
-        starts=start or ("candidate",), seeds=seeds, steps=steps, measure=measure.value,
+        starts=start or ("candidate",), seeds=seeds, steps=steps, measure=measure,
         deadline=deadline, covariances=covariances, cell_timeout=cell_timeout,
     )
     _run(what, store, out, jobs=jobs, scheduler=scheduler, retry_failed=retry_failed)

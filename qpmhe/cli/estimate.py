@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from enum import StrEnum
 from time import monotonic
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -20,22 +19,6 @@ __all__ = ["estimate", "run"]
 
 # Seconds until the progress bar appears, and between two refreshes.
 _BAR_AFTER, _REFRESH = 1.0, 0.1
-
-
-class Uncertainty(StrEnum):
-    """Values of --covariances."""
-
-    NONE = "none"
-    STD = "std"
-    FULL = "full"
-
-
-class DecimalMark(StrEnum):
-    """Values of --decimal."""
-
-    AUTO = "auto"
-    POINT = "."
-    COMMA = ","
 
 
 def estimate(
@@ -71,8 +54,9 @@ def estimate(
     ] = None,
     engine: Annotated[str | None, typer.Option(help="python or compiled.")] = None,
     covariances: Annotated[
-        Uncertainty, typer.Option(help="Standard deviations or covariances of the estimates.")
-    ] = Uncertainty.NONE,
+        Literal["none", "std", "full"],
+        typer.Option(help="Standard deviations or covariances of the estimates."),
+    ] = "none",
     step_time: Annotated[
         bool, typer.Option(help="Whether to write the seconds of each step.")
     ] = True,
@@ -105,7 +89,7 @@ def estimate(
     separator: Annotated[
         str | None, typer.Option(help="Of a CSV file: a character, comma, semicolon, tab, ...")
     ] = None,
-    decimal: Annotated[DecimalMark, typer.Option(help="Decimal mark.")] = DecimalMark.AUTO,
+    decimal: Annotated[Literal["auto", ".", ","], typer.Option(help="Decimal mark.")] = "auto",
     encoding: Annotated[str, typer.Option(help="Of a CSV file.")] = "utf-8",
     missing: Annotated[
         list[str] | None,
@@ -114,8 +98,9 @@ def estimate(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
 ) -> None:
     """Estimate the states of a measured record; in a pipe, line by line."""
-    options: dict[str, Any] = {"horizon": horizon, "backend": backend, "engine": engine}
-    options = {name: value for name, value in options.items() if value is not None}
+    options: dict[str, Any] = {
+        name: value for name, value in locals().items() if value is not None
+    }
     if max_qps is not None:
         options["max_qps"] = _number("--max-qps", max_qps, "converged")
     if max_solver_iterations is not None:
@@ -124,14 +109,7 @@ def estimate(
         )
     if initial_state is not None:
         options["initial_state"] = _vector(initial_state)
-    run(
-        Console(stderr=True), model, record, out, quiet=quiet, time=time, outputs=outputs,
-        inputs=inputs, separator=separator, decimal=decimal.value, encoding=encoding,
-        missing=missing or (), dt=dt, time_scale=time_scale, equal_steps=equal_steps,
-        max_gap=max_gap, skip_repeated=skip_repeated, covariances=covariances.value,
-        step_time=step_time, resume=resume, overwrite=overwrite,
-        checkpoint_every=checkpoint_every, **options,
-    )
+    run(Console(stderr=True), **options)
 
 
 def run(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -10,16 +9,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from ..studies.qpbenchmark_set import export_qpbenchmark
+from ..studies.qpbenchmark_set import Matrices, export_qpbenchmark
 
 __all__ = ["export_qps"]
-
-
-class Matrices(StrEnum):
-    """Values of --matrices."""
-
-    SPARSE = "sparse"
-    DENSE = "dense"
 
 
 def export_qps(
@@ -31,11 +23,11 @@ def export_qps(
     ] = Path("results/qpbenchmark"),
     matrices: Annotated[
         Matrices, typer.Option(help="What solvers that take both kinds are given.")
-    ] = Matrices.SPARSE,
+    ] = "sparse",
 ) -> None:
     """Write dumped QPs as a test set of qpbenchmark."""
     console = Console()
-    exported = export_qpbenchmark(files, out, matrices=matrices.value)
+    exported = export_qpbenchmark(files, out, matrices=matrices)
     for path, reason in exported.skipped.items():
         console.print(f"[yellow]left out[/] {escape(str(path))}: {reason}", highlight=False)
     console.print(

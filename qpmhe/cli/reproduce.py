@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -17,21 +16,14 @@ from ..studies.paper import SETTLED, Reproduction
 __all__ = ["reproduce"]
 
 
-class Discretisation(StrEnum):
-    """Values of --method."""
-
-    EULER = "euler"
-    RK4 = "rk4"
-
-
 def reproduce(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
     steps: Annotated[int, typer.Option(min=1, help="Number of measurements.")] = 150,
     backend: Annotated[str, typer.Option(help="QP backend of the first table.")] = "auto",
     out: Annotated[Path, typer.Option(help="Folder for figure and CSV files.")] = Path("results"),
     method: Annotated[
-        Discretisation, typer.Option(help="Discretisation of the reactor.")
-    ] = Discretisation.EULER,
+        Literal["euler", "rk4"], typer.Option(help="Discretisation of the reactor.")
+    ] = "euler",
     ipopt: Annotated[
         bool, typer.Option("--ipopt", help="Run CasADi with Ipopt, the paper's tool, as well.")
     ] = False,
@@ -44,7 +36,7 @@ def reproduce(
     ) as bar:
         task = bar.add_task("")
         found = studies.reproduce(
-            out, seed=seed, steps=steps, method=method.value, backend_name=backend, ipopt=ipopt,
+            out, seed=seed, steps=steps, method=method, backend_name=backend, ipopt=ipopt,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     console.print(_paper_table(found))

@@ -5,15 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.system import System
 from ..observers import Luenberger
-from .example import Example, make_example
+from .example import Array, Example, make_example
 
 __all__ = ["batch_reactor", "casadi_output", "casadi_rate"]
-
-Array = NDArray[Any]
 
 _K1, _K2 = 0.16, 0.64
 _DT = 0.1

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.sets import Box
 from ..model.system import System
 from ..observers import Luenberger
-from .example import Example, make_example
+from .example import Array, Example, make_example
 
 __all__ = ["battery_cell"]
-
-Array = NDArray[Any]
 
 _CAPACITY = 0.85  # Ah
 _R0, _R1, _R2 = 0.07446, 0.04669, 0.04984  # Ohm

@@ -12,11 +12,9 @@ from .._checks import count
 from ..errors import OptionError
 from ..model.system import System
 from ..observers import design_luenberger
-from .example import Example, make_example
+from .example import Array, Example, make_example
 
 __all__ = ["casadi_output", "casadi_rate", "chain_of_masses"]
-
-Array = NDArray[Any]
 
 _MASS, _STIFFNESS, _LENGTH = 0.033, 1.0, 0.033  # kg, N/m, m
 _GRAVITY, _SPACING = 9.81, 0.25  # m/s^2, m

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.sets import Box
 from ..model.system import System
 from ..observers import design_luenberger
-from .example import Example, make_example
+from .example import Array, Example, make_example
 
 __all__ = ["cstr"]
-
-Array = NDArray[Any]
 
 _FLOW = 1.0  # 1/min, q/V = 100 L/min / 100 L
 _FEED, _FEED_TEMPERATURE = 1.0, 350.0  # mol/L, K

@@ -5,14 +5,16 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..costs import QuadraticCost
 from ..model.system import System
 from ..observers import Observer
 from .scenario import Scenario
 
-__all__ = ["Example", "make_example"]
+__all__ = ["Array", "Example", "make_example"]
+
+Array = NDArray[Any]
 
 
 class Example(NamedTuple):

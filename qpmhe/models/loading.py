@@ -275,11 +275,15 @@ def _files(path: Path) -> list[Path]:
     """A file, first, and those of its folder that it imports, at whatever depth."""
     top = next(one for one in path.parents if not (one / "__init__.py").is_file())
     finder = ModuleFinder([str(top), str(path.parent)])
+    *packages, _ = parts = path.relative_to(top).with_suffix("").parts
+    for depth in range(1, len(packages) + 1):  # whose own code is not the model's
+        package: Any = finder.add_module(".".join(packages[:depth]))
+        package.__path__ = [str(top.joinpath(*packages[:depth]))]
     with contextlib.suppress(Exception):  # the import reports it
-        if top == path.parent:
-            finder.run_script(str(path))
+        if packages:
+            finder.import_hook(".".join(parts))
         else:
-            finder.import_hook(".".join(path.relative_to(top).with_suffix("").parts))
+            finder.run_script(str(path))
     places = (getattr(one, "__file__", None) for one in finder.modules.values())
     found = {Path(place).resolve() for place in places if place} - {path}
     return [path, *(

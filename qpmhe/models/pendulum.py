@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.system import System
 from ..observers import HighGain
-from .example import Example, make_example
+from .example import Array, Example, make_example
 
 __all__ = ["pendulum"]
-
-Array = NDArray[Any]
 
 _STIFFNESS, _DAMPING = 9.81 / 0.5, 0.2  # 1/s^2, 1/s
 _DT = 0.02  # s

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.system import System
 from ..observers import design_luenberger
-from .example import Example, make_example
+from .example import Array, Example, make_example
 
 __all__ = ["quadrotor"]
-
-Array = NDArray[Any]
 
 _MASS, _GRAVITY = 0.65, 9.81  # kg, m/s^2
 _INERTIA = np.array([7.5e-3, 7.5e-3, 1.3e-2])  # kg m^2

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.system import System
 from ..observers import HighGain
-from .example import Example, make_example
+from .example import Array, Example, make_example
 
 __all__ = ["van_der_pol"]
-
-Array = NDArray[Any]
 
 _MU, _DT = 1.0, 0.1
 _OUTPUT = np.array([[1.0, 0.0]])

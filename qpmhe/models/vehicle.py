@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.system import System
 from ..observers import OutputInjection
-from .example import Example, make_example
+from .example import Array, Example, make_example
 
 __all__ = ["vehicle"]
-
-Array = NDArray[Any]
 
 # East of all of the path, so that atan2 does not jump on it.
 _BEACONS = np.array([[9.0, -5.0], [10.0, 6.0]])  # m

@@ -1,22 +1,35 @@
-"""The measurements of a record, checked one after another."""
+"""The measurements of a record: its columns, its fields, and checks one sample after another."""
 
 from __future__ import annotations
 
+import csv
+import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from datetime import UTC, datetime, timedelta
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..errors import InvalidInputError
-from .columns import ColumnNames
+from .._checks import Array
+from ..errors import InvalidInputError, OptionError
 from .tables import RecordError, Row, open_table
-from .values import FieldReader, Time
 
-__all__ = ["Measurement", "RecordReader"]
+__all__ = [
+    "ColumnNames", "Columns", "FieldReader", "Measurement", "RecordReader", "Time",
+    "seconds_between",
+]
 
-Array = NDArray[np.float64]
+_TIMES = ("time", "t", "timestamp", "datetime", "date_time")
+# "Voltage (V)", "Voltage [V]", "Voltage / V"
+_UNIT = re.compile(r"\s*(\([^()]*\)|\[[^\[\]]*\]|/\s*\S+)$")
+# An error shows so many names, and so much of each.
+_NAMES_SHOWN, _LETTERS_SHOWN = 40, 60
+_MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "null", "none"})
+_WHOLE = re.compile(r"[+-]?[0-9]{1,19}")
+_NANOSECONDS = re.compile(r":\d\d[.,]\d{6}(\d{1,3})(?!\d)")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @dataclass(eq=False)
@@ -158,3 +171,233 @@ class RecordReader:
             f"time {time.text} is before {before.time.text} in {unit} {before.line}; sort the "
             "record by time.", row.line, column,
         )
+
+
+class Columns(NamedTuple):
+    """Positions in a row; -1 for an output that the record does not have."""
+
+    time: int
+    outputs: tuple[int, ...]
+    inputs: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ColumnNames:
+    """The model's names of y and u, and the options --time, --outputs and --inputs."""
+
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+    time: str | None = None
+    output_columns: str | None = None
+    input_columns: str | None = None
+
+    def find(self, header: Sequence[str], file: str, line: int | None = None) -> Columns:
+        """The columns in a header; RecordError where one is missing or ambiguous."""
+        table = _Header([name.strip() for name in header], file, line)
+        if self.time is not None:
+            time = table.exactly(self.time, "the time", "name it by --time.")
+        else:
+            time = table.guess(_TIMES, "the time", "name it by --time COLUMN.")
+        outputs = _find(table, "outputs", self.outputs, self.output_columns)
+        inputs = _find(table, "inputs", self.inputs, self.input_columns)
+        if all(position < 0 for position in outputs):
+            raise OptionError("--outputs leaves all outputs out; expected a column for one.")
+        if time in (*outputs, *inputs):
+            raise OptionError(
+                f"column {header[time]!r} is both the time and an output or input; choose a "
+                "different column for each by --time, --outputs and --inputs."
+            )
+        return Columns(time, outputs, inputs)
+
+
+def _find(
+    table: _Header, option: str, names: tuple[str, ...], given: str | None
+) -> tuple[int, ...]:
+    letter = "y" if option == "outputs" else "u"
+    chosen = _chosen(option, given, letter, names)
+    found = []
+    for i, name in enumerate(names):
+        what = f"{option[:-1]} {name!r}"
+        remedy = f"name it by --{option} {letter}{i + 1}=COLUMN."
+        if i in chosen:
+            if not chosen[i] and option == "inputs":
+                raise OptionError(f"--inputs gives no column for {name!r}; inputs are needed.")
+            found.append(table.exactly(chosen[i], what, remedy) if chosen[i] else -1)
+            continue
+        guesses = [name, f"{letter}{i + 1}", f"{letter}_{i + 1}"]
+        if len(names) == 1:
+            guesses.append(letter)
+        if option == "outputs":
+            remedy = f"{remedy[:-1]}, or leave it out by --outputs {letter}{i + 1}= (no column)."
+        found.append(table.guess(guesses, what, remedy))
+    return tuple(found)
+
+
+@dataclass
+class _Header:
+    names: list[str]
+    file: str
+    line: int | None
+
+    def exactly(self, name: str, what: str, remedy: str) -> int:
+        """The column of this very name, or of this name but for case."""
+        lower = [one.lower() for one in self.names]
+        for names, wanted in ((self.names, name), (lower, name.lower())):
+            if names.count(wanted) > 1:
+                raise RecordError(
+                    f"there are {names.count(wanted)} columns {name!r}; rename all but one.",
+                    self.file, self.line,
+                )
+            if wanted in names:
+                return names.index(wanted)
+        raise self._missing(f"column {name!r} for {what}", remedy)
+
+    def guess(self, names: Sequence[str], what: str, remedy: str) -> int:
+        """The column of the first of these names; units behind a column's name do not count."""
+        lower = [one.lower() for one in self.names]
+        bare = [_UNIT.sub("", one) for one in lower]
+        for name in names:
+            if name.lower() in lower:
+                return self.exactly(name, what, remedy)
+            found = [i for i, one in enumerate(bare) if one == name.lower()]
+            if len(found) == 1:
+                return found[0]
+            if found:
+                same = ", ".join(repr(self.names[i]) for i in found)
+                raise RecordError(f"{same} could all be {what}; {remedy}", self.file, self.line)
+        tried = ", ".join(map(repr, dict.fromkeys(names)))
+        raise self._missing(f"column for {what} (looked for {tried})", remedy)
+
+    def _missing(self, what: str, remedy: str) -> RecordError:
+        shown = ", ".join(
+            repr(name if len(name) <= _LETTERS_SHOWN else f"{name[:_LETTERS_SHOWN]}...")
+            for name in self.names[:_NAMES_SHOWN]
+        )
+        if len(self.names) > _NAMES_SHOWN:
+            shown += f" and {len(self.names) - _NAMES_SHOWN} more"
+        return RecordError(
+            f"there is no {what}; the columns are {shown}. If it is one of them, {remedy}",
+            self.file, self.line,
+        )
+
+
+def _chosen(
+    option: str, text: str | None, letter: str, names: tuple[str, ...]
+) -> dict[int, str]:
+    """Read ``y1=column,y2=column`` or ``column,column``: the column of each index."""
+    if text is None:
+        return {}
+    indices = {f"{letter}{i + 1}": i for i in range(len(names))}
+    if len(names) == 1:
+        indices[letter] = 0
+    indices |= {name: i for i, name in enumerate(names)}
+    known = ", ".join(indices) or f"none: the model has no {option}"
+    items = [item.strip() for item in next(csv.reader([text], skipinitialspace=True), [])]
+    if len(items) == len(names) and not any(
+        item.partition("=")[0].strip() in indices for item in items
+    ):
+        return dict(enumerate(items))
+    found: dict[int, str] = {}
+    for item in items:
+        name, equals, column = (part.strip() for part in item.partition("="))
+        if not equals or name not in indices:
+            raise OptionError(
+                f"--{option} has {item!r}; expected NAME=COLUMN between commas with a name of "
+                f"{known}, or {len(names)} columns in order."
+            )
+        if indices[name] in found:
+            raise OptionError(f"--{option} gives {name!r} twice; give it once.")
+        found[indices[name]] = column
+    return found
+
+
+class Time(NamedTuple):
+    """A number, or a date in nanoseconds since 1970.
+
+    Whole numbers stay integers: nanoseconds since 1970 do not fit into a float.
+    """
+
+    kind: str
+    value: int | float
+    text: str
+
+
+def seconds_between(before: Time, after: Time) -> float:
+    """Difference of two times of one kind: of numbers in their unit, of dates in seconds."""
+    difference = after.value - before.value
+    return float(difference) if after.kind == "number" else difference / 1e9
+
+
+class FieldReader:
+    """Reads fields, with one decimal mark in the whole record: the first one, if ``auto``."""
+
+    def __init__(self, decimal: str = "auto", missing: Sequence[str] = ()) -> None:
+        self._mark = "" if decimal == "auto" else decimal
+        words = [str(word).strip().lower() for word in missing]
+        if not all(words):
+            raise OptionError("--missing is blank; expected a word. Blank fields are missing.")
+        self._missing = _MISSING.union(words)
+        # -999 is also written -999.0.
+        self._numbers = set()
+        for word in words:
+            try:
+                self._numbers.add(float(word))
+            except ValueError:
+                continue
+
+    def number(self, field: str) -> float:
+        """The value of a field, NaN where it is missing; ValueError where it is no number."""
+        text = field.strip()
+        if text.lower() in self._missing:
+            return math.nan
+        value = self._parse(text)
+        return math.nan if value in self._numbers else value
+
+    def time(self, field: str) -> Time:
+        """The time in a field, a number or an ISO date; ValueError where it is neither."""
+        text = field.strip()
+        if text.lower() in _MISSING:
+            raise ValueError("is blank; every line needs its time")
+        if _WHOLE.fullmatch(text):
+            return Time("number", int(text), text)
+        try:
+            value = self._parse(text)
+        except ValueError:
+            try:
+                moment = datetime.fromisoformat(text)
+            except ValueError:
+                pass
+            else:
+                return _date(moment, text)
+            raise
+        if not math.isfinite(value):
+            raise ValueError("is not finite")
+        return Time("number", value, text.replace(",", "."))
+
+    def _parse(self, text: str) -> float:
+        comma, point = "," in text, "." in text
+        try:
+            value = float(text.replace(",", "" if point else ".") if comma else text)
+        except ValueError:
+            raise ValueError("is not a number") from None
+        if "_" in text:  # 1_000 is a number in Python only
+            raise ValueError("is not a number")
+        if comma and point:
+            raise ValueError("has two kinds of decimal marks; leave out the thousands separator")
+        if comma or point:
+            mark = "," if comma else "."
+            self._mark = self._mark or mark
+            if mark != self._mark:
+                raise ValueError(
+                    f"has the decimal mark {mark!r}, where {self._mark!r} is expected; use the "
+                    "same one in all numbers, or choose it by --decimal"
+                )
+        return value
+
+
+def _date(moment: datetime, text: str) -> Time:
+    kind = "date" if moment.tzinfo is None else "date with a zone"
+    since = moment.replace(tzinfo=moment.tzinfo or UTC) - _EPOCH
+    rest = _NANOSECONDS.search(text)  # a datetime has microseconds only
+    nanoseconds = 1000 * (since // timedelta(microseconds=1))
+    return Time(kind, nanoseconds + (int(rest[1].ljust(3, "0")) if rest else 0), text)

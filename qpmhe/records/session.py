@@ -19,15 +19,11 @@ from .._checks import count
 from ..errors import InvalidInputError, OptionError
 from ..estimation.estimate import Status
 from .checkpoints import Checkpoint, CheckpointError, WriteError, load, save, versions
-from .columns import ColumnNames
-from .measurements import Measurement, RecordReader
-from .model_failures import ModelFailures
-from .output import Output, RowFormat
-from .record_model import RecordModel, load_record_model
-from .standard_output import standard_output_for_rows
+from .measurements import ColumnNames, FieldReader, Measurement, RecordReader, seconds_between
+from .output import Output, RowFormat, standard_output_for_rows
+from .record_model import ModelFailures, RecordModel, load_record_model
 from .steps import OnlyGapsError, Step, Steps
 from .tables import RecordError
-from .values import FieldReader, seconds_between
 
 __all__ = ["Summary", "estimate_record"]
 

@@ -12,10 +12,10 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from qpmhe_solvers import Backend, BackendError, backend, register
 
+from .._checks import Array
 from ..estimation.estimate import Estimate
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
@@ -26,7 +26,6 @@ from .environment import environment
 
 __all__ = ["OBSERVER", "Cell", "Result", "Task", "compute", "failure"]
 
-Array = NDArray[np.float64]
 Result = dict[str, Any]
 
 #: Backend of a cell that solves no QP.

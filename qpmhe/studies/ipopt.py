@@ -8,9 +8,8 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .._checks import need
+from .._checks import Array, need
 from ..costs import QuadraticCost
 from ..errors import InvalidInputError
 from ..estimation.estimate import Estimate, Status
@@ -20,8 +19,6 @@ from ..model.system import System
 from ..observers import Observer
 
 __all__ = ["IpoptEstimator"]
-
-Array = NDArray[np.float64]
 
 
 class IpoptEstimator:

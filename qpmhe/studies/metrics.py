@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .._checks import Array
 from ..estimation.estimate import Status
 from ..estimation.run import Run
 
 __all__ = ["accuracy", "consistency", "cost_ratio", "outcomes", "timing"]
-
-Array = NDArray[np.float64]
 
 _FAILURES = (
     Status.SOLVER_FAILED | Status.NO_DECREASE | Status.MODEL_FAILED | Status.FAILED_STAGE

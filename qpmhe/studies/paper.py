@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from qpmhe_solvers import available, backend, create
 
-from .._checks import make_folder
+from .._checks import Array, make_folder
 from ..estimation.estimate import Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
@@ -27,8 +26,6 @@ from .ipopt import IpoptEstimator
 from .metrics import accuracy, timing
 
 __all__ = ["SETTLED", "PaperStudy", "Reproduction", "Row", "reproduce"]
-
-Array = NDArray[np.float64]
 
 # The paper's i = 0, 2, 5 and converged, and i = 1 beside them; the paper's own of Ipopt.
 _ITERATIONS: tuple[int | None, ...] = (0, 1, 2, 5, None)

@@ -13,7 +13,6 @@ import numpy as np
 from qpmhe_solvers import QP
 from qpmhe_solvers.dispatch import qpsolvers_arguments
 from qpmhe_solvers.files import StoredQP, load, qp_files
-from qpmhe_solvers.gathered import GatheredQP
 from qpmhe_solvers.layout import Layout, Structure, Style
 
 from ..errors import InvalidInputError, OptionError
@@ -155,10 +154,9 @@ def _problem(qp: QP) -> qpsolvers.Problem:
 
     sides = [np.isfinite(side) for side in (qp.lower, qp.upper)]
     box = all(side.all() or not side.any() for side in sides)
-    gathered = GatheredQP.of(qp)
     style = Style("dense", bounds="box" if box else "rows", sides=1)
-    layout = Layout(style, Structure.of(gathered, exact=True), *gathered.sizes)
-    layout.fill(gathered, None)
+    layout = Layout(style, Structure.of(qp, exact=True), *qp.sizes)
+    layout.fill(qp, None)
     P, q, G, h, A, b, lower, upper = qpsolvers_arguments(layout)
     return qpsolvers.Problem(
         P, q, G, h, A, b,

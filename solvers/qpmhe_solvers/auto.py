@@ -6,21 +6,16 @@ from contextlib import suppress
 from itertools import chain
 from time import perf_counter
 
-import numpy as np
-from numpy.typing import NDArray
-
 from .backend import make_solver
 from .banded import BandedSolver
 from .contained import ContainedSolver
 from .native import NATIVE
 from .options import SolverOptions
-from .qp import QP
+from .qp import QP, Array
 from .solution import Solution, SolveStatus
 from .solver import Solver
 
 __all__ = ["AutoSolver"]
-
-Array = NDArray[np.float64]
 
 # daqp is the fastest up to about this many unknowns; sparse interior points win beyond.
 _SMALL = 60

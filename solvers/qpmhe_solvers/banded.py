@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .options import SolverOptions
-from .qp import QP
+from .qp import QP, Array
 from .solution import Residuals, Solution, SolveStatus
 from .solver import Solver
 
 __all__ = ["BandedSolver"]
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 # How far equality rows may be missed after a solve, in scaled numbers.
@@ -55,7 +54,7 @@ class BandedSolver(Solver):
 
     def _solve_scaled(self, qp: QP) -> Solution:
         """Solve with equality rows; pivots, unlike a Cholesky factor, depend on units."""
-        scale, scaled = self._scale(self._gather(qp))
+        scale, scaled = self._scale(qp)
         step, multipliers = self._with_equalities(scaled)
         if step is None:
             message = "the factorisation failed: H is not positive definite, or not finite"

@@ -8,18 +8,15 @@ from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .options import SolverOptions
-from .qp import ARRAYS, QP
+from .qp import ARRAYS, QP, Array
 from .registry import Backend, backend, create
 from .sample_qps import Bounds, Sides, contradiction, sample
 from .solution import Solution, SolveStatus
 from .solver import Solver
 
 __all__ = ["Capabilities", "Conformance", "Finding", "check", "measure"]
-
-Array = NDArray[np.float64]
 
 # Caps at which backends are tried.
 _CAPS = (1, 2, 5)

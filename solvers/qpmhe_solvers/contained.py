@@ -7,15 +7,12 @@ from collections.abc import Callable
 from itertools import count
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .qp import QP
+from .qp import QP, Array
 from .solution import Residuals, Solution, SolveStatus
 from .solver import Solver, as_count, as_iterate, as_multipliers, failure
 
 __all__ = ["ContainedSolver"]
-
-Array = NDArray[np.float64]
 
 _NUMBERS = count(1)
 

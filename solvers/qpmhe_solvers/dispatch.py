@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .gathered import GatheredQP
 from .layout import Layout, Structure, Style
 from .native import Answer, NativeSolver
 from .options import SolverOptions
+from .qp import QP
 
 __all__ = ["TRANSLATIONS", "DispatchSolver", "Translation", "qpsolvers_arguments"]
 
@@ -119,7 +119,7 @@ class DispatchSolver(NativeSolver):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.name, self.options)
 
-    def structure(self, qp: GatheredQP) -> Structure:
+    def structure(self, qp: QP) -> Structure:
         """The limits of this QP."""
         return Structure.of(qp, exact=True)
 

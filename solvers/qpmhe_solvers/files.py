@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 
 from .errors import InvalidInputError
 from .options import SolverOptions
-from .qp import ARRAYS, QP
+from .qp import ARRAYS, QP, Array
 from .registry import backends
 from .solution import Residuals, Solution, SolveStatus
 
 __all__ = ["StoredQP", "dump", "load", "qp_files"]
-
-Array = NDArray[np.float64]
 
 _FORMAT = "qpmhe QP"
 _VERSION = 1

@@ -14,20 +14,15 @@ import weakref
 from contextlib import suppress
 from typing import IO, Any, cast
 
-import numpy as np
-from numpy.typing import NDArray
-
 from .backend import Backend, make_solver
 from .contained import ContainedSolver
 from .errors import BackendError
 from .options import SolverOptions
-from .qp import QP
+from .qp import QP, Array
 from .solution import Solution, SolveStatus
 from .solver import Solver
 
 __all__ = ["IsolatedSolver"]
-
-Array = NDArray[np.float64]
 
 # Seconds in which a process has to import and make its solver.
 _START = 120.0

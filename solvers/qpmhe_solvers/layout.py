@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .gathered import GatheredQP
-from .qp import as_csc, hessian_pattern, rows_pattern
+from .qp import QP, Array, Places, as_csc, hessian_pattern, rows_pattern
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
 __all__ = ["Layout", "Structure", "Style", "Voids"]
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Index = NDArray[np.intp]
 
@@ -48,7 +46,7 @@ class Structure(NamedTuple):
     equal: Flags
 
     @staticmethod
-    def of(qp: GatheredQP, *, exact: bool = False) -> Structure:
+    def of(qp: QP, *, exact: bool = False) -> Structure:
         """The structure that a QP needs; with room for its own limits only, if exact."""
         stages, n, rows = qp.sizes
         size = stages * n
@@ -106,7 +104,7 @@ class Layout:
     def __init__(
         self, style: Style, structure: Structure, stages: int, n: int, rows: int
     ) -> None:
-        places = GatheredQP(stages, n, rows)  # its numbers are not read
+        places = Places.of(stages, n, rows)
         self.style, self.structure = style, structure
         self.size, self.count = size, count = stages * n, stages * (n + rows)
         self.equalities, self.constraints, self.signs = _rows(style, structure, size)
@@ -115,14 +113,14 @@ class Layout:
         )
         patterns = _patterns(style, stages, n, rows, self.constraints, self.equalities)
         # Behind the limits of the constraints stands the upper limit of a void row: 0 x <= 1.
-        lower = np.append(places.lower_at + np.arange(count), places.one_at)
-        upper = np.append(places.upper_at + np.arange(count), places.one_at)
+        lower = np.append(places.lower + np.arange(count), places.one)
+        upper = np.append(places.upper + np.arange(count), places.one)
         box = slice(size if self.boxed else 0)
         above = np.where(self.signs > 0, upper[self.constraints], lower[self.constraints])
         below = lower[self.constraints] if style.sides == 2 else lower[:0]
         sources = [
-            patterns[0].data, *(places.own_at + pattern.data for pattern in patterns[1:]),
-            places.gradient_at + np.arange(size), upper[self.equalities],
+            patterns[0].data, *(places.own + pattern.data for pattern in patterns[1:]),
+            places.gradient + np.arange(size), upper[self.equalities],
             lower[box], below, upper[box], above,
         ]
         self._source = np.concatenate(sources)
@@ -151,7 +149,7 @@ class Layout:
         self._dense.append((full.reshape(-1), places, values))
         return full
 
-    def voids(self, qp: GatheredQP) -> Voids | None:
+    def voids(self, qp: QP) -> Voids | None:
         """The rows of C without a limit in this QP, as far as the solver cannot have such."""
         if self.style.infinite:
             return None
@@ -166,7 +164,7 @@ class Layout:
         below = rows if self.style.sides == 2 else rows[:0]
         return Voids(np.flatnonzero(void[self._entry_rows]), below, rows)
 
-    def fill(self, qp: GatheredQP, voids: Voids | None) -> None:
+    def fill(self, qp: QP, voids: Voids | None) -> None:
         """Write the numbers of a QP into the arrays."""
         # Any mode but the default one writes into ``out`` without a buffer between.
         qp.numbers.take(self._source, out=self._values, mode="clip")

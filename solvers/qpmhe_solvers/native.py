@@ -13,16 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend import Backend
-from .gathered import GatheredQP
 from .layout import Layout, Structure, Style, Voids
 from .options import SolverOptions
-from .qp import QP
+from .qp import QP, Array
 from .solution import RawSolution
 from .solver import Solver
 
 __all__ = ["NATIVE", "Answer", "NativeSolver"]
 
-Array = NDArray[np.float64]
 Point = Array | None
 
 # Workspaces kept by one solver: a window of full length needs one, or one for each structure
@@ -71,7 +69,7 @@ class NativeSolver(Solver):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.options,)
 
-    def structure(self, qp: GatheredQP) -> Structure:
+    def structure(self, qp: QP) -> Structure:
         """The limits that a layout for this QP has room for."""
         return Structure.of(qp)
 
@@ -102,10 +100,9 @@ class NativeSolver(Solver):
         """Solve, from an increment (K n,) and multipliers (K n + K rows,); None for zero."""
 
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
-        gathered = GatheredQP.of(qp)
-        key, workspace, voids = self._taken(gathered)
+        key, workspace, voids = self._taken(qp)
         layout = workspace.layout
-        layout.fill(gathered, voids)
+        layout.fill(qp, voids)
         # Whatever raises from here on leaves the workspace out.
         if workspace.handle is None:
             with warnings.catch_warnings(action="ignore"):
@@ -115,7 +112,7 @@ class NativeSolver(Solver):
         if self.time_limit is not None:
             self._limit(workspace.handle, self.time_limit)
         point = None if start is None else np.ravel(start)
-        answer = self._run(workspace.handle, layout, point, self._kept_duals(workspace, gathered))
+        answer = self._run(workspace.handle, layout, point, self._kept_duals(workspace, qp))
         if answer.sound and _finite(answer.x) and _finite(answer.duals):
             workspace.duals, workspace.shifts = answer.duals, self._shifts
             if len(self._workspaces) == _KEPT:
@@ -128,7 +125,7 @@ class NativeSolver(Solver):
             answer.x, answer.solved, answer.iterations, bounds, rows, answer.message
         )
 
-    def _taken(self, qp: GatheredQP) -> tuple[Hashable, _Workspace, Voids | None]:
+    def _taken(self, qp: QP) -> tuple[Hashable, _Workspace, Voids | None]:
         """The workspace for a QP, taken off the shelf, its key, and the QP's void rows."""
         pattern = (
             qp.sizes, np.isfinite(qp.limits).tobytes(), (qp.all_lower == qp.all_upper).tobytes()
@@ -148,7 +145,7 @@ class NativeSolver(Solver):
             known = self._known[pattern] = kind, workspace.layout.voids(qp)
         return key, workspace, known[1]
 
-    def _kept_duals(self, workspace: _Workspace, qp: GatheredQP) -> Array | None:
+    def _kept_duals(self, workspace: _Workspace, qp: QP) -> Array | None:
         """Multipliers of the workspace's last solve, moved with the trajectory."""
         duals = workspace.duals
         if duals is None or not (self._keeps and self.options.warm_start):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
 __all__ = [
-    "ARRAYS", "QP", "as_csc", "band_index", "band_of", "hessian_pattern", "rows_pattern",
+    "ARRAYS", "QP", "Array", "Places", "as_csc", "band_index", "band_of", "hessian_pattern",
+    "rows_pattern",
 ]
 
 Array = NDArray[np.float64]
@@ -94,6 +95,24 @@ def as_csc(pattern: csc_matrix, values: Array) -> csc_matrix:
     return matrix
 
 
+class Places(NamedTuple):
+    """Where the parts of `QP.numbers` start: after the band, and the next rows after the own."""
+
+    gradient: int
+    own: int
+    one: int
+    lower: int
+    upper: int
+    end: int
+
+    @staticmethod
+    def of(stages: int, n: int, rows: int) -> Places:
+        """The places in a QP of these sizes."""
+        limits = stages * (n + rows)
+        sizes = (2 * stages * n * n, stages * n, 2 * stages * rows * n, 1, limits, limits)
+        return Places(*np.cumsum(sizes).tolist())
+
+
 class QP:
     r"""A convex QP in the increments :math:`d_0, \dots, d_{K-1}` of a trajectory.
 
@@ -104,7 +123,8 @@ class QP:
 
     H is symmetric, block-tridiagonal and positive definite. The lower triangle is held in
     stage-wise band panels (see `band_index`), which LAPACK reads in place; the CSC and
-    dense views are made from these same numbers.
+    dense views are made from these same numbers. Whatever is assigned to an array is written
+    into it.
 
     Parameters
     ----------
@@ -138,30 +158,45 @@ class QP:
         If a size is not a positive integer.
     """
 
-    __slots__ = (*ARRAYS, "bounded", "n", "rows", "size", "stages")
+    # All arrays are views of ``numbers``: the band panels, the gradient, the own rows, the next
+    # rows, a 1, and the limits of all constraints, first all lower, then all upper; bounds come
+    # before rows. ``key`` names the scale that they are in.
+    __slots__ = (
+        *ARRAYS, "all_lower", "all_upper", "bounded", "key", "limits", "n", "numbers", "rows",
+        "size", "sizes", "stages",
+    )
 
     def __init__(self, stages: int, n: int, rows: int = 0) -> None:
         for name, value, least in (("stages", stages, 1), ("n", n, 1), ("rows", rows, 0)):
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
                 raise ShapeError(f"{name} is {value!r}; a QP needs an integer {name} >= {least}.")
         self.stages, self.n, self.rows, self.size = stages, n, rows, stages * n
-        self.band: Array = np.zeros((stages, n, 2 * n))
-        self.gradient: Array = np.zeros((stages, n))
-        self.lower: Array = np.full((stages, n), -np.inf)
-        self.upper: Array = np.full((stages, n), np.inf)
-        self.row_own: Array = np.zeros((stages, rows, n))
-        self.row_next: Array = np.zeros((stages, rows, n))
-        self.row_lower: Array = np.full((stages, rows), -np.inf)
-        self.row_upper: Array = np.full((stages, rows), np.inf)
-        self.bounded = True
+        self.sizes, self.bounded, self.key = (stages, n, rows), True, 0
+        places = Places.of(stages, n, rows)
+        numbers = self.numbers = np.zeros(places.end)
+        numbers[places.one] = 1.0
+        self.band = numbers[: places.gradient].reshape(stages, n, 2 * n)
+        self.gradient = numbers[places.gradient : places.own].reshape(stages, n)
+        self.row_own, self.row_next = numbers[places.own : places.one].reshape(2, stages, rows, n)
+        self.limits = numbers[places.lower :]
+        self.all_lower, self.all_upper = self.limits.reshape(2, -1)
+        self.all_lower[...], self.all_upper[...] = -np.inf, np.inf
+        self.lower, self.row_lower = _divided(self.all_lower, stages, n, rows)
+        self.upper, self.row_upper = _divided(self.all_upper, stages, n, rows)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in ARRAYS and hasattr(self, name):
+            getattr(self, name)[...] = value
+        else:
+            object.__setattr__(self, name, value)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Copied views would be arrays of their own.
+        return _remade, (self.sizes, self.numbers, self.bounded, self.key)
 
     def copy(self) -> QP:
         """The same problem in arrays of its own."""
-        twin = object.__new__(QP)
-        for name in QP.__slots__:
-            value = getattr(self, name)
-            setattr(twin, name, value.copy() if isinstance(value, np.ndarray) else value)
-        return twin
+        return _remade(self.sizes, self.numbers, self.bounded, self.key)
 
     @property
     def lapack_band(self) -> Array:
@@ -226,8 +261,30 @@ class QP:
 
     def finite(self) -> bool:
         """Whether H, g and the rows are free of NaN and infinities, and no bound is NaN."""
-        numbers = (self.gradient, self.band, self.row_own, self.row_next)
-        limits = (self.lower, self.upper, self.row_lower, self.row_upper)
-        return all(np.isfinite(one).all() for one in numbers) and not any(
-            np.isnan(one).any() for one in limits
-        )
+        data = self.numbers[: self.numbers.size - self.limits.size]
+        return bool(np.isfinite(data).all()) and not np.isnan(self.limits).any()
+
+    def fault(self) -> str:
+        """What no solver must be given: NaN hangs some and comes back as success from others."""
+        data = self.numbers[: self.numbers.size - self.limits.size]
+        # Squares may overflow where the numbers do not: then each one is looked at.
+        finite = math.isfinite(data.dot(data)) or np.isfinite(data).all()
+        ordered = np.logical_and.reduce(self.all_lower <= self.all_upper)
+        if finite and ordered:
+            return ""
+        if not finite or np.isnan(self.limits).any():
+            return "the QP's data are not finite"
+        return "the QP is infeasible: a lower bound is above its upper bound"
+
+
+def _divided(limits: Array, stages: int, n: int, rows: int) -> tuple[Array, Array]:
+    """Limits of the bounds (K, n), and of the rows (K, rows)."""
+    size = stages * n
+    return limits[:size].reshape(stages, n), limits[size:].reshape(stages, rows)
+
+
+def _remade(sizes: tuple[int, int, int], numbers: Array, bounded: bool, key: int) -> QP:
+    qp = QP(*sizes)
+    qp.numbers[...] = numbers
+    qp.bounded, qp.key = bounded, key
+    return qp

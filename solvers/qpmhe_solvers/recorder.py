@@ -14,22 +14,19 @@ from types import TracebackType
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .backend import make_solver
 from .contained import ContainedSolver
 from .errors import InvalidInputError, OptionError
 from .files import dump
 from .options import SolverOptions
-from .qp import QP
+from .qp import QP, Array
 from .registry import backend as registered_backend
 from .registry import backends, register, unregister
 from .solution import Solution, SolveStatus
 from .solver import Solver
 
 __all__ = ["Recording", "RecordingWarning"]
-
-Array = NDArray[np.float64]
 
 Which = Literal["suspicious", "failed", "all"]
 

@@ -9,7 +9,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from .gathered import GatheredQP
+from .qp import QP, Places
 
 __all__ = ["Scale", "Scaling"]
 
@@ -24,6 +24,9 @@ _KEPT = 4
 # below, since those of a sequence of QPs shrink as the sequence converges.
 _PEAKS = 2.0**-8, 2.0**8
 _STEP_PEAKS = 2.0**-10, 2.0**3
+# Spread of the Hessian's diagonal over the stages at which the least known stage, rather than the
+# best, is what the accuracy is for; and below which share double precision has none.
+_SPREAD, _LEAST = 2.0**10, 2.0**-34
 # Largest exponent: products of two factors do not overflow.
 _MOST = 500
 
@@ -37,7 +40,7 @@ class Scale:
     with a diagonal S, the same at all stages, that brings the diagonal of H' to about 1 or less,
     for each component, or to more where a stage would be lost beside the others; a diagonal R
     that does so for the largest entry of each row; and one number t, for the unit of the cost,
-    that does so for the gradient or the step, as `GatheredQP.peaks` puts them together.
+    that does so for the gradient or the step, as `Peaks` puts them together.
 
     Attributes
     ----------
@@ -73,7 +76,7 @@ class Scale:
         self.step: Array = self.units[: stages * n].reshape(stages, n)
         self.cost = math.ldexp(1.0, 2 * int(exponents[-1]))
 
-    def apply(self, qp: GatheredQP, scaled: GatheredQP) -> None:
+    def apply(self, qp: QP, scaled: QP) -> None:
         """Write the scaled numbers of a QP."""
         np.multiply(qp.numbers, self._factor, out=scaled.numbers)
         scaled.key = self.key
@@ -115,12 +118,59 @@ def _places(sizes: tuple[int, int, int]) -> Index:
     return np.concatenate(made, axis=1)
 
 
+class Peaks:
+    """What shows how well the numbers of QPs of one size are scaled, the signs left out."""
+
+    def __init__(self, stages: int, n: int, rows: int) -> None:
+        self._n, size, places = n, stages * n, Places.of(stages, n, rows)
+        diagonal = np.arange(places.gradient).reshape(stages, n, 2 * n)[:, :, 0].T
+        own, following = np.arange(places.own, places.one).reshape(2, stages, rows, n)
+        gradient = np.arange(places.gradient, places.own).reshape(stages, n).T
+        limits = np.arange(places.lower, places.end)
+        # Gradients, then steps, then violations at zero, which are lower - 0 and 0 - upper, then
+        # the diagonal with the other sign, whose largest entries are its smallest. The last
+        # stage's G is never read.
+        groups = [
+            *diagonal,
+            *(np.append(own[:, row], following[:-1, row]) for row in range(rows)),
+            gradient, gradient, limits, *diagonal,
+        ]
+        self._entries = np.concatenate(groups, axis=None)
+        seen = self._seen = np.empty(self._entries.size)
+        magnitudes = seen.size - limits.size - size
+        self._magnitudes, self._diagonal = seen[:magnitudes], seen[:size]
+        self._steps = seen[magnitudes - size : magnitudes]
+        self._negated = seen[magnitudes + limits.size // 2 :]
+        self._positive = np.empty(size, np.bool_)
+        self._starts = np.cumsum([0] + [group.size for group in groups[:-1]])
+
+    def of(self, qp: QP) -> list[float]:
+        """The peaks of the diagonal for each component, of each row, and of the step."""
+        # Any mode but the default one writes into ``out`` without a buffer between.
+        qp.numbers.take(self._entries, out=self._seen, mode="clip")
+        diagonal, steps, positive = self._diagonal, self._steps, self._positive
+        np.absolute(self._magnitudes, out=self._magnitudes)
+        np.greater(diagonal, 0.0, out=positive)
+        np.divide(steps, diagonal, out=steps, where=positive)
+        np.negative(self._negated, out=self._negated)
+        found: list[float] = np.maximum.reduceat(self._seen, self._starts).tolist()
+        negated = found[-self._n :]
+        slope, step, missed = found[-self._n - 3 : -self._n]
+        del found[-self._n - 2 :]
+        found[-1] = max(min(slope, step), missed)
+        for at, low in enumerate(negated):
+            most = found[at]
+            if -low * _SPREAD < most:
+                found[at] = min(most, _SPREAD * max(-low, _LEAST * most))
+        return found
+
+
 class Scaling:
     """The scales of one solver.
 
     Attributes
     ----------
-    qp : GatheredQP
+    qp : QP
         The last scaled QP.
     """
 
@@ -128,7 +178,7 @@ class Scaling:
         self._held = held
         self._scales: list[Scale] = []  # the last used is the last one
         self._keys = count(1)
-        self.qp = GatheredQP(1, 1, 0)
+        self._hold((1, 1, 0))
 
     def __reduce__(self) -> tuple[type[Scaling], tuple[bool]]:
         return Scaling, (self._held,)
@@ -137,11 +187,15 @@ class Scaling:
         """Drop the scales: the next one is that of the next QP alone."""
         self._scales.clear()
 
-    def scale(self, qp: GatheredQP) -> Scale:
+    def _hold(self, sizes: tuple[int, int, int]) -> None:
+        """Make room for QPs of these sizes."""
+        self.qp, self._peaks = QP(*sizes), Peaks(*sizes)
+
+    def scale(self, qp: QP) -> Scale:
         """Scale a QP, whose numbers are finite but for limits, into `Scaling.qp`."""
+        if self.qp.sizes != qp.sizes:
+            self._hold(qp.sizes)
         scaled, scales = self.qp, self._scales
-        if scaled.sizes != qp.sizes:
-            scaled = self.qp = GatheredQP(*qp.sizes)
         scaled.bounded = qp.bounded
         if not self._held:
             scales.clear()
@@ -149,7 +203,7 @@ class Scaling:
             scale = scales[at]
             if scale.sizes == qp.sizes:
                 scale.apply(qp, scaled)
-                if scale.fits(scaled.peaks()):
+                if scale.fits(self._peaks.of(scaled)):
                     if at < len(scales) - 1:
                         scales.append(scales.pop(at))
                     return scale
@@ -160,12 +214,12 @@ class Scaling:
         scales.append(scale)
         return scale
 
-    def _ideal(self, qp: GatheredQP, scaled: GatheredQP) -> Scale:
+    def _ideal(self, qp: QP, scaled: QP) -> Scale:
         """The best scale for one QP."""
         _, n, rows = qp.sizes
         places, key = _places(qp.sizes), next(self._keys)
         exponents = np.zeros(n + rows + 1, np.int64)
-        peaks = qp.peaks()
+        peaks = self._peaks.of(qp)
         # The peaks of rows depend on S, and that of the step on both.
         for part in (slice(n), slice(n, n + rows), slice(n + rows, None)):
             found = np.frexp(peaks[part])[1]
@@ -177,6 +231,6 @@ class Scaling:
             scale = Scale(exponents, places, qp.sizes, key)
             if part.stop is not None:
                 scale.apply(qp, scaled)
-                peaks = scaled.peaks()
+                peaks = self._peaks.of(scaled)
         scale.leave_out(peaks)
         return scale

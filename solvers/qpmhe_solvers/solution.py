@@ -9,16 +9,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .qp import QP
+from .qp import QP, Array
 
 if TYPE_CHECKING:
     from .scaling import Scale
 
 __all__ = ["Errors", "RawSolution", "Residuals", "Solution", "SolveStatus"]
-
-Array = NDArray[np.float64]
 
 _NOTHING = np.zeros(0)
 _largest = np.maximum.reduce  # the method of an array comes to this, by detours

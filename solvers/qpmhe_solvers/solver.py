@@ -10,19 +10,15 @@ from functools import partial, wraps
 from typing import Any, ClassVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .errors import InvalidInputError
-from .gathered import GatheredQP
 from .options import SolverOptions
-from .qp import ARRAYS, QP
+from .qp import ARRAYS, QP, Array
 from .sample_qps import sample
 from .scaling import Scale, Scaling
 from .solution import Errors, RawSolution, Solution, SolveStatus
 
 __all__ = ["Solver", "as_count", "as_iterate", "as_multipliers", "expect_qp", "failure"]
-
-Array = NDArray[np.float64]
 
 # A claim of success is believed while the recomputed residuals stay below this many times the
 # tolerance, since solvers measure in scaled norms of their own, but not beyond the loosest.
@@ -47,7 +43,6 @@ class Solver(ABC):
     """
 
     time_limit: float | None = None
-    _gathered: GatheredQP | None = None  # kept while the sizes of the QPs stay
     _scaling: Scaling | None = None
     # Whether Python code may warn during a solve: to keep that inside takes as long as a small QP.
     _warns: ClassVar[bool] = True
@@ -155,11 +150,10 @@ class Solver(ABC):
 
     def _checked(self, qp: QP, start: Array | None) -> Solution:
         """Look at the data, solve, and judge."""
-        gathered = self._gather(qp)
-        fault = gathered.fault()
+        fault = qp.fault()
         if fault:
             return Solution(None, SolveStatus.FAILED, message=fault)
-        scale, scaled = self._scale(gathered)
+        scale, scaled = self._scale(qp)
         usable = self._usable(start, qp, scale)
         if self._builtin:
             return self._judged(scaled, scale, self._solve(scaled, usable))
@@ -169,19 +163,12 @@ class Solver(ABC):
             solution.message = f"{solution.message}; {note}" if solution.message else note
         return solution
 
-    def _gather(self, qp: QP) -> GatheredQP:
-        gathered = self._gathered
-        if gathered is None or gathered.sizes != (qp.stages, qp.n, qp.rows):
-            gathered = self._gathered = GatheredQP(qp.stages, qp.n, qp.rows)
-        gathered.gather(qp)
-        return gathered
-
-    def _scale(self, gathered: GatheredQP) -> tuple[Scale, GatheredQP]:
+    def _scale(self, qp: QP) -> tuple[Scale, QP]:
         """The scale of a QP, and the scaled QP, which holds until the next one."""
         scaling = self._scaling
         if scaling is None:
             scaling = self._scaling = Scaling(self._keeps)
-        return scaling.scale(gathered), scaling.qp
+        return scaling.scale(qp), scaling.qp
 
     def _solve_lent(self, qp: QP, start: Array | None) -> object:
         """Solve with copies, and see what was written into them."""
@@ -201,7 +188,7 @@ class Solver(ABC):
         scaled: Array = start / scale.step
         return scaled if np.isfinite(scaled).all() else None
 
-    def _judged(self, qp: GatheredQP, scale: Scale, raw: object) -> Solution:
+    def _judged(self, qp: QP, scale: Scale, raw: object) -> Solution:
         """Judge the answer to a scaled QP, and give it in the user's units."""
         if isinstance(raw, Solution):  # of a class that is derived from one of this package
             raw = RawSolution(

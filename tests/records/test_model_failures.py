@@ -118,7 +118,7 @@ def test_exit_codes(record, body, expected, quiet):
 
 def test_a_model_that_is_not_asked_in_vain(here):
     """What cannot be found out is said, too."""
-    from qpmhe.records.model_failures import ModelFailures as Failures
+    from qpmhe.records.record_model import ModelFailures as Failures
 
     system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1)
     failures = Failures(system, 5)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qpmhe.records import RecordError, estimate_record
-from qpmhe.records.values import FieldReader, seconds_between
+from qpmhe.records.measurements import FieldReader, seconds_between
 
 from .conftest import CONTINUOUS, DISCRETE
 from .test_resume import put

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from qpmhe_solvers import QP, available, backend, register, unregister
-from qpmhe_solvers.gathered import GatheredQP
 from qpmhe_solvers.scaling import Scaling
 
 EVERY = available()
@@ -191,7 +190,7 @@ def make(stages, n, rows=0, *, seed=0, bounds="none", sides="none", decades=0.0)
 def of_order_one(qp):
     """A QP that solvers are handed as it is, made of another one, and its dense twin."""
     scaling = Scaling(held=False)
-    scaling.scale(GatheredQP.of(qp))
+    scaling.scale(qp)
     qp = scaling.qp.copy()
     return qp, Dense(
         qp.dense(), qp.gradient.ravel(), qp.dense_rows(), qp.lower.ravel(), qp.upper.ravel(),

@@ -6,7 +6,6 @@ import scipy.sparse
 
 from qpmhe_solvers import QP
 from qpmhe_solvers.dispatch import DispatchSolver, qpsolvers_arguments
-from qpmhe_solvers.gathered import GatheredQP
 from qpmhe_solvers.layout import Layout, Structure, Style
 
 from .problems import ARRAYS, CASES, make
@@ -27,16 +26,15 @@ class Form:
     """A layout in the form of qpsolvers, as `DispatchSolver` uses it."""
 
     def __init__(self, qp, dense, box, needs_row, keep_empty):
-        gathered = GatheredQP.of(qp)
         style = Style(
             "dense" if dense else "csc", bounds="box" if box else "rows", sides=1,
             needs_row=needs_row,
         )
-        self.layout = Layout(style, Structure.of(gathered, exact=True), *gathered.sizes)
+        self.layout = Layout(style, Structure.of(qp, exact=True), *qp.sizes)
         self.arguments = qpsolvers_arguments(self.layout, keep_empty)
 
     def fill(self, qp):
-        self.layout.fill(GatheredQP.of(qp), None)
+        self.layout.fill(qp, None)
 
     def multipliers(self, **given):
         """Multipliers in an answer of qpsolvers, as the solver hands them on."""
@@ -49,7 +47,7 @@ class Form:
 
 
 def key(qp):
-    return qp.stages, qp.n, qp.rows, Structure.of(GatheredQP.of(qp), exact=True).key
+    return qp.stages, qp.n, qp.rows, Structure.of(qp, exact=True).key
 
 
 def expected(dense, box, needs_row, keep_empty):

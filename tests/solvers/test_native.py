@@ -6,9 +6,9 @@ import pytest
 import scipy.sparse
 
 from qpmhe_solvers import QP, SolverOptions, SolveStatus, backends, create
-from qpmhe_solvers.gathered import GatheredQP
 from qpmhe_solvers.layout import Layout, Structure, Style
 from qpmhe_solvers.native import NativeSolver
+from qpmhe_solvers.qp import Places
 from qpmhe_solvers.sample_qps import contradiction, sample
 
 from .problems import CASES, make, of_order_one
@@ -31,9 +31,8 @@ STYLES = {
 
 
 def laid_out(style, qp):
-    gathered = GatheredQP.of(qp)
-    layout = Layout(style, Structure.of(gathered), *gathered.sizes)
-    layout.fill(gathered, layout.voids(gathered))
+    layout = Layout(style, Structure.of(qp), *qp.sizes)
+    layout.fill(qp, layout.voids(qp))
     return layout
 
 
@@ -104,9 +103,8 @@ def test_a_layout_has_room_for_missing_measurements(style):
         other, dense = make(7, 3, 2, bounds="part", sides="two")
         other.row_lower[stage, 1], other.row_upper[stage, 1] = -np.inf, np.inf
         dense.row_lower, dense.row_upper = other.row_lower.ravel(), other.row_upper.ravel()
-        gathered = GatheredQP.of(other)
-        assert Structure.of(gathered).key == Structure.of(GatheredQP.of(qp)).key
-        for source in (gathered, GatheredQP.of(qp), gathered):  # nothing is left of the one before
+        assert Structure.of(other).key == Structure.of(qp).key
+        for source in (other, qp, other):  # nothing is left of the one before
             layout.fill(source, layout.voids(source))
         low, high = limits(layout, dense)
         np.testing.assert_array_equal(low[21:], dense.row_lower)
@@ -482,19 +480,19 @@ def test_void_rows_do_not_make_a_solver_talk(name, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_gathered_numbers_are_those_of_the_qp():
+def test_all_numbers_of_a_qp_are_in_one_array():
     qp, _ = make(**CASES["all kinds"])
-    gathered = GatheredQP.of(qp)
-    copied = pickle.loads(pickle.dumps(gathered))
-    copied.gather(qp)
-    for one in (gathered, copied):
-        np.testing.assert_array_equal(one.all_lower, np.append(qp.lower, qp.row_lower))
-        np.testing.assert_array_equal(one.all_upper, np.append(qp.upper, qp.row_upper))
+    for one in (qp, qp.copy(), pickle.loads(pickle.dumps(qp)), copy.deepcopy(qp)):
+        one.gradient = np.asfortranarray(one.gradient + 1.0)  # is written, not exchanged
+        one.row_lower -= 0.5
+        places = Places.of(*one.sizes)
+        np.testing.assert_array_equal(one.all_lower, np.append(one.lower, one.row_lower))
+        np.testing.assert_array_equal(one.all_upper, np.append(one.upper, one.row_upper))
         np.testing.assert_array_equal(one.limits, np.append(one.all_lower, one.all_upper))
-        assert one.numbers[one.one_at] == 1.0
+        assert one.numbers[places.one] == 1.0
         for start, array in (
-            (0, qp.band), (one.gradient_at, qp.gradient), (one.own_at, qp.row_own),
-            (one.own_at + qp.row_own.size, qp.row_next),
+            (0, one.band), (places.gradient, one.gradient), (places.own, one.row_own),
+            (places.own + one.row_own.size, one.row_next),
         ):
             np.testing.assert_array_equal(one.numbers[start : start + array.size], array.ravel())
 
@@ -503,13 +501,13 @@ def test_faults_of_huge_numbers_are_not_made_up():
     qp = QP(2, 2, 1)
     qp.gradient[...] = 1e200  # whose squares overflow
     with np.errstate(all="ignore"):
-        assert GatheredQP.of(qp).fault() == ""
+        assert qp.fault() == ""
     qp.gradient[...] = 0.0
     qp.gradient[0, 0] = np.inf
-    assert "not finite" in GatheredQP.of(qp).fault()
+    assert "not finite" in qp.fault()
     qp.gradient[0, 0], qp.row_upper[0] = 0.0, np.nan
-    assert "not finite" in GatheredQP.of(qp).fault()
+    assert "not finite" in qp.fault()
     qp.gradient[...], qp.row_upper[0] = 0.0, -np.inf
-    assert GatheredQP.of(qp).fault() == ""
+    assert qp.fault() == ""
     qp.row_lower[0] = 0.0
-    assert "a lower bound is above its upper bound" in GatheredQP.of(qp).fault()
+    assert "a lower bound is above its upper bound" in qp.fault()

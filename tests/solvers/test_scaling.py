@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from qpmhe_solvers import QP, RawSolution, Solver, SolverOptions, SolveStatus, backends, create
-from qpmhe_solvers.gathered import GatheredQP
 from qpmhe_solvers.scaling import Scaling
 
 from .problems import CASES, EVERY, WITH_INEQUALITIES, make, of_order_one
@@ -176,7 +175,7 @@ def test_what_was_scaled_is_scaled_already():
 
 
 def scaled(scaling, qp):
-    return scaling.scale(GatheredQP.of(qp))
+    return scaling.scale(qp)
 
 
 def test_a_scale_is_held_while_it_fits():

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..._checks import Array
 from ..summary import CONFIGURATION, PROBLEM
 from .drawing import Axis, Drawing, Mark, Panel
 from .words import cap_words, configuration_words, missing, number, percent, qps_words, seconds
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["SOLVED", "Profile", "Spread", "accuracy", "anytime", "performance", "profiles",
            "spreads", "times"]
-
-Array = NDArray[np.float64]
 
 #: A problem counts as solved if J is on average within this part of the converged one.
 SOLVED = 0.01
