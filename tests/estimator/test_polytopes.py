@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.estimation.problem import Problem
-from qpmhe.estimation.subproblem import Subproblem
-from qpmhe.estimation.window import Window
 
-from .plain import Record, differences, spd
+from .plain import Record, assembled, differences, spd
 
 NONE = np.zeros(0)
 GENERATOR = np.random.default_rng(1)
@@ -48,9 +45,9 @@ class Case:
     def __init__(self, names, kind, missing=0.0, horizon=4):
         self.sets = {name: roomy(kind, SIZES[name]) for name in names}
         self.system = qpmhe.System(swing, seen, n=2, p=3, **self.sets)
-        self.window = Window(self.system, qpmhe.Luenberger(GAIN), COST, horizon, START, True)
-        self.problem = Problem(self.system, COST)
-        self.subproblem = Subproblem(self.system, COST, horizon)
+        self.window, self.formulation, self.subproblem = assembled(
+            self.system, qpmhe.Luenberger(GAIN), COST, horizon, START
+        )
         self.kept = Record(seen, GAIN, START, (P, Q, R), horizon)
         self.generator, self.missing = np.random.default_rng(2), missing
 
@@ -58,7 +55,7 @@ class Case:
         y = self.generator.standard_normal(3)
         y[self.generator.random(3) < self.missing] = np.nan
         self.window.push(y, NONE)
-        self.problem.bind(self.window)
+        self.problem = self.formulation.problem(self.window)
         self.kept.push(swing, y)
 
     def trajectory(self, scale):
@@ -132,12 +129,12 @@ def test_rows_and_bounds_of_the_qp(names, kind, missing):
     for t in range(5):
         case.push()
         candidate, trajectory = case.window.candidate.copy(), case.trajectory(0.5)
-        check_qp(case, case.subproblem.at_candidate(case.problem, case.window), candidate)
+        check_qp(case, case.subproblem.at(case.problem, case.problem.candidate), candidate)
         trial = case.problem.evaluate(trajectory)
         check_qp(case, case.subproblem.at(case.problem, trial), trajectory)
         if t == 3:
             case.problem.leave_out(names[:1])
-            qp = case.subproblem.at_candidate(case.problem, case.window)
+            qp = case.subproblem.at(case.problem, case.problem.candidate)
             check_qp(case, qp, candidate, names[:1])
 
 
