@@ -4,12 +4,25 @@ import math
 
 import numpy as np
 
+from qpmhe.estimation.problem import Formulation
+from qpmhe.estimation.subproblem import Subproblem
+from qpmhe.estimation.window import Window
+
 STEP = 1e-30  # of the complex differences, which are exact for any tiny step
 
 
 def spd(generator, n):
     root = generator.standard_normal((n, n))
     return root @ root.T + 0.5 * np.eye(n)
+
+
+def assembled(system, observer, cost, horizon, start, project=True):
+    """What a step in Python consists of: window, formulation and subproblem."""
+    formulation = Formulation(system, observer, cost)
+    return (
+        Window(system, observer, cost, horizon, start, True, project), formulation,
+        Subproblem(system, cost, formulation.constraints, horizon),
+    )
 
 
 def quadratic(s, weight):

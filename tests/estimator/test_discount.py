@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.estimation.problem import Problem
-from qpmhe.estimation.subproblem import Subproblem
-from qpmhe.estimation.window import Window
 
 from . import plain
-from .plain import Record, is_minimum, spd
+from .plain import Record, assembled, is_minimum, spd
 
 GENERATOR = np.random.default_rng(1)
 P, Q, R = spd(GENERATOR, 2), spd(GENERATOR, 2), spd(GENERATOR, 2)
@@ -55,10 +52,9 @@ class Case:
     def __init__(self, losses, discount, horizon, missing=0.0):
         self.generator, self.missing = np.random.default_rng(2), missing
         system, self.cost = system_of(), cost_of(losses, discount)
-        observer = qpmhe.Luenberger(GAIN)
-        self.window = Window(system, observer, self.cost, horizon, START, True)
-        self.problem = Problem(system, self.cost)
-        self.subproblem = Subproblem(system, self.cost, horizon)
+        self.window, self.formulation, self.subproblem = assembled(
+            system, qpmhe.Luenberger(GAIN), self.cost, horizon, START
+        )
         self.kept = Record(
             seen, GAIN, START, (P, Q, R), horizon, discount=discount, losses=LOSSES[losses][1]
         )
@@ -67,7 +63,7 @@ class Case:
         y = self.generator.standard_normal(2)
         y[self.generator.random(2) < self.missing] = np.nan
         self.window.push(y, NONE)
-        self.problem.bind(self.window)
+        self.problem = self.formulation.problem(self.window)
         self.kept.push(swing, y)
 
 
@@ -83,7 +79,7 @@ def test_the_cost_and_that_of_the_candidate(losses, discount, horizon, missing):
             continue
         kept, candidate = case.kept, case.window.candidate
         assert case.window.candidate_cost == pytest.approx(kept.cost(candidate), rel=1e-10)
-        assert case.problem.candidate(case.window).cost == case.window.candidate_cost
+        assert case.problem.candidate.cost == case.window.candidate_cost
         trajectory = candidate + case.generator.standard_normal(candidate.shape)
         found = case.problem.evaluate(trajectory).cost
         assert found == pytest.approx(kept.cost(trajectory), rel=1e-10)
@@ -114,7 +110,7 @@ def test_the_gradient_of_the_qp_is_that_of_half_the_cost(losses, discount, missi
             continue
         candidate = case.window.candidate
         if losses != "power":  # whose prior term has no derivative at zero
-            qp = case.subproblem.at_candidate(case.problem, case.window)
+            qp = case.subproblem.at(case.problem, case.problem.candidate)
             check_qp(qp, case.kept, candidate.copy(), losses)
         trajectory = candidate + 0.7 * case.generator.standard_normal(candidate.shape)
         qp = case.subproblem.at(case.problem, case.problem.evaluate(trajectory))
@@ -154,10 +150,10 @@ def test_the_prior_weight_of_an_observer_is_discounted():
         prior=qpmhe.ObserverPrior(), disturbance=Q, noise=R, discount=0.7
     )
     system = system_of()
-    window, problem = Window(system, observer, cost, 3, START, True), Problem(system, cost)
+    window, formulation, _ = assembled(system, observer, cost, 3, START)
     for t, y in enumerate(np.random.default_rng(4).standard_normal((6, 2))):
         window.push(y, NONE)
-        problem.bind(window)
+        problem = formulation.problem(window)
         weight = 0.7 ** min(t + 1, 3) * np.linalg.inv(window.prior_covariance)
         np.testing.assert_allclose(problem.prior_weight_at(np.ones(2)), weight, rtol=1e-9)
 

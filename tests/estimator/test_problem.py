@@ -4,15 +4,10 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.estimation.problem import Problem
-from qpmhe.estimation.window import Window
+
+from .plain import assembled, spd
 
 NONE = np.zeros(0)
-
-
-def spd(generator, n):
-    root = generator.standard_normal((n, n))
-    return root @ root.T + 0.5 * np.eye(n)
 
 
 def nonlinear(n, p, m, **sets):
@@ -30,17 +25,16 @@ def nonlinear(n, p, m, **sets):
 
 
 def filled(system, cost, samples, *, horizon=4, observer=None, missing=0.0, seed=1):
-    """A window after some samples, and the problem bound to it."""
+    """A window after some samples, and its problem."""
     generator = np.random.default_rng(seed)
     observer = observer or qpmhe.Luenberger(0.1 * np.ones((system.n, system.p)))
-    window = Window(system, observer, cost, horizon, generator.standard_normal(system.n), True)
+    start = generator.standard_normal(system.n)
+    window, formulation, _ = assembled(system, observer, cost, horizon, start)
     for _ in range(samples):
         y, u = generator.standard_normal(system.p), generator.standard_normal(system.m)
         y[generator.random(system.p) < missing] = np.nan
         window.push(y, u)
-    problem = Problem(system, cost)
-    assert problem.bind(window) is None
-    return window, problem
+    return window, formulation.problem(window)
 
 
 def random_cost(n, p, seed=2):
@@ -108,7 +102,7 @@ def test_residuals_and_their_weights(samples, missing):
 def test_the_candidate_has_no_prior_cost_and_its_stages_cost(samples, missing):
     system, cost = nonlinear(3, 2, 0), random_cost(3, 2)
     window, problem = filled(system, cost, samples, missing=missing)
-    trial = problem.candidate(window)
+    trial = problem.candidate
     np.testing.assert_array_equal(problem.prior, window.candidate[0])
     assert trial.cost == window.candidate_cost
     assert problem.evaluate(window.candidate.copy()).cost == pytest.approx(trial.cost, rel=1e-11)
@@ -146,14 +140,15 @@ def test_a_constant_prior_weight_ignores_the_observers_covariance():
 # Sets
 
 
-def plain_violation(box, points):
-    if box is None:
-        return 0.0
-    return max(
-        max(low - s, s - high, 0.0)
-        for point in points
-        for s, low, high in zip(point, box.lower, box.upper, strict=True)
-    )
+def plain_rows(name, box, points, weight, first):
+    """The rows that points miss, each with its miss in the row's scale."""
+    spread, found = np.sqrt(np.linalg.inv(weight).diagonal()), {}
+    for k, j in np.ndindex(points.shape) if box else ():
+        scale, s = min(spread[j], box.upper[j] - box.lower[j]), points[k, j]
+        for side, missed in (("lower", box.lower[j] - s), ("upper", s - box.upper[j])):
+            if missed > 0.0:
+                found[name, j, side, first + k] = missed / scale
+    return found
 
 
 def roomy_sets(n, p):
@@ -179,24 +174,21 @@ def test_violation_and_cost_with_sets(sizes, names):
     sets = {name: box for name, box in roomy_sets(n, p).items() if name in names}
     system, cost = nonlinear(*sizes, **sets), random_cost(n, p)
     window, problem = filled(system, cost, 6)
-    assert problem.violated_sets(problem.candidate(window)) == ()
+    assert problem.candidate.violation == 0.0
     generator = np.random.default_rng(6)
     seen = set()
     for scale in [0.1, 1.0, 5.0, 10.0, 40.0] * 6:
         trajectory = window.candidate + scale * generator.standard_normal(window.candidate.shape)
         trial = problem.evaluate(trajectory)
-        amounts = {
-            "states": plain_violation(system.states, trajectory),
-            "disturbances": plain_violation(system.disturbances, trial.residuals[:, :n]),
-            "noises": plain_violation(system.noises, trial.residuals[:, n:]),
-        }
-        violated = tuple(name for name, amount in amounts.items() if amount > 1e-6)
-        expected = float(max(amounts.values()))
-        assert problem.violation(trajectory, trial.residuals) == trial.violation
+        w, v = trial.residuals[:, :n], trial.residuals[:, n:]
+        missed = plain_rows("states", system.states, trajectory, cost.prior, 2)
+        missed |= plain_rows("disturbances", system.disturbances, w, cost.disturbance, 2)
+        missed |= plain_rows("noises", system.noises, v, cost.noise, 2)
+        expected = max(missed.values(), default=0.0)
         assert trial.violation == pytest.approx(expected, rel=1e-11, abs=1e-12)
-        assert problem.violated_sets(trial) == violated
+        assert set(problem.missed_rows(trial)) == set(missed)
         seen.add(math.isfinite(trial.cost))
-        if violated:
+        if missed:
             assert trial.cost == math.inf
         else:
             assert trial.cost == pytest.approx(
@@ -218,42 +210,57 @@ def test_the_last_state_counts_and_rounding_does_not(stage, beyond):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_set_that_the_candidate_leaves_is_dropped_and_comes_back(name):
+def test_rows_that_the_candidate_violates_are_left_out_and_come_back(name):
     tight = {
         "states": qpmhe.Box([-3.0], [3.0]),
         "disturbances": qpmhe.Box([-1.0], [1.0]),
         "noises": qpmhe.Box([-4.0], [4.0]),
     }
-    cost = random_cost(1, 1)
     # Which y, met at z = 0, leaves just this set: states z+ = L, disturbances L, noises y.
     gain, y = {"states": (1.0, 3.5), "disturbances": (0.5, 3.0), "noises": (0.1, 5.0)}[name]
     sets = dict(tight, disturbances=qpmhe.Box([-9.0], [9.0])) if name == "states" else tight
-    system = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=1, p=1, **sets)
-    window = Window(system, qpmhe.Luenberger([gain]), cost, 2, np.zeros(1), True)
-    problem = Problem(system, cost)
+    system, cost = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=1, p=1, **sets), random_cost(1, 1)
+    window, formulation, _ = assembled(
+        system, qpmhe.Luenberger([gain]), cost, 2, np.zeros(1), project=False
+    )
     history = []
     for value in (0.0, y, None, None, None, None):
         measured = window.candidate[-1] if value is None else np.array([value])
         window.push(measured.copy(), NONE)
-        problem.bind(window)
-        assert all(getattr(problem, key) is sets[key] for key in NAMES)
-        violated = problem.violated_sets(problem.candidate(window))
-        assert (problem.evaluate(window.candidate.copy()).cost == math.inf) is bool(violated)
-        problem.leave_out(violated)
-        kept = {key: getattr(problem, key) for key in NAMES}
-        expected = {
-            "states": window.candidate,
-            "disturbances": window.residuals[:, :1],
-            "noises": window.residuals[:, 1:],
-        }
-        for key in NAMES:
-            inside = plain_violation(sets[key], expected[key]) <= 1e-9
-            assert kept[key] is (sets[key] if inside else None)
-        history.append(list(violated))
-        assert math.isfinite(problem.candidate(window).cost)
-        assert math.isfinite(problem.evaluate(window.candidate.copy()).cost)
-    assert [name] in history
-    assert history[0] == history[-1] == []
+        problem, candidate = formulation.problem(window), window.candidate.copy()
+        w, v = window.residuals[:, :1], window.residuals[:, 1:]
+        first = window.time - window.length
+        missed = plain_rows("states", sets["states"], candidate, cost.prior, first)
+        missed |= plain_rows("disturbances", sets["disturbances"], w, cost.disturbance, first)
+        missed |= plain_rows("noises", sets["noises"], v, cost.noise, first)
+        assert set(problem.missed_rows(problem.candidate)) == set(missed)
+        assert (problem.evaluate(candidate).cost == math.inf) is bool(missed)
+        assert problem.candidate.cost == window.candidate_cost
+        relaxed = problem.without_violated()
+        assert math.isfinite(relaxed.evaluate(candidate).cost)
+        # The other side of such a row holds, and so do the rows of other stages.
+        for far in (-30.0, 30.0):
+            found = problem.missed_rows(problem.evaluate(candidate + far))
+            left = relaxed.missed_rows(relaxed.evaluate(candidate + far))
+            assert set(left) == set(found) - set(missed)
+        assert (problem.evaluate(candidate).cost == math.inf) is bool(missed)
+        history.append({row[0] for row in missed})
+    assert {name} in history
+    assert history[0] == history[-1] == set()
+
+
+@pytest.mark.parametrize("fixed", [0.0, 0.3])
+def test_noise_free_rows_are_never_left_out(fixed):
+    box = qpmhe.Box([fixed, -0.1], [fixed, 0.1])
+    system = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=2, p=2, disturbances=box)
+    window, problem = filled(system, random_cost(2, 2), 3)
+    candidate, relaxed = window.candidate.copy(), problem.without_violated()
+    missed = {row.row for row in problem.missed_rows(problem.candidate)}
+    assert missed == {0, 1}
+    assert {row.row for row in relaxed.missed_rows(problem.candidate)} == {0}
+    # A trial is rolled out along them.
+    trial = relaxed.evaluate(candidate)
+    np.testing.assert_allclose(trial.residuals[:, 0], fixed, atol=1e-15)
 
 
 def test_a_missing_output_has_no_noise_that_could_leave_its_set():
@@ -262,12 +269,12 @@ def test_a_missing_output_has_no_noise_that_could_leave_its_set():
     )
     cost = random_cost(2, 2)
     start = np.array([50.0, -70.0])
-    window = Window(system, qpmhe.Luenberger(np.zeros((2, 2))), cost, 3, start, True)
-    problem = Problem(system, cost)
+    observer = qpmhe.Luenberger(np.zeros((2, 2)))
+    window, formulation, _ = assembled(system, observer, cost, 3, start)
     for y in ([50.5, np.nan], [np.nan, np.nan], [np.nan, -70.5], [50.5, -70.5]):
         window.push(np.array(y), NONE)
-        problem.bind(window)
-        assert problem.violated_sets(problem.candidate(window)) == ()
+        problem = formulation.problem(window)
+        assert problem.candidate.violation == 0.0
         for inside in (0.0, 0.4):
             trajectory = window.candidate + inside
             assert problem.evaluate(trajectory).cost == pytest.approx(
@@ -297,11 +304,11 @@ def test_a_trajectory_without_model_costs_infinitely(root, where, stage):
     with np.errstate(all="ignore"):
         system = qpmhe.System(functions["f"], functions["h"], n=1, p=1)
         cost = random_cost(1, 1)
-        window = Window(system, qpmhe.Luenberger([0.1]), cost, 4, np.ones(1), False)
+        observer = qpmhe.Luenberger([0.1])
+        window, formulation, _ = assembled(system, observer, cost, 4, np.ones(1))
         for _ in range(4):
             window.push(np.ones(1), NONE)
-        problem = Problem(system, cost)
-        problem.bind(window)
+        problem = formulation.problem(window)
         assert math.isfinite(problem.evaluate(window.candidate.copy()).cost)
         trajectory = window.candidate.copy()
         trajectory[stage] = -1.0

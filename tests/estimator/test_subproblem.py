@@ -2,18 +2,12 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.estimation.problem import Problem
-from qpmhe.estimation.subproblem import Subproblem
-from qpmhe.estimation.window import Window
+
+from .plain import assembled, spd
 
 NONE = np.zeros(0)
 SIZES = [(1, 1, 0), (2, 1, 0), (3, 2, 1), (2, 3, 2)]
 STEP = 1e-30  # of the complex differences, which are exact for any tiny step
-
-
-def spd(generator, n):
-    root = generator.standard_normal((n, n))
-    return root @ root.T + 0.5 * np.eye(n)
 
 
 def nonlinear(n, p, m, **options):
@@ -44,9 +38,9 @@ class Case:
         )
         observer = observer or qpmhe.Luenberger(0.1 * np.ones((self.n, self.p)))
         start = generator.standard_normal(self.n)
-        self.window = Window(self.system, observer, self.cost, horizon, start, True)
-        self.problem = Problem(self.system, self.cost)
-        self.subproblem = Subproblem(self.system, self.cost, horizon)
+        self.window, self.formulation, self.subproblem = assembled(
+            self.system, observer, self.cost, horizon, start
+        )
 
     def push(self, y=None):
         generator = self.generator
@@ -54,7 +48,7 @@ class Case:
             y = generator.standard_normal(self.p)
             y[generator.random(self.p) < self.missing] = np.nan
         self.window.push(np.array(y, dtype=float), generator.standard_normal(self.m))
-        self.problem.bind(self.window)
+        self.problem = self.formulation.problem(self.window)
 
     def trajectory(self):
         shape = self.window.candidate.shape
@@ -119,7 +113,7 @@ def test_the_qp_of_growing_and_sliding_windows(sizes, horizon, missing):
     for t in range(1, horizon + 4):
         case.push()
         assert case.window.length == min(t, horizon)
-        case.check(case.subproblem.at_candidate(case.problem, case.window), case.window.candidate)
+        case.check(case.subproblem.at(case.problem, case.problem.candidate), case.window.candidate)
         trajectory = case.trajectory()
         case.check(case.subproblem.at(case.problem, case.problem.evaluate(trajectory)), trajectory)
 
@@ -129,7 +123,7 @@ def test_the_qp_after_slides_to_the_front():
     for t in range(1, 220):
         case.push()
         if t % 64 in (1, 2, 3, 4, 5) or case.window.has_special_weights:
-            qp = case.subproblem.at_candidate(case.problem, case.window)
+            qp = case.subproblem.at(case.problem, case.problem.candidate)
             case.check(qp, case.window.candidate)
 
 
@@ -154,13 +148,13 @@ def test_on_a_linear_system_the_qp_is_the_problem():
     system = qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T, n=2, p=1)
     generator = np.random.default_rng(2)
     cost = qpmhe.QuadraticCost(prior=spd(generator, 2), disturbance=spd(generator, 2), noise=3.0)
-    window = Window(system, qpmhe.Luenberger([0.3, 0.1]), cost, 5, np.zeros(2), True)
-    problem, subproblem = Problem(system, cost), Subproblem(system, cost, 5)
+    window, formulation, subproblem = assembled(
+        system, qpmhe.Luenberger([0.3, 0.1]), cost, 5, np.zeros(2)
+    )
     for _ in range(8):
         window.push(generator.standard_normal(1), NONE)
-        problem.bind(window)
-        qp = subproblem.at_candidate(problem, window)
-        base = problem.candidate(window).cost
+        problem = formulation.problem(window)
+        qp, base = subproblem.at(problem, problem.candidate), problem.candidate.cost
         for _ in range(5):
             d = generator.standard_normal(window.candidate.shape)
             true = problem.evaluate(window.candidate + d).cost
@@ -172,7 +166,7 @@ def test_the_candidate_by_either_way(missing):
     case = Case((3, 2, 1), missing=missing, **sets(3, 2))
     for _ in range(9):
         case.push()
-        qp = case.subproblem.at_candidate(case.problem, case.window)
+        qp = case.subproblem.at(case.problem, case.problem.candidate)
         kept = {name: getattr(qp, name).copy() for name in QP_ARRAYS}
         trial = case.problem.evaluate(case.window.candidate.copy())
         qp = case.subproblem.at(case.problem, trial)
@@ -189,7 +183,7 @@ def test_the_prior_weight_of_an_observer(missing):
     for _ in range(8):
         case.push()
         weight = np.linalg.inv(case.window.prior_covariance)
-        qp = case.subproblem.at_candidate(case.problem, case.window)
+        qp = case.subproblem.at(case.problem, case.problem.candidate)
         case.check(qp, case.window.candidate, weight)
         trajectory = case.trajectory()
         qp = case.subproblem.at(case.problem, case.problem.evaluate(trajectory))
@@ -274,8 +268,8 @@ def test_bounds_and_rows_are_the_linearised_sets(sizes, missing, names):
     case = Case(sizes, missing=missing, **chosen)
     for _ in range(6):
         case.push()
-        assert case.problem.violated_sets(case.problem.candidate(case.window)) == ()
-        qp = case.subproblem.at_candidate(case.problem, case.window)
+        assert case.problem.candidate.violation == 0.0
+        qp = case.subproblem.at(case.problem, case.problem.candidate)
         check_sets(case, qp, case.window.candidate, chosen)
         trajectory = case.trajectory()
         qp = case.subproblem.at(case.problem, case.problem.evaluate(trajectory))
@@ -286,7 +280,7 @@ def test_linearised_rows_bound_the_true_residuals_to_second_order():
     case = Case((2, 1, 0), **sets(2, 1))
     for _ in range(5):
         case.push()
-    qp = case.subproblem.at_candidate(case.problem, case.window)
+    qp = case.subproblem.at(case.problem, case.problem.candidate)
     direction = case.generator.standard_normal(case.window.candidate.shape)
     errors = []
     for length in (1e-2, 1e-3):
@@ -296,35 +290,30 @@ def test_linearised_rows_bound_the_true_residuals_to_second_order():
     assert errors[0] / errors[1] == pytest.approx(100.0, rel=0.1)
 
 
-def test_sets_that_were_dropped_leave_no_bounds_and_come_back():
-    boxes = {
-        "states": qpmhe.Box([-2.0], [2.0]),
-        "disturbances": qpmhe.Box([-2.0], [2.0]),
-        "noises": qpmhe.Box([-2.0], [2.0]),
-    }
-    system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1, **boxes)
+def test_rows_that_the_candidate_violates_lose_that_side_and_come_back():
+    box = qpmhe.Box([-2.0], [2.0])
+    system = qpmhe.System(
+        lambda x: 0.8 * x, lambda x: x, n=1, p=1, states=box, disturbances=box, noises=box
+    )
     cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
-    window = Window(system, qpmhe.Luenberger([0.8]), cost, 2, np.zeros(1), True)
-    problem, subproblem = Problem(system, cost), Subproblem(system, cost, 2)
-    patterns = []
-    for y in (0.5, 0.5, 9.0, 0.0, 0.0, 0.0, 0.0, 0.0):
+    window, formulation, subproblem = assembled(
+        system, qpmhe.Luenberger([0.8]), cost, 2, np.zeros(1), project=False
+    )
+    missing = []
+    for y in (0.5, 0.5, 9.0, 0.0, 0.0, -9.0, 0.0, 0.0, 0.0, 0.0, 0.0):
         window.push(np.array([y]), NONE)
-        problem.bind(window)
-        problem.leave_out(problem.violated_sets(problem.candidate(window)))
-        qp = subproblem.at_candidate(problem, window)
-        found = (
-            qp.bounded and bool(np.isfinite(qp.lower).all() and np.isfinite(qp.upper).all()),
-            bool(np.isfinite(qp.row_lower[:-1, 0]).all()),
-            bool(np.isfinite(qp.row_upper[:-1, 1]).all()),
+        problem = formulation.problem(window).without_violated()
+        qp = subproblem.at(problem, problem.candidate)
+        sides = (
+            (window.candidate, qp.lower, qp.upper),
+            (window.residuals, qp.row_lower[:-1], qp.row_upper[:-1]),
         )
-        kept = (problem.states, problem.disturbances, problem.noises)
-        assert found == tuple(box is not None for box in kept)
-        if problem.states is None:
-            assert np.isinf(qp.lower).all()
-            assert np.isinf(qp.upper).all()
-        patterns.append(found)
-    assert (False, False, False) in patterns
-    assert patterns[0] == patterns[-1] == (True, True, True)
+        for points, lower, upper in sides:
+            np.testing.assert_array_equal(lower, np.where(points < -2.0, -np.inf, -2.0 - points))
+            np.testing.assert_array_equal(upper, np.where(points > 2.0, np.inf, 2.0 - points))
+        missing.append([int(np.isinf(side).sum()) for _, *both in sides for side in both])
+    assert np.max(missing, axis=0).min() > 0
+    assert missing[0] == missing[-1] == [0, 0, 0, 0]
 
 
 @pytest.mark.parametrize(
@@ -340,11 +329,12 @@ def test_there_is_no_qp_where_there_is_no_jacobian(jacobian, stage):
     with np.errstate(all="ignore"):
         system = qpmhe.System(lambda x: np.sqrt(x), lambda x: x, n=1, p=1, f_jacobian=jacobian)
         cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
-        window = Window(system, qpmhe.Luenberger([0.1]), cost, 3, np.ones(1), True)
+        window, formulation, subproblem = assembled(
+            system, qpmhe.Luenberger([0.1]), cost, 3, np.ones(1)
+        )
         for _ in range(3):
             window.push(np.ones(1), NONE)
-        problem, subproblem = Problem(system, cost), Subproblem(system, cost, 3)
-        problem.bind(window)
+        problem = formulation.problem(window)
         trajectory = np.ones((4, 1))
         assert subproblem.at(problem, problem.evaluate(trajectory)) is not None
         trajectory[stage] = 0.0

@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe import Status
 from qpmhe.estimation.linearization import StageTerms
 from qpmhe.estimation.window import Window
 
+from .plain import spd
+
 NONE = np.zeros(0)
-
-
-def spd(generator, n):
-    root = generator.standard_normal((n, n))
-    return root @ root.T + 0.5 * np.eye(n)
 
 
 def nonlinear(n, p, m, seed=0):
@@ -62,7 +60,7 @@ class Case:
         self.z = [start]
         self.covariances = [self.observer.initial_covariance()]
         self.corrections, self.errors, self.jacobians, self.weights = [], [], [], []
-        self.window = Window(self.system, self.observer, self.cost, horizon, start, True)
+        self.window = Window(self.system, self.observer, self.cost, horizon, start, True, True)
 
     def push(self):
         """Push the next sample into the window and the lists."""
@@ -82,12 +80,13 @@ class Case:
         self.errors.append(error)
         self.jacobians.append(np.vstack([a, c]))
         self.weights.append(self.cost.partial_weight(there))
-        return self.window.push(y, u), bool((~there).any())
+        self.window.push(y, u)
+        assert self.window.events == (0 if there.all() else Status.MISSING.value)
 
     def pushed(self):
         """Push everything, yielding the time and the first stage of the window."""
         for t in range(1, self.pushes + 1):
-            assert self.push()[0][1:] == (False, False)
+            self.push()
             yield t, max(0, t - self.horizon)
 
     def due(self, t):
@@ -218,9 +217,8 @@ def test_a_missing_sample_is_known_while_it_stays(horizon, when):
     case = Case("luenberger", horizon)
     case.ys[when, 1] = np.nan
     for t in range(1, 140):
-        (missing, held, flat), _ = case.push()
-        assert missing is (t == when + 1)
-        assert held is flat is False
+        case.push()
+        assert (case.window.events == Status.MISSING.value) is (t == when + 1)
         assert case.window.has_special_weights is (max(0, t - horizon) <= when < t)
         assert case.window.stage_weights.ndim == (3 if case.window.has_special_weights else 2)
 
@@ -234,7 +232,8 @@ def test_a_sample_without_any_output_is_predicted(kind, bad):
         case.push()
     cost = window.candidate_cost
     with np.errstate(invalid="ignore"):
-        assert window.push(np.full(2, bad), NONE) == (True, False, False)
+        window.push(np.full(2, bad), NONE)
+    assert window.events == Status.MISSING.value
     np.testing.assert_array_equal(window.candidate[-1], system.f(window.candidate[-2], NONE))
     np.testing.assert_array_equal(window.residuals[-1], np.zeros(4))
     assert window.candidate_cost == cost
@@ -243,7 +242,7 @@ def test_a_sample_without_any_output_is_predicted(kind, bad):
 @pytest.mark.parametrize("horizon", [1, 3, 90])
 def test_windows_for_the_observer_alone_give_the_same_candidate(horizon):
     case = Case("luenberger", horizon, 0.02)
-    plain = Window(case.system, case.observer, case.cost, horizon, case.z[0], False)
+    plain = Window(case.system, case.observer, case.cost, horizon, case.z[0], False, True)
     for t, _ in case.pushed():
         plain.push(case.ys[t - 1], NONE)
         np.testing.assert_array_equal(plain.candidate, case.window.candidate)
@@ -283,7 +282,7 @@ def failing_window(root, where, horizon=3, kind="luenberger"):
     observer = qpmhe.Luenberger([1.0])
     if kind == "kalman":
         observer = qpmhe.ExtendedKalman(prior=1.0, disturbance=1.0, noise=0.1)
-    return Window(system, observer, cost, horizon, np.array([4.0]), True)
+    return Window(system, observer, cost, horizon, np.array([4.0]), True, True)
 
 
 @pytest.mark.parametrize("kind", ["luenberger", "kalman"])
@@ -292,12 +291,15 @@ def failing_window(root, where, horizon=3, kind="luenberger"):
 def test_a_failed_stage_steps_back_and_costs_infinitely(root, where, kind):
     window = failing_window(root, where, kind=kind)
     with np.errstate(invalid="ignore"):
-        assert window.push(np.array([4.0]), NONE) == (False, False, False)
-        assert window.push(np.array([-500.0]), NONE) == (False, False, False)
+        for y in (4.0, -500.0):
+            window.push(np.array([y]), NONE)
+            assert window.events == 0
         below = window.candidate[-1].copy()
         assert below[0] < 0.0
         assert math.isfinite(window.candidate_cost)
-        assert window.push(np.array([1.0]), NONE) == (False, True, False)
+        window.push(np.array([1.0]), NONE)
+        assert window.newest_failed
+        assert window.events == Status.MODEL_FAILED.value
         # From there on, the observer goes on where the model last worked.
         np.testing.assert_array_equal(window.candidate[-2:], [below, window.candidate[1]])
         assert window.candidate_cost == math.inf
@@ -306,7 +308,8 @@ def test_a_failed_stage_steps_back_and_costs_infinitely(root, where, kind):
         window.restart(np.array([4.0]))
         np.testing.assert_array_equal(window.candidate[-1], [4.0])
         for left in (True, True, False):
-            assert window.push(np.array([4.0]), NONE) == (False, False, False)
+            window.push(np.array([4.0]), NONE)
+            assert window.events == 0
             assert (window.candidate_cost == math.inf) is left
     kept = slice(window.start, window.start + 3)
     assert all(
@@ -325,9 +328,11 @@ def flat_root():
 
 def test_a_stage_without_jacobian_keeps_its_residual_and_cost():
     system, cost = flat_root()
-    window = Window(system, qpmhe.Luenberger([0.5]), cost, 4, np.zeros(1), True)
+    window = Window(system, qpmhe.Luenberger([0.5]), cost, 4, np.zeros(1), True, True)
     with np.errstate(all="ignore"):
-        assert window.push(np.array([1.0]), NONE) == (False, False, True)
+        window.push(np.array([1.0]), NONE)
+    assert window.events == Status.MODEL_FAILED.value
+    assert not window.newest_failed
     np.testing.assert_array_equal(window.candidate, [[0.0], [0.5]])
     np.testing.assert_array_equal(window.residuals, [[0.5, 1.0]])
     assert window.candidate_cost == 2.0 * 0.5**2 + 3.0 * 1.0**2
