@@ -12,8 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import Array, count, record
 from ..errors import InvalidInputError, OptionError, ShapeError
+from ..estimation.constraints import Constraints
 from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
+from ..estimation.limits import FEASIBLE
 from ..estimation.run import Run
 from ..model.system import System
 from .certificate import Certificate
@@ -25,7 +27,6 @@ __all__ = [
 
 _RELATIVE = 1e-6
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
-_FEASIBLE = 1e-8  # what the estimator itself takes for rounding on the sets' boundary
 _BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
 
 
@@ -322,8 +323,8 @@ def monitor(
         observer_candidate=observed, kappa=bounded,
         candidate_in_region=usual and bool(region.contains(estimate.candidate[:-1]).all()),
         estimate_in_region=usual and bool(region.contains(estimate.trajectory[:-1]).all()),
-        candidate_in_sets=_in_sets(system, estimate.candidate, corrections, fit),
-        feasible=_in_sets(system, estimate.trajectory, w, estimate.noises),
+        candidate_in_sets=_in_sets(certificate, estimate.candidate, corrections, fit, y),
+        feasible=_in_sets(certificate, estimate.trajectory, w, estimate.noises, y),
     )
 
 
@@ -382,8 +383,9 @@ def _costs(
     return bool(missed <= _RELATIVE * abs(stated) + rounding / _RELATIVE)
 
 
-def _in_sets(system: System, states: Array, w: Array, v: Array) -> bool:
-    pairs = ((system.states, states[:-1]), (system.disturbances, w), (system.noises, v))
-    return all(
-        one is None or one.violation(values, rounding=_FEASIBLE) == 0.0 for one, values in pairs
-    )
+def _in_sets(certificate: Certificate, states: Array, w: Array, v: Array, y: Array) -> bool:
+    """Whether a trajectory is in X, W and V as the estimator itself judges it."""
+    cost, covariance = certificate.cost, certificate.observer.initial_covariance()
+    deviations = cost.prior_deviations(covariance)
+    sets = Constraints(certificate.system, cost, np.diag(deviations**2))
+    return sets.violation(states, np.hstack((w, v)), y) <= 2.0 * FEASIBLE

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from qpmhe_solvers.values import shown
 
 from .._checks import Array, positive_definite, vector
+from .._linalg import solve, unit_diagonal
 from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
 from ..model.system import System, checked_system
 from .luenberger import Luenberger
@@ -18,6 +19,9 @@ from .luenberger import Luenberger
 __all__ = ["design_luenberger"]
 
 ComplexArray = NDArray[np.complex128]
+
+# So many standard deviations of the disturbance are a typical magnitude of a state.
+_STEPS = 100.0
 
 # Below this a direction counts as unseen. Matrices are scaled to norm one before, and the
 # Jacobians may be finite differences.
@@ -52,7 +56,8 @@ def design_luenberger(
     poles : (n,) array_like, optional
         Eigenvalues of A - K C, inside the unit circle, complex ones in conjugate pairs.
         With several outputs, none more often than the rank of C. For a continuous-time
-        pole s and a sampling time dt, give exp(s dt).
+        pole s and a sampling time dt, give exp(s dt). Where the states' units differ by orders
+        of magnitude, give the system its `scales`.
     disturbance, noise : (n, n) and (p, p) array_like, optional
         Instead of poles: covariances Q of w and R of v (squared units), symmetric positive
         definite.
@@ -92,10 +97,12 @@ def design_luenberger(
     checked_system(system)
     if poles is not None and disturbance is None and noise is None:
         a, c, point = linearize(system, at, u)
-        return Luenberger(_placed(a, c, _checked_poles(poles, system.n), point))
+        return Luenberger(
+            _placed(a, c, _checked_poles(poles, system.n), point, system.scales)
+        )
     if poles is None and disturbance is not None and noise is not None:
-        a, c, point = linearize(system, at, u)
         q = positive_definite("disturbance covariance", disturbance, system.n)
+        a, c, point = linearize(system, at, u, q)
         r = positive_definite("noise covariance", noise, system.p)
         return Luenberger(stationary(a, c, q, r, point)[0])
     options = {"poles": poles, "disturbance": disturbance, "noise": noise}
@@ -106,14 +113,23 @@ def design_luenberger(
     )
 
 
-def linearize(system: System, at: ArrayLike, u: ArrayLike | None) -> tuple[Array, Array, Array]:
-    """The Jacobians A (n, n) and C (p, n) at a point, and the point (n,)."""
+def linearize(
+    system: System, at: ArrayLike, u: ArrayLike | None, disturbance: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """The Jacobians A (n, n) and C (p, n) at a point, and the point (n,).
+
+    A covariance of the disturbance, (n, n), says how large the states are: many times it.
+    """
     point = vector("at", at, system.n)
     if u is None and system.m:
         raise InvalidInputError(
             f"u is missing; the system has {system.m} inputs, whose values at the point matter."
         )
     inputs = np.zeros(0) if u is None else vector("u", u, system.m)
+    if disturbance is not None:
+        system = system.copy(_STEPS * np.sqrt(disturbance.diagonal()))
+        for jacobian in (system.f_jacobian, system.h_jacobian):
+            jacobian.check(point, inputs)
     found = []
     for function, jacobian in ((system.f, system.f_jacobian), (system.h, system.h_jacobian)):
         try:
@@ -137,6 +153,19 @@ def linearize(system: System, at: ArrayLike, u: ArrayLike | None) -> tuple[Array
 
 def stationary(a: Array, c: Array, q: Array, r: Array, point: Array) -> tuple[Array, Array]:
     """Gain (n, p) and covariance (n, n) of the stationary Kalman predictor."""
+    # In standard deviations of disturbance and noise, rounded to powers of two: the result
+    # then depends on no unit.
+    (q, states, whole), (r, outputs, other) = unit_diagonal(q), unit_diagonal(r)
+    r = np.ldexp(r, other - whole)
+    a = np.ldexp(a, states - states[:, None])
+    c = np.ldexp(c, states - outputs[:, None])
+    gain, covariance = _stationary(a, c, q, r, point)
+    covariance = np.ldexp(covariance, whole + states[:, None] + states)
+    return np.ldexp(gain, states[:, None] - outputs), covariance
+
+
+def _stationary(a: Array, c: Array, q: Array, r: Array, point: Array) -> tuple[Array, Array]:
+    """The same in numbers of order one."""
     from scipy.linalg import solve_discrete_are
 
     hidden = _unobservable_modes(a, c)
@@ -156,7 +185,7 @@ def stationary(a: Array, c: Array, q: Array, r: Array, point: Array) -> tuple[Ar
         ) from error
     covariance = 0.5 * (covariance + covariance.T)
     cross = a @ covariance @ c.T
-    gain: Array = np.asarray(np.linalg.solve(c @ covariance @ c.T + r, cross.T).T, np.float64)
+    gain = solve(c @ covariance @ c.T + r, cross.T).T
     radius = spectral_radius(a - gain @ c)
     if not radius < 1.0:
         raise ModelError(
@@ -196,7 +225,20 @@ def _eigenvalues(matrix: Array) -> ComplexArray:
     return np.asarray(np.linalg.eigvals(matrix), dtype=np.complex128)
 
 
-def _placed(a: Array, c: Array, poles: ComplexArray, point: Array) -> Array:
+def _placed(
+    a: Array, c: Array, poles: ComplexArray, point: Array, scales: Array | None
+) -> Array:
+    """The gain that places the poles, found in numbers of order one."""
+    exponents = np.zeros(point.size, np.int32) if scales is None else np.frexp(scales)[1]
+    a = np.ldexp(a, exponents - exponents[:, None])
+    c = np.ldexp(c, exponents)
+    rows = np.frexp(np.abs(c).max(axis=1))[1]
+    found = _placed_scaled(a, np.ldexp(c, -rows[:, None]), poles, point)
+    gain: Array = np.ldexp(found, exponents[:, None] - rows)
+    return gain
+
+
+def _placed_scaled(a: Array, c: Array, poles: ComplexArray, point: Array) -> Array:
     hidden = _unobservable_modes(a, c)
     if hidden.size:
         raise ModelError(

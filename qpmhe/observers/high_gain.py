@@ -113,7 +113,9 @@ class HighGain(Luenberger):
                 chain += term
         poles = np.exp(roots.astype(np.complex128) * (self.dt / self.epsilon))
         gain = ackermann(chain, np.eye(1, n), poles)[:, 0]
-        super().__init__(gain / self.dt ** np.arange(n))
+        # Products, not powers: so a time unit larger by a power of two changes no digit.
+        self._units: Array = np.cumprod(np.append(1.0, np.full(n - 1, 1.0 / self.dt)))
+        super().__init__(gain * self._units)
 
     def check(self, system: System, initial_state: Array) -> None:
         """Check that there is one output, and stability at z(0); see `Observer.check`."""
@@ -131,7 +133,8 @@ class HighGain(Luenberger):
                 "system's sampling time."
             )
         a, c, _ = linearize(system, initial_state, np.zeros(system.m))
-        radius = spectral_radius(a - self.gain @ c)
+        error = (a - self.gain @ c) * self._units / self._units[:, None]
+        radius = spectral_radius(error)
         if not radius < 1.0:
             raise ModelError(
                 f"A - K C has the spectral radius {radius:.6g} at the initial state "

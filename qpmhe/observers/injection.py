@@ -44,29 +44,34 @@ class OutputInjection(Observer):
     def check(self, system: System, initial_state: Array) -> None:
         """Check that values have shape (n,), and that L(z, 0) = 0; see `Observer.check`."""
         self._check_metric(system)
-        self._check_at(initial_state, system.p)
         generator = np.random.default_rng(20210829)
-        for _ in range(3):
-            near = initial_state * generator.uniform(0.5, 1.5, system.n)
-            self._check_at(near + generator.uniform(-0.1, 0.1, system.n), system.p)
+        # Within the set, as the model and the correction may be defined nowhere else.
+        near = initial_state * generator.uniform(0.5, 1.5, (3, system.n))
+        if system.scales is not None:
+            near += system.scales * generator.uniform(-0.1, 0.1, near.shape)
+        if system.states is not None:
+            near = np.clip(near, system.states.lower, system.states.upper)
+        misfit = _change_of_output(system, initial_state, near[0])
+        for z in (initial_state, *near):
+            self._check_at(z, misfit)
 
-    def _check_at(self, z: Array, outputs: int) -> None:
+    def _check_at(self, z: Array, misfit: Array) -> None:
         try:
             with np.errstate(all="ignore"):
-                value = np.asarray(self._correction(z.copy(), np.zeros(outputs)), np.float64)
+                value = np.asarray(self._correction(z.copy(), np.zeros(misfit.size)), np.float64)
         except Exception as error:
             raise ModelError(
                 f"correction raised {type(error).__name__}: {error} at z = {z.tolist()}, v = 0."
             ) from error
         if value.shape != z.shape:
             raise ModelError(f"correction returned shape {value.shape}; expected (n,) = {z.shape}.")
-        state, misfit = z.copy(), np.full(outputs, 0.1)
+        state, fit = z.copy(), misfit.copy()
         try:
             with np.errstate(all="ignore"):
-                self._correction(state, misfit)
+                self._correction(state, fit)
         except Exception:  # bad luck far from the data is for the run
             pass
-        if not (np.array_equal(state, z) and np.all(misfit == 0.1)):
+        if not (np.array_equal(state, z) and np.array_equal(fit, misfit)):
             raise ModelError(
                 "correction changes z or v in place; copy them before writing to them."
             )
@@ -80,3 +85,16 @@ class OutputInjection(Observer):
         """L(z, v); see `Observer.correct`."""
         # Copies: a correction may write into what it gets in a branch that no check has seen.
         return np.asarray(self._correction(z.copy(), v.copy()), dtype=np.float64), None
+
+
+def _change_of_output(system: System, one: Array, other: Array) -> Array:
+    """The change of h from one state to another: a fitting error (p,) of a usual size."""
+    try:
+        with np.errstate(all="ignore"):
+            first, second = (
+                np.array(system.h(x, np.zeros(system.m)), np.float64) for x in (one, other)
+            )
+    except Exception:  # outside its domain
+        return np.zeros(system.p)
+    change = second - first
+    return change if np.isfinite(change).all() else np.zeros(system.p)

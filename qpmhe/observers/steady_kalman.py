@@ -81,8 +81,9 @@ class SteadyStateKalman(Observer):
         self, system: System, at: ArrayLike, u: ArrayLike | None = None, *, disturbance: ArrayLike,
         noise: ArrayLike, prior: ArrayLike | None = None,
     ) -> None:
-        self._a, self._c, point = linearize(checked_system(system), at, u)
+        checked_system(system)
         self._disturbance = positive_definite("disturbance covariance", disturbance, system.n)
+        self._a, self._c, point = linearize(system, at, u, self._disturbance)
         self._noise = positive_definite("noise covariance", noise, system.p)
         self.gain, self.covariance = stationary(
             self._a, self._c, self._disturbance, self._noise, point

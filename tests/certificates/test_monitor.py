@@ -125,6 +125,30 @@ def test_costs_that_are_not_those_of_the_trajectories_are_seen(which):
     assert not monitor(certificate, estimate).cost_decrease
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_what_does_not_hold_is_seen_in_any_unit(unit):
+    system = qpmhe.System(
+        lambda x: 0.8 * x, lambda x: x, n=1, p=1, noises=qpmhe.Box([-unit], [unit])
+    )
+    certificate = certify(
+        system, qpmhe.Luenberger([0.3]),
+        qpmhe.QuadraticCost(prior=1e-12 / unit**2, disturbance=2e-12 / unit**2,
+                            noise=1e-12 / unit**2),
+        horizon=3, region=qpmhe.Box([-10.0 * unit], [10.0 * unit]),
+        detectability=Detectability.assumed(eta=0.8, c_p=1.0, c_w=1.25, c_v=0.01),
+        stability=ObserverStability.assumed(rho=0.5, C_p=1.0, C_w=2.0, C_v=0.6, kappa=0.3),
+    )
+    mhe = estimator(certificate)
+    assert values(monitor(certificate, mhe.update(0.9 * unit))) == set()
+    estimate = mhe.update(4.0 * unit)
+    assert "candidate_in_sets" in values(monitor(certificate, estimate))
+    estimate.candidate_cost *= 1.001
+    assert not monitor(certificate, estimate).cost_decrease
+    moved = mhe.update(0.5 * unit)
+    moved.candidate[-1] += 1e-3 * unit  # a correction that is not the gain's
+    assert not monitor(certificate, moved).observer_candidate
+
+
 def test_a_trajectory_above_the_candidates_cost_is_seen():
     certificate = made()
     mhe = estimator(certificate)

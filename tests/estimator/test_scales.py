@@ -242,3 +242,103 @@ def test_a_model_is_called_for_derivatives_as_often_as_before():
     calls.clear()
     system.f_jacobian.batch(np.ones((10, 2)), np.zeros((10, 0)))
     assert len(calls) == 40  # two states to each side, at each of ten
+
+
+# Observers
+
+UNITS = [(1e-9, 1e9, 1e-6), (1e6, 1.0, 1e9), (1.0, 1e-9, 1e-9)]
+
+
+def oscillator(a, b):
+    return [a + 0.1 * b, b - 0.1 * np.sin(a) - 0.02 * b]
+
+
+def oscillator_in(units, **options):
+    """The same oscillator, its states and its output in these units."""
+    one, two, out = units
+
+    def f(x):
+        a, b = oscillator(x[0] / one, x[1] / two)
+        return np.array([a * one, b * two])
+
+    return qpmhe.System(f, lambda x: x[:1] / one * out, n=2, p=1, **options)
+
+
+@pytest.mark.parametrize("units", UNITS)
+def test_designed_gains_in_any_unit(units):
+    states, out = np.array(units[:2]), units[2]
+    q, r = np.diag([0.01, 0.02]), 0.1
+    plain, other = oscillator_in((1.0, 1.0, 1.0)), oscillator_in(units, scales=states)
+    for options, scaled in (
+        ({"poles": [0.5, 0.6]}, {"poles": [0.5, 0.6]}),
+        (
+            {"disturbance": q, "noise": r},
+            {"disturbance": q * np.outer(states, states), "noise": r * out**2},
+        ),
+    ):
+        best = qpmhe.design_luenberger(plain, [0.1, 0.2], **options).gain
+        found = qpmhe.design_luenberger(other, states * [0.1, 0.2], **scaled).gain
+        np.testing.assert_allclose(found * out / states[:, None], best, rtol=1e-7)
+    steady = qpmhe.SteadyStateKalman(other, states * [0.1, 0.2], **scaled)
+    best = qpmhe.SteadyStateKalman(plain, [0.1, 0.2], **options)
+    np.testing.assert_allclose(
+        steady.covariance / np.outer(states, states), best.covariance, rtol=1e-9
+    )
+
+
+def test_the_stationary_filter_is_equivariant_to_the_bit():
+    generator = np.random.default_rng(7)
+    q, r = np.array([[0.01, 0.004], [0.004, 0.02]]), np.array([[0.1]])
+    best = qpmhe.SteadyStateKalman(
+        oscillator_in((1.0, 1.0, 1.0)), [0.1, 0.2], disturbance=q, noise=r
+    )
+    for _ in range(5):
+        units = 2.0 ** generator.integers(-30, 31, 3)
+        states, out = units[:2], units[2]
+        found = qpmhe.SteadyStateKalman(
+            oscillator_in(units), states * [0.1, 0.2],
+            disturbance=q * np.outer(states, states), noise=r * out**2,
+        )
+        np.testing.assert_array_equal(found.gain * out / states[:, None], best.gain)
+        np.testing.assert_array_equal(
+            found.covariance / np.outer(states, states), best.covariance
+        )
+
+
+@pytest.mark.parametrize("unit", [2.0**-30, 2.0**-7, 2.0**20])
+def test_a_high_gain_observer_is_equivariant_to_the_bit_in_time(unit):
+    best = qpmhe.HighGain(4, epsilon=0.3, dt=0.07).gain
+    found = qpmhe.HighGain(4, epsilon=0.3 * unit, dt=0.07 * unit).gain
+    np.testing.assert_array_equal(found * unit ** np.arange(4)[:, None], best)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_a_correction_is_tried_near_the_start_in_any_unit(unit):
+    def correction(z, v):
+        # Defined near 3 units alone, and far from fits it would write into v.
+        assert abs(z[0] / unit - 3.0) < 2.0
+        if abs(v[0]) > 100.0 * unit:
+            v[0] = 0.0
+        return 0.2 * v
+
+    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.OutputInjection(correction), cost_of([unit], unit**2), horizon=3,
+        initial_state=[3.0 * unit],
+    )
+    assert np.isfinite(mhe.update([3.1 * unit]).state).all()
+    wrong = qpmhe.OutputInjection(lambda z, v: 0.2 * v + (z - 3.0 * unit))
+    with pytest.raises(ModelError, match="must not correct where the output fits"):
+        qpmhe.MovingHorizonEstimator(
+            system, wrong, cost_of([unit], unit**2), horizon=3, initial_state=[3.0 * unit]
+        )
+
+
+def test_a_correction_is_tried_within_x_alone():
+    system = qpmhe.System(
+        lambda x: 0.9 * x, lambda x: x, n=1, p=1, states=qpmhe.Box([0.0], [np.inf])
+    )
+    qpmhe.MovingHorizonEstimator(
+        system, qpmhe.OutputInjection(lambda z, v: v * 0.1 * math.sqrt(z[0])), cost_of([1.0]),
+        horizon=3, initial_state=[0.0],
+    )
