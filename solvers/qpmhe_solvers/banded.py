@@ -20,6 +20,8 @@ Index = NDArray[np.intp]
 # How far equality rows may be missed after a solve, in scaled numbers.
 _ROUNDING = 1e-10
 
+_COST_UNITS = 1.0, 0.5
+
 
 class BandedSolver(Solver):
     """Solve ``H d = -g``, exact wherever the result meets every inequality.
@@ -74,8 +76,10 @@ class BandedSolver(Solver):
             work = band, band.reshape(qp.size, 2 * qp.n).T, step
             self._work, self._size = work, (qp.stages, qp.n)
         band, lapack_band, step = work
-        band[...] = qp.band
-        np.negative(qp.gradient, out=step)
+        # A root is exact for powers of four alone: an odd unit of the cost goes before.
+        unit = _COST_UNITS[math.frexp(qp.band.item(0))[1] % 2]
+        np.multiply(qp.band, unit, out=band)
+        np.multiply(qp.gradient, -unit, out=step)
         flat = step.reshape(qp.size)
         _, _, info = self._dpbsv(lapack_band, flat, lower=1, overwrite_ab=1, overwrite_b=1)
         finite = math.isfinite(flat.dot(flat))

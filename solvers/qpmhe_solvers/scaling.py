@@ -35,12 +35,14 @@ class Scale:
     r"""Powers of two that take QPs of one size to numbers of order one, exactly.
 
     .. math::
-        d_k = t S d'_k, \quad H' = S H S, \quad g' = S g / t, \quad F' = R F S, \quad a' = R a / t
+        d_k = t S d'_k, \quad H' = c\, S H S, \quad g' = c\, S g / t, \quad F' = R F S, \quad
+        a' = R a / t
 
     with a diagonal S, the same at all stages, that brings the diagonal of H' to about 1 or less,
     for each component, or to more where a stage would be lost beside the others; a diagonal R
     that does so for the largest entry of each row; and one number t, for the unit of the cost,
-    that does so for the gradient or the step, as `Peaks` puts them together.
+    that does so for the gradient or the step, as `Peaks` puts them together. The cost's unit is
+    :math:`t^2 / c`, with c = 1 or 1/2, as its square root need not be a power of two.
 
     Attributes
     ----------
@@ -51,9 +53,9 @@ class Scale:
     units : (K n + K rows,) array
         Units of the constraints: t S of the bounds, and t / R of the rows.
     duals : (K n + K rows,) array
-        Units of the multipliers: t / S, also the unit of the gradient, and t R.
+        Units of the multipliers: t / (c S), also the unit of the gradient, and t R / c.
     cost : float
-        t squared, the unit of the objective.
+        t squared over c, the unit of the objective.
     """
 
     __slots__ = (
@@ -61,12 +63,13 @@ class Scale:
     )
 
     def __init__(
-        self, exponents: Index, places: Index, sizes: tuple[int, int, int], key: int
+        self, exponents: Index, odd: int, places: Index, sizes: tuple[int, int, int], key: int
     ) -> None:
         stages, n, rows = self.sizes = sizes
         self.key = key
         self._unknown: list[int] = []
-        signed = np.concatenate((exponents, -exponents, _NOTHING))
+        s, r = exponents[:n] - odd, exponents[n:-1] + odd  # of c S and of R / c
+        signed = np.concatenate((exponents, -exponents, _NOTHING, s, -s, r))
         factors = np.ldexp(1.0, signed[places[0]] + signed[places[1]])
         count = stages * (n + rows)
         self._factor: Array = factors[: -2 * count]
@@ -74,7 +77,7 @@ class Scale:
         self.units: Array = units[0]
         self.duals: Array = units[1]
         self.step: Array = self.units[: stages * n].reshape(stages, n)
-        self.cost = math.ldexp(1.0, 2 * int(exponents[-1]))
+        self.cost = math.ldexp(1.0, 2 * int(exponents[-1]) + odd)
 
     def apply(self, qp: QP, scaled: QP) -> None:
         """Write the scaled numbers of a QP."""
@@ -99,17 +102,22 @@ class Scale:
 
 @lru_cache(maxsize=64)
 def _places(sizes: tuple[int, int, int]) -> Index:
-    """Which two of the exponents of S, R, t, 1/S, 1/R, 1/t and 1 make up each factor."""
+    """Which two of the exponents make up each factor.
+
+    They are those of S, R, t, 1/S, 1/R, 1/t, 1, c S, 1/(c S) and R/c.
+    """
     stages, n, rows = sizes
     s, r, t = np.arange(n), n + np.arange(rows), np.array(n + rows)
     one = 2 * (n + rows + 1)
+    cs = one + 1 + s
+    cs_less, cr_less = cs + n, one + 1 + 2 * n + np.arange(rows)
     s_less, r_less, t_less = (place + n + rows + 1 for place in (s, r, t))
     panel = (s[:, None] + np.arange(2 * n)) % n  # the row of each of its entries
     row, next_row = (np.broadcast_arrays(r[:, None], s) for _ in range(2))
     parts = [
-        (s[:, None] + 0 * panel, panel), (s, t_less), row, next_row,
+        (s[:, None] + 0 * panel, cs[panel]), (cs, t_less), row, next_row,
         (s_less, t_less), (r, t_less), (s_less, t_less), (r, t_less),
-        (s, t), (r_less, t), (s_less, t), (r, t),
+        (s, t), (r_less, t), (cs_less, t), (cr_less, t),
     ]
     made = [
         np.tile(np.array(np.broadcast_arrays(*part)).reshape(2, -1), stages) for part in parts
@@ -220,15 +228,17 @@ class Scaling:
         places, key = _places(qp.sizes), next(self._keys)
         exponents = np.zeros(n + rows + 1, np.int64)
         peaks = self._peaks.of(qp)
+        # A unit of the cost changes all the diagonal's exponents, units of unknowns the even part.
+        odd = next((math.frexp(peak)[1] % 2 for peak in peaks[:n] if peak > 0.0), 0)
         # The peaks of rows depend on S, and that of the step on both.
         for part in (slice(n), slice(n, n + rows), slice(n + rows, None)):
             found = np.frexp(peaks[part])[1]
             if part.start is None:
-                exponents[part] = -(found // 2)
+                exponents[part] = -((found - odd) // 2)
             else:
                 exponents[part] = found if part.stop is None else -found
             np.clip(exponents, -_MOST, _MOST, out=exponents)
-            scale = Scale(exponents, places, qp.sizes, key)
+            scale = Scale(exponents, odd, places, qp.sizes, key)
             if part.stop is not None:
                 scale.apply(qp, scaled)
                 peaks = self._peaks.of(scaled)
