@@ -14,6 +14,7 @@ from .._checks import make_folder
 from ..errors import OptionError
 from ..studies import Store, Study, StudyError, run
 from ..studies.grid import WORDS, Measure
+from ..studies.report import check_libraries
 from .report import show_report
 
 __all__ = ["compare", "study"]
@@ -108,7 +109,10 @@ def study(
 
 def _run(what: Study, store: Path, out: Path, **options: Any) -> None:
     console = Console()
+    # What the report lacks would otherwise be known only when all cells have run.
+    check_libraries()
     make_folder(store.parent)
+    make_folder(out)
     # As after Ctrl-C, worker processes and progress bar end before this process.
     before = signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
     try:

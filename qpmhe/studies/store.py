@@ -7,6 +7,7 @@ import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
+from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,8 @@ import numpy as np
 from qpmhe_solvers.values import shown
 
 from .._checks import need
-from ..errors import InvalidInputError, OptionError
+from ..errors import InvalidInputError, OptionError, QpmheError
+from .cell import Cell
 from .errors import StoreError
 
 if TYPE_CHECKING:
@@ -52,6 +54,7 @@ _PARTS = {
 }
 _JSON = ("rmse_states", "rmse_settled_states", "reasons")
 _REAL = tuple(name for name, kind in COLUMNS.items() if kind == "REAL")
+_SHARES = ("improved", "kept", "fallback", "cap_hits")
 _TYPES = {
     **dict.fromkeys((*_REAL, "late"), "float64"),
     **dict.fromkeys(("qps", "solver_iterations"), "Int64"),
@@ -82,6 +85,8 @@ _REMEDIES = {
     "SQLITE_IOERR": "the disk does not read or write; give the same command again when it works",
     "SQLITE_CANTOPEN": "it cannot be opened; check that the folder exists and can be written",
     "SQLITE_CORRUPT": _DAMAGED,
+    "SQLITE_ERROR": _DAMAGED,  # a table or column that we made is not there
+    "": _DAMAGED,  # text that cannot be decoded
     "SQLITE_NOTADB": "it is no SQLite file and was left as it is; name another",
 }
 
@@ -121,18 +126,18 @@ class Store:
         names = [name for name in COLUMNS if name != "parts"]
         with _reading(self.path) as connection:
             found = connection.execute(f"SELECT {', '.join(names)} FROM cells ORDER BY rowid")
-            rows = [dict(zip(names, map(_decoded, names, row), strict=True)) for row in found]
+            rows = [_checked(dict(zip(names, row, strict=True))) for row in found]
             last = connection.execute(
                 "SELECT settings FROM studies ORDER BY id DESC LIMIT 1"
             ).fetchone()
-        deadline = json.loads(last[0])["deadline"] if last else None
-        for row in rows:
-            measured = row["times"] is not None and deadline is not None
-            row["late"] = float((row["times"] > deadline).mean()) if measured else float("nan")
-        names.insert(names.index("times"), "late")
-        columns = {name: [row[name] for row in rows] for name in names}
-        frame = pandas.DataFrame(columns, columns=names).astype(_TYPES)
-        whole: DataFrame = frame.assign(shared=frame["shared"].astype("bool"))
+            deadline = json.loads(last[0])["deadline"] if last else None
+            for row in rows:
+                measured = row["times"] is not None and deadline is not None
+                row["late"] = float((row["times"] > deadline).mean()) if measured else float("nan")
+            names.insert(names.index("times"), "late")
+            columns = {name: [row[name] for row in rows] for name in names}
+            frame = pandas.DataFrame(columns, columns=names).astype(_TYPES)
+            whole: DataFrame = frame.assign(shared=frame["shared"].astype("bool"))
         return whole
 
     def meta(self) -> dict[str, Any]:
@@ -170,17 +175,7 @@ class Store:
             found = connection.execute(
                 "SELECT header, numbers FROM trajectories WHERE key = ?", (key,)
             ).fetchone()
-        if found is None:
-            return None
-        header = json.loads(found[0])
-        rows, n = header.pop("shape")
-        numbers = np.frombuffer(found[1])
-        return {
-            "times": numbers[:rows],
-            "states": numbers[rows : rows * (n + 1)].reshape(rows, n),
-            "estimates": numbers[rows * (n + 1) :].reshape(rows, n),
-            **header,
-        }
+            return None if found is None else _unpacked(*found)
 
     @contextmanager
     def writing(self) -> Iterator[Writer]:
@@ -231,9 +226,9 @@ class Writer:
     def present(self, retry_failed: bool) -> dict[str, frozenset[str]]:
         """The parts that each cell has; if failed cells are to be retried, without those."""
         where = "WHERE outcome = 'done'" if retry_failed else ""
-        with _explained(self._path):
+        with _explained(self._path), _undamaged(self._path):
             rows = self._connection.execute(f"SELECT key, parts FROM cells {where}").fetchall()
-        return {key: frozenset(parts.split(",")) for key, parts in rows}
+            return {key: frozenset(parts.split(",")) for key, parts in rows}
 
     def put(self, result: dict[str, Any]) -> None:
         """Store what `qpmhe.studies.cell.compute` gives."""
@@ -291,9 +286,30 @@ def _encoded(name: str, value: Any) -> Any:
     return ",".join(sorted(value)) if name == "parts" else value
 
 
+def _checked(row: dict[str, Any]) -> dict[str, Any]:
+    """A row of cells, decoded; raises any exception where it cannot be what was stored."""
+    found = {name: _decoded(name, value) for name, value in row.items()}
+    cell = Cell(**{one.name: found[one.name] for one in fields(Cell)})
+    done = found["outcome"] == "done"
+    lists, reasons = [found["rmse_states"], found["rmse_settled_states"]], found["reasons"]
+    if (
+        cell.key != found["key"]
+        or found["outcome"] not in ("done", "failed")
+        or (done and not all(isinstance(one, list) and np.ndim(one) == 1 for one in lists))
+        or (done and not all(number >= 0 for number in reasons.values()))
+        or not all(found[name] >= 0 for name in ("horizon", "seed", "steps", "environment"))
+        or any(found[name] < 0.0 for name in _REAL)
+        or any(found[name] > 1.0 for name in _SHARES)
+    ):
+        raise ValueError(f"a value of the cell {found['key']}")
+    return found
+
+
 def _decoded(name: str, value: Any) -> Any:
+    if name in _REAL:
+        return float("nan") if value is None else float(value)
     if value is None:
-        return float("nan") if name in _REAL else None
+        return None
     if name in _JSON:
         return json.loads(value)
     return np.frombuffer(value, np.float32) if name == "times" else value
@@ -339,6 +355,21 @@ def _packed(trajectory: dict[str, Any]) -> tuple[str, bytes]:
     header["shape"] = list(trajectory["states"].shape)
     numbers = np.concatenate([np.ravel(trajectory[name]) for name in names])
     return json.dumps(header), numbers.astype(np.float64).tobytes()
+
+
+def _unpacked(packed: str, numbers: bytes) -> dict[str, Any]:
+    header = json.loads(packed)
+    rows, n = header.pop("shape")
+    values = np.frombuffer(numbers)
+    found = {
+        "times": values[:rows],
+        "states": values[rows : rows * (n + 1)].reshape(rows, n),
+        "estimates": values[rows * (n + 1) :].reshape(rows, n),
+        **header,
+    }
+    if len(found["labels"]) != n or not isinstance(found["time_unit"], str):
+        raise ValueError("the labels of a run")
+    return found
 
 
 def _now() -> str:
@@ -414,7 +445,7 @@ def _reading(path: Path) -> Iterator[sqlite3.Connection]:
     if not path.exists():
         raise StoreError(f"there is no store {path}; run a study first, or check the name.")
     _check_file(path)
-    with _explained(path), closing(_reader(path)) as connection:
+    with _undamaged(path), _explained(path), closing(_reader(path)) as connection:
         connection.execute("BEGIN")
         _check(connection, path, empty=False)
         yield connection
@@ -443,6 +474,17 @@ def _unwritten(path: Path) -> bool:
 def _code(error: sqlite3.Error) -> str:
     """The primary code: SQLITE_READONLY for SQLITE_READONLY_DIRECTORY."""
     return "_".join(getattr(error, "sqlite_errorname", "").split("_")[:2])
+
+
+@contextmanager
+def _undamaged(path: Path) -> Iterator[None]:
+    """Report content that cannot be decoded as damage."""
+    try:
+        yield
+    except QpmheError:
+        raise
+    except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError) as error:
+        raise StoreError(f"the store {path}: {_DAMAGED} ({error}).") from error
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from qpmhe.cli import compare as commands
 from qpmhe.cli.app import app
-from qpmhe.errors import OptionError, QpmheError
+from qpmhe.errors import InvalidInputError, OptionError, QpmheError
 from qpmhe.studies import Store
 
 ODD = f'{__file__.rpartition("/")[0]}/odd_models.py'
@@ -78,6 +78,22 @@ def test_a_study_file_names_store_and_report(tmp_path, shown):
     assert shown == [(store, tmp_path / "mine-report"), (store, tmp_path / "there")]
     command("export", store, tmp_path / "cells.csv")
     assert len(pd.read_csv(tmp_path / "cells.csv")) == 2
+
+
+@pytest.mark.parametrize("name", ["pandas", "itables"])
+def test_a_library_of_the_report_is_missed_before_any_cell_runs(tmp_path, monkeypatch, name):
+    monkeypatch.setattr("qpmhe.studies.report.page.find_spec", lambda one: one != name)
+    for words in (["compare", "--backend", "banded", "--store", tmp_path / "s.sqlite"],
+                  ["study", study_file(tmp_path)]):
+        with pytest.raises(InvalidInputError, match=rf"the report needs {name}.*qpmhe\[studies\]"):
+            command(*words, "--out", tmp_path / "out")
+    assert [one.name for one in tmp_path.iterdir()] == ["mine.toml"]
+
+
+def test_a_folder_that_cannot_be_is_refused_before_any_cell_runs(tmp_path):
+    with pytest.raises(InvalidInputError, match="cannot make the folder"):
+        command("study", study_file(tmp_path), "--out", tmp_path / "mine.toml" / "out")
+    assert [one.name for one in tmp_path.iterdir()] == ["mine.toml"]
 
 
 def test_failed_cells_are_reported(tmp_path, shown):

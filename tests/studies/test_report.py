@@ -1,5 +1,6 @@
 import json
 import re
+import resource
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -286,6 +287,28 @@ def test_folder_that_cannot_be(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidInputError, match="cannot make the folder"):
         write_report(stored(), tmp_path / "file" / "out")
+
+
+def test_a_full_disk_leaves_the_former_report(tmp_path):
+    page = tmp_path / "index.html"
+    page.write_text("the former one")
+    content = frame().query("horizon == 4"), stored().meta()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))  # to a program, a full disk
+    try:
+        with pytest.raises(InvalidInputError, match=r"cannot write the report into .*make room"):
+            write_report(content, tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [one.name for one in tmp_path.iterdir()] == ["index.html"]
+    assert page.read_text() == "the former one"
+
+
+@pytest.mark.parametrize("name", ["summary.csv", "profile.png"])
+def test_what_cannot_be_written_is_named(tmp_path, name):
+    (tmp_path / name).mkdir()
+    with pytest.raises(InvalidInputError, match=r"cannot write the report into .*directory"):
+        write_report((frame(), stored().meta()), tmp_path)
 
 
 def test_libraries_are_loaded_late():

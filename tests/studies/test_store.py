@@ -9,7 +9,7 @@ import pytest
 
 from qpmhe.errors import InvalidInputError, OptionError
 from qpmhe.models.loading import find
-from qpmhe.studies import Store, StoreError, Study, export
+from qpmhe.studies import Store, StoreError, Study, export, summarise
 from qpmhe.studies import store as module
 from qpmhe.studies.cell import Cell, Task, compute, failure
 
@@ -204,6 +204,70 @@ def test_a_truncated_store_is_refused_and_left_alone(path, share):
     assert path.read_bytes() == before
     path.write_bytes(whole)
     assert len(Store(path).frame()) == 40
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory):
+    """The bytes of a store with a trajectory, without a log beside it."""
+    path = tmp_path_factory.mktemp("content") / "store.sqlite"
+    stored(path, compute(task(keep=True)), compute(task(1)), failure(task(2), "out of time"))
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA journal_mode = DELETE")
+    return path.read_bytes()
+
+
+def read(path):
+    store = Store(path)
+    store.meta()
+    frame = store.frame()
+    for key in frame["key"]:
+        store.trajectory(key)
+    summarise(frame)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_flipped_bytes_are_no_traceback(path, content, seed):
+    generator, damaged = np.random.default_rng(seed), 0
+    used = np.flatnonzero(np.frombuffer(content, np.uint8))  # pages are mostly zeros
+    for _ in range(60):
+        changed = bytearray(content)
+        for place in generator.choice(used, 2):
+            changed[place] ^= int(generator.integers(1, 256))
+        path.write_bytes(changed)
+        try:
+            read(path)
+        except StoreError as error:
+            damaged += str(path) in str(error)
+    assert damaged > 20
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "cells SET rmse_states = '[1,'", "cells SET rmse_states = 3", "cells SET outcome = 'dgne'",
+        "cells SET seed = 7", "cells SET seed = 'x'", "cells SET reasons = '{\"IMPROVED\": -3}'",
+        "cells SET times = x'00'", "cells SET rmse = 'much'", "cells SET improved = 1.5",
+        "cells SET time_median = -1.0", "cells SET reason = CAST(x'ff' AS TEXT)",
+        "studies SET settings = '{}'", "studies SET settings = NULL",
+        "environments SET settings = '['", "trajectories SET numbers = x'0000000000000000'",
+        "trajectories SET header = '{}'", "trajectories SET header = '{\"shape\": [13]}'",
+    ],
+)
+def test_damage_is_named_with_the_remedy(path, content, change):
+    path.write_bytes(content)
+    read(path)
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(f"UPDATE {change}")
+    with pytest.raises(StoreError, match=r"store\.sqlite: it is damaged .* take an earlier copy"):
+        read(path)
+
+
+def test_a_table_that_is_not_there_is_damage(path, content):
+    path.write_bytes(content)
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("DROP TABLE studies")
+    with pytest.raises(StoreError, match="damaged"):
+        read(path)
 
 
 def test_an_empty_file_is_a_new_store(path):

@@ -37,7 +37,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-__all__ = ["write_report"]
+__all__ = ["check_libraries", "write_report"]
+
+_LIBRARIES = ("pandas", "plotly", "itables", "jinja2")
 
 #: States that the page draws, and a file.
 MOST_STATES, _MOST_STATIC = 12, 6
@@ -86,11 +88,7 @@ def write_report(
         If the store cannot be read or has no finished cell, the folder cannot be made, or a
         library is missing.
     """
-    absent = [name for name in ("pandas", "plotly", "itables", "jinja2") if not find_spec(name)]
-    if absent:
-        raise InvalidInputError(
-            f"the report needs {listed(absent)}, not installed here: pip install 'qpmhe[studies]'."
-        )
+    check_libraries()
     if isinstance(source, (str, Path)):
         source = Store(source)
     frame, meta = source if isinstance(source, tuple) else (source.frame(), source.meta())
@@ -109,12 +107,30 @@ def write_report(
         for part in found:
             part.runs = choose_runs(source, part.cells, part.case, _TRAJECTORY_BYTES // len(found))
     drawn, profile = styles(summary["backend"]), figures.profiles(frame)
-    page = folder / "index.html"
-    page.write_text(_page(frame, meta, found, drawn, profile), encoding="utf-8")
-    summary.to_csv(folder / "summary.csv", index=False)
-    for name, figure in files(found, drawn, profile).items():
-        save(figure, folder / name)
+    page, unfinished = folder / "index.html", folder / "index.html.part"
+    try:
+        # A former report stays whole where the new one cannot be written.
+        unfinished.write_text(_page(frame, meta, found, drawn, profile), encoding="utf-8")
+        unfinished.replace(page)
+        summary.to_csv(folder / "summary.csv", index=False)
+        for name, figure in files(found, drawn, profile).items():
+            save(figure, folder / name)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise InvalidInputError(
+            f"cannot write the report into {folder}: {error.strerror or error}. The store is as it "
+            "was; make room, or name another folder, and write the report again."
+        ) from error
     return page
+
+
+def check_libraries() -> None:
+    """Raise an `InvalidInputError` where a library that the report needs is missing."""
+    absent = [name for name in _LIBRARIES if not find_spec(name)]
+    if absent:
+        raise InvalidInputError(
+            f"the report needs {listed(absent)}, not installed here: pip install 'qpmhe[studies]'."
+        )
 
 
 @dataclass
