@@ -51,7 +51,7 @@ def _output(x: Array, u: Array) -> Array:
 
 
 def _output_jacobian(x: Array) -> Array:
-    slope = np.ones((*x.shape[:-1], 1, 3))
+    slope = np.ones((*x.shape[:-1], 1, 3), x.dtype)
     slope[..., 0, 0] = _voltage_slope(x[..., 0])
     return slope
 

@@ -43,7 +43,7 @@ def _rate_jacobian(x: Array) -> Array:
     concentration, temperature = x[..., 0], x[..., 1]
     constant = _constant(temperature)
     warmer = constant * concentration * _ACTIVATION / (temperature * temperature)
-    slope = np.empty((*x.shape, 2))
+    slope = np.empty((*x.shape, 2), x.dtype)
     slope[..., 0, 0] = -_FLOW - constant
     slope[..., 0, 1] = -warmer
     slope[..., 1, 0] = _HEAT * constant

@@ -10,7 +10,7 @@ import importlib.util
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from modulefinder import ModuleFinder
@@ -29,7 +29,8 @@ from .example import Example
 from .scenario import Scenario
 
 __all__ = [
-    "ModelSource", "build", "code_place", "find", "fingerprint", "imported", "load", "module_file",
+    "ModelSource", "build", "check_parts", "code_place", "find", "fingerprint", "imported", "load",
+    "module_file",
 ]
 
 _FORM = re.compile(r"(?P<where>[^()]+)(?:\((?P<arguments>.*)\))?", re.DOTALL)
@@ -147,13 +148,18 @@ def load(source: ModelSource) -> Example:
             f"model {name!r} gave {type(parts).__name__}; expected (system, observer, cost, "
             "scenario), as qpmhe.models.Example."
         )
-    for part, (kind, what) in zip(parts, _PARTS, strict=True):
+    check_parts(name, parts)
+    return Example(*parts)
+
+
+def check_parts(name: str, parts: Sequence[Any], remedy: str = "") -> None:
+    """Raise `ModelError` unless these are system, observer, cost and scenario, or the first few."""
+    for part, (kind, what) in zip(parts, _PARTS, strict=False):
         if not isinstance(part, kind):
             raise ModelError(
                 f"model {name!r} gave a {type(part).__name__} for its {what}; expected "
-                f"qpmhe's {kind.__name__}."
+                f"qpmhe's {kind.__name__}.{remedy}"
             )
-    return Example(*parts)
 
 
 def code_place(error: BaseException, file: Path | None) -> str:

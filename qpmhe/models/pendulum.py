@@ -25,7 +25,7 @@ def _rate(x: Array) -> Array:
 
 
 def _rate_jacobian(x: Array) -> Array:
-    slope = np.zeros((*x.shape, 2))
+    slope = np.zeros((*x.shape, 2), x.dtype)
     slope[..., 0, 1] = 1.0
     slope[..., 1, 0] = -_STIFFNESS * np.cos(x[..., 0])
     slope[..., 1, 1] = -_DAMPING

@@ -49,7 +49,7 @@ def _rate_jacobian(x: Array, u: Array) -> Array:
     s1, s2, s3, c1, c2, c3 = _circular(x)
     lift = u[..., 0] / _MASS
     turn, other = s1 * q + c1 * r, c1 * q - s1 * r
-    slope = np.zeros((*x.shape, 12))
+    slope = np.zeros((*x.shape, 12), x.dtype)
     slope[..., [0, 1, 2], [3, 4, 5]] = 1.0
 
     slope[..., 3, 6] = lift * (c1 * s3 - s1 * s2 * c3)

@@ -24,7 +24,7 @@ def _rate(x: Array) -> Array:
 
 def _rate_jacobian(x: Array) -> Array:
     first, second = x[..., 0], x[..., 1]
-    slope = np.zeros((*x.shape, 2))
+    slope = np.zeros((*x.shape, 2), x.dtype)
     slope[..., 0, 1] = 1.0
     slope[..., 1, 0] = -2.0 * _MU * first * second - 1.0
     slope[..., 1, 1] = _MU * (1.0 - first * first)

@@ -30,7 +30,7 @@ def _rate(x: Array, u: Array) -> Array:
 
 def _rate_jacobian(x: Array, u: Array) -> Array:
     heading, speed = x[..., 2], u[..., 0]
-    slope = np.zeros((*x.shape, 3))
+    slope = np.zeros((*x.shape, 3), x.dtype)
     slope[..., 0, 2] = -speed * np.sin(heading)
     slope[..., 1, 2] = speed * np.cos(heading)
     return slope
@@ -51,7 +51,7 @@ def _output(x: Array) -> Array:
 def _output_jacobian(x: Array) -> Array:
     offsets = _offsets(x)
     squares = np.sum(offsets * offsets, axis=-1, keepdims=True)
-    slope = np.zeros((*x.shape[:-1], 4, 3))
+    slope = np.zeros((*x.shape[:-1], 4, 3), x.dtype)
     slope[..., :2, :2] = -offsets / np.sqrt(squares)
     slope[..., 2:, 0] = offsets[..., 1] / squares[..., 0]
     slope[..., 2:, 1] = -offsets[..., 0] / squares[..., 0]

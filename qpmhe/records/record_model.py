@@ -11,19 +11,16 @@ from typing import Any
 import numpy as np
 
 from .._checks import Array
-from ..costs import Cost
 from ..errors import ModelError, OptionError, QpmheError
 from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..model.functions import EvaluationError
 from ..model.system import System
 from ..models import Scenario
-from ..models.loading import build, code_place, find
-from ..observers import Observer
+from ..models.loading import build, check_parts, code_place, find
 
 __all__ = ["ModelFailures", "RecordModel", "load_record_model"]
 
-_PARTS = ((System, "system"), (Observer, "observer"), (Cost, "cost"))
 _SIZES = {"states": "n", "outputs": "p", "inputs": "m"}
 _EXPECTED = (
     "expected (system, observer, cost), optionally followed by a scenario or a dict of options; "
@@ -96,12 +93,7 @@ def _parts(name: str, made: Any) -> tuple[tuple[Any, ...], dict[str, Any]]:
     if not isinstance(made, (tuple, list)) or not 3 <= len(made) <= 5:
         shape = f" of {len(made)}" if isinstance(made, (tuple, list)) else ""
         raise ModelError(f"model {name!r} gave a {type(made).__name__}{shape}; {_EXPECTED}.")
-    for part, (kind, what) in zip(made, _PARTS, strict=False):
-        if not isinstance(part, kind):
-            raise ModelError(
-                f"model {name!r} gave a {type(part).__name__} for its {what}; expected "
-                f"qpmhe's {kind.__name__}. In all, {_EXPECTED}."
-            )
+    check_parts(name, made[:3], f" In all, {_EXPECTED}.")
     options = {}
     for extra in made[3:]:
         if isinstance(extra, Scenario):

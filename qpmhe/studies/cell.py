@@ -6,7 +6,7 @@ import faulthandler
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 from functools import lru_cache
 from time import perf_counter
 from typing import Any
@@ -62,10 +62,7 @@ class Cell:
     @property
     def configuration(self) -> tuple[object, ...]:
         """Everything but the seed."""
-        return (
-            self.model, self.backend, self.qps, self.solver_iterations, self.horizon, self.start,
-            self.steps,
-        )
+        return astuple(replace(self, seed=0))
 
 
 @dataclass(frozen=True)
@@ -239,9 +236,9 @@ def _reference(task: Task, record: Record, limit: float) -> Array | None:
     if key not in _REFERENCES:
         if len(_REFERENCES) >= 8:
             del _REFERENCES[next(iter(_REFERENCES))]
-        converged = Task(
-            Cell(cell.model, "auto", None, None, cell.horizon, cell.start, cell.seed, cell.steps),
-            source, frozenset(), task.timeout,
+        converged = replace(
+            task, cell=replace(cell, backend="auto", qps=None, solver_iterations=None),
+            isolated=False,
         )
         _REFERENCES[key] = None  # where it runs out of time, it does so once
         _REFERENCES[key] = _run(_estimator(load(source), converged), record, limit).costs

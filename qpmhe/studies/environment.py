@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
+from contextlib import suppress
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -22,13 +23,10 @@ _PACKAGES = ("numpy", "scipy", "qpsolvers", "cvxpy", "casadi", "jax", "joblib")
 @lru_cache(maxsize=1)
 def environment() -> dict[str, Any]:
     """What this process runs on."""
-    packages = dict.fromkeys(
-        [*_PACKAGES, *(entry.distribution for entry in backends() if entry.distribution)]
-    )
+    packages = {*_PACKAGES, *(entry.distribution for entry in backends() if entry.distribution)}
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
-        "versions": {"qpmhe": __version__}
-        | {name: _version(name) for name in sorted(packages) if _version(name)},
+        "versions": {"qpmhe": __version__, **_versions(sorted(packages))},
         "cpu": _processor(),
         "cores": cores or 1,
         "python": platform.python_version(),
@@ -38,12 +36,12 @@ def environment() -> dict[str, Any]:
     }
 
 
-@lru_cache(maxsize=128)
-def _version(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
+def _versions(names: list[str]) -> dict[str, str]:
+    found = {}
+    for name in names:
+        with suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
 
 
 def _processor() -> str:

@@ -229,13 +229,10 @@ def _write(found: Reproduction, record: Record, folder: Path) -> list[Path]:
         scenario.labels, f"time t ({scenario.time_unit})",
     )
     paths = save(axes[0].figure, folder / "reproduce")
-    columns = {"t": times}
-    for j in range(record.states.shape[1]):
-        columns[f"real_x{j + 1}"] = record.states[:, j]
+    columns = {"t": times, **_by_state("real", record.states)}
     columns["y"] = np.append(record.measurements[:, 0], np.nan)
     for row in found.rows:
-        for j in range(row.states.shape[1]):
-            columns[f"{row.label.replace(' ', '_').replace('=', 'is')}_x{j + 1}"] = row.states[:, j]
+        columns |= _by_state(row.label.replace(" ", "_").replace("=", "is"), row.states)
     tables: dict[str, list[list[Any]]] = {
         "reproduce": [[*columns], *np.column_stack(list(columns.values())).tolist()],
         "reproduce_summary": [
@@ -254,3 +251,7 @@ def _write(found: Reproduction, record: Record, folder: Path) -> list[Path]:
         with paths[-1].open("w", newline="") as file:
             csv.writer(file).writerows(lines)
     return paths
+
+
+def _by_state(name: str, states: Array) -> dict[str, Array]:
+    return {f"{name}_x{j}": values for j, values in enumerate(states.T, start=1)}

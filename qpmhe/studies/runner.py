@@ -6,14 +6,8 @@ import asyncio
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Future,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent import futures
+from concurrent.futures import BrokenExecutor, CancelledError, Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -241,7 +235,7 @@ def _results(workers: _Processes | _Cluster, tasks: Iterable[Task]) -> Iterator[
                 break
         for future in islice(sent, workers.jobs):  # tasks start in the order of their sending
             began.setdefault(future, monotonic())
-        ended, _ = wait(sent, timeout=1.0, return_when=FIRST_COMPLETED)
+        ended, _ = futures.wait(sent, timeout=1.0, return_when=futures.FIRST_COMPLETED)
         for future in ended:
             task, start = sent.pop(future), began.pop(future, None)
             answer = _answer(workers, task, future, start)
@@ -291,7 +285,7 @@ def _again(workers: _Processes | _Cluster, task: Task) -> Result:
         start = monotonic()
         future = workers.submit(replace(task, isolated=isolated))
         # A worker of a cluster may still hang in a cell that was given up.
-        if not wait([future], 2 * task.hard_limit + _GRACE).done:
+        if not futures.wait([future], 2 * task.hard_limit + _GRACE).done:
             future.cancel()
             return failure(task, _HUNG)
         answer = _answer(workers, task, future, start)
@@ -339,24 +333,17 @@ def _shown(
     if progress is False:
         yield lambda _failed: None
         return
+    from rich import progress as bars
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     console = Console(stderr=True) if progress is True else progress
     total, failures = missing + found, 0
     if found:
         console.print(f"{found} of {total} cells were there already")
-    with Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-        TextColumn("elapsed"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
-        console=console, speed_estimate_period=600.0,
+    with bars.Progress(
+        bars.TextColumn("{task.description}"), bars.BarColumn(), bars.MofNCompleteColumn(),
+        bars.TextColumn("elapsed"), bars.TimeElapsedColumn(), bars.TextColumn("left"),
+        bars.TimeRemainingColumn(), console=console, speed_estimate_period=600.0,
     ) as bar:
         task = bar.add_task("cells", total=total, completed=found)
 

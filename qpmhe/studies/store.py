@@ -148,21 +148,14 @@ class Store:
         version of the tables.
         """
         with _reading(self.path) as connection:
-            studies = [
-                {**json.loads(settings), "started": started}
-                for settings, started in connection.execute(
-                    "SELECT settings, started FROM studies ORDER BY id"
-                )
-            ]
-            environments = [
-                json.loads(settings)
-                for (settings,) in connection.execute(
-                    "SELECT settings FROM environments ORDER BY id"
-                )
-            ]
-        last = {name: one for name, one in (studies or [{}])[-1].items() if name != "started"}
+            begun = connection.execute("SELECT settings, started FROM studies ORDER BY id")
+            studies = [(json.loads(settings), started) for settings, started in begun]
+            places = connection.execute("SELECT settings FROM environments ORDER BY id")
+            environments = [json.loads(settings) for (settings,) in places]
         return {
-            "study": last, "studies": studies, "environments": environments, "schema": SCHEMA,
+            "study": studies[-1][0] if studies else {},
+            "studies": [{**settings, "started": started} for settings, started in studies],
+            "environments": environments, "schema": SCHEMA,
         }
 
     def trajectory(self, key: str) -> dict[str, Any] | None:

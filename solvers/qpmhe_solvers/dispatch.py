@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,87 +12,11 @@ from .layout import Layout, Structure, Style
 from .native import Answer, NativeSolver
 from .options import SolverOptions
 from .qp import QP
+from .translations import TRANSLATIONS
 
-__all__ = ["TRANSLATIONS", "DispatchSolver", "Translation", "qpsolvers_arguments"]
+__all__ = ["TRANSLATIONS", "DispatchSolver", "qpsolvers_arguments"]
 
 Point = NDArray[np.float64] | None
-
-
-@dataclass(frozen=True)
-class Translation:
-    """How our vocabulary reads in one solver's own."""
-
-    method: str
-    package: str
-    matrices: Literal["csc", "dense"]
-    bounds: Literal["box", "rows"]
-    cap: str | None
-    absolute: tuple[str, ...]
-    relative: tuple[str, ...] = ()
-    time_limit: str | None = None
-    start: bool = False
-    needs_row: bool = False
-    keep_empty: bool = False
-    reports_infeasibility: bool = False
-    default_cap: int | None = None
-    beyond_cap: int = 0
-    others: tuple[tuple[str, float], ...] = ()
-    objective: float = 1.0
-
-
-# Caps, tolerances and traps as measured (qpsolvers 4.13). cvxopt is harmed by its start; the
-# IPMs and quadprog ignore it; clarabel and scs hand a QP without rows to a least-squares
-# routine that calls it unbounded; ecos and cvxopt choke on infinite bounds, and ecos on a
-# relative tolerance of 0. highs without rows claims to be optimal far from the optimum, and adds
-# 1e-7 to the Hessian's diagonal, which is much where weights spread over decades; with 1e-12 it
-# can cycle for ever, so it gets 1e-9 and a cap. proxqp takes
-# a direction d with |H d| <= 1e-4 |d| for an unbounded one, as osqp and piqp do; qpsolvers lets
-# nobody change that of proxqp.
-TRANSLATIONS: Mapping[str, Translation] = {
-    "clarabel": Translation(
-        "interior point", "clarabel", "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"),
-        ("tol_gap_rel",), "time_limit", needs_row=True, reports_infeasibility=True,
-    ),
-    "cvxopt": Translation(
-        "interior point", "cvxopt", "csc", "rows", "maxiters", ("abstol", "feastol"), ("reltol",),
-    ),
-    "daqp": Translation(
-        "dual active set", "daqp", "dense", "box", "iter_limit", ("primal_tol", "dual_tol"),
-        time_limit="time_limit", start=True, beyond_cap=1,
-    ),
-    "ecos": Translation(
-        "interior point", "ecos", "dense", "rows", "max_iters", ("abstol", "feastol", "reltol"),
-        needs_row=True,
-    ),
-    "highs": Translation(
-        "active set", "highspy", "csc", "box", "qp_iteration_limit",
-        ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), time_limit="time_limit",
-        needs_row=True, default_cap=10000, others=(("qp_regularization_value", 1e-9),),
-    ),
-    "osqp": Translation(
-        "ADMM", "osqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit",
-        start=True, reports_infeasibility=True, others=(("eps_dual_inf", 1e-12),),
-    ),
-    "piqp": Translation(
-        "interior point", "piqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),
-        keep_empty=True, reports_infeasibility=True, others=(("eps_dual_inf", 1e-12),),
-    ),
-    "proxqp": Translation(
-        "augmented Lagrangian", "proxsuite", "dense", "box", "max_iter", ("eps_abs",),
-        ("eps_rel",), default_cap=200, reports_infeasibility=True, objective=2.0**10,
-    ),
-    "qpalm": Translation(
-        "augmented Lagrangian", "qpalm", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),
-        "time_limit", reports_infeasibility=True,
-    ),
-    "quadprog": Translation(
-        "dual active set", "quadprog", "dense", "rows", None, (),
-    ),
-    "scs": Translation(
-        "ADMM", "scs", "csc", "rows", "max_iters", ("eps_abs",), ("eps_rel",), "time_limit_secs",
-        start=True, needs_row=True,
-    ),
-}
 
 
 class DispatchSolver(NativeSolver):
@@ -113,7 +36,7 @@ class DispatchSolver(NativeSolver):
             how.matrices, bounds=how.bounds, sides=1, needs_row=how.needs_row,
             objective=how.objective,
         )
-        self._keywords = _keywords(how, options)
+        self._keywords = how.keywords(options)
         self._solve_problem: Callable[..., Any] = self._package.solve_problem
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -173,16 +96,6 @@ def _multipliers(layout: Layout, answer: Any) -> Point:
             return None
         parts.append(numbers[:size])
     return layout.duals(*parts)
-
-
-def _keywords(how: Translation, options: SolverOptions) -> dict[str, Any]:
-    words: dict[str, Any] = dict(how.others)
-    words.update(dict.fromkeys(how.absolute, options.absolute_tolerance))
-    words.update(dict.fromkeys(how.relative, options.relative_tolerance))
-    cap = how.default_cap if options.max_iterations is None else options.max_iterations
-    if cap is not None and how.cap is not None:
-        words[how.cap] = int(cap) + how.beyond_cap
-    return words
 
 
 def _report(extras: Mapping[str, Any]) -> tuple[int | None, str]:

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import weakref
+from concurrent.futures import Future
 from contextlib import suppress
 from typing import IO, Any, cast
 
@@ -135,12 +136,11 @@ class _Child:
         self._out = cast("IO[bytes]", process.stdin)
         self._back = cast("IO[bytes]", process.stdout)
         self.end = weakref.finalize(self, _end, process, self._owner)
-        self._fault, self._late = "", False
+        self._late = False
         # Answered by a thread: while a process starts, steps go on without it.
-        self._answered = threading.Event()
+        self._started: Future[str] = Future()
         threading.Thread(
-            target=_begin, args=(weakref.ref(self), self._out, self._back, (sent, options, size)),
-            daemon=True,
+            target=_begin, args=(process, (sent, options, size), self._started), daemon=True
         ).start()
 
     @property
@@ -151,23 +151,19 @@ class _Child:
     @property
     def ready(self) -> bool:
         """Whether the solver is made."""
-        return self._answered.is_set() and not self._fault
+        return self._started.done() and not self._started.result()
 
     @property
     def ended(self) -> bool:
         """Whether it could not make the solver."""
-        return self._answered.is_set() and bool(self._fault)
-
-    def answered(self, fault: str | None) -> None:
-        """Take in what the process said of its start; None if it died."""
-        self._fault = self._death() if fault is None else fault
-        self._answered.set()
+        return self._started.done() and bool(self._started.result())
 
     def wait(self, seconds: float) -> str:
         """Wait until the solver is made; what hinders it, if anything does."""
-        if not self._answered.wait(seconds):
+        try:
+            return self._started.result(seconds)
+        except TimeoutError:
             return f"the process of the backend was not ready after {seconds:g} s"
-        return self._fault
 
     def send(self, message: object) -> None:
         """Send a message."""
@@ -197,34 +193,32 @@ class _Child:
         self._process.kill()
 
     def _death(self) -> str:
-        """How it ended."""
-        try:
-            code = self._process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            return "its process does not answer"
         if self._late:
             return "out of time: its process was ended at the time limit"
-        if code >= 0:
-            return f"its process ended with exit code {code}"
-        try:
-            return f"its process died: {signal.Signals(-code).name}"
-        except ValueError:
-            return f"its process died of signal {-code}"
+        return _death(self._process)
 
 
-def _begin(
-    child: weakref.ref[_Child], out: IO[bytes], back: IO[bytes], message: object
-) -> None:
-    """Have the solver made, and pass the answer on; the process may end meanwhile."""
-    fault: str | None
+def _death(process: subprocess.Popen[bytes]) -> str:
+    """How a process ended."""
     try:
-        _write(out, message)
-        fault = str(pickle.load(back))
+        code = process.wait(5.0)
+    except subprocess.TimeoutExpired:
+        return "its process does not answer"
+    if code >= 0:
+        return f"its process ended with exit code {code}"
+    try:
+        return f"its process died: {signal.Signals(-code).name}"
+    except ValueError:
+        return f"its process died of signal {-code}"
+
+
+def _begin(process: subprocess.Popen[bytes], message: object, started: Future[str]) -> None:
+    """Have the solver made, and pass the answer on; the process may end meanwhile."""
+    try:
+        _write(cast("IO[bytes]", process.stdin), message)
+        started.set_result(str(pickle.load(cast("IO[bytes]", process.stdout))))
     except (OSError, EOFError, ValueError, pickle.UnpicklingError):
-        fault = None
-    one = child()
-    if one is not None:
-        one.answered(fault)
+        started.set_result(_death(process))
 
 
 def _end(process: subprocess.Popen[bytes], owner: int) -> None:

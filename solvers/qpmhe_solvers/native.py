@@ -18,6 +18,7 @@ from .options import SolverOptions
 from .qp import QP, Array
 from .solution import RawSolution
 from .solver import Solver
+from .translations import TRANSLATIONS
 
 __all__ = ["NATIVE", "Answer", "NativeSolver"]
 
@@ -54,8 +55,9 @@ class _Workspace:
 class NativeSolver(Solver):
     """A solver with workspaces, one for each structure and size of QPs; few are kept."""
 
-    #: The module of the solver, and how it wants its QPs.
+    #: The module of the solver, its name in the table of translations, and how it wants its QPs.
     package: ClassVar[str]
+    translation: ClassVar[str]
     style: Style
     _warns = False
 
@@ -84,6 +86,17 @@ class NativeSolver(Solver):
     def prepare(self, size: int) -> None:
         """Import what the first solve imports; see `Solver.prepare`."""
         self._rehearse()
+
+    @property
+    def _words(self) -> dict[str, Any]:
+        return TRANSLATIONS[self.translation].keywords(self.options)
+
+    def _translated(self, settings: Any) -> Any:
+        """Write the options into the solver's settings."""
+        for name, value in self._words.items():
+            if name != "eps_dual_inf" or hasattr(settings, name):  # PIQP 0.6.1 has no such limit
+                setattr(settings, name, value)
+        return settings
 
     @abstractmethod
     def _set_up(self, layout: Layout) -> Any:
@@ -173,20 +186,17 @@ class ClarabelSolver(NativeSolver):
     It knows no start: it begins anew each time.
     """
 
-    package = "clarabel"
+    package, translation = "clarabel", "clarabel"
     style = Style(
         "csc", triangle="upper", bounds="rows", equalities="among", sides=1, infinite=False
     )
 
     def _set_up(self, layout: Layout) -> Any:
-        options, settings = self.options, self._package.DefaultSettings()
+        settings = self._package.DefaultSettings()
         settings.verbose = False
         settings.presolve_enable = False  # its data could not be updated
         settings.max_threads = 1
-        settings.tol_gap_abs = settings.tol_feas = options.absolute_tolerance
-        settings.tol_gap_rel = options.relative_tolerance
-        if options.max_iterations is not None:
-            settings.max_iter = int(options.max_iterations)
+        self._translated(settings)
         equal = int(layout.structure.equal.sum())
         cones = [
             kind(count)
@@ -242,18 +252,12 @@ class DaqpSolver(NativeSolver):
     active; where it stops at a cap or time limit, there is no iterate.
     """
 
-    package = "daqp"
+    package, translation = "daqp", "daqp"
     style = Style("dense", equalities="among")
 
     def _set_up(self, layout: Layout) -> Any:
-        options, handle = self.options, self._package.Model()
-        settings = {
-            "primal_tol": options.absolute_tolerance, "dual_tol": options.absolute_tolerance
-        }
-        if options.max_iterations is not None:
-            # Its loop ends before the iteration of that number.
-            settings["iter_limit"] = int(options.max_iterations) + 1
-        handle.settings = handle.settings | settings
+        handle = self._package.Model()
+        handle.settings = handle.settings | self._words
         flag, _ = handle.setup(
             layout.hessian, layout.gradient, layout.matrix, layout.all_upper, layout.all_lower,
             self._sense(layout, None, None),
@@ -325,27 +329,15 @@ _RHO = 0.1
 class OsqpSolver(NativeSolver):
     """Solve by OSQP."""
 
-    package = "osqp"
+    package, translation = "osqp", "osqp"
     style = Style("csc", triangle="upper", bounds="rows", equalities="among")
 
-    def __init__(self, options: SolverOptions) -> None:
-        super().__init__(options)
-        cap = options.max_iterations
-        self._settings: dict[str, Any] = {
-            "eps_abs": options.absolute_tolerance, "eps_rel": options.relative_tolerance,
-            "verbose": False, "rho": _RHO,
-            "eps_dual_inf": 1e-12,  # H is positive definite: there is always a minimiser
-        }
-        if cap is not None:
-            self._settings["max_iter"] = int(cap)
-            if cap < _CHECKED:
-                self._settings["check_termination"] = 1
-
     def _set_up(self, layout: Layout) -> Any:
-        handle = self._package.OSQP()
+        handle, cap = self._package.OSQP(), self.options.max_iterations
+        often = {} if cap is None or cap >= _CHECKED else {"check_termination": 1}
         handle.setup(
             layout.hessian, layout.gradient, layout.matrix, layout.lower, layout.upper,
-            **self._settings,
+            verbose=False, rho=_RHO, **often, **self._words,
         )
         return handle
 
@@ -382,7 +374,7 @@ class PiqpSolver(NativeSolver):
     PIQP knows no start: it begins anew each time.
     """
 
-    package = "piqp"
+    package, translation = "piqp", "piqp"
     style = Style("csc", triangle="upper", infinite=False)
 
     def _made(self) -> Any:
@@ -392,13 +384,9 @@ class PiqpSolver(NativeSolver):
 
     def _set_up(self, layout: Layout) -> Any:
         handle, options = self._made(), self.options
-        settings = handle.settings
-        settings.eps_abs = settings.eps_duality_gap_abs = options.absolute_tolerance
-        settings.eps_rel = settings.eps_duality_gap_rel = options.relative_tolerance
-        if hasattr(settings, "eps_dual_inf"):  # PIQP 0.6.1 has no such limit
-            settings.eps_dual_inf = 1e-12  # H is positive definite: there is always a minimiser
-        if options.max_iterations is not None:
-            settings.max_iter = int(options.max_iterations)
+        settings = self._translated(handle.settings)
+        settings.eps_duality_gap_abs = options.absolute_tolerance
+        settings.eps_duality_gap_rel = options.relative_tolerance
         handle.setup(layout.hessian, layout.gradient, *self._others(layout))
         return handle
 
@@ -433,10 +421,6 @@ class PiqpDenseSolver(PiqpSolver):
         return self._package.DenseSolver()
 
 
-# Outer iterations where no cap is asked for: of its own accord it takes 10000, for minutes.
-_CAP = 200
-
-
 class ProxqpSolver(NativeSolver):
     """Solve by ProxQP's dense solver.
 
@@ -444,7 +428,7 @@ class ProxqpSolver(NativeSolver):
     of the last solve took as many iterations or more, and longer.
     """
 
-    package = "proxsuite"
+    package, translation = "proxsuite", "proxqp"
     style = Style("dense")
 
     def _made(self, layout: Layout) -> Any:
@@ -454,12 +438,11 @@ class ProxqpSolver(NativeSolver):
 
     def _set_up(self, layout: Layout) -> Any:
         handle, options = self._made(layout), self.options
-        settings = handle.settings
-        settings.eps_abs = settings.eps_duality_gap_abs = options.absolute_tolerance
-        settings.eps_rel = settings.eps_duality_gap_rel = options.relative_tolerance
+        settings = self._translated(handle.settings)
+        settings.eps_duality_gap_abs = options.absolute_tolerance
+        settings.eps_duality_gap_rel = options.relative_tolerance
         settings.check_duality_gap = True
         settings.eps_dual_inf = 0.0  # H is positive definite: there is always a minimiser
-        settings.max_iter = _CAP if options.max_iterations is None else int(options.max_iterations)
         handle.init(**self._parts(layout))
         return handle
 
@@ -503,12 +486,12 @@ class ProxqpSparseSolver(ProxqpSolver):
 
 
 def _native(
-    kind: type[NativeSolver], name: str, method: str, *, iterate_at_cap: bool = True,
-    starts: bool = False, time_limit: bool = False,
+    kind: type[NativeSolver], name: str, *, iterate_at_cap: bool = True, starts: bool = False,
 ) -> Backend:
+    how = TRANSLATIONS[kind.translation]
     return Backend(
-        name, kind, method, kind.package, kind.package, kind.style.matrices, iteration_cap=True,
-        iterate_at_cap=iterate_at_cap, warm_start=starts, time_limit=time_limit,
+        name, kind, how.method, how.package, how.package, kind.style.matrices, iteration_cap=True,
+        iterate_at_cap=iterate_at_cap, warm_start=starts, time_limit=how.time_limit is not None,
         keeps_duals=starts, reports_infeasibility=True, keeps_workspace=True,
     )
 
@@ -517,15 +500,12 @@ def _native(
 NATIVE: Mapping[str, Backend] = {
     backend.name: backend
     for backend in (
-        _native(ClarabelSolver, "clarabel", "interior point", time_limit=True),
-        _native(
-            DaqpSolver, "daqp", "dual active set", iterate_at_cap=False, starts=True,
-            time_limit=True,
-        ),
-        _native(OsqpSolver, "osqp", "ADMM", starts=True, time_limit=True),
-        _native(PiqpSolver, "piqp", "interior point"),
-        _native(PiqpDenseSolver, "piqp_dense", "interior point"),
-        _native(ProxqpSolver, "proxqp", "augmented Lagrangian"),
-        _native(ProxqpSparseSolver, "proxqp_sparse", "augmented Lagrangian"),
+        _native(ClarabelSolver, "clarabel"),
+        _native(DaqpSolver, "daqp", iterate_at_cap=False, starts=True),
+        _native(OsqpSolver, "osqp", starts=True),
+        _native(PiqpSolver, "piqp"),
+        _native(PiqpDenseSolver, "piqp_dense"),
+        _native(ProxqpSolver, "proxqp"),
+        _native(ProxqpSparseSolver, "proxqp_sparse"),
     )
 }

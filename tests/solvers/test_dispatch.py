@@ -8,7 +8,8 @@ import pytest
 import scipy.sparse
 
 from qpmhe_solvers import SolverOptions, backends, create
-from qpmhe_solvers.dispatch import TRANSLATIONS, DispatchSolver
+from qpmhe_solvers.dispatch import DispatchSolver
+from qpmhe_solvers.translations import TRANSLATIONS
 
 from .problems import ARRAYS, CASES, make
 from .test_matrices import LETTERS, parts

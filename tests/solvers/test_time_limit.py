@@ -13,8 +13,9 @@ from qpmhe_solvers import (
     backend,
     create,
 )
-from qpmhe_solvers.dispatch import TRANSLATIONS, DispatchSolver
+from qpmhe_solvers.dispatch import DispatchSolver
 from qpmhe_solvers.sample_qps import sample
+from qpmhe_solvers.translations import TRANSLATIONS
 
 from .problems import EVERY
 

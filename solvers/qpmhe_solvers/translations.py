@@ -1,0 +1,98 @@
+"""What each solver calls our caps and tolerances, and how it wants its matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from .options import SolverOptions
+
+__all__ = ["TRANSLATIONS", "Translation"]
+
+
+@dataclass(frozen=True)
+class Translation:
+    """How our vocabulary reads in one solver's own."""
+
+    method: str
+    package: str
+    matrices: Literal["csc", "dense"]
+    bounds: Literal["box", "rows"]
+    cap: str | None
+    absolute: tuple[str, ...]
+    relative: tuple[str, ...] = ()
+    time_limit: str | None = None
+    start: bool = False
+    needs_row: bool = False
+    keep_empty: bool = False
+    reports_infeasibility: bool = False
+    default_cap: int | None = None
+    beyond_cap: int = 0
+    others: tuple[tuple[str, float], ...] = ()
+    objective: float = 1.0
+
+    def keywords(self, options: SolverOptions) -> dict[str, Any]:
+        """The options in the solver's own words, but for the time limit."""
+        words: dict[str, Any] = dict(self.others)
+        words.update(dict.fromkeys(self.absolute, options.absolute_tolerance))
+        words.update(dict.fromkeys(self.relative, options.relative_tolerance))
+        cap = self.default_cap if options.max_iterations is None else options.max_iterations
+        if cap is not None and self.cap is not None:
+            words[self.cap] = int(cap) + self.beyond_cap
+        return words
+
+
+# Caps, tolerances and traps as measured (qpsolvers 4.13). cvxopt is harmed by its start; the
+# IPMs and quadprog ignore it; clarabel and scs hand a QP without rows to a least-squares
+# routine that calls it unbounded; ecos and cvxopt choke on infinite bounds, and ecos on a
+# relative tolerance of 0. highs without rows claims to be optimal far from the optimum, and adds
+# 1e-7 to the Hessian's diagonal, which is much where weights spread over decades; with 1e-12 it
+# can cycle for ever, so it gets 1e-9 and a cap. osqp, piqp and proxqp take a direction d with
+# |H d| <= 1e-4 |d| for an unbounded one, though H is positive definite; qpsolvers lets nobody
+# change that of proxqp, which without a cap goes on for minutes.
+TRANSLATIONS: Mapping[str, Translation] = {
+    "clarabel": Translation(
+        "interior point", "clarabel", "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"),
+        ("tol_gap_rel",), "time_limit", needs_row=True, reports_infeasibility=True,
+    ),
+    "cvxopt": Translation(
+        "interior point", "cvxopt", "csc", "rows", "maxiters", ("abstol", "feastol"), ("reltol",),
+    ),
+    "daqp": Translation(
+        "dual active set", "daqp", "dense", "box", "iter_limit", ("primal_tol", "dual_tol"),
+        time_limit="time_limit", start=True, beyond_cap=1,
+    ),
+    "ecos": Translation(
+        "interior point", "ecos", "dense", "rows", "max_iters", ("abstol", "feastol", "reltol"),
+        needs_row=True,
+    ),
+    "highs": Translation(
+        "active set", "highspy", "csc", "box", "qp_iteration_limit",
+        ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), time_limit="time_limit",
+        needs_row=True, default_cap=10000, others=(("qp_regularization_value", 1e-9),),
+    ),
+    "osqp": Translation(
+        "ADMM", "osqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit",
+        start=True, reports_infeasibility=True, others=(("eps_dual_inf", 1e-12),),
+    ),
+    "piqp": Translation(
+        "interior point", "piqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),
+        keep_empty=True, reports_infeasibility=True, others=(("eps_dual_inf", 1e-12),),
+    ),
+    "proxqp": Translation(
+        "augmented Lagrangian", "proxsuite", "dense", "box", "max_iter", ("eps_abs",),
+        ("eps_rel",), default_cap=200, reports_infeasibility=True, objective=2.0**10,
+    ),
+    "qpalm": Translation(
+        "augmented Lagrangian", "qpalm", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),
+        "time_limit", reports_infeasibility=True,
+    ),
+    "quadprog": Translation(
+        "dual active set", "quadprog", "dense", "rows", None, (),
+    ),
+    "scs": Translation(
+        "ADMM", "scs", "csc", "rows", "max_iters", ("eps_abs",), ("eps_rel",), "time_limit_secs",
+        start=True, needs_row=True,
+    ),
+}
