@@ -36,6 +36,7 @@ examples: $(VENV)/.test
 	$(BIN)/python examples/quickstart.py
 	$(BIN)/python examples/paper_figure.py --out results
 	$(BIN)/python examples/outliers.py --seeds 4 --out results
+	$(BIN)/python examples/textbook_reactors.py --seeds 2 --out results
 	$(BIN)/python examples/benchmarks/compare_peers.py --quick --problem reactor --out results
 	$(BIN)/python examples/benchmarks/constrained.py --steps 60 --out results
 	$(BIN)/python examples/benchmarks/batch.py --members 200 --steps 40 --out results

@@ -1,24 +1,24 @@
 """Two textbook reactors on which an extended Kalman filter settles at negative pressures.
 
 Gases react in a closed vessel, the total pressure is measured, and the first guess is wrong. Many
-compositions have the same pressure; of these the filter (EKF) finds one that does not exist. It is
-the standard argument for moving horizon estimation (MHE) with constraints x >= 0.
+compositions have the same pressure; of these the filter (EKF) finds one that does not exist.
 
 - 2A -> B: Haseltine and Rawlings, Critical evaluation of extended Kalman filtering and
-  moving-horizon estimation, Ind. Eng. Chem. Res. 44 (2005), example 1. States are partial pressures.
+  moving-horizon estimation, Ind. Eng. Chem. Res. 44 (2005), example 1; partial pressures.
 - A <-> B + C, 2B <-> C: Rawlings, Mayne and Diehl, Model Predictive Control, 2nd edition, 2017,
-  example 4.27. States are concentrations.
+  example 4.27; concentrations.
 
-Known remedies are tried beside ours: states clipped at zero after each step of the filter, and a
-chi-square gate on its innovations. `MovingHorizonEstimator` projects its observer onto X = {x >= 0}
-in the filter's own metric; ``project_observer=False`` is the paper's plain observer. Ipopt fits each
-record as a whole at each time, from the first guess on: the reference.
+Known remedies are to clip the filter's states at zero, and a chi-square gate on its innovations.
+Moving horizon estimation (MHE) with X = {x >= 0} projects its observer onto X, in the filter's own
+metric. The reference is Ipopt, which at each time fits all measurements so far.
 """
 
 import argparse
-import dataclasses
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,17 +28,19 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
+from rich.table import Column, Table
 
 import qpmhe
 from qpmhe.plots import save, trajectories
 from qpmhe.plots.style import LIGHT
 
 Array = NDArray[np.float64]
+Way = Callable[..., tuple[Array, float]]  # of a reactor and its pressures
+Drawn = tuple[Array, dict[str, Array]]  # true states of a record, and estimates of them
 
 GATE = 10.83  # squared innovation of one output that 99.9 % of the samples stay below
-GAINS = (0.001, 0.003, 0.01)
-EKF = "EKF"
+QUIET: dict[str, Any] = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+SHOWN = ("MHE, 2 QPs", "EKF, clipped", "EKF, gated", "EKF")
 
 
 class Reactor(NamedTuple):
@@ -53,13 +55,10 @@ class Reactor(NamedTuple):
     steps: int
     start: tuple[float, ...]
     guess: tuple[float, ...]
-    prior: float  # standard deviations
-    disturbance: float
-    noise: float
-    horizon: int = 10
+    deviations: tuple[float, float, float]  # of prior, disturbance and noise
 
 
-def dimer(a: Any, b: Any) -> tuple[Any, ...]:
+def dimer(a: Any, _: Any) -> tuple[Any, ...]:
     reaction = 0.16 * a * a
     return -2 * reaction, reaction
 
@@ -70,75 +69,70 @@ def batch(a: Any, b: Any, c: Any) -> tuple[Any, ...]:
 
 
 REACTORS = (
-    Reactor("2A → B", dimer, ("A", "B"), "atm", 1.0, 0.1, 100, (3.0, 1.0), (0.1, 4.5), 6.0, 0.001, 0.1),
+    Reactor("2A → B", dimer, ("A", "B"), "atm", 1.0, 0.1, 100, (3, 1), (0.1, 4.5), (6, 1e-3, 0.1)),
     Reactor(
-        "A ⇌ B + C, 2B ⇌ C", batch, ("A", "B", "C"), "mol/L", 32.84, 0.25, 80, (0.5, 0.05, 0.0),
-        (1.0, 0.0, 4.0), 0.5, 0.001, 0.25,
+        "A ⇌ B + C, 2B ⇌ C", batch, ("A", "B", "C"), "mol/L", 32.84, 0.25, 80, (0.5, 0.05, 0),
+        (1, 0, 4), (0.5, 1e-3, 0.25),
     ),
 )
 
 
-def model(reactor: Reactor, bounded: bool = True) -> qpmhe.System:
-    """One Runge-Kutta step of the reactor, with X or without."""
+def model(reactor: Reactor) -> qpmhe.System:
+    """One Runge-Kutta step of the reactor, and X."""
     n = len(reactor.start)
     return qpmhe.System.from_ode(
         lambda x: np.stack(reactor.rates(*np.moveaxis(x, -1, 0)), axis=-1),
         lambda x: reactor.output * x.sum(axis=-1), dt=reactor.dt, n=n, p=1,
-        states=qpmhe.Box(np.zeros(n), np.full(n, np.inf)) if bounded else None,
+        states=qpmhe.Box(np.zeros(n), np.full(n, np.inf)),
     )
 
 
 def simulate(reactor: Reactor, seed: int) -> tuple[Array, Array]:
     """True states, whose disturbances do not make them negative, and measured pressures."""
-    rng, f = np.random.default_rng(seed), model(reactor).f
-    states, pressures = [np.array(reactor.start)], []
+    rng, f, (_, *deviations) = np.random.default_rng(seed), model(reactor).f, reactor.deviations
+    states, pressures = [np.array(reactor.start, float)], []
     for _ in range(reactor.steps):
-        x = states[-1]
-        pressures.append([reactor.output * x.sum() + reactor.noise * rng.standard_normal()])
-        w = reactor.disturbance * rng.standard_normal(x.size)
-        states.append(np.maximum(f(x, np.zeros(0)) + w, 0.0))
+        v, w = rng.standard_normal(), rng.standard_normal(len(reactor.start))
+        pressures.append([reactor.output * states[-1].sum() + deviations[1] * v])
+        states.append(np.maximum(f(states[-1], np.zeros(0)) + deviations[0] * w, 0.0))
     return np.array(states), np.array(pressures)
 
 
 class Clipped(qpmhe.ExtendedKalman):
-    """The filter whose states are set to zero where they are negative; its covariance stays."""
+    """The filter whose states are set to zero where they are negative."""
 
     def correct(self, z: Array, v: Array, sample: Any) -> tuple[Array, Array]:
+        """Correct such that z(t+1) >= 0; the covariance is the filter's."""
         correction, covariance = super().correct(z, v, sample)
         ahead = sample.system.f(z, sample.u)
         return np.maximum(ahead + correction, 0.0) - ahead, covariance
 
 
 class Gated(qpmhe.ExtendedKalman):
-    """The filter that ignores measurements which it holds for impossible."""
+    """The filter that ignores a measurement too far from what it expects."""
 
     def correct(self, z: Array, v: Array, sample: Any) -> tuple[Array, Array]:
+        """Correct unless the gate is shut."""
         c = sample.h_jacobian
         if v @ np.linalg.solve(c @ sample.covariance @ c.T + self._noise, v) > GATE:
-            sample = dataclasses.replace(sample, observed=np.zeros(v.size, bool))
+            sample = replace(sample, observed=np.zeros(v.size, bool))
         return super().correct(z, v, sample)
 
 
 def estimate(
     reactor: Reactor, pressures: Array, kind: Any = qpmhe.ExtendedKalman, max_qps: int | None = 0,
-    bounded: bool = True, **options: Any,
+    **options: Any,
 ) -> tuple[Array, float]:
     """States of a run, and the share of its steps in which inequalities were dropped."""
     n = len(reactor.start)
-    covariances = {
-        "prior": reactor.prior**2 * np.eye(n), "disturbance": reactor.disturbance**2 * np.eye(n),
-        "noise": [[reactor.noise**2]],
-    }
-    if isinstance(kind, float):
-        observer, prior = qpmhe.Luenberger(np.full(n, kind)), np.linalg.inv(covariances["prior"])
-    else:
-        observer, prior = kind(**covariances), qpmhe.ObserverPrior()
-    cost = qpmhe.QuadraticCost(
-        prior=prior, disturbance=np.linalg.inv(covariances["disturbance"]),
-        noise=np.linalg.inv(covariances["noise"]),
-    )
+    p, q, r = np.square(reactor.deviations)
+    prior, observer = np.eye(n) / p, None
+    if not isinstance(kind, float):
+        observer = kind(prior=p * np.eye(n), disturbance=q * np.eye(n), noise=[[r]])
+        prior = qpmhe.ObserverPrior()
+    cost = qpmhe.QuadraticCost(prior=prior, disturbance=np.eye(n) / q, noise=1.0 / r)
     mhe = qpmhe.MovingHorizonEstimator(
-        model(reactor, bounded), observer, cost, horizon=reactor.horizon,
+        model(reactor), observer or qpmhe.Luenberger(np.full(n, kind)), cost, horizon=10,
         initial_state=reactor.guess, max_qps=max_qps, **options,
     )
     with np.errstate(all="ignore"):  # a runaway observer overflows
@@ -146,28 +140,26 @@ def estimate(
     return run.states, run.share(qpmhe.Status.ROWS_DROPPED)
 
 
-def ipopt(reactor: Reactor) -> Callable[[Reactor, Array], tuple[Array, float]]:
+def ipopt(reactor: Reactor) -> Way:
     """Estimation from all measurements so far, converged; each start is the last solution."""
     import casadi as ca
 
-    n, dt = len(reactor.start), reactor.dt
+    n, k = len(reactor.start), [0]
     x = ca.SX.sym("x", n)
-    k = [ca.vertcat(*reactor.rates(*ca.vertsplit(x)))]
-    for part in (0.5, 0.5, 1.0):
-        k.append(ca.vertcat(*reactor.rates(*ca.vertsplit(x + part * dt * k[-1]))))
-    step = ca.Function("f", [x], [x + dt / 6 * (k[0] + 2 * k[1] + 2 * k[2] + k[3])])
+    for part in (0.0, 0.5, 0.5, 1.0):
+        k.append(ca.vertcat(*reactor.rates(*ca.vertsplit(x + part * reactor.dt * k[-1]))))
+    step = ca.Function("f", [x], [x + reactor.dt / 6 * (k[1] + 2 * k[2] + 2 * k[3] + k[4])])
     states, measured = ca.SX.sym("x", n, reactor.steps + 1), ca.SX.sym("y", reactor.steps)
-    j = ca.sumsqr(states[:, 0] - ca.DM(reactor.guess)) / reactor.prior**2
-    solvers = []
+    p, q, r = np.square(reactor.deviations)
+    j, solvers = ca.sumsqr(states[:, 0] - ca.DM(reactor.guess)) / p, []
     for t in range(reactor.steps):
-        j += ca.sumsqr(states[:, t + 1] - step(states[:, t])) / reactor.disturbance**2
-        j += (measured[t] - reactor.output * ca.sum1(states[:, t])) ** 2 / reactor.noise**2
+        j += ca.sumsqr(states[:, t + 1] - step(states[:, t])) / q
+        j += (measured[t] - reactor.output * ca.sum1(states[:, t])) ** 2 / r
         program = {"x": ca.vec(states[:, : t + 2]), "p": measured[: t + 1], "f": j}
-        options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
-        solvers.append(ca.nlpsol("s", "ipopt", program, options))
+        solvers.append(ca.nlpsol("s", "ipopt", program, QUIET))
 
-    def run(reactor: Reactor, pressures: Array) -> tuple[Array, float]:
-        found, newest = np.array(reactor.guess), [np.array(reactor.guess)]
+    def run(_: Reactor, pressures: Array) -> tuple[Array, float]:
+        newest = [found := np.array(reactor.guess, float)]
         for t, solver in enumerate(solvers):
             start = np.append(found, np.array(step(found[-n:])))
             found = np.array(solver(x0=start, p=pressures[: t + 1], lbx=0.0)["x"]).ravel()
@@ -177,92 +169,80 @@ def ipopt(reactor: Reactor) -> Callable[[Reactor, Array], tuple[Array, float]]:
     return run
 
 
-def rows(reactor: Reactor, with_ipopt: bool) -> dict[str, Callable[..., tuple[Array, float]]]:
+def rows(reactor: Reactor) -> dict[str, Way]:
     """What is compared, by its name in the table."""
-    found: dict[str, Callable[..., tuple[Array, float]]] = {
-        EKF: partial(estimate, bounded=False),
-        "EKF, clipped": partial(estimate, kind=Clipped, project_observer=False),
-        "EKF, gated": partial(estimate, kind=Gated, bounded=False),
-        "MHE, plain EKF, 2 QPs": partial(estimate, max_qps=2, project_observer=False),
+    plain = partial(estimate, project_observer=False)
+    found: dict[str, Way] = {
+        "EKF": plain, "EKF, clipped": partial(plain, kind=Clipped),
+        "EKF, gated": partial(plain, kind=Gated),
+        "MHE, plain EKF, 2 QPs": partial(plain, max_qps=2), "EKF, projected": estimate,
     }
-    for i in (0, 1, 2, 5, None):
-        name = {0: "EKF, projected", 1: "MHE, 1 QP", None: "MHE, converged"}.get(i, f"MHE, {i} QPs")
-        found[name] = partial(estimate, max_qps=i)
-    for gain in GAINS:
-        found[f"gain {gain:g}, plain"] = partial(estimate, kind=gain, project_observer=False)
+    for name, count in (("1 QP", 1), ("2 QPs", 2), ("5 QPs", 5), ("converged", None)):
+        found[f"MHE, {name}"] = partial(estimate, max_qps=count)
+    for gain in (0.001, 0.003, 0.01):
+        found[f"gain {gain:g}, plain"] = partial(plain, kind=gain)
         found[f"gain {gain:g}, projected"] = partial(estimate, kind=gain)
         found[f"MHE, gain {gain:g}, 2 QPs"] = partial(estimate, kind=gain, max_qps=2)
-    if with_ipopt:
+    if find_spec("casadi") is not None:
         found["Ipopt, all measurements"] = ipopt(reactor)
     return found
 
 
-def number(value: float) -> str:
-    return f"{value:.4f}" if value < 100.0 else f"{value:.0e}"
-
-
-def draw(curves: list[dict[str, Array]], truths: list[Array]) -> Figure:
-    """States of the first records; a column a reactor."""
+def draw(shown: list[Drawn]) -> Figure:
+    """The records at the median of the filter's error; a column a reactor, grey where x < 0."""
     with rc_context(LIGHT):
         figure = Figure(figsize=(8.4, 6.2), layout="constrained")
-        grid = figure.subplots(3, 2, sharex="col", squeeze=False)
-        for column, (reactor, lines, truth) in enumerate(zip(REACTORS, curves, truths, strict=True)):
-            axes = list(grid[: len(reactor.species), column])
+        grid = figure.subplots(3, 2, squeeze=False)
+        for reactor, axes, (truth, lines) in zip(REACTORS, grid.T, shown, strict=True):
+            panels = list(axes[: len(reactor.species)])
             trajectories(
                 reactor.dt * np.arange(reactor.steps + 1.0), truth, lines,
-                [f"{name} ({reactor.unit})" for name in reactor.species], "time t", axes=axes,
+                [f"{name} ({reactor.unit})" for name in reactor.species],
+                "time t (unit of the rate constants)", axes=panels,
             )
-            axes[0].set_title(reactor.title)
-            for panel, real in zip(axes, truth.T, strict=True):
-                panel.get_legend() and panel.get_legend().remove()
-                width = max(np.ptp(real), 0.5 * np.max(truth))
-                panel.set_ylim(-1.5 * width, 2.5 * width)
-                panel.axhspan(-1.5 * width, 0.0, color="0.92", zorder=0)
+            panels[0].set_title(reactor.title)
+            for panel, top in zip(panels, np.max(truth, axis=0), strict=True):
+                panel.set_ylim(-1.5 * top, 2.5 * top)
+                panel.axhspan(-1.5 * top, 0.0, color="0.92", zorder=0)
+            panels[0].get_legend().remove()
         grid[2, 0].axis("off")
-        grid[1, 0].xaxis.set_tick_params(labelbottom=True)
         grid[2, 0].legend(*grid[0, 0].get_legend_handles_labels(), loc="center", frameon=False)
     return figure
+
+
+def compare(reactor: Reactor, seeds: int) -> tuple[Table, Drawn]:
+    """The table of a reactor, and what to draw of it."""
+    records = [simulate(reactor, seed) for seed in range(seeds)]
+    headings = (Column(x, justify="right") for x in ("median", "worst", "negative %", "dropped %"))
+    table = Table("estimator", *headings, title=f"{reactor.title}: settled RMSE ({reactor.unit})")
+    lines, middle = {}, 0
+    for name, way in track(rows(reactor).items(), reactor.title):
+        found = [way(reactor, pressures) for _, pressures in records]
+        lines[name] = [states for states, _ in found]
+        errors = np.array(lines[name]) - [real for real, _ in records]
+        rmse = np.sqrt(np.mean(errors[:, reactor.steps // 2 :] ** 2, axis=(1, 2)))
+        shares = np.array(lines[name]).min(axis=2) < 0.0, [share for _, share in found]
+        texts = [f"{x:.4f}" if x < 100.0 else f"{x:.0e}" for x in (np.median(rmse), rmse.max())]
+        table.add_row(name, *texts, *(f"{100 * np.mean(each):.0f}" for each in shares))
+        if name == "EKF":
+            middle = int(np.argsort(rmse)[seeds // 2])
+    return table, (records[middle][0], {name: lines[name][middle] for name in SHOWN})
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=10, help="number of records")
-    parser.add_argument("--no-ipopt", action="store_true", help="leave out the reference")
     parser.add_argument("--out", type=Path, help="folder for the figure, if one is wanted")
     arguments, console = parser.parse_args(), Console()
-    try:
-        import casadi  # noqa: F401
-    except ImportError:
-        console.print("CasADi is not installed: the row of Ipopt is left out.")
-        arguments.no_ipopt = True
-    curves, truths = [], []
+    # Of the plain observers, which are far from the estimates here.
+    warnings.simplefilter("ignore", qpmhe.ObserverWarning)
+    shown = []
     for reactor in REACTORS:
-        records = [simulate(reactor, seed) for seed in range(arguments.seeds)]
-        half = reactor.steps // 2
-        table = Table(title=f"{reactor.title}: settled RMSE ({reactor.unit})")
-        for heading in ("estimator", "median", "worst", "negative %", "dropped %"):
-            table.add_column(heading, justify="left" if heading == "estimator" else "right")
-        first = {}
-        for name, way in track(rows(reactor, not arguments.no_ipopt).items(), reactor.title):
-            found = [way(reactor, pressures) for _, pressures in records]
-            errors = [
-                np.sqrt(np.mean((states - real)[half:] ** 2))
-                for (states, _), (real, _) in zip(found, records, strict=True)
-            ]
-            negative = np.mean([(states < 0.0).any(axis=1) for states, _ in found])
-            dropped = np.mean([share for _, share in found])
-            table.add_row(
-                name, number(np.median(errors)), number(np.max(errors)), f"{100 * negative:.0f}",
-                f"{100 * dropped:.0f}",
-            )
-            if name in (EKF, "EKF, clipped", "EKF, gated", "MHE, 2 QPs"):
-                first[name] = found[0][0]
+        table, drawn = compare(reactor, arguments.seeds)
         console.print(table)
-        curves.append(first)
-        truths.append(records[0][0])
+        shown.append(drawn)
     if arguments.out is not None:
-        for path in save(draw(curves, truths), arguments.out / "textbook_reactors"):
-            console.print(f"wrote {path}")
+        console.print(*save(draw(shown), arguments.out / "textbook_reactors"), sep="\n")
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ WIDTH, COLORS, MOST = 1000, 96, 150_000  # pixels, of a palette, bytes
 PROGRAMS = {
     "paper-figure": (["paper_figure.py"], "paper_figure.png"),
     "outliers": (["outliers.py"], "outliers.png"),
+    "textbook-reactors": (["textbook_reactors.py"], "textbook_reactors.png"),
     "closed-loop": (["closed_loop.py"], "closed_loop.png"),
     "do-mpc-masses": (["do_mpc_masses.py"], "do_mpc_masses.png"),
 }

@@ -276,11 +276,16 @@ class Window(Stages):
             return
         assert covariance is not None
         found = nearest(z_next, covariance)
-        z_next[...] = found.point
-        np.subtract(z_next, predicted, view.terms.disturbance)
         self.events |= _PROJECTED
         if not nearest.contains(predicted):
             self.events |= _PREDICTION_OUTSIDE
+            if found.reached and nearest.is_beyond(z_next, found.point, covariance):
+                # Every point of X is nearer to the truth than z_next is. That prediction says
+                # nothing, but would drown the correction.
+                inside = nearest(predicted, covariance).point
+                found = nearest(inside + view.terms.disturbance, covariance)
+        z_next[...] = found.point
+        np.subtract(z_next, predicted, view.terms.disturbance)
         if not found.reached:
             self.events |= _METRIC_SINGULAR
 

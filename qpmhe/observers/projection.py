@@ -68,6 +68,7 @@ class NearestPoint:
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = np.where(self._sizes > 0.0, self._side_sizes[:, None] / self._sizes, 0.0)
         self._largest = reach.max(axis=0, initial=0.0)  # sizes that the set gives its components
+        self._widths: Array = convex_set.upper - convex_set.lower
 
     def contains(self, point: Array) -> bool:
         """Whether a point is in the set, up to rounding in general inequalities."""
@@ -96,6 +97,18 @@ class NearestPoint:
         if found is None:
             found = np.clip(point, self._lower, self._upper)
         return Projected(found, False)
+
+    def is_beyond(self, point: Array, nearest: Array, covariance: Array) -> bool:
+        """Whether a point is farther from the set than any two points of the set are apart."""
+        if not np.isfinite(self._widths).all():
+            return False
+        try:
+            metric = inverse(covariance)
+        except np.linalg.LinAlgError:
+            return False
+        offset = point - nearest
+        # From below and from above: |e_i| <= w_i implies e' M e <= w' |M| w.
+        return bool(offset @ metric @ offset > self._widths @ np.abs(metric) @ self._widths)
 
     def _nearest(self, point: Array, covariance: Array) -> Array | None:
         rows = self._rows
