@@ -12,6 +12,7 @@ from qpmhe.codegen.compiler import find_compiler
 from .test_own_memory import (
     BATCHES,
     BOX,
+    NARROW,
     assert_same,
     batch_of,
     estimator,
@@ -26,7 +27,8 @@ CASES = {
     "reinitialized": ("numpy", {"candidate": "reinitialized", "warm_start": True}),
     "kalman": ("numpy", {"kalman": True, "candidate": "reinitialized"}),
     "robust": ("numpy", {"robust": True, "max_qps": 2}),
-    "projected": ("numpy", {"sets": BOX, "outside": "project", "max_qps": 2}),
+    "projected": ("numpy", {"sets": BOX, "max_qps": 2}),
+    "dropped": ("numpy", {"sets": NARROW, "max_qps": 2}),
     "discount": ("numpy", {"discount": 0.8, "warm_start": True}),
     "casadi": ("casadi", {}),
     "compiled": ("compiled", {"candidate": "reinitialized"}),

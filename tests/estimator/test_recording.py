@@ -22,7 +22,7 @@ CONSTRAINED = qpmhe.System(
 def estimator(system, name, **options):
     return qpmhe.MovingHorizonEstimator(
         system, OBSERVER, COST, horizon=6, initial_state=[3.0, 0.5], backend=name,
-        outside="project", **options,
+        **options,
     )
 
 
@@ -42,7 +42,7 @@ def test_runs_are_the_same_with_and_without(name, system, tmp_path):
     if system is SYSTEM:
         assert recording.seen == run.qps.sum() >= STEPS
     else:
-        assert recording.seen > run.qps.sum()  # projections and corrections are QPs, too
+        assert recording.seen > run.qps.sum()  # nearest points and corrections are QPs, too
     assert len(recording.files) == recording.seen
     if name == "auto" and system is CONSTRAINED:
         stored = [load(path) for path in recording.files]
