@@ -15,14 +15,13 @@ _, MEASUREMENTS = SCENARIO.simulate(0, STEPS)
 # Bounds that the record drives the estimates into: those above leave one side open.
 CONSTRAINED = qpmhe.System(
     lambda x: SYSTEM.f(x, np.zeros(0)), lambda x: SYSTEM.h(x, np.zeros(0)), n=2, p=1,
-    states=qpmhe.Box([0.0, 0.0], [3.2, np.inf]), noises=qpmhe.Box([-0.3], [0.3]),
+    states=qpmhe.Box([0.0, 0.0], [3.2, np.inf]), disturbances=qpmhe.Box([-0.02] * 2, [0.02] * 2),
 )
 
 
 def estimator(system, name, **options):
     return qpmhe.MovingHorizonEstimator(
-        system, OBSERVER, COST, horizon=6, initial_state=[3.0, 0.5], backend=name,
-        **options,
+        system, OBSERVER, COST, horizon=6, initial_state=[3.0, 0.5], backend=name, **options,
     )
 
 
