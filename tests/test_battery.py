@@ -161,7 +161,7 @@ def test_a_prior_that_is_too_sure_is_overcome(cell):
 def test_estimates_stay_within_the_state_set(cell):
     cycle = drive(cell, 4, seconds=400)
     run = model.estimator(cell, DT, max_qps=1).run(cycle.voltage, cycle.current)
-    inside = ~np.array([qpmhe.Status.SETS_DROPPED in status for status in run.statuses])
+    inside = ~np.array([qpmhe.Status.CANDIDATE_OUTSIDE in status for status in run.statuses])
     assert inside.mean() > 0.9
     soc = run.states[1:, 0][inside]
     assert np.all((soc >= -1e-6) & (soc <= 1.0 + 1e-6))

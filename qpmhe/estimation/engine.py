@@ -211,10 +211,10 @@ class PythonEngine:
                 self._trajectory = None  # of this window already: no warm start from it
                 estimate = self._estimate(began)
             self._history[-1] = estimate.state.copy()
+            return estimate
         except BaseException:
             self.undo()
             raise
-        return estimate
 
     def _set_undo_point(self, whole: bool) -> None:
         """Save what `undo` needs; all stages where some will be rewritten."""

@@ -150,17 +150,6 @@ def test_noise_free_components(free, missing):
         close(case.mhe.covariances(), expected)
 
 
-def test_a_set_that_is_dropped_lets_the_noise_in():
-    box = qpmhe.Box([0.0, -np.inf], [0.0, np.inf])
-    case = Case((2, 1), sets={"disturbances": box})
-    assert case.kept.gain[0, 0] != 0.0
-    for _ in range(6):
-        estimate = case.update()
-        assert estimate.dropped == ("disturbances",)
-        hessian = case.kept.hessian(estimate.trajectory)
-        close(case.mhe.covariances(), blocks(np.linalg.inv(hessian), 2))
-
-
 def test_inequalities_do_not_enter():
     case = Case((2, 1), sets={"states": qpmhe.Box([-9.0, -9.0], [9.0, 9.0])})
     for _ in range(5):

@@ -103,13 +103,13 @@ def test_time_that_the_model_takes_is_not_left_to_the_solver(clock):
 @pytest.mark.parametrize("seconds", [1.0, 2.0])
 def test_a_qp_that_is_ready_too_late_is_not_begun(clock, monkeypatch, seconds):
     mhe = estimator(backend="ticking", max_qps=2, time_budget=1.0)
-    made = qpmhe.estimation.subproblem.Subproblem.at_candidate
+    made = qpmhe.estimation.subproblem.Subproblem.at
 
-    def slow(self, problem, window):
+    def slow(self, problem, trial):
         clock.now += seconds
-        return made(self, problem, window)
+        return made(self, problem, trial)
 
-    monkeypatch.setattr(qpmhe.estimation.subproblem.Subproblem, "at_candidate", slow)
+    monkeypatch.setattr(qpmhe.estimation.subproblem.Subproblem, "at", slow)
     estimate = mhe.update(MEASUREMENTS[0])
     assert clock.limits == []
     assert (estimate.qps, estimate.solve_time) == (0, 0.0)
@@ -264,8 +264,8 @@ BOXED = qpmhe.System(
 
 
 @pytest.mark.parametrize("options", [
-    {}, {"system": BOXED, "outside": "project"}, {"system": BOXED, "time_budget": 60.0},
-], ids=["free", "projected", "limited"])
+    {}, {"system": BOXED}, {"system": BOXED, "time_budget": 60.0},
+], ids=["free", "bounded", "limited"])
 @pytest.mark.parametrize("word", [
     "something else", "nothing", "short", "not finite", "odd status", "raises", "exits", "panics",
 ])

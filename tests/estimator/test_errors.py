@@ -1,4 +1,6 @@
 import math
+import re
+import warnings
 
 import numpy as np
 import pytest
@@ -6,6 +8,7 @@ import pytest
 import qpmhe
 from qpmhe.errors import (
     InvalidInputError,
+    ObserverWarning,
     SetError,
     ShapeError,
     WeightError,
@@ -132,21 +135,27 @@ STATE_SETS = {
 
 
 @pytest.mark.parametrize("kind", STATE_SETS)
-@pytest.mark.parametrize("outside", ["drop", "project", "keep"])
-def test_an_initial_state_outside_of_the_state_set(kind, outside):
-    system = system_of(states=STATE_SETS[kind])
-    fragments = ["initial_state is [2.0, 7.0]", "outside of the state set", repr(STATE_SETS[kind])]
-    check(
-        InvalidInputError, [*fragments, "start within it"],
-        lambda: estimator(system, initial_state=[2.0, 7.0], outside=outside),
-    )
-    mhe = estimator(system, outside=outside)
+@pytest.mark.parametrize("project", [True, False])
+def test_an_initial_state_outside_of_the_state_set_is_projected(kind, project):
+    states = STATE_SETS[kind]
+    system, given = system_of(states=states), [2.0, 7.0]
+    words = re.escape(f"is {given}, outside of the state set {states!r}; the estimator starts at")
+    with pytest.warns(ObserverWarning, match=words):
+        mhe = estimator(system, initial_state=given, project_observer=project)
+    start = mhe.initial_state
+    assert states.violation(start) <= 1e-12
+    np.testing.assert_array_equal(mhe.state, start)
+    nearest = {"box": [2.0, 5.0], "polytope": [0.0, 5.0], "both": [0.0, 5.0]}[kind]
+    np.testing.assert_allclose(start, nearest, rtol=1e-12, atol=1e-12)
     mhe.update([1.0])
-    before = mhe.state.copy()
-    check(InvalidInputError, fragments, lambda: mhe.reset([2.0, 7.0]))
-    assert mhe.time == 1
-    np.testing.assert_array_equal(mhe.state, before)
-    np.testing.assert_array_equal(mhe.initial_state, [1.0, 2.0])
+    with pytest.warns(ObserverWarning, match=words):
+        mhe.reset(given)
+    np.testing.assert_array_equal(mhe.state, start)
+    mhe.update([1.0])
+    with warnings.catch_warnings(), pytest.raises(ObserverWarning):
+        warnings.simplefilter("error")
+        mhe.reset(given)
+    assert mhe.time == 1  # as it was
 
 
 def test_an_initial_state_on_the_boundary_is_inside():

@@ -12,6 +12,7 @@ from qpmhe.codegen.compiler import find_compiler
 from .test_own_memory import (
     BATCHES,
     BOX,
+    NARROW,
     assert_same,
     batch_of,
     estimator,
@@ -26,7 +27,8 @@ CASES = {
     "reinitialized": ("numpy", {"candidate": "reinitialized", "warm_start": True}),
     "kalman": ("numpy", {"kalman": True, "candidate": "reinitialized"}),
     "robust": ("numpy", {"robust": True, "max_qps": 2}),
-    "projected": ("numpy", {"sets": BOX, "outside": "project", "max_qps": 2}),
+    "projected": ("numpy", {"sets": BOX, "max_qps": 2}),
+    "dropped": ("numpy", {"sets": NARROW, "max_qps": 2}),
     "discount": ("numpy", {"discount": 0.8, "warm_start": True}),
     "casadi": ("casadi", {}),
     "compiled": ("compiled", {"candidate": "reinitialized"}),
@@ -114,7 +116,8 @@ def test_an_interrupted_step_was_not_taken(name):
         if t in (0, 1, 3, 6, 10, 17, 36, 37):  # the first move of stages to the front is at 36
             both(lambda one, a=arguments: feed(one, a, False))
         else:
-            twin.state_dict()
+            for one in (mhe, twin):
+                one.state_dict()
             expected = numbers(feed(twin, arguments, False))
             assert_same(numbers(feed(mhe, arguments, False)), expected)
         if t in (2, 9, 20):

@@ -7,7 +7,7 @@ import qpmhe
 from qpmhe.codegen.compiler import find_compiler
 
 BOX = {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9])}
-# For the step in C, which takes no X.
+# Outside of which the candidate is, now and then.
 NARROW = {"disturbances": qpmhe.Box([-0.1, -0.1], [0.1, 0.1])}
 OPTIONS = {
     "plain": {},
@@ -15,9 +15,9 @@ OPTIONS = {
     "best": {"warm_start": True, "max_qps": 2},
     "reinitialized": {"candidate": "reinitialized", "warm_start": True},
     "delayed": {"delay": 2},
-    "dropped": {"sets": BOX, "max_qps": 3},
-    "projected": {"sets": BOX, "outside": "project", "warm_start": True},
-    "kept": {"sets": BOX, "outside": "keep"},
+    "dropped": {"sets": NARROW, "max_qps": 3},
+    "projected": {"sets": BOX, "warm_start": True},
+    "kept": {"sets": NARROW, "infeasible": "keep_candidate"},
     "discount": {"discount": 0.8},
 }
 PYTHON_ONLY = {

@@ -15,14 +15,13 @@ _, MEASUREMENTS = SCENARIO.simulate(0, STEPS)
 # Bounds that the record drives the estimates into: those above leave one side open.
 CONSTRAINED = qpmhe.System(
     lambda x: SYSTEM.f(x, np.zeros(0)), lambda x: SYSTEM.h(x, np.zeros(0)), n=2, p=1,
-    states=qpmhe.Box([0.0, 0.0], [3.2, np.inf]), noises=qpmhe.Box([-0.3], [0.3]),
+    states=qpmhe.Box([0.0, 0.0], [3.2, np.inf]), disturbances=qpmhe.Box([-0.02] * 2, [0.02] * 2),
 )
 
 
 def estimator(system, name, **options):
     return qpmhe.MovingHorizonEstimator(
-        system, OBSERVER, COST, horizon=6, initial_state=[3.0, 0.5], backend=name,
-        outside="project", **options,
+        system, OBSERVER, COST, horizon=6, initial_state=[3.0, 0.5], backend=name, **options,
     )
 
 
@@ -42,7 +41,7 @@ def test_runs_are_the_same_with_and_without(name, system, tmp_path):
     if system is SYSTEM:
         assert recording.seen == run.qps.sum() >= STEPS
     else:
-        assert recording.seen > run.qps.sum()  # projections and corrections are QPs, too
+        assert recording.seen > run.qps.sum()  # nearest points and corrections are QPs, too
     assert len(recording.files) == recording.seen
     if name == "auto" and system is CONSTRAINED:
         stored = [load(path) for path in recording.files]

@@ -82,8 +82,8 @@ def test_available_backends_are_accepted(backend):
     [
         *(("engine", value, ["python"]) for value in ("fast", "Python", None, 0)),
         *(
-            ("outside", value, ["drop", "project", "keep"])
-            for value in ("dropped", "", "Keep", None, True, ["drop"])
+            ("infeasible", value, ["drop_rows", "keep_candidate"])
+            for value in ("drop", "", "Keep_candidate", None, True, ["drop_rows"])
         ),
         *(
             ("candidate", value, ["observer", "reinitialized"])
@@ -98,11 +98,11 @@ def test_unknown_choices_list_the_known_ones(name, value, known):
     )
 
 
+@pytest.mark.parametrize("name", ["warm_start", "project_observer"])
 @pytest.mark.parametrize("value", ["best", None, 1])
-def test_a_warm_start_is_wanted_or_not(value):
+def test_flags_are_true_or_false(name, value):
     check(
-        OptionError, [f"warm_start is {value!r}", "True or False"],
-        lambda: estimator(warm_start=value),
+        OptionError, [f"{name} is {value!r}", "True or False"], lambda: estimator(**{name: value})
     )
 
 
@@ -134,7 +134,8 @@ def test_delays_beyond_the_horizon(value):
 def test_settings_are_kept_and_frozen():
     given = {
         "horizon": 4, "backend": "banded", "max_qps": 2, "max_solver_iterations": 7,
-        "solver_tolerance": 1e-5, "tolerance": 1e-6, "engine": "python", "outside": "keep",
+        "solver_tolerance": 1e-5, "tolerance": 1e-6, "engine": "python",
+        "infeasible": "keep_candidate", "project_observer": False,
         "warm_start": True, "candidate": "reinitialized", "time_budget": 3.5, "delay": 1,
     }
     settings = estimator(**given).settings
@@ -142,7 +143,8 @@ def test_settings_are_kept_and_frozen():
     with pytest.raises(dataclasses.FrozenInstanceError):
         settings.horizon = 5
     defaults = dataclasses.asdict(estimator().settings)
-    assert (defaults["outside"], defaults["warm_start"]) == ("drop", False)
+    assert (defaults["infeasible"], defaults["warm_start"]) == ("drop_rows", False)
+    assert defaults["project_observer"] is True
     assert (defaults["candidate"], defaults["time_budget"]) == ("observer", None)
     assert (defaults["max_qps"], defaults["delay"]) == (1, 0)
 

@@ -159,7 +159,7 @@ def test_caps_and_policies_may_change(engine):
         ({}, {"max_qps": None, "tolerance": 1e-6, "solver_tolerance": 1e-5, "delay": 1}),
         ({}, {"backend": "banded", "max_solver_iterations": 7}),
         ({}, {"warm_start": True, "max_qps": None}),
-        ({"outside": "keep"}, {"outside": "drop"}),
+        ({"infeasible": "keep_candidate"}, {"infeasible": "drop_rows"}),
     ):
         one, other, fresh = made(**first), made(**second), made(**second)
         assert other.engine == own
@@ -314,7 +314,7 @@ def test_damaged_states_are_refused_whole_or_harmless(engine, options):
             # What no computation confirms: estimates of the past, the covariance at the
             # window's start, and what a model that failed had before.
             assert path[0] in (
-                "history", "trajectory", "dropped", "modes", "memory", "methods", "linearized"
+                "history", "trajectory", "watched", "modes", "memory", "methods", "linearized"
             ) or (
                 path[:2] in (
                     ("window", "earlier"), ("window", "earlier_covariance"),
@@ -345,8 +345,8 @@ def test_damaged_states_are_refused_whole_or_harmless(engine, options):
         (("window", "last_irregular"), 10**30), (("window", "z"), np.full((5, 2), np.nan)),
         (("window", "z"), np.zeros((5, 2))), (("window", "z"), np.zeros((5, 2), np.float32)),
         (("window", "covariance"), np.zeros((5, 2, 2))), (("window", "stages"), []),
-        (("trajectory",), None), (("linearized",), 1), (("dropped",), ("nothing",)),
-        (("dropped",), ("states",)), (("estimator",), None), (("estimator",), {}),
+        (("trajectory",), None), (("linearized",), 1), (("watched",), (0, 16)),
+        (("watched",), (-1, 0)), (("watched",), (0.0, 0)), (("estimator",), None), (("estimator",), {}),
         (("engine",), "compiled"), (("problem",), (2, 1)),
     ],
     ids=str,

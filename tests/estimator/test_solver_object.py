@@ -31,7 +31,7 @@ def constrained(**options):
     cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=5.0 * np.eye(2), noise=np.eye(1))
     return qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger([[0.1], [0.1]]), cost, horizon=4, initial_state=[0.1, 0.1],
-        max_qps=2, outside="project", **options,
+        max_qps=2, **options,
     )
 
 

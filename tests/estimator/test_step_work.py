@@ -104,7 +104,7 @@ def calls_in_a_step(mhe, measurements):
 # clock has to see.
 @pytest.mark.parametrize(
     ("options", "most"),
-    [({"max_qps": 0}, 83), ({"max_qps": 1}, 153), ({"max_qps": 2}, 240)],
+    [({"max_qps": 0}, 99), ({"max_qps": 1}, 153), ({"max_qps": 2}, 240)],
     ids=["no QP", "one QP", "two QPs"],
 )
 def test_a_step_takes_no_more_calls_than_it_did(options, most):

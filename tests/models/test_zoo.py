@@ -249,7 +249,7 @@ def test_two_qps_a_sample_make_sense(name):
     run = mhe.run(record.measurements, record.inputs)
     alone = observe(system, observer, scenario.initial_estimate, record)
     assert run.share(qpmhe.Status.IMPROVED) > 0.95
-    assert run.share(qpmhe.Status.SETS_DROPPED) == 0.0
+    assert run.share(qpmhe.Status.ROWS_DROPPED) == 0.0
     assert np.all(run.costs <= run.candidate_costs)
     if system.states is not None:
         assert system.states.violation(run.states) < 1e-6

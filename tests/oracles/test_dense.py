@@ -97,7 +97,7 @@ def in_box(box, **options):
 def test_convergence_in_a_state_box_is_the_dense_minimum(backend, bounded_minima):
     box, Y, minima = bounded_minima
     run = in_box(box, backend=backend, max_qps=None, solver_tolerance=1e-9).run(Y)
-    assert run.share(qpmhe.Status.SETS_DROPPED) == 0.0
+    assert run.share(qpmhe.Status.OBSERVER_PROJECTED) == 0.0
     np.testing.assert_allclose(run.costs, minima, rtol=1e-6)
 
 
@@ -148,11 +148,9 @@ class Rows:
         return [mhe.update(y) for y in self.Y]
 
     def _minimum(self, estimate):
-        """By cvxpy; NaN where the candidate is outside of the sets, which do not hold then."""
+        """By cvxpy; NaN where it is above the cost of a candidate outside of the sets."""
         import cvxpy
 
-        if qpmhe.Status.SETS_DROPPED in estimate.status:
-            return np.nan
         size = len(estimate.candidate) - 1
         Y = self.Y[estimate.time + 1 - size : estimate.time + 1]
         x = cvxpy.Variable((size + 1, 2))
@@ -167,7 +165,7 @@ class Rows:
         problem.solve(
             solver=cvxpy.CLARABEL, tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12
         )
-        return problem.value
+        return problem.value if problem.value <= estimate.candidate_cost else np.nan
 
 
 @pytest.fixture(scope="module")
