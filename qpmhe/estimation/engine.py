@@ -152,11 +152,12 @@ class PythonEngine:
             if Status.MODEL_FAILED not in status:
                 status |= Status.FAILED_STAGE
         trajectory, residuals, filtered = trial.trajectory, trial.residuals, None
-        if self._watch.note(
-            trajectory[-1] - candidate.trajectory[-1], problem.prior_weight, bool(outcome.dropped)
-        ):
-            status |= Status.OBSERVER_FAR
-        if not outcome.improved:
+        if outcome.improved:
+            offset = trajectory[-1] - candidate.trajectory[-1]
+            if self._watch.note(offset, problem.prior_weight, bool(outcome.dropped)):
+                status |= Status.OBSERVER_FAR
+        else:
+            self._watch.counts = 0, 0
             # They are views of the window.
             trajectory, residuals = trajectory.copy(), residuals.copy()
             filtered = window.filtered()

@@ -72,6 +72,7 @@ class Window(Stages):
                     observer, cost.initial_weight(observer.initial_covariance()), noise
                 )
         self._correct = contained(observer.correct)
+        self._has_filter = type(observer).filter is not Observer.filter
         self._evaluate_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
         self._functions = system.f.direct, system.h.direct
         self._jacobian_functions = system.f_jacobian.direct, system.h_jacobian.direct
@@ -291,7 +292,7 @@ class Window(Stages):
 
     def filtered(self) -> Array | None:
         """The observer's estimate of x(t) that has used y(t), within X; None if it has none."""
-        if self.newest_failed:
+        if not self._has_filter or self.newest_failed:
             return None
         view = self._stage_views[self.end - 1]
         try:
