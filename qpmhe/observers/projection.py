@@ -15,11 +15,14 @@ __all__ = ["ErrorMetric", "NearestPoint", "Projected"]
 
 _EPS = float(np.finfo(np.float64).eps)
 
-# A row or a pair of rows whose variance is below this share of the largest possible one has none.
+# A sum of rows whose variance is below this share of the largest possible one has none.
 _SINGULAR = 1e-12
 
 # Rows miss by at most this share of the terms that they sum up, or they are violated.
 _ROUNDING = 16.0 * _EPS
+
+# Each takes as many digits off a miss as a number has.
+_REFINEMENTS = 4
 
 # E^(2^k) of a stable matrix has vanished by then, unless its spectral radius rounds to 1.
 _DOUBLINGS = 60
@@ -120,6 +123,7 @@ class NearestPoint:
         scale = np.sqrt(np.where(usable, variances, 1.0))
         # In units of each row's standard deviation, so that no row's unit matters.
         gram = (rows @ spread) / np.outer(scale, scale)
+        reach = np.sqrt(possible) / scale  # the largest possible deviation of each
         active: list[int] = []
         multipliers = np.zeros(0)
         current = point
@@ -133,23 +137,41 @@ class NearestPoint:
                 return clipped
             if not usable[worst]:
                 return None
-            entering = self._enter(gram, worst, float(missed[worst]), active, multipliers)
+            entering = self._enter(gram, reach, worst, float(missed[worst]), active, multipliers)
             if entering is None:
                 return None
             multipliers = entering
-            current = point - spread[:, active] @ (multipliers / scale[active])
+            current = self._reached(point, multipliers, gram, spread, scale, active)
         return None
+
+    def _reached(
+        self, point: Array, multipliers: Array, gram: Array, spread: Array, scale: Array,
+        active: list[int],
+    ) -> Array:
+        """The point that these multipliers lead to, on the active rows however far it came."""
+        rows, sides, within = self._rows[active], self._sides[active], np.ix_(active, active)
+        current = point - spread[:, active] @ (multipliers / scale[active])
+        for _ in range(_REFINEMENTS):
+            missed = (rows @ current - sides) / scale[active]
+            rounding = _ROUNDING * (self._sizes[active] @ np.abs(current) + np.abs(sides))
+            if (np.abs(missed) * scale[active] <= rounding).all():
+                break
+            current = current - spread[:, active] @ (
+                np.linalg.solve(gram[within], missed) / scale[active]
+            )
+        return current
 
     @staticmethod
     def _enter(
-        gram: Array, row: int, missed: float, active: list[int], multipliers: Array
+        gram: Array, reach: Array, row: int, missed: float, active: list[int], multipliers: Array
     ) -> Array | None:
         """Make a violated row active, and others inactive where they have to; None if in vain."""
         own = 0.0
         while True:
             exchange = np.linalg.solve(gram[np.ix_(active, active)], gram[active, row])
             curvature = float(gram[row, row] - gram[row, active] @ exchange)
-            full = (missed / curvature) if curvature > _SINGULAR else np.inf
+            largest = float(reach[row] + np.abs(exchange) @ reach[active])
+            full = (missed / curvature) if curvature > _SINGULAR * largest**2 else np.inf
             with np.errstate(divide="ignore", invalid="ignore"):
                 limits = np.where(exchange > 0.0, multipliers / exchange, np.inf)
             blocking = int(limits.argmin()) if limits.size else -1
