@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import numbers, positive
-from ..errors import InvalidInputError, ModelError, OptionError
+from .._checks import need, numbers, positive
+from ..errors import ModelError, OptionError
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System, probe_points
@@ -58,7 +58,7 @@ def from_control(
     InvalidInputError
         If python-control is not installed.
     """
-    control = _import_control()
+    control = need("control", "from_control", "control")
     linear = isinstance(system, control.StateSpace)
     if not linear and not isinstance(system, control.NonlinearIOSystem):
         raise ModelError(
@@ -90,17 +90,6 @@ def from_control(
         from_control, {"system": system, "dt": dt, "method": method, **sets}
     )
     return made
-
-
-def _import_control() -> Any:
-    try:
-        import control
-    except ImportError as error:
-        raise InvalidInputError(
-            "python-control is not installed; pip install control, or give f and h to "
-            "qpmhe.System as functions."
-        ) from error
-    return control
 
 
 def _real(name: str, matrix: Any) -> Array:

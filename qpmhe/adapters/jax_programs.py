@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import need
 from ..errors import InvalidInputError, ModelError
 from ..model.discretize import discretize
 from ..model.functions import Probes, check_inputs, takes_input
@@ -193,12 +194,7 @@ def _runge_kutta(jax: Any, rate: Function, dt: Any, x: Any, u: Any) -> Any:
 
 def _imported() -> tuple[Any, Function, Any]:
     """JAX, its switch to double precision, and its CPU."""
-    try:
-        jax: Any = importlib.import_module("jax")
-    except ImportError as error:
-        raise InvalidInputError(
-            "JAX compiles the functions, and is not installed; pip install 'qpmhe[jax]'."
-        ) from error
+    jax: Any = need("jax", "from_jax", "jax")
     try:
         device = jax.local_devices(backend="cpu")[0]
     except RuntimeError as error:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import positive
-from ..errors import InvalidInputError, ModelError
+from .._checks import need, positive
+from ..errors import ModelError
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System
@@ -63,13 +63,7 @@ def from_sympy(
     InvalidInputError
         If SymPy is not installed.
     """
-    try:
-        import sympy
-    except ImportError as error:
-        raise InvalidInputError(
-            "SymPy is not installed; pip install sympy, or give f and h to qpmhe.System as "
-            "functions."
-        ) from error
+    sympy = need("sympy", "from_sympy", "sympy")
     state, given = _symbols(sympy, "x", x), _symbols(sympy, "u", u)
     _check_symbols(state, given)
     rates, outputs = _column(sympy, "f", f), _column(sympy, "h", h)

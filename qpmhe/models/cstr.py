@@ -7,7 +7,7 @@ import numpy as np
 from ..model.sets import Box
 from ..model.system import System
 from ..observers import design_luenberger
-from .example import Array, Example, make_example
+from .example import Array, Example, Selection, make_example
 
 __all__ = ["cstr"]
 
@@ -17,7 +17,7 @@ _FREQUENCY, _ACTIVATION = 7.2e10, 8750.0  # 1/min, E/R in K
 _HEAT = 5e4 / (1000.0 * 0.239)  # K L/mol, -dH / (rho C_p)
 _COOLING = 5e4 / (100.0 * 1000.0 * 0.239)  # 1/min, UA / (V rho C_p)
 _DT = 0.05  # min
-_OUTPUT = np.array([[0.0, 1.0]])
+_MEASURED = Selection(2, slice(1, 2))
 
 # The controller's setpoint swings about the steady state.
 _MEAN, _SWING, _PERIOD = 350.0, 8.0, 5.0  # K, K, min
@@ -49,14 +49,6 @@ def _rate_jacobian(x: Array) -> Array:
     slope[..., 1, 0] = _HEAT * constant
     slope[..., 1, 1] = _HEAT * warmer - _FLOW - _COOLING
     return slope
-
-
-def _output(x: Array) -> Array:
-    return x[..., 1:]
-
-
-def _output_jacobian(x: Array) -> Array:
-    return np.broadcast_to(_OUTPUT, (*x.shape[:-1], 1, 2))
 
 
 def _coolant(t: int, x: Array) -> Array:
@@ -105,8 +97,8 @@ def cstr(method: str = "rk4") -> Example:
     Mellichamp and Doyle, Process Dynamics and Control, 3rd edition, 2011, example 2.5.
     """
     system = System.from_ode(
-        _rate, _output, dt=_DT, n=2, p=1, m=1, method=method,
-        rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
+        _rate, _MEASURED.output, dt=_DT, n=2, p=1, m=1, method=method,
+        rate_jacobian=_rate_jacobian, h_jacobian=_MEASURED.jacobian,
         states=Box([0.0, 250.0], [_FEED, 500.0]),
     )
     observer = design_luenberger(

@@ -12,9 +12,24 @@ from ..model.system import System
 from ..observers import Observer
 from .scenario import Scenario
 
-__all__ = ["Array", "Example", "make_example"]
+__all__ = ["Array", "Example", "Selection", "make_example"]
 
 Array = NDArray[Any]
+
+
+class Selection:
+    """The output of some components of a state of n, and its Jacobian."""
+
+    def __init__(self, n: int, components: slice | list[int]) -> None:
+        self._components, self._matrix = components, np.eye(n)[components]
+
+    def output(self, x: Array) -> Array:
+        """The components of x, (..., p)."""
+        return x[..., self._components]
+
+    def jacobian(self, x: Array) -> Array:
+        """The same matrix everywhere, (..., p, n)."""
+        return np.broadcast_to(self._matrix, (*x.shape[:-1], *self._matrix.shape))
 
 
 class Example(NamedTuple):

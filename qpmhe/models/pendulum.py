@@ -6,14 +6,14 @@ import numpy as np
 
 from ..model.system import System
 from ..observers import HighGain
-from .example import Array, Example, make_example
+from .example import Array, Example, Selection, make_example
 
 __all__ = ["pendulum"]
 
 _STIFFNESS, _DAMPING = 9.81 / 0.5, 0.2  # 1/s^2, 1/s
 _DT = 0.02  # s
 _COUNT = 2.0 * np.pi / 64  # rad
-_OUTPUT = np.array([[1.0, 0.0]])
+_MEASURED = Selection(2, slice(0, 1))
 
 
 def _rate(x: Array) -> Array:
@@ -30,14 +30,6 @@ def _rate_jacobian(x: Array) -> Array:
     slope[..., 1, 0] = -_STIFFNESS * np.cos(x[..., 0])
     slope[..., 1, 1] = -_DAMPING
     return slope
-
-
-def _output(x: Array) -> Array:
-    return x[..., :1]
-
-
-def _output_jacobian(x: Array) -> Array:
-    return np.broadcast_to(_OUTPUT, (*x.shape[:-1], 1, 2))
 
 
 def pendulum(method: str = "rk4") -> Example:
@@ -68,8 +60,8 @@ def pendulum(method: str = "rk4") -> Example:
     Khalil, Nonlinear Systems, 3rd edition, 2002, section 1.2.1.
     """
     system = System.from_ode(
-        _rate, _output, dt=_DT, n=2, p=1, method=method,
-        rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
+        _rate, _MEASURED.output, dt=_DT, n=2, p=1, method=method,
+        rate_jacobian=_rate_jacobian, h_jacobian=_MEASURED.jacobian,
     )
     return make_example(
         system, HighGain(2, epsilon=0.1, dt=_DT), prior=[1.0, 5.0], disturbance=[0.001, 0.02],

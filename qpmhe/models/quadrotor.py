@@ -6,7 +6,7 @@ import numpy as np
 
 from ..model.system import System
 from ..observers import design_luenberger
-from .example import Array, Example, make_example
+from .example import Array, Example, Selection, make_example
 
 __all__ = ["quadrotor"]
 
@@ -14,8 +14,7 @@ _MASS, _GRAVITY = 0.65, 9.81  # kg, m/s^2
 _INERTIA = np.array([7.5e-3, 7.5e-3, 1.3e-2])  # kg m^2
 _GYRATION = (np.roll(_INERTIA, -1) - np.roll(_INERTIA, -2)) / _INERTIA
 _DT = 0.05  # s
-_MEASURED = [0, 1, 2, 6, 7, 8]
-_OUTPUT = np.eye(12)[_MEASURED]
+_MEASURED = Selection(12, [0, 1, 2, 6, 7, 8])
 
 
 def _rate(x: Array, u: Array) -> Array:
@@ -80,14 +79,6 @@ def _rate_jacobian(x: Array, u: Array) -> Array:
     return slope
 
 
-def _output(x: Array) -> Array:
-    return x[..., _MEASURED]
-
-
-def _output_jacobian(x: Array) -> Array:
-    return np.broadcast_to(_OUTPUT, (*x.shape[:-1], 6, 12))
-
-
 def _fly(t: int, x: Array) -> Array:
     """Thrust and torques of a cascaded controller that flies a rising and falling circle."""
     phase = t * _DT
@@ -150,8 +141,8 @@ def quadrotor(method: str = "rk4") -> Example:
     and Automation Magazine 19 (2012).
     """
     system = System.from_ode(
-        _rate, _output, dt=_DT, n=12, p=6, m=4, method=method,
-        rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
+        _rate, _MEASURED.output, dt=_DT, n=12, p=6, m=4, method=method,
+        rate_jacobian=_rate_jacobian, h_jacobian=_MEASURED.jacobian,
     )
     disturbance, noise = _each(0.002, 0.05, 0.002, 0.1), _each(0.1, 0.02)
     hover = np.array([_MASS * _GRAVITY, 0.0, 0.0, 0.0])

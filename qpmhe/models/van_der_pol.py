@@ -6,12 +6,12 @@ import numpy as np
 
 from ..model.system import System
 from ..observers import HighGain
-from .example import Array, Example, make_example
+from .example import Array, Example, Selection, make_example
 
 __all__ = ["van_der_pol"]
 
 _MU, _DT = 1.0, 0.1
-_OUTPUT = np.array([[1.0, 0.0]])
+_MEASURED = Selection(2, slice(0, 1))
 
 
 def _rate(x: Array) -> Array:
@@ -29,14 +29,6 @@ def _rate_jacobian(x: Array) -> Array:
     slope[..., 1, 0] = -2.0 * _MU * first * second - 1.0
     slope[..., 1, 1] = _MU * (1.0 - first * first)
     return slope
-
-
-def _output(x: Array) -> Array:
-    return x[..., :1]
-
-
-def _output_jacobian(x: Array) -> Array:
-    return np.broadcast_to(_OUTPUT, (*x.shape[:-1], 1, 2))
 
 
 def van_der_pol(method: str = "rk4") -> Example:
@@ -63,8 +55,8 @@ def van_der_pol(method: str = "rk4") -> Example:
     Khalil, Nonlinear Systems, 3rd edition, 2002, section 2.4.
     """
     system = System.from_ode(
-        _rate, _output, dt=_DT, n=2, p=1, method=method,
-        rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
+        _rate, _MEASURED.output, dt=_DT, n=2, p=1, method=method,
+        rate_jacobian=_rate_jacobian, h_jacobian=_MEASURED.jacobian,
     )
     return make_example(
         system, HighGain(2, epsilon=0.4, dt=_DT), prior=[1.0, 1.0], disturbance=[0.02, 0.05],

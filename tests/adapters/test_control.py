@@ -176,5 +176,5 @@ def test_a_map_is_asked_at_its_own_times_only():
 
 def test_without_python_control_there_is_a_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "control", None)
-    with pytest.raises(InvalidInputError, match="pip install control"):
+    with pytest.raises(InvalidInputError, match=r"pip install 'qpmhe\[control\]'"):
         from_control(object())

@@ -170,5 +170,5 @@ def test_special_functions_are_those_of_scipy():
 
 def test_without_sympy_there_is_a_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "sympy", None)
-    with pytest.raises(InvalidInputError, match="pip install sympy"):
+    with pytest.raises(InvalidInputError, match=r"pip install 'qpmhe\[sympy\]'"):
         from_sympy([X[0]], [X[0]], [X[0]])
