@@ -10,7 +10,7 @@ from .._checks import Array
 from ..estimation.estimate import Status
 from ..estimation.run import Run
 
-__all__ = ["accuracy", "consistency", "cost_ratio", "outcomes", "timing"]
+__all__ = ["accuracy", "consistency", "cost_ratio", "outcomes", "scales", "timing"]
 
 _FAILURES = (
     Status.SOLVER_FAILED | Status.NO_DECREASE | Status.MODEL_FAILED | Status.FAILED_STAGE
@@ -19,21 +19,41 @@ _FAILURES = (
 
 
 def accuracy(estimates: Array, states: Array, settled: int) -> dict[str, Any]:
-    """Root mean square errors of the estimates of x(0), ..., x(T), arrays of (T + 1, n).
+    r"""Root mean square errors of the estimates of x(0), ..., x(T), arrays of (T + 1, n).
 
-    ``rmse`` is the root of the mean of |x_hat(t) - x(t)|^2 over all t, ``rmse_settled`` over
-    t >= settled, and ``rmse_states``, ``rmse_settled_states`` list the same for each state. NaN
+    ``rmse_states`` lists the error :math:`\epsilon_j` of each state in its unit over all t,
+    ``rmse_settled_states`` over t >= settled. ``rmse`` and ``rmse_settled`` sum them up without a
+    unit,
+
+    .. math::
+        \sqrt{\frac1n \sum_{j=1}^n \frac{\epsilon_j^2}{s_j^2}}, \qquad
+        s_j^2 = \frac1{T+1} \sum_{t=0}^T (x_j(t) - \hat x_j(0))^2
+
+    with the scales of `scales`: 1 is the error of keeping the initial estimate for ever. NaN
     where no time counts as settled.
     """
     with np.errstate(all="ignore"):
+        sizes = scales(states, estimates[0])
         squares = (estimates - states) ** 2
-        late = squares[settled:]
+        late, relative = squares[settled:], ((estimates - states) / sizes) ** 2
         return {
-            "rmse": _root(squares.sum(axis=1)),
-            "rmse_settled": _root(late.sum(axis=1)),
+            "rmse": _root(relative),
+            "rmse_settled": _root(relative[settled:]),
             "rmse_states": [_root(column) for column in squares.T],
             "rmse_settled_states": [_root(column) for column in late.T],
         }
+
+
+def scales(states: Array, initial_estimate: Array) -> Array:
+    """Each state's root mean square distance from its initial estimate, which is a scale (n,).
+
+    A state that never leaves its initial estimate has its own size as scale, and one that is
+    always zero has its unit.
+    """
+    distance = np.sqrt(((states - initial_estimate) ** 2).mean(axis=0))
+    size = np.abs(states).max(axis=0)
+    found: Array = np.where(distance > 0.0, distance, np.where(size > 0.0, size, 1.0))
+    return found
 
 
 def _root(squares: Array) -> float:

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Store", "Writer", "export"]
 
-#: Version of the tables.
-SCHEMA = 1
+#: Version of the tables, and of what their columns mean.
+SCHEMA = 2
 # Distinguishes our files from other SQLite files: "qpmh".
 _APPLICATION = 0x71706D68
 # Seconds to wait for another program's lock.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -69,7 +70,8 @@ def summarise(frame: DataFrame) -> DataFrame:
           ``rmse_excess`` is ``rmse`` relative to the most accurate configuration of the same
           problem (`PROBLEM`), minus 1, seed by seed, so that what the seeds have in common
           cancels;
-        - ``rmse_states`` and ``rmse_settled_states``: lists, a value a state;
+        - ``rmse_states`` and ``rmse_settled_states``: lists, a value a state in its unit, with
+          ``_low`` and ``_high``;
         - ``reasons``: dict, share of the steps with each flag of `qpmhe.Status`;
         - ``pareto``: whether no configuration of the same problem is faster (``time_median``)
           and more accurate (``rmse``, by more than `TOLERANCE`). Only configurations without
@@ -109,7 +111,9 @@ def summarise(frame: DataFrame) -> DataFrame:
     done = done.assign(rmse_excess=_excess(done, summary.reset_index()))
     _add_means(summary, done, ["rmse_excess"])
     for name in _STATES:
-        summary[name] = done.groupby(keys, dropna=False)[name].agg(_list_mean)
+        lists = done.groupby(keys, dropna=False)[name]
+        for place, suffix in enumerate(("", "_low", "_high")):
+            summary[f"{name}{suffix}"] = lists.agg(partial(_state_means, place=place))
     summary["reasons"] = groups[["reasons", "steps"]].apply(_reason_shares)
     summary = summary.reset_index().sort_values(keys, na_position="last", ignore_index=True)
     summary["pareto"] = False
@@ -140,12 +144,9 @@ def _reason_shares(cells: DataFrame) -> dict[str, float]:
 
 
 def _add_means(summary: DataFrame, done: DataFrame, names: list[str]) -> None:
-    from scipy.stats import t as student
-
     groups = done.groupby(list(CONFIGURATION), dropna=False)[names]
     mean, deviation, count = groups.mean(), groups.std(), groups.count()
-    factor = student.ppf(0.5 + 0.5 * _CONFIDENCE, np.maximum(count - 1, 1))
-    half = factor * deviation / np.sqrt(count)
+    half = _student(count) * deviation / np.sqrt(count)
     for name in names:
         low, high = mean[name] - half[name], mean[name] + half[name]
         if name in _POSITIVE:
@@ -183,11 +184,23 @@ def cells_of(cells: DataFrame, row: Any, keys: tuple[str, ...]) -> DataFrame:
     return cells[chosen]
 
 
-def _list_mean(lists: Series) -> list[float] | None:
+def _student(count: Any) -> Any:
+    """Half the width of the confidence interval of a mean, in standard errors."""
+    from scipy.stats import t as student
+
+    return student.ppf(0.5 + 0.5 * _CONFIDENCE, np.maximum(count - 1, 1))
+
+
+def _state_means(lists: Series, place: int) -> list[float] | None:
+    """The mean of each state's errors, its lower limit, or its upper limit."""
     rows = [np.asarray(one, dtype=float) for one in lists if one is not None]
     if not rows or len({row.shape for row in rows}) != 1:
         return None
-    values: list[float] = np.mean(rows, axis=0).tolist()
+    mean, count = np.mean(rows, axis=0), len(rows)
+    half = np.full(mean.shape, np.nan)
+    if count > 1:
+        half = _student(count) * np.std(rows, axis=0, ddof=1) / np.sqrt(count)
+    values: list[float] = (mean, np.maximum(mean - half, 0.0), mean + half)[place].tolist()
     return values
 
 

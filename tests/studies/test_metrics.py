@@ -48,10 +48,9 @@ def test_a_cell_is_the_run_of_an_estimator_made_by_hand(qps, cap, backend, start
     errors = np.array([initial, *(e.state for e in estimates)]) - states
     settled = round(qpmhe.models.batch_reactor().scenario.settling_time / 0.1)
     assert 0 < settled < STEPS
-    assert row["rmse"] == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()), rel=1e-12)
-    assert row["rmse_settled"] == pytest.approx(
-        np.sqrt((errors[settled:] ** 2).sum(axis=1).mean()), rel=1e-12
-    )
+    relative = (errors / np.sqrt(((states - initial) ** 2).mean(axis=0))) ** 2
+    assert row["rmse"] == pytest.approx(np.sqrt(relative.mean()), rel=1e-12)
+    assert row["rmse_settled"] == pytest.approx(np.sqrt(relative[settled:].mean()), rel=1e-12)
     assert row["rmse_states"] == pytest.approx(np.sqrt((errors**2).mean(axis=0)), rel=1e-12)
     assert row["rmse_settled_states"] == pytest.approx(
         np.sqrt((errors[settled:] ** 2).mean(axis=0)), rel=1e-12
@@ -140,9 +139,39 @@ def test_consistency_leaves_out_covariances_that_say_nothing():
     assert np.isnan(metrics.consistency(estimates, states, covariances[[1, 1, 2]]))
 
 
+def test_errors_of_different_units_are_summed_up_without_one():
+    generator = np.random.default_rng(0)
+    states, errors = generator.standard_normal((2, 30, 3))
+    estimates, units = states + 0.1 * errors, np.array([2.0**-30, 1.0, 2.0**20])
+    plain = metrics.accuracy(estimates, states, 5)
+    scaled = metrics.accuracy(estimates * units, states * units, 5)
+    assert (scaled["rmse"], scaled["rmse_settled"]) == (plain["rmse"], plain["rmse_settled"])
+    for name in ("rmse_states", "rmse_settled_states"):
+        assert scaled[name] == (np.array(plain[name]) * units).tolist()
+    # Whoever is right about the small numbers only is not ahead.
+    wrong = metrics.accuracy(np.where([True, True, False], states, estimates) * units,
+                             states * units, 5)
+    other = metrics.accuracy(np.where([False, True, True], states, estimates) * units,
+                             states * units, 5)
+    assert 0.3 < wrong["rmse"] / other["rmse"] < 3.0
+
+
+def test_keeping_the_initial_estimate_has_an_error_of_one():
+    states = np.random.default_rng(1).standard_normal((20, 3)) + 5.0
+    found = metrics.accuracy(np.tile([1.0, 7.0, -3.0], (20, 1)), states, 0)
+    assert found["rmse"] == pytest.approx(1.0)
+
+
+def test_states_that_never_leave_their_initial_estimate_have_a_scale():
+    states = np.array([[0.0, 4.0, 1.0], [0.0, 4.0, 3.0]])
+    assert metrics.scales(states, np.array([0.0, 4.0, 1.0])).tolist() == [1.0, 4.0, 2.0**0.5]
+    # A constant that is to be found: the initial error.
+    assert metrics.scales(states, np.array([0.0, 1.0, 1.0]))[1] == 3.0
+
+
 def test_nothing_settled_has_no_settled_error():
     found = metrics.accuracy(np.ones((3, 2)), np.zeros((3, 2)), 7)
-    assert found["rmse"] == pytest.approx(np.sqrt(2.0))
+    assert found["rmse"] == pytest.approx(1.0)
     assert np.isnan(found["rmse_settled"])
     assert np.isnan(found["rmse_settled_states"]).all()
 

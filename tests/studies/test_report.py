@@ -63,6 +63,42 @@ def test_observer_and_failures_are_told():
     assert texts(frame())[0]["Failures"] == "No backend failed, in any run or step."
 
 
+def test_what_is_worse_than_no_qp_is_named():
+    assert texts(frame())[0]["Worse than no QP"] == "No configuration."
+    rows = frame()
+    observer = rows[(rows.backend == "observer") & (rows.horizon == 10)].set_index("seed")
+    worse = (rows.backend == "osqp") & (rows.solver_iterations == 2) & (rows.horizon == 10)
+    rows.loc[worse, "rmse"] = 4.0 * observer.rmse.loc[rows.seed[worse]].to_numpy()
+    late = (rows.backend == "daqp") & rows.solver_iterations.isna() & (rows.horizon == 10)
+    rows.loc[late, "rmse_settled"] = (
+        1.5 * observer.rmse_settled.loc[rows.seed[late]].to_numpy()
+    )
+    mean = 4.0 * observer.rmse.mean()
+    settled = 1.5 * observer.rmse_settled.mean()
+    assert texts(rows)[0]["Worse than no QP"] == (
+        "2 of 6 configurations have a larger error than the observer alone, although J is never "
+        "above the candidate's: osqp, 2 QPs per sample, cap 2 "
+        f"(RMSE {number(mean)}, 4.00 times); daqp, 2 QPs per sample "
+        f"(RMSE after settling {number(settled)}, 1.50 times)."
+    )
+    rows.loc[worse, "rmse"] = np.inf
+    assert "osqp, 2 QPs per sample, cap 2 (RMSE ∞); daqp" in texts(rows)[0]["Worse than no QP"]
+
+
+def test_without_the_observer_nothing_is_worse_than_it():
+    assert "Worse than no QP" not in texts(frame().query("backend != 'observer'"))[0]
+
+
+def test_most_of_what_is_worse_is_counted():
+    rows = frame().query("horizon == 10 and backend != 'observer'")
+    many = pd.concat([frame().query("horizon == 10 and backend == 'observer'"), *(
+        rows.assign(solver_iterations=cap, rmse=rows.rmse * 100.0) for cap in (1, 2, 3)
+    )])
+    text = texts(many.drop_duplicates(["backend", "solver_iterations", "seed"]))[0]
+    assert text["Worse than no QP"].startswith("9 of 9 configurations have")
+    assert text["Worse than no QP"].endswith("; and 3 more.")
+
+
 def test_failed_steps_are_told():
     rows = frame()
     rows["reasons"] = [
@@ -146,9 +182,60 @@ def test_profile_against_its_definition():
             assert (one.ratios <= tau).sum() / one.problems == share
 
 
-def test_no_profile_of_one_problem():
+def test_no_profile_of_one_problem_or_where_nothing_is_solved():
     rows = frame()
     assert profiles(rows.query("seed == 0 and horizon == 10")) == []
+    assert profiles(rows.assign(cost_ratio=2.0)) == []
+
+
+def test_times_alone_have_no_figure_of_a_cost(tmp_path):
+    rows = frame().assign(cost_ratio=np.nan)
+    page = write_report(Altered(rows), tmp_path)
+    text, (_, data) = page.read_text(encoding="utf-8"), embedded(page)
+    assert "Performance profile" not in text
+    assert "true cost J" not in text
+    assert not (tmp_path / "profile.png").exists()
+    for case in data["cases"].values():
+        assert case["profile"] is None
+        assert "cost_ratio" not in case["accuracy"]
+        titles = {axis["title"]["text"] for axis in case["anytime"]["layout"].values()
+                  if isinstance(axis, dict) and "title" in axis}
+        assert titles == {"RMSE", "cap on the solver's iterations"}
+    assert (tmp_path / "batch-reactor-N-10-anytime.png").exists()
+
+
+def test_accuracy_alone_has_no_figure_of_times(tmp_path):
+    rows = frame().assign(times=None)
+    rows[["time_median", "time_p95", "time_p99", "time_max"]] = np.nan
+    text = write_report(Altered(rows), tmp_path).read_text(encoding="utf-8")
+    assert "Accuracy against time" not in text
+    assert "Time per step" not in text
+    assert "Stopping the solver early" in text
+
+
+def test_a_menu_entry_for_each_state():
+    rows, (_, data) = summarise(frame()), embedded(written())
+    case = data["cases"]["batch-reactor-N-10"]
+    entries = dict(case["menus"]["accuracy"]["metric"])
+    assert list(entries)[:4] == ["rmse", "rmse_settled", "rmse_excess", "cost_ratio"]
+    assert list(entries.values())[4:] == ["RMSE of x1 (A)", "RMSE of x2 (B)"]
+    assert set(case["accuracy"]) == set(entries)
+    for j in (0, 1):
+        drawn = sorted(
+            y for trace in case["accuracy"][f"rmse_{j + 1}"]["data"]
+            if trace["meta"].get("backend") for y in trace["y"]
+        )
+        expected = [one[j] for one in rows[rows.horizon == 10].rmse_states]
+        assert drawn == pytest.approx(sorted(expected))
+        assert case["accuracy"][f"rmse_{j + 1}"]["layout"]["yaxis"]["title"]["text"] == (
+            entries[f"rmse_{j + 1}"]
+        )
+
+
+def test_states_without_names_are_numbered():
+    rows = frame()
+    (case, *_) = cases(summarise(rows))
+    assert Part(case, rows, None).state_labels() == ["state 1", "state 2"]
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ def test_a_study_runs_once_and_more_cells_are_added(path, monkeypatch):
     ).run(record.measurements)
     row = frame[(frame["backend"] == "observer") & (frame["seed"] == 1)].iloc[0]
     errors = alone.states - record.states
-    assert row["rmse"] == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()), rel=1e-12)
+    assert row["rmse_states"] == pytest.approx(np.sqrt((errors**2).mean(axis=0)), rel=1e-12)
     # First seeds keep their trajectory, others do not.
     for row in frame.itertuples():
         assert (store.trajectory(row.key) is None) == (row.seed != 0)

@@ -48,10 +48,17 @@ def test_means_and_limits_are_students():
                 assert row[f"{name}_high"] == pytest.approx(high, rel=1e-9)
 
 
-def test_state_errors_make_up_the_whole():
+def test_state_errors_have_means_and_limits():
     rows = frame()
-    for _, row in summarise(rows[rows.seed == 0]).iterrows():
-        assert np.linalg.norm(row.rmse_states) == pytest.approx(row.rmse, rel=1e-9)
+    for _, row in summarise(rows).iterrows():
+        lists = np.array([*cells_of(rows, row)["rmse_states"]])
+        assert lists.shape == (3, 2)
+        assert row.rmse_states == pytest.approx(lists.mean(axis=0))
+        limits = ttest_1samp(lists, 0.0).confidence_interval(0.95)
+        assert row.rmse_states_low == pytest.approx(np.maximum(limits.low, 0.0))
+        assert row.rmse_states_high == pytest.approx(limits.high)
+    (one, *_) = summarise(rows[rows.seed == 0]).to_dict("records")
+    assert np.isnan(one["rmse_states_low"]).all()
 
 
 def test_excess_is_paired_by_seed():

@@ -19,6 +19,7 @@ __all__ = ["NEAR", "Answer", "Case", "cases", "chosen", "failures", "limitations
 #: "Within 1 % of the best RMSE".
 NEAR = 0.01
 _FEW_SEEDS = 10
+_MOST_NAMED = 6
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Case:
         return rows[(rows["failures"] == 0) & np.isfinite(rows["rmse"].astype(float))]
 
     def answers(self) -> list[Answer]:
-        """Fastest near the best, most accurate, the observer alone, what failed."""
+        """Fastest near the best, most accurate, the observer alone, what is worse, what failed."""
         best = chosen(self.summary)
         if best is None:
             return [Answer("Result", "No configuration finished all its runs."), self._failed()]
@@ -63,7 +64,8 @@ class Case:
             found.append(Answer("Fastest", "The study has no times: it measured accuracy only."))
         found.append(Answer("Most accurate", self._accurate(accurate, fastest)))
         observer = self._observer(fastest if fastest is not None else accurate)
-        return [*found, *([observer] if observer else []), self._failed()]
+        worse = self._worse()
+        return [*found, *[one for one in (observer, worse) if one], self._failed()]
 
     def front(self) -> list[str]:
         """The Pareto front in words, the fastest first."""
@@ -110,6 +112,37 @@ class Case:
                 f", in {seconds(observer['time_median'])} per step ({percent(share)} of its time)"
             )
         return Answer("Observer alone (no QP)", text + ".")
+
+    def _worse(self) -> Answer | None:
+        """The configurations that estimate worse than the observer alone, the worst first."""
+        observers = self.whole[self.whole["backend"] == "observer"]
+        rows = self.summary[
+            (self.summary["backend"] != "observer") & (self.summary["failures"] == 0)
+        ]
+        if observers.empty or rows.empty:
+            return None
+        question, alone = "Worse than no QP", observers.iloc[0]
+        found = []
+        for _, row in rows.iterrows():
+            for name, words in (("rmse", "RMSE"), ("rmse_settled", "RMSE after settling")):
+                error, limit = float(row[name]), (1 + TOLERANCE) * float(alone[name])
+                if error > limit or (np.isnan(error) and not np.isnan(limit)):
+                    ratio = error / float(alone[name]) if alone[name] > 0 else np.inf
+                    times = f", {number(ratio)} times" if np.isfinite(ratio) else ""
+                    text = f"{configuration_words(row)} ({words} {number(error)}{times})"
+                    found.append((np.nan_to_num(ratio, nan=np.inf), text))
+                    break
+        if not found:
+            return Answer(question, "No configuration.")
+        found.sort(key=lambda one: -one[0])
+        named = [text for _, text in found[:_MOST_NAMED]]
+        more = f"; and {len(found) - len(named)} more" if len(found) > len(named) else ""
+        are = "configuration has" if len(found) == 1 else "configurations have"
+        return Answer(
+            question,
+            f"{len(found)} of {len(rows)} {are} a larger error than the observer alone, although J "
+            f"is never above the candidate's: {'; '.join(named)}{more}.",
+        )
 
     def _failed(self) -> Answer:
         rows = self.summary[self.summary["backend"] != "observer"]
@@ -195,8 +228,10 @@ def limitations(frame: DataFrame, summary: DataFrame) -> list[str]:
     notes = [
         "A time covers a whole update: the observer's step, building the QPs, the solver, and the "
         "verdict on its iterate.",
-        "An RMSE covers the whole state vector, in the states' own units; where these differ in "
-        "size, the largest dominates. The table gives it for each state.",
+        "An RMSE has no unit: each state's is divided by the state's root mean square distance "
+        "from its initial estimate over the record, and the states' mean square is taken. So 1 is "
+        "the error of keeping the initial estimate for ever. The first figure's menu and the table "
+        "give the RMSE of each state in its unit.",
         "Confidence limits are of the mean over seeds (Student's, 95 %). They cover other noise, "
         "not another machine, model or tuning.",
         f"RMSEs within {percent(TOLERANCE)} count as equal on the Pareto front.",

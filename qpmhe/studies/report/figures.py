@@ -16,13 +16,25 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 __all__ = ["SOLVED", "Profile", "Spread", "accuracy", "anytime", "performance", "profiles",
-           "spreads", "times"]
+           "spreads", "times", "with_states"]
 
 #: A problem counts as solved if J is on average within this part of the converged one.
 SOLVED = 0.01
 _QUANTILES = (0.01, 0.25, 0.5, 0.75, 0.99, 1.0)
 # Diameters of points, by QPs per sample.
 _SIZES, _LARGEST = {"0": 9.5, "1": 5.1, "2": 6.5}, 8.1
+
+
+def with_states(summary: DataFrame, count: int) -> DataFrame:
+    """A summary with a column for the RMSE of each of so many states, and for its limits."""
+    columns = {}
+    for suffix in ("", "_low", "_high"):
+        lists = summary[f"rmse_states{suffix}"]
+        for j in range(count):
+            columns[f"rmse_{j + 1}{suffix}"] = [
+                one[j] if isinstance(one, list) and len(one) > j else np.nan for one in lists
+            ]
+    return summary.assign(**columns)
 
 
 def accuracy(summary: DataFrame, metric: str, label: str, front: Any) -> Drawing | None:
@@ -39,7 +51,7 @@ def accuracy(summary: DataFrame, metric: str, label: str, front: Any) -> Drawing
     for backend, mine in rows.groupby("backend", sort=False):
         marks.append(Mark(
             "points", mine["time_median"].tolist(), mine[metric].tolist(), str(backend),
-            [_hover(row) for _, row in mine.iterrows()], _bars(mine, metric),
+            [_hover(row, metric, label) for _, row in mine.iterrows()], _bars(mine, metric),
             sizes=[_SIZES.get(qps_words(one), _LARGEST) for one in mine["qps"]],
             hollow=mine["solver_iterations"].notna().tolist(),
             pale=(mine["failures"] > 0).tolist(), meta={"backend": str(backend)},
@@ -51,15 +63,20 @@ def accuracy(summary: DataFrame, metric: str, label: str, front: Any) -> Drawing
 
 
 def anytime(summary: DataFrame) -> Drawing | None:
-    """RMSE and cost ratio against the cap, a line for each backend and number of QPs per sample."""
+    """RMSE and cost ratio against the cap, a line for each backend and number of QPs per sample.
+
+    Without the cost ratio where the study has none.
+    """
     rest = summary[(summary["backend"] != "observer") & (summary["failures"] == 0)]
     if rest.empty:
         return None
     observer = summary[summary["backend"] == "observer"]
     caps = sorted({int(cap) for cap in rest["solver_iterations"] if not missing(cap)})
     order = [*map(str, caps), "none"]
-    panels = []
-    for metric, label in (("rmse", "RMSE"), ("cost_ratio", "J / converged J")):
+    panels: list[Panel] = []
+    metrics = [("rmse", "RMSE"), ("cost_ratio", "J / converged J")]
+    metrics = [(name, label) for name, label in metrics if rest[name].notna().any()]
+    for metric, label in metrics:
         marks = [
             Mark("level", order, [float(row[metric])] * len(order), "observer",
                  [_hover(row)] * len(order), meta={"backend": "observer"})
@@ -74,12 +91,12 @@ def anytime(summary: DataFrame) -> Drawing | None:
                 [_hover(row) for _, row in rows.iterrows()], _bars(rows, metric),
                 meta={"backend": str(backend), "qps": qps_words(qps), "start": str(start)},
             ))
-        title = "cap on the solver's iterations" if metric == "cost_ratio" else ""
+        title = "cap on the solver's iterations" if metric == metrics[-1][0] else ""
         panels.append(Panel(
             Axis(title, "category", order),
             Axis(label, "error", summary[metric].astype(float).tolist()), marks,
         ))
-    return Drawing(panels, 560)
+    return Drawing(panels, 60 + 250 * len(panels)) if panels else None
 
 
 def times(found: list[Spread], deadline: float | None) -> Drawing | None:
@@ -129,10 +146,12 @@ def performance(found: list[Profile]) -> Drawing | None:
     )], 420)
 
 
-def _hover(row: Any) -> str:
+def _hover(row: Any, metric: str = "rmse", label: str = "RMSE") -> str:
+    shown = {"rmse": "RMSE"} | {metric: label}
     lines = [
         f"<b>{configuration_words(row)}</b>" + (" (Pareto front)" if row["pareto"] else ""),
-        f"RMSE {number(row['rmse'])} ({number(row['rmse_low'])} to {number(row['rmse_high'])})",
+        *(f"{words} {number(row[name])} ({number(row[f'{name}_low'])} to "
+          f"{number(row[f'{name}_high'])})" for name, words in shown.items()),
         f"RMSE settled {number(row['rmse_settled'])}, J / converged {number(row['cost_ratio'])}",
         f"time median {seconds(row['time_median'])} ({seconds(row['time_median_low'])} to "
         f"{seconds(row['time_median_high'])}), 99 % {seconds(row['time_p99'])}",
@@ -204,8 +223,8 @@ def profiles(frame: DataFrame) -> list[Profile]:
 
     A backend is represented by its configuration that solves most problems, of several such by
     the one with the lowest geometric mean time (median per step). Solved means: the run finished
-    and its J is on average within `SOLVED` of the converged one. There are none without times or
-    with fewer than two problems.
+    and its J is on average within `SOLVED` of the converged one. There are none without times,
+    with fewer than two problems, or where no problem counts as solved.
     """
     problems = [*PROBLEM, "seed"]
     cells = frame[frame["backend"] != "observer"]
@@ -217,6 +236,8 @@ def profiles(frame: DataFrame) -> list[Profile]:
         (cells["outcome"] == "done") & (cells["cost_ratio"].astype(float) <= 1 + SOLVED)
         & cells["time_median"].notna()
     )
+    if not solved.any():
+        return []
     cells = cells.assign(problem=names, solved=solved, time=cells["time_median"].astype(float))
     # The same settings on different problems are one configuration here.
     keys = [key for key in CONFIGURATION if key not in problems]

@@ -45,12 +45,12 @@ _LIBRARIES = ("pandas", "plotly", "itables", "jinja2")
 MOST_STATES, _MOST_STATIC = 12, 6
 # Bytes of trajectories that the page may hold.
 _TRAJECTORY_BYTES = 1_000_000
-_METRICS = (
-    ("rmse", "RMSE"),
-    ("rmse_settled", "RMSE after settling"),
-    ("rmse_excess", f"RMSE above the best (%, at least {100 * TOLERANCE:g})"),
-    ("cost_ratio", "J / converged J"),
-)
+_METRICS = {
+    "rmse": "RMSE",
+    "rmse_settled": "RMSE after settling",
+    "rmse_excess": f"RMSE above the best (%, at least {100 * TOLERANCE:g})",
+    "cost_ratio": "J / converged J",
+}
 # Settings with a unit, and what None means in a setting.
 _HEADINGS = {"deadline": "deadline (s)", "cell_timeout": "cell timeout (s)", "qps": "QPs"}
 _NONE = {
@@ -153,6 +153,13 @@ class Part:
     cells: DataFrame
     deadline: float | None
     runs: Runs = field(default_factory=Runs)
+
+    def state_labels(self) -> list[str]:
+        """Names of the states, at most `MOST_STATES`: the model's, or numbers without a run."""
+        if self.runs.first is not None:
+            return [str(one) for one in self.runs.first["labels"]][:MOST_STATES]
+        sizes = [len(one) for one in self.case.summary["rmse_states"] if isinstance(one, list)]
+        return [f"state {j + 1}" for j in range(min(max(sizes, default=0), MOST_STATES))]
 
 
 def choose_runs(source: Store, cells: DataFrame, case: Case, most: int) -> Runs:
@@ -323,7 +330,8 @@ def _page(
         data=embedded(data),
         cases=found,
         styles=[(name, style) for name, style in drawn.items() if name in set(frame["backend"])],
-        metrics=_METRICS,
+        timed=bool(frame["time_median"].notna().any()),
+        costs=bool(frame["cost_ratio"].notna().any()),
         problems=profile[0].problems if profile else 0,
         solved=percent(SOLVED),
         profile_words="; ".join(one.words for one in profile),
@@ -344,28 +352,21 @@ def embedded(value: Any) -> str:
 
 def _figures(part: Part, drawn: Mapping[str, Style], overall: Drawing | None) -> dict[str, Any]:
     summary, runs = part.case.summary, part.runs
-    whole = summary["failures"] == 0
-    measures = {}
-    for metric, label in _METRICS:
-        by = "rmse" if metric == "rmse_excess" else metric
-        front = whole & pareto_front(
-            summary["time_median"].where(whole), summary[by].where(whole), TOLERANCE
-        )
-        rows = _in_percent(summary) if metric == "rmse_excess" else summary
-        measures[metric] = interactive(figures.accuracy(rows, metric, label, front), drawn)
+    measures = _measures(part, drawn)
     rest = summary[summary["backend"] != "observer"]
     qps = [(word, word) for word in ranked(map(qps_words, rest["qps"]))]
     caps = [(word, word) for word in ranked(map(cap_words, rest["solver_iterations"]))]
     starts = [(str(one), str(one)) for one in sorted(rest["start"].unique(), key=usual_first)]
     numbers = [word for word, _ in qps if word.isdigit()]
     return {
-        "accuracy": measures,
+        "accuracy": {metric: figure for metric, (_, figure) in measures.items()},
         "anytime": interactive(figures.anytime(summary), drawn),
         "times": interactive(figures.times(figures.spreads(part.cells), part.deadline), drawn),
         "profile": interactive(overall, drawn),
         "trajectories": None if runs.first is None else _run_figure(runs.first),
         "runs": {"observer": runs.observer, "all": runs.all},
         "menus": {
+            "accuracy": {"metric": [(metric, label) for metric, (label, _) in measures.items()]},
             "anytime": {"qps": qps, "start": starts},
             "times": {"qps": qps, "cap": caps, "start": starts},
             "trajectories": {"run": runs.entries},
@@ -377,6 +378,25 @@ def _figures(part: Part, drawn: Mapping[str, Style], overall: Drawing | None) ->
             "run": runs.entries[0][0] if runs.entries else None,
         },
     }
+
+
+def _measures(part: Part, drawn: Mapping[str, Style]) -> dict[str, tuple[str, Any]]:
+    """Accuracy against time by each measure that there is: its label and its figure."""
+    labels = [f"RMSE of {label}" for label in part.state_labels()]
+    summary = figures.with_states(part.case.summary, len(labels))
+    whole = summary["failures"] == 0
+    found = {}
+    states = {f"rmse_{j}": label for j, label in enumerate(labels, start=1)}
+    for metric, label in (_METRICS | states).items():
+        by = "rmse" if metric == "rmse_excess" else metric
+        front = whole & pareto_front(
+            summary["time_median"].where(whole), summary[by].where(whole), TOLERANCE
+        )
+        rows = _in_percent(summary) if metric == "rmse_excess" else summary
+        figure = interactive(figures.accuracy(rows, metric, label, front), drawn)
+        if figure is not None:
+            found[metric] = label, figure
+    return found
 
 
 def _in_percent(summary: DataFrame) -> DataFrame:

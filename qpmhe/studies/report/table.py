@@ -83,7 +83,7 @@ def table(cases: list[Case]) -> str:
     }
     empty = {
         name for _, name, _ in _NUMBERS
-        if frame[name].isna().all() and name not in ("RMSE", "J / converged")
+        if frame[name].isna().all() and name != "RMSE"
     }
     frame = frame.drop(columns=sorted(single | empty))
     places = {name: place for place, name in enumerate(frame.columns)}
