@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,9 @@ from ..observers.projection import ErrorMetric, NearestPoint
 from .estimate import Status
 from .limits import LARGEST
 from .linearization import Stage, StageTerms
+from .running import RunningObservers, project
 from .snapshot import mismatch, near
-from .stages import Stages, StageView, WindowView
+from .stages import Mark, Stages, StageView, WindowView, read_only
 
 __all__ = ["Window"]
 
@@ -25,9 +27,6 @@ Array = NDArray[np.float64]
 
 # As integers: to combine flags of an enumeration takes longer than the rest of the step's logic.
 _MISSING, _MODEL_FAILED = Status.MISSING.value, Status.MODEL_FAILED.value
-_PROJECTED, _PREDICTION_OUTSIDE, _METRIC_SINGULAR = (
-    Status.OBSERVER_PROJECTED.value, Status.PREDICTION_OUTSIDE.value, Status.METRIC_SINGULAR.value
-)
 
 
 class Window(Stages):
@@ -49,6 +48,7 @@ class Window(Stages):
         initial_state: Array,
         with_terms: bool,
         project: bool,
+        reinitialized: bool = False,
     ) -> None:
         n, p, m = system.n, system.p, system.m
         self._system, self._observer, self._cost = system, observer, cost
@@ -71,6 +71,14 @@ class Window(Stages):
                 self.metric = ErrorMetric(
                     observer, cost.initial_weight(observer.initial_covariance()), noise
                 )
+        # For the re-initialised candidate; None where `replay` has to make it.
+        self._observers: RunningObservers | None = None
+        gain, size = observer.constant_gain, horizon * horizon * (2 * n + p)
+        if (
+            reinitialized and gain is not None and size <= RunningObservers.LARGEST
+            and self._covariances is None and not observer.needs_jacobians
+        ):
+            self._observers = RunningObservers(gain, horizon, self._nearest, self.metric)
         self._correct = contained(observer.correct)
         self._evaluate_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
         self._functions = system.f.direct, system.h.direct
@@ -113,7 +121,10 @@ class Window(Stages):
         if noise_weight is not None:
             self._own_noise[self.time] = noise_weight
             self._set_weight(k, self.time)
-        self._compute_stage(k, self.time)
+        if self._runs:
+            self._components(k, self.time)
+        else:
+            self._compute_stage(k, self.time)
         self.end = k + 1
         self.time += 1
         if self.end - self.start > self.horizon:
@@ -123,6 +134,7 @@ class Window(Stages):
 
     def amend(self, time: int, y: Array) -> None:
         """Fill the finite components of y into a sample of the window, and redo what follows."""
+        self._forget_observers()
         k = self.end - (self.time - time)
         new = np.abs(y) < LARGEST
         self._y[k, new] = y[new]
@@ -138,20 +150,85 @@ class Window(Stages):
         for k in range(first, self.end):
             self._compute_stage(k, self.time - (self.end - k))
 
+    def reinitialize(self, estimates: Sequence[Array]) -> None:
+        """Start the observer anew at the window's first state.
+
+        ``estimates`` are those of x(t-1), last, and of the states before it, each made at its time.
+        """
+        if not self._runs or not self._follow(estimates):
+            self.replay(self.length, estimates[len(estimates) - self.length])
+
+    @property
+    def _runs(self) -> bool:
+        """Whether observers run, as `replay` would make them run now."""
+        return self._observers is not None and (self.metric is None or self.metric.settled)
+
+    def _follow(self, estimates: Sequence[Array]) -> bool:
+        """Take the candidate from a running observer; False if anything on it is not finite."""
+        observers, now, first = self._observers, self.time, self.time - self.length
+        assert observers is not None
+        if observers.time < first:
+            observers.restart(first, estimates[len(estimates) - self.length])
+        for time in range(observers.time, now):
+            k = self.end - (now - time)
+            self._describe(k, self._components(k, time))
+            observers.advance(estimates[len(estimates) - (now - time)], self._y[k], self._sample)
+        found = observers.trajectory(first)
+        if found is None:
+            return False
+        self._z[self.start : self.end + 1], self.residuals[...], self.events = found
+        if not self._set_all_stages():
+            return False
+        self.failure, sample = "", self._sample
+        if self._own_noise or sample.noise_weight is not None:
+            sample.noise_weight = self._own_noise.get(now - 1)
+        if sample.observed is not None:
+            self.events |= _MISSING
+        return True
+
+    def _set_all_stages(self) -> bool:
+        """Compute the Jacobians, terms and costs of all stages; whether all are finite."""
+        terms, view, n, weights = self.terms, self.view, self._n, self.stage_weights
+        residuals, states = read_only(view.residuals), view.candidate[:-1]
+        try:
+            if self._with_jacobians:
+                minus_jacobian, inputs, model = view.span.minus_jacobian, self.inputs, self.model
+                np.negative(model.f_jacobian.batch(states, inputs), minus_jacobian[:, :n])
+                np.negative(model.h_jacobian.batch(states, inputs), minus_jacobian[:, n:])
+            if not self._quadratic:
+                view.costs[...] = self._evaluate_costs(residuals, read_only(weights))
+                if self._with_terms:
+                    weights = self._majorise(residuals, read_only(weights))
+                    self._majorising_weights[self.start : self.end] = weights
+            if self._quadratic or self._with_terms:
+                costs = terms.set_all(self.length, weights, self.start)
+                if self._quadratic:
+                    view.costs[...] = costs
+                elif not np.isfinite(costs).all():
+                    return False
+        except Exception:  # what the user wrote, at some stage
+            return False
+        return bool(np.isfinite(view.costs).all())
+
+    def _forget_observers(self) -> None:
+        """Restart the running observers at their next use: samples have changed."""
+        if self._observers is not None:
+            self._observers.time = -1
+
+    def roll_back(self, mark: Mark) -> None:
+        """Undo all changes since a mark, as the arrays alone would."""
+        self._forget_observers()
+        super().roll_back(mark)
+
     def _compute_stage(self, k: int, time: int) -> None:
         """Compute stage k, of this time, from its sample and the observer's state."""
-        y = self._stage_views[k].y
-        observed: NDArray[np.bool_] | None = None
-        if not math.isfinite(y.dot(y)):
-            self._observed[k] = observed = np.abs(y) < LARGEST  # False for NaN, too
-            self._set_weight(k, time)
-        elif self.unusual and not self._observed[k].all():
-            observed = self._observed[k]
+        y, observed = self._stage_views[k].y, self._components(k, time)
         self.failure = ""
         cost = self._evaluate_stage(k, time, observed)
         if not math.isfinite(cost) and observed is None:
             small = np.abs(y) < LARGEST
             if not small.all():  # a huge component may be the reason: without it
+                self._forget_observers()
                 self._observed[k] = observed = small
                 self._set_weight(k, time)
                 cost = self._evaluate_stage(k, time, observed)
@@ -167,6 +244,16 @@ class Window(Stages):
             self.events |= _MISSING
         if model_failed or jacobian_failed:
             self.events |= _MODEL_FAILED
+
+    def _components(self, k: int, time: int) -> NDArray[np.bool_] | None:
+        """Which components of y are there at stage k; None for all."""
+        y = self._stage_views[k].y
+        if not math.isfinite(y.dot(y)):
+            self._observed[k] = np.abs(y) < LARGEST  # False for NaN, too
+            self._set_weight(k, time)
+        elif not self.unusual or self._observed[k].all():
+            return None
+        return self._observed[k]
 
     def _set_weight(self, k: int, time: int) -> None:
         """Set the weight of stage k from its observed components and its noise weight."""
@@ -208,10 +295,9 @@ class Window(Stages):
         self, k: int, view: StageView, observed: NDArray[np.bool_] | None
     ) -> None:
         """Write y - h(z), the Jacobians and, as z(t+1), f(z); describe the stage in the sample."""
-        model, u, terms, sample = self._system, view.u, view.terms, self._sample
+        terms = view.terms
         self._running = "the model"
-        if self.unusual and self._irregular[k]:
-            model, u = self._system.timed, self._u[k]
+        model, u = self._describe(k, observed)
         kernel = model.kernel if self._with_jacobians else None
         if kernel is None:
             usual = model is self._system
@@ -234,7 +320,14 @@ class Window(Stages):
             np.negative(jacobian, terms.linear[:, 1:])
         if observed is not None:
             terms.noise[~observed] = 0.0
+
+    def _describe(self, k: int, observed: NDArray[np.bool_] | None) -> tuple[System, Array]:
+        """Describe stage k in the sample; return its model and input."""
+        model, u, sample = self._system, self._stage_views[k].u, self._sample
+        if self.unusual and self._irregular[k]:
+            model, u = self._system.timed, self._u[k]
         sample.system, sample.u, sample.observed = model, u, observed
+        return model, u
 
     def _advance_observer(self, k: int, time: int, view: StageView) -> bool:
         """Add the correction to f(z), and project; whether state and covariance are finite."""
@@ -275,19 +368,7 @@ class Window(Stages):
         if nearest.contains(z_next):
             return
         assert covariance is not None
-        found = nearest(z_next, covariance)
-        self.events |= _PROJECTED
-        if not nearest.contains(predicted):
-            self.events |= _PREDICTION_OUTSIDE
-            if found.reached and nearest.is_beyond(z_next, found.point, covariance):
-                # Every point of X is nearer to the truth than z_next is. That prediction says
-                # nothing, but would drown the correction.
-                inside = nearest(predicted, covariance).point
-                found = nearest(inside + view.terms.disturbance, covariance)
-        z_next[...] = found.point
-        np.subtract(z_next, predicted, view.terms.disturbance)
-        if not found.reached:
-            self.events |= _METRIC_SINGULAR
+        self.events |= project(nearest, covariance, predicted, z_next, view.terms.disturbance)
 
     def filtered(self) -> Array | None:
         """The observer's estimate of x(t) that has used y(t), within X; None if it has none."""

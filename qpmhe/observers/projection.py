@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .._checks import Array
 from .._linalg import inverse
@@ -72,15 +73,22 @@ class NearestPoint:
 
     def contains(self, point: Array) -> bool:
         """Whether a point is in the set, up to rounding in general inequalities."""
-        # Comparisons with NaN are false: a NaN is no member.
-        if not ((self._lower <= point).all() and (point <= self._upper).all()):
-            return False
-        return not self._has_rows or not (self._misses(point) > 0.0).any()
+        return bool(self.inside(point))
 
-    def _misses(self, point: Array) -> Array:
-        """By how much a point misses each row; 0 where only by rounding."""
-        missed: Array = self._rows @ point - self._sides
-        rounding = _ROUNDING * (self._sizes @ np.abs(point) + self._side_sizes)
+    def inside(self, points: Array) -> NDArray[np.bool_]:
+        """Which of the points (..., n) the set contains."""
+        # Comparisons with NaN are false: a NaN is no member.
+        inside: NDArray[np.bool_] = (
+            (self._lower <= points) & (points <= self._upper)
+        ).all(axis=-1)
+        if self._has_rows:
+            inside = inside & ~(self._misses(points) > 0.0).any(axis=-1)
+        return inside
+
+    def _misses(self, points: Array) -> Array:
+        """By how much points (..., n) miss each row; 0 where only by rounding."""
+        missed: Array = points @ self._rows.T - self._sides
+        rounding = _ROUNDING * (np.abs(points) @ self._sizes.T + self._side_sizes)
         return np.where(missed > rounding, missed, 0.0)
 
     def __call__(self, point: Array, covariance: Array) -> Projected:
