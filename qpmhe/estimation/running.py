@@ -10,7 +10,7 @@ from ..observers import Sample
 from ..observers.projection import ErrorMetric, NearestPoint
 from .estimate import Status
 
-__all__ = ["RunningObservers", "project"]
+__all__ = ["RunningObservers", "keep_inside"]
 
 Array = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ _PROJECTED, _PREDICTION_OUTSIDE, _METRIC_SINGULAR = (
 )
 
 
-def project(
+def keep_inside(
     nearest: NearestPoint, covariance: Array, predicted: Array, state: Array, correction: Array
 ) -> int:
     """Project z(t+1) onto X, set its correction to match, and return flags of `Status`."""
@@ -60,18 +60,15 @@ class RunningObservers:
         self._predicted = np.zeros((horizon, n))
         self._failed = np.zeros(horizon, np.bool_)
         self._events = [0] * horizon  # flags of `Status` at the last sample
-        #: Time of the next sample; -1 before `restart`.
-        self.time = -1
 
     def restart(self, time: int, state: Array) -> None:
         """Start all observers at one state."""
         self._states[time % (self._count + 1)] = state
         self._failed[:] = False
-        self.time = time
 
-    def advance(self, start: Array, y: Array, sample: Sample) -> None:
-        """Start an observer at the newest estimate, and advance all by one sample."""
-        n, count, time, failed = self._n, self._count, self.time, self._failed
+    def advance(self, time: int, start: Array, y: Array, sample: Sample) -> None:
+        """Start an observer at the estimate of x(time), and advance all by the sample then."""
+        n, count, failed = self._n, self._count, self._failed
         now, ahead = self._states[time % (count + 1)], self._states[(time + 1) % (count + 1)]
         residuals, predicted = self._residuals[time % count], self._predicted
         now[time % count] = start
@@ -91,30 +88,30 @@ class RunningObservers:
         if not finite.all():
             failed |= ~finite
         if self._nearest is not None:
-            self._project(self._nearest, ahead, correction)
-        self.time = time + 1
+            self._project(self._nearest, predicted, ahead, correction)
 
-    def _project(self, nearest: NearestPoint, ahead: Array, correction: Array) -> None:
-        metric, failed, predicted = self._metric, self._failed, self._predicted
+    def _project(
+        self, nearest: NearestPoint, predicted: Array, ahead: Array, correction: Array
+    ) -> None:
+        metric, failed, self._events = self._metric, self._failed, [0] * self._count
         assert metric is not None
-        self._events = [0] * self._count
         for i in np.flatnonzero(~(nearest.inside(ahead) | failed)):
             try:
-                self._events[i] = project(
+                self._events[i] = keep_inside(
                     nearest, metric.covariance, predicted[i], ahead[i], correction[i]
                 )
             except np.linalg.LinAlgError:
                 failed[i] = True
 
-    def trajectory(self, first: int) -> tuple[Array, Array, int] | None:
-        """What the observer started at this time has done; None if it failed.
+    def trajectory(self, first: int, last: int) -> tuple[Array, Array, int] | None:
+        """States and residuals of the observer started at ``first``, up to the last sample.
 
-        Its states (K + 1, n), its residuals (K, n + p) and its flags at the last sample.
+        None if it failed. The third part are its flags at that sample.
         """
         row = first % self._count
         if self._failed[row]:
             return None
-        times = np.arange(first, self.time + 1)
+        times = np.arange(first, last + 1)
         states = self._states[times % (self._count + 1), row]
         return states, self._residuals[times[:-1] % self._count, row], self._events[row]
 

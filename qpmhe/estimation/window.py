@@ -17,9 +17,9 @@ from ..observers.projection import ErrorMetric, NearestPoint
 from .estimate import Status
 from .limits import LARGEST
 from .linearization import Stage, StageTerms
-from .running import RunningObservers, project
+from .running import RunningObservers, keep_inside
 from .snapshot import mismatch, near
-from .stages import Mark, Stages, StageView, WindowView, read_only
+from .stages import Stages, StageView, WindowView, read_only
 
 __all__ = ["Window"]
 
@@ -134,7 +134,7 @@ class Window(Stages):
 
     def amend(self, time: int, y: Array) -> None:
         """Fill the finite components of y into a sample of the window, and redo what follows."""
-        self._forget_observers()
+        self._run_to = -1
         k = self.end - (self.time - time)
         new = np.abs(y) < LARGEST
         self._y[k, new] = y[new]
@@ -167,13 +167,16 @@ class Window(Stages):
         """Take the candidate from a running observer; False if anything on it is not finite."""
         observers, now, first = self._observers, self.time, self.time - self.length
         assert observers is not None
-        if observers.time < first:
+        if self._run_to < first:
             observers.restart(first, estimates[len(estimates) - self.length])
-        for time in range(observers.time, now):
-            k = self.end - (now - time)
+            self._run_to = first
+        while self._run_to < now:
+            time, age = self._run_to, now - self._run_to
+            k = self.end - age
             self._describe(k, self._components(k, time))
-            observers.advance(estimates[len(estimates) - (now - time)], self._y[k], self._sample)
-        found = observers.trajectory(first)
+            observers.advance(time, estimates[len(estimates) - age], self._y[k], self._sample)
+            self._run_to = time + 1
+        found = observers.trajectory(first, now)
         if found is None:
             return False
         self._z[self.start : self.end + 1], self.residuals[...], self.events = found
@@ -210,16 +213,6 @@ class Window(Stages):
             return False
         return bool(np.isfinite(view.costs).all())
 
-    def _forget_observers(self) -> None:
-        """Restart the running observers at their next use: samples have changed."""
-        if self._observers is not None:
-            self._observers.time = -1
-
-    def roll_back(self, mark: Mark) -> None:
-        """Undo all changes since a mark, as the arrays alone would."""
-        self._forget_observers()
-        super().roll_back(mark)
-
     def _compute_stage(self, k: int, time: int) -> None:
         """Compute stage k, of this time, from its sample and the observer's state."""
         y, observed = self._stage_views[k].y, self._components(k, time)
@@ -228,7 +221,7 @@ class Window(Stages):
         if not math.isfinite(cost) and observed is None:
             small = np.abs(y) < LARGEST
             if not small.all():  # a huge component may be the reason: without it
-                self._forget_observers()
+                self._run_to = -1
                 self._observed[k] = observed = small
                 self._set_weight(k, time)
                 cost = self._evaluate_stage(k, time, observed)
@@ -368,7 +361,7 @@ class Window(Stages):
         if nearest.contains(z_next):
             return
         assert covariance is not None
-        self.events |= project(nearest, covariance, predicted, z_next, view.terms.disturbance)
+        self.events |= keep_inside(nearest, covariance, predicted, z_next, view.terms.disturbance)
 
     def filtered(self) -> Array | None:
         """The observer's estimate of x(t) that has used y(t), within X; None if it has none."""
