@@ -17,7 +17,7 @@ from ..observers.projection import ErrorMetric, NearestPoint
 from .estimate import Status
 from .limits import LARGEST
 from .linearization import Stage, StageTerms
-from .running import RunningObservers, keep_inside
+from .running import RunningObservers
 from .snapshot import mismatch, near
 from .stages import Stages, StageView, WindowView, read_only
 
@@ -27,6 +27,11 @@ Array = NDArray[np.float64]
 
 # As integers: to combine flags of an enumeration takes longer than the rest of the step's logic.
 _MISSING, _MODEL_FAILED = Status.MISSING.value, Status.MODEL_FAILED.value
+_PROJECTED, _PREDICTION_OUTSIDE, _METRIC_SINGULAR = (
+    Status.OBSERVER_PROJECTED.value, Status.PREDICTION_OUTSIDE.value, Status.METRIC_SINGULAR.value
+)
+# N observers that run side by side hold at most so many numbers.
+_MOST_RUNNING = 2**23
 
 
 class Window(Stages):
@@ -73,12 +78,10 @@ class Window(Stages):
                 )
         # For the re-initialised candidate; None where `replay` has to make it.
         self._observers: RunningObservers | None = None
-        gain, size = observer.constant_gain, horizon * horizon * (2 * n + p)
-        if (
-            reinitialized and gain is not None and size <= RunningObservers.LARGEST
-            and self._covariances is None and not observer.needs_jacobians
-        ):
-            self._observers = RunningObservers(gain, horizon, self._nearest, self.metric)
+        gain, simple = observer.constant_gain, not observer.needs_jacobians
+        small = horizon * horizon * (2 * n + p) <= _MOST_RUNNING
+        if reinitialized and gain is not None and small and simple and self._covariances is None:
+            self._observers = RunningObservers(gain, horizon, self._nearest, self._keep_inside)
         self._correct = contained(observer.correct)
         self._evaluate_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
         self._functions = system.f.direct, system.h.direct
@@ -134,7 +137,7 @@ class Window(Stages):
 
     def amend(self, time: int, y: Array) -> None:
         """Fill the finite components of y into a sample of the window, and redo what follows."""
-        self._run_to = -1
+        self._run_to = min(self._run_to, time)
         k = self.end - (self.time - time)
         new = np.abs(y) < LARGEST
         self._y[k, new] = y[new]
@@ -151,12 +154,9 @@ class Window(Stages):
             self._compute_stage(k, self.time - (self.end - k))
 
     def reinitialize(self, estimates: Sequence[Array]) -> None:
-        """Start the observer anew at the window's first state.
-
-        ``estimates`` are those of x(t-1), last, and of the states before it, each made at its time.
-        """
+        """Replay the window from its first estimate; the last ones are x(t-N), ..., x(t-1)."""
         if not self._runs or not self._follow(estimates):
-            self.replay(self.length, estimates[len(estimates) - self.length])
+            self.replay(self.length, estimates[-self.length])
 
     @property
     def _runs(self) -> bool:
@@ -164,54 +164,47 @@ class Window(Stages):
         return self._observers is not None and (self.metric is None or self.metric.settled)
 
     def _follow(self, estimates: Sequence[Array]) -> bool:
-        """Take the candidate from a running observer; False if anything on it is not finite."""
+        """Take the candidate from a running observer; False where `replay` has to make it."""
         observers, now, first = self._observers, self.time, self.time - self.length
         assert observers is not None
-        if self._run_to < first:
-            observers.restart(first, estimates[len(estimates) - self.length])
-            self._run_to = first
-        while self._run_to < now:
-            time, age = self._run_to, now - self._run_to
-            k = self.end - age
+        # What failed may not fail with other samples.
+        if self._run_to < first or (self._run_to < now - 1 and observers.failed.any()):
+            observers.failed[:], self._run_to = True, first
+        for time in range(self._run_to, now):
+            k = self.end - (now - time)
             self._describe(k, self._components(k, time))
-            observers.advance(time, estimates[len(estimates) - age], self._y[k], self._sample)
-            self._run_to = time + 1
-        found = observers.trajectory(first, now)
-        if found is None:
-            return False
-        self._z[self.start : self.end + 1], self.residuals[...], self.events = found
-        if not self._set_all_stages():
-            return False
+            observers.advance(time, estimates[time - now], self._y[k], self._sample)
+        self._run_to = now
+        self._z[self.start : self.end + 1], self.residuals[...], self.events = (
+            observers.trajectory(first, now)
+        )
         self.failure, sample = "", self._sample
         if self._own_noise or sample.noise_weight is not None:
             sample.noise_weight = self._own_noise.get(now - 1)
         if sample.observed is not None:
             self.events |= _MISSING
-        return True
+        return not observers.failed[first % self.horizon] and self._set_all_stages()
 
     def _set_all_stages(self) -> bool:
         """Compute the Jacobians, terms and costs of all stages; whether all are finite."""
-        terms, view, n, weights = self.terms, self.view, self._n, self.stage_weights
+        view, n, weights = self.view, self._n, self.stage_weights
         residuals, states = read_only(view.residuals), view.candidate[:-1]
         try:
             if self._with_jacobians:
                 minus_jacobian, inputs, model = view.span.minus_jacobian, self.inputs, self.model
                 np.negative(model.f_jacobian.batch(states, inputs), minus_jacobian[:, :n])
                 np.negative(model.h_jacobian.batch(states, inputs), minus_jacobian[:, n:])
-            if not self._quadratic:
-                view.costs[...] = self._evaluate_costs(residuals, read_only(weights))
+            if self._quadratic:
+                view.costs[...] = checked = self.terms.set_all(self.length, weights, self.start)
+            else:
+                view.costs[...] = checked = self._evaluate_costs(residuals, read_only(weights))
                 if self._with_terms:
                     weights = self._majorise(residuals, read_only(weights))
                     self._majorising_weights[self.start : self.end] = weights
-            if self._quadratic or self._with_terms:
-                costs = terms.set_all(self.length, weights, self.start)
-                if self._quadratic:
-                    view.costs[...] = costs
-                elif not np.isfinite(costs).all():
-                    return False
+                    checked = checked + self.terms.set_all(self.length, weights, self.start)
         except Exception:  # what the user wrote, at some stage
             return False
-        return bool(np.isfinite(view.costs).all())
+        return bool(np.isfinite(checked).all())
 
     def _compute_stage(self, k: int, time: int) -> None:
         """Compute stage k, of this time, from its sample and the observer's state."""
@@ -221,7 +214,7 @@ class Window(Stages):
         if not math.isfinite(cost) and observed is None:
             small = np.abs(y) < LARGEST
             if not small.all():  # a huge component may be the reason: without it
-                self._run_to = -1
+                self._run_to = min(self._run_to, time)
                 self._observed[k] = observed = small
                 self._set_weight(k, time)
                 cost = self._evaluate_stage(k, time, observed)
@@ -349,19 +342,36 @@ class Window(Stages):
         """Project z(t+1) onto X in the observer's metric, and set its correction to match."""
         nearest, metric, z_next = self._nearest, self.metric, view.z_next
         assert nearest is not None
-        if metric is not None:
-            if not metric.settled:
-                if self._with_jacobians:
-                    a, c = -view.terms.minus_a, -view.terms.minus_c
-                else:
-                    model, u = self._sample.system, self._sample.u
-                    a, c = model.f_jacobian(view.z, u), model.h_jacobian(view.z, u)
-                metric.settle(view.z, a, c, self._sample)
-            covariance = metric.covariance
-        if nearest.contains(z_next):
-            return
-        assert covariance is not None
-        self.events |= keep_inside(nearest, covariance, predicted, z_next, view.terms.disturbance)
+        if metric is not None and not metric.settled:
+            if self._with_jacobians:
+                a, c = -view.terms.minus_a, -view.terms.minus_c
+            else:
+                model, u = self._sample.system, self._sample.u
+                a, c = model.f_jacobian(view.z, u), model.h_jacobian(view.z, u)
+            metric.settle(view.z, a, c, self._sample)
+        if not nearest.contains(z_next):
+            correction = view.terms.disturbance
+            self.events |= self._keep_inside(predicted, z_next, correction, covariance)
+
+    def _keep_inside(
+        self, predicted: Array, z_next: Array, correction: Array, covariance: Array | None = None
+    ) -> int:
+        """Project z(t+1) onto X, set its correction to match; return flags of `Status`."""
+        nearest, events = self._nearest, _PROJECTED
+        if self.metric is not None:
+            covariance = self.metric.covariance
+        assert nearest is not None and covariance is not None
+        found = nearest(z_next, covariance)
+        if not nearest.contains(predicted):
+            events |= _PREDICTION_OUTSIDE
+            if found.reached and nearest.is_beyond(z_next, found.point, covariance):
+                # Every point of X is nearer to the truth than z_next is. That prediction says
+                # nothing, but would drown the correction.
+                inside = nearest(predicted, covariance).point
+                found = nearest(inside + correction, covariance)
+        z_next[...] = found.point
+        np.subtract(z_next, predicted, correction)
+        return events if found.reached else events | _METRIC_SINGULAR
 
     def filtered(self) -> Array | None:
         """The observer's estimate of x(t) that has used y(t), within X; None if it has none."""

@@ -71,19 +71,11 @@ class NearestPoint:
         self._largest = reach.max(axis=0, initial=0.0)  # sizes that the set gives its components
         self._widths: Array = convex_set.upper - convex_set.lower
 
-    def contains(self, point: Array) -> bool:
-        """Whether a point is in the set, up to rounding in general inequalities."""
-        return bool(self.inside(point))
-
-    def inside(self, points: Array) -> NDArray[np.bool_]:
-        """Which of the points (..., n) the set contains."""
+    def contains(self, points: Array) -> NDArray[np.bool_]:
+        """Whether each of the points (..., n) is in the set, up to rounding in general rows."""
         # Comparisons with NaN are false: a NaN is no member.
-        inside: NDArray[np.bool_] = (
-            (self._lower <= points) & (points <= self._upper)
-        ).all(axis=-1)
-        if self._has_rows:
-            inside = inside & ~(self._misses(points) > 0.0).any(axis=-1)
-        return inside
+        inside: NDArray[np.bool_] = ((self._lower <= points) & (points <= self._upper)).all(-1)
+        return inside & ~(self._misses(points) > 0.0).any(-1) if self._has_rows else inside
 
     def _misses(self, points: Array) -> Array:
         """By how much points (..., n) miss each row; 0 where only by rounding."""
