@@ -68,13 +68,13 @@ class PythonEngine:
         self._subproblem = Subproblem(system, cost, formulation.constraints, settings.horizon)
         self._optimizer = Optimizer(self._subproblem, solver, settings)
         self._with_terms = settings.qp_limit > 0
+        self._reinitialized = settings.candidate == "reinitialized"
         self._window = self._fresh_window(initial_state)
         self._watch = ObserverWatch(settings.horizon)
         self._known_modes = system.call_modes()  # as found at construction
         self._undo_point: tuple[Mark, Array | None, tuple[int, int], tuple[Array, ...]]
         self._trajectory: Array | None = None  # of the last estimate
         # Estimates of x(t-N), ..., x(t), each made at its own time; otherwise of x(t) only.
-        self._reinitialized = settings.candidate == "reinitialized"
         self._history: deque[Array] = deque(
             [initial_state.copy()], maxlen=settings.horizon + 1 if self._reinitialized else 1
         )
@@ -83,7 +83,7 @@ class PythonEngine:
         settings = self._settings
         return Window(
             self._system, self._observer, self._cost, settings.horizon, initial_state,
-            self._with_terms, settings.project_observer,
+            self._with_terms, settings.project_observer, self._reinitialized,
         )
 
     @property
@@ -115,7 +115,7 @@ class PythonEngine:
                     self._solver.shift()
                 window.push(y, u, dt, noise_weight)
                 if reinitialized:
-                    window.replay(window.length, self._history[len(self._history) - window.length])
+                    window.reinitialize(self._history)
                 estimate = self._estimate(began)
             assert self._trajectory is not None
             state = self._trajectory[-1]

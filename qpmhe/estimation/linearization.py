@@ -128,17 +128,20 @@ class StageTerms:
         # 0 times anything that is not finite is NaN, so one product checks all entries.
         return float(flat[0] + flat.dot(self._zeros))
 
-    def set_all(self, count: int, weight: Array) -> None:
-        """Compute the terms of the first stages from their ``linear``."""
-        linear = self.linear[:count]
+    def set_all(self, count: int, weight: Array, first: int = 0) -> Array:
+        """Compute terms of successive stages as `set_stage` does; return their costs."""
+        span = slice(first, first + count)
+        linear = self.linear[span]
         weighted = np.matmul(weight, linear)
         square = np.matmul(linear.transpose(0, 2, 1), weighted)
         flat = np.concatenate(
             (square.reshape(count, -1), weighted.reshape(count, -1), np.zeros((count, 1))), axis=1
         )
-        flat.take(self._panel_index, axis=1, out=self.panel[:count], mode="clip")
-        self.gradient[:count] = square[:, 1:, 0]
-        self.next_gradient[:count] = weighted[:, : self.gradient.shape[1], 0]
+        flat.take(self._panel_index, axis=1, out=self.panel[span], mode="clip")
+        self.gradient[span] = square[:, 1:, 0]
+        self.next_gradient[span] = weighted[:, : self.gradient.shape[1], 0]
+        costs: Array = flat[:, 0] + flat.dot(self._zeros)
+        return costs
 
     def copy_scaled(self, span: Span, factors: Array) -> None:
         """Copy stages to the first ones here, each with its cost times a factor."""

@@ -109,6 +109,8 @@ class Stages:
         self.time = 0  # number of samples pushed: the window ends at x(time)
         self.start = self.end = 0
         self._last_special = self._last_irregular = -self.horizon - 1
+        # Up to where running observers have taken the samples; -1 where samples have changed.
+        self._run_to = -1
         # Before the first stage in the arrays: the last state at which the model worked.
         self._earlier_state = initial_state.copy()
         self._earlier_covariance = None if covariance is None else covariance.copy()
@@ -228,6 +230,7 @@ class Stages:
 
     def roll_back(self, mark: Mark) -> None:
         """Undo all changes since a mark, which must be later than the last `make_room`."""
+        self._run_to = -1
         self.start, self.end, self.time = mark.start, mark.end, mark.time
         self._last_special, self._last_irregular = mark.last_special, mark.last_irregular
         self._own_noise = mark.own_noise or {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,9 @@ from ..observers.projection import ErrorMetric, NearestPoint
 from .estimate import Status
 from .limits import LARGEST
 from .linearization import Stage, StageTerms
+from .running import RunningObservers
 from .snapshot import mismatch, near
-from .stages import Stages, StageView, WindowView
+from .stages import Stages, StageView, WindowView, read_only
 
 __all__ = ["Window"]
 
@@ -28,6 +30,8 @@ _MISSING, _MODEL_FAILED = Status.MISSING.value, Status.MODEL_FAILED.value
 _PROJECTED, _PREDICTION_OUTSIDE, _METRIC_SINGULAR = (
     Status.OBSERVER_PROJECTED.value, Status.PREDICTION_OUTSIDE.value, Status.METRIC_SINGULAR.value
 )
+# N observers that run side by side hold at most so many numbers.
+_MOST_RUNNING = 2**23
 
 
 class Window(Stages):
@@ -49,6 +53,7 @@ class Window(Stages):
         initial_state: Array,
         with_terms: bool,
         project: bool,
+        reinitialized: bool = False,
     ) -> None:
         n, p, m = system.n, system.p, system.m
         self._system, self._observer, self._cost = system, observer, cost
@@ -71,6 +76,12 @@ class Window(Stages):
                 self.metric = ErrorMetric(
                     observer, cost.initial_weight(observer.initial_covariance()), noise
                 )
+        # For the re-initialised candidate; None where `replay` has to make it.
+        self._observers: RunningObservers | None = None
+        gain, simple = observer.constant_gain, not observer.needs_jacobians
+        small = horizon * horizon * (2 * n + p) <= _MOST_RUNNING
+        if reinitialized and gain is not None and small and simple and self._covariances is None:
+            self._observers = RunningObservers(gain, horizon, self._nearest, self._keep_inside)
         self._correct = contained(observer.correct)
         self._has_filter = type(observer).filter is not Observer.filter
         self._evaluate_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
@@ -114,7 +125,10 @@ class Window(Stages):
         if noise_weight is not None:
             self._own_noise[self.time] = noise_weight
             self._set_weight(k, self.time)
-        self._compute_stage(k, self.time)
+        if self._runs:
+            self._components(k, self.time)
+        else:
+            self._compute_stage(k, self.time)
         self.end = k + 1
         self.time += 1
         if self.end - self.start > self.horizon:
@@ -124,6 +138,7 @@ class Window(Stages):
 
     def amend(self, time: int, y: Array) -> None:
         """Fill the finite components of y into a sample of the window, and redo what follows."""
+        self._run_to = min(self._run_to, time)
         k = self.end - (self.time - time)
         new = np.abs(y) < LARGEST
         self._y[k, new] = y[new]
@@ -139,20 +154,68 @@ class Window(Stages):
         for k in range(first, self.end):
             self._compute_stage(k, self.time - (self.end - k))
 
+    def reinitialize(self, estimates: Sequence[Array]) -> None:
+        """Replay the window from its first estimate; the last ones are x(t-N), ..., x(t-1)."""
+        if not self._runs or not self._follow(estimates):
+            self.replay(self.length, estimates[-self.length])
+
+    @property
+    def _runs(self) -> bool:
+        """Whether observers run, as `replay` would make them run now."""
+        return self._observers is not None and (self.metric is None or self.metric.settled)
+
+    def _follow(self, estimates: Sequence[Array]) -> bool:
+        """Take the candidate from a running observer; False where `replay` has to make it."""
+        observers, now, first = self._observers, self.time, self.time - self.length
+        assert observers is not None
+        # What failed may not fail with other samples.
+        if self._run_to < first or (self._run_to < now - 1 and observers.failed.any()):
+            observers.failed[:], self._run_to = True, first
+        for time in range(self._run_to, now):
+            k = self.end - (now - time)
+            self._describe(k, self._components(k, time))
+            observers.advance(time, estimates[time - now], self._y[k], self._sample)
+        self._run_to = now
+        self._z[self.start : self.end + 1], self.residuals[...], self.events = (
+            observers.trajectory(first, now)
+        )
+        self.failure, sample = "", self._sample
+        if self._own_noise or sample.noise_weight is not None:
+            sample.noise_weight = self._own_noise.get(now - 1)
+        if sample.observed is not None:
+            self.events |= _MISSING
+        return not observers.failed[first % self.horizon] and self._set_all_stages()
+
+    def _set_all_stages(self) -> bool:
+        """Compute the Jacobians, terms and costs of all stages; whether all are finite."""
+        view, n, weights = self.view, self._n, self.stage_weights
+        residuals, states = read_only(view.residuals), view.candidate[:-1]
+        try:
+            if self._with_jacobians:
+                minus_jacobian, inputs, model = view.span.minus_jacobian, self.inputs, self.model
+                np.negative(model.f_jacobian.batch(states, inputs), minus_jacobian[:, :n])
+                np.negative(model.h_jacobian.batch(states, inputs), minus_jacobian[:, n:])
+            if self._quadratic:
+                view.costs[...] = checked = self.terms.set_all(self.length, weights, self.start)
+            else:
+                view.costs[...] = checked = self._evaluate_costs(residuals, read_only(weights))
+                if self._with_terms:
+                    weights = self._majorise(residuals, read_only(weights))
+                    self._majorising_weights[self.start : self.end] = weights
+                    checked = checked + self.terms.set_all(self.length, weights, self.start)
+        except Exception:  # what the user wrote, at some stage
+            return False
+        return bool(np.isfinite(checked).all())
+
     def _compute_stage(self, k: int, time: int) -> None:
         """Compute stage k, of this time, from its sample and the observer's state."""
-        y = self._stage_views[k].y
-        observed: NDArray[np.bool_] | None = None
-        if not math.isfinite(y.dot(y)):
-            self._observed[k] = observed = np.abs(y) < LARGEST  # False for NaN, too
-            self._set_weight(k, time)
-        elif self.unusual and not self._observed[k].all():
-            observed = self._observed[k]
+        y, observed = self._stage_views[k].y, self._components(k, time)
         self.failure = ""
         cost = self._evaluate_stage(k, time, observed)
         if not math.isfinite(cost) and observed is None:
             small = np.abs(y) < LARGEST
             if not small.all():  # a huge component may be the reason: without it
+                self._run_to = min(self._run_to, time)
                 self._observed[k] = observed = small
                 self._set_weight(k, time)
                 cost = self._evaluate_stage(k, time, observed)
@@ -168,6 +231,16 @@ class Window(Stages):
             self.events |= _MISSING
         if model_failed or jacobian_failed:
             self.events |= _MODEL_FAILED
+
+    def _components(self, k: int, time: int) -> NDArray[np.bool_] | None:
+        """Which components of y are there at stage k; None for all."""
+        y = self._stage_views[k].y
+        if not math.isfinite(y.dot(y)):
+            self._observed[k] = np.abs(y) < LARGEST  # False for NaN, too
+            self._set_weight(k, time)
+        elif not self.unusual or self._observed[k].all():
+            return None
+        return self._observed[k]
 
     def _set_weight(self, k: int, time: int) -> None:
         """Set the weight of stage k from its observed components and its noise weight."""
@@ -209,10 +282,9 @@ class Window(Stages):
         self, k: int, view: StageView, observed: NDArray[np.bool_] | None
     ) -> None:
         """Write y - h(z), the Jacobians and, as z(t+1), f(z); describe the stage in the sample."""
-        model, u, terms, sample = self._system, view.u, view.terms, self._sample
+        terms = view.terms
         self._running = "the model"
-        if self.unusual and self._irregular[k]:
-            model, u = self._system.timed, self._u[k]
+        model, u = self._describe(k, observed)
         kernel = model.kernel if self._with_jacobians else None
         if kernel is None:
             usual = model is self._system
@@ -235,7 +307,14 @@ class Window(Stages):
             np.negative(jacobian, terms.linear[:, 1:])
         if observed is not None:
             terms.noise[~observed] = 0.0
+
+    def _describe(self, k: int, observed: NDArray[np.bool_] | None) -> tuple[System, Array]:
+        """Describe stage k in the sample; return its model and input."""
+        model, u, sample = self._system, self._stage_views[k].u, self._sample
+        if self.unusual and self._irregular[k]:
+            model, u = self._system.timed, self._u[k]
         sample.system, sample.u, sample.observed = model, u, observed
+        return model, u
 
     def _advance_observer(self, k: int, time: int, view: StageView) -> bool:
         """Add the correction to f(z), and project; whether state and covariance are finite."""
@@ -264,31 +343,36 @@ class Window(Stages):
         """Project z(t+1) onto X in the observer's metric, and set its correction to match."""
         nearest, metric, z_next = self._nearest, self.metric, view.z_next
         assert nearest is not None
-        if metric is not None:
-            if not metric.settled:
-                if self._with_jacobians:
-                    a, c = -view.terms.minus_a, -view.terms.minus_c
-                else:
-                    model, u = self._sample.system, self._sample.u
-                    a, c = model.f_jacobian(view.z, u), model.h_jacobian(view.z, u)
-                metric.settle(view.z, a, c, self._sample)
-            covariance = metric.covariance
-        if nearest.contains(z_next):
-            return
-        assert covariance is not None
+        if metric is not None and not metric.settled:
+            if self._with_jacobians:
+                a, c = -view.terms.minus_a, -view.terms.minus_c
+            else:
+                model, u = self._sample.system, self._sample.u
+                a, c = model.f_jacobian(view.z, u), model.h_jacobian(view.z, u)
+            metric.settle(view.z, a, c, self._sample)
+        if not nearest.contains(z_next):
+            correction = view.terms.disturbance
+            self.events |= self._keep_inside(predicted, z_next, correction, covariance)
+
+    def _keep_inside(
+        self, predicted: Array, z_next: Array, correction: Array, covariance: Array | None = None
+    ) -> int:
+        """Project z(t+1) onto X, set its correction to match; return flags of `Status`."""
+        nearest, events = self._nearest, _PROJECTED
+        if self.metric is not None:
+            covariance = self.metric.covariance
+        assert nearest is not None and covariance is not None
         found = nearest(z_next, covariance)
-        self.events |= _PROJECTED
         if not nearest.contains(predicted):
-            self.events |= _PREDICTION_OUTSIDE
+            events |= _PREDICTION_OUTSIDE
             if found.reached and nearest.is_beyond(z_next, found.point, covariance):
                 # Every point of X is nearer to the truth than z_next is. That prediction says
                 # nothing, but would drown the correction.
                 inside = nearest(predicted, covariance).point
-                found = nearest(inside + view.terms.disturbance, covariance)
+                found = nearest(inside + correction, covariance)
         z_next[...] = found.point
-        np.subtract(z_next, predicted, view.terms.disturbance)
-        if not found.reached:
-            self.events |= _METRIC_SINGULAR
+        np.subtract(z_next, predicted, correction)
+        return events if found.reached else events | _METRIC_SINGULAR
 
     def filtered(self) -> Array | None:
         """The observer's estimate of x(t) that has used y(t), within X; None if it has none."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .._checks import Array
 from .._linalg import inverse
@@ -73,17 +74,16 @@ class NearestPoint:
         self._largest = reach.max(axis=0, initial=0.0)  # sizes that the set gives its components
         self._widths: Array = convex_set.upper - convex_set.lower
 
-    def contains(self, point: Array) -> bool:
-        """Whether a point is in the set, up to rounding in general inequalities."""
+    def contains(self, points: Array) -> NDArray[np.bool_]:
+        """Whether each of the points (..., n) is in the set, up to rounding in general rows."""
         # Comparisons with NaN are false: a NaN is no member.
-        if not ((self._lower <= point).all() and (point <= self._upper).all()):
-            return False
-        return not self._has_rows or not (self._misses(point) > 0.0).any()
+        inside: NDArray[np.bool_] = ((self._lower <= points) & (points <= self._upper)).all(-1)
+        return inside & ~(self._misses(points) > 0.0).any(-1) if self._has_rows else inside
 
-    def _misses(self, point: Array) -> Array:
-        """By how much a point misses each row; 0 where only by rounding."""
-        missed: Array = self._rows @ point - self._sides
-        rounding = _ROUNDING * (self._sizes @ np.abs(point) + self._side_sizes)
+    def _misses(self, points: Array) -> Array:
+        """By how much points (..., n) miss each row; 0 where only by rounding."""
+        missed: Array = points @ self._rows.T - self._sides
+        rounding = _ROUNDING * (np.abs(points) @ self._sizes.T + self._side_sizes)
         return np.where(missed > rounding, missed, 0.0)
 
     def __call__(self, point: Array, covariance: Array) -> Projected:

@@ -1,0 +1,87 @@
+"""Observers that start at each estimate of a window and run side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.functions import BatchedFunction
+from ..observers import Sample
+from ..observers.projection import NearestPoint
+
+__all__ = ["RunningObservers"]
+
+Array = NDArray[np.float64]
+
+
+class RunningObservers:
+    """N observers with a constant gain, of which one starts at each sample and lasts N samples.
+
+    Each sample advances all of them by one call of f and one of h, always with N rows; the
+    observer that starts at time s has row s mod N. So a row's numbers depend on its start and
+    its samples alone, and observers that are advanced through the samples of a window again
+    have the numbers of those that ran on.
+
+    ``keep_inside(predicted, state, correction)`` projects one state and returns flags of `Status`.
+    """
+
+    def __init__(
+        self, gain: Array, horizon: int, nearest: NearestPoint | None,
+        keep_inside: Callable[[Array, Array, Array], int],
+    ) -> None:
+        n, p = gain.shape
+        self._n, self._count, self._transposed_gain = n, horizon, gain.T.copy()
+        self._nearest, self._keep_inside = nearest, keep_inside
+        # Rings in time: states z(t) and residuals (L(t), v(t)), one row for each observer.
+        self._states = np.zeros((horizon + 1, horizon, n))
+        self._residuals = np.zeros((horizon, horizon, n + p))
+        self._predicted = np.zeros((horizon, n))
+        self._events = [0] * horizon  # flags at the last sample
+        #: Which rows have no observer at which the model works.
+        self.failed = np.ones(horizon, np.bool_)
+
+    def advance(self, time: int, start: Array, y: Array, sample: Sample) -> None:
+        """Start an observer at the estimate of x(time), and advance all by the sample then."""
+        n, count, failed, predicted = self._n, self._count, self.failed, self._predicted
+        now, ahead = self._states[time % (count + 1)], self._states[(time + 1) % (count + 1)]
+        residuals = self._residuals[time % count]
+        correction, error = residuals[:, :n], residuals[:, n:]
+        now[time % count], failed[time % count] = start, False
+        if failed.any():
+            now[failed] = start  # where the model works, if anywhere
+        self._evaluate(sample.system.h, now, sample.u, error)
+        np.subtract(y, error, error)
+        if sample.observed is not None:
+            error[:, ~sample.observed] = 0.0
+        self._evaluate(sample.system.f, now, sample.u, predicted)
+        np.matmul(error, self._transposed_gain, correction)
+        np.add(predicted, correction, ahead)
+        failed |= ~np.isfinite(np.einsum("ij,ij->i", ahead, ahead))  # as its cost overflows
+        if self._nearest is None:
+            return
+        self._events = [0] * count
+        for i in np.flatnonzero(~(self._nearest.contains(ahead) | failed)):
+            try:
+                self._events[i] = self._keep_inside(predicted[i], ahead[i], correction[i])
+            except Exception:  # of linear algebra
+                failed[i] = True
+
+    def _evaluate(self, function: BatchedFunction, states: Array, u: Array, values: Array) -> None:
+        """Write a function's values at all states, and mark those at which it raises."""
+        try:
+            np.copyto(values, function.batch(states, np.broadcast_to(u, (self._count, u.size))))
+        except Exception:
+            # Functions that raise at some states are called one by one within a batch, too.
+            for i, state in enumerate(states):
+                try:
+                    np.copyto(values[i], function(state, u))
+                except Exception:
+                    self.failed[i] = True
+
+    def trajectory(self, first: int, last: int) -> tuple[Array, Array, int]:
+        """States, residuals and last flags of the observer that started at time ``first``."""
+        times, row = np.arange(first, last + 1), first % self._count
+        states = self._states[times % (self._count + 1), row]
+        return states, self._residuals[times[:-1] % self._count, row], self._events[row]
