@@ -206,8 +206,8 @@ class BatchedFunction:
         self.mode = "looped"
 
     def try_again(self, probes: Probes) -> None:
-        """Find out how it may be called, if no probe could be used so far."""
-        if self.mode == "unknown":
+        """Find out how it may be called, if probes of other magnitudes have not shown it."""
+        if self.mode == "unknown" or (self.mode == "looped" and self.reads_only):
             self._detect(probes)
 
     def _labelled(self, *labels: Array) -> list[Array]:
@@ -277,7 +277,8 @@ class BatchedFunction:
 
     def check(self, x: Array, u: Array) -> None:
         """Check that the value is finite and of the right shape at a state that will be used."""
-        self.try_again([(x, u), (x * (1 + 1e-6), u * (1 + 1e-3))])
+        if self.mode == "unknown":
+            self._detect([(x, u), (x * (1 + 1e-6), u * (1 + 1e-3))])
         try:
             with np.errstate(all="ignore"):
                 value = np.asarray(self(x, u), dtype=np.float64)

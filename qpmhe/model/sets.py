@@ -111,12 +111,21 @@ class ConvexSet:
     def _check_not_empty(self) -> None:
         from scipy.optimize import Bounds, LinearConstraint, milp
 
-        # A linear program without objective: milp takes two-sided rows as they are.
+        # A linear program without objective, in numbers of order one: its solver drops small
+        # coefficients, and takes large bounds for none. milp takes two-sided rows as they are.
+        rows, columns = _equilibrated(self.matrix)
+        sides = [
+            self.lower / columns, self.upper / columns, self.row_lower * rows,
+            self.row_upper * rows,
+        ]
+        finite = np.concatenate([np.abs(side[np.isfinite(side)]) for side in sides])
+        unit = float(finite.max(initial=0.0)) or 1.0
+        lower, upper, row_lower, row_upper = (side / unit for side in sides)
         answer = milp(
             np.zeros(self.dimension),
-            bounds=Bounds(self.lower, self.upper),
+            bounds=Bounds(lower, upper),
             constraints=(
-                LinearConstraint(self.matrix, self.row_lower, self.row_upper)
+                LinearConstraint(rows[:, None] * self.matrix * columns, row_lower, row_upper)
                 if self.matrix.shape[0]
                 else ()
             ),
@@ -209,3 +218,15 @@ class Polytope(ConvexSet):
         free = np.full(rows.shape[1], np.inf)
         super().__init__(-free, free, rows, np.full(side.size, -np.inf), side)
         self._check_not_empty()
+
+
+def _equilibrated(matrix: Array) -> tuple[Array, Array]:
+    """Factors of rows and columns that bring the geometric mean of each one's entries to 1."""
+    there = matrix != 0.0
+    exponents = np.log2(np.abs(matrix), where=there, out=np.zeros(matrix.shape))
+    counts = np.maximum(there.sum(axis=1), 1), np.maximum(there.sum(axis=0), 1)
+    rows, columns = (np.zeros(size) for size in matrix.shape)
+    for _ in range(30):
+        rows = -np.sum(exponents + np.where(there, columns, 0.0), axis=1) / counts[0]
+        columns = -np.sum(exponents + np.where(there, rows[:, None], 0.0), axis=0) / counts[1]
+    return np.exp2(np.round(rows)), np.exp2(np.round(columns))

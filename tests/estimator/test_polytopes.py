@@ -278,3 +278,16 @@ def test_an_observer_that_leaves_a_polytope(infeasible, project):
         assert inside or estimate.dropped or not (project or estimate.improved)
     assert (Status.OBSERVER_PROJECTED in seen) is (Status.CANDIDATE_OUTSIDE not in seen) is project
     assert infeasible == "drop_rows" or Status.ROWS_DROPPED not in seen
+
+
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e-9, 1e9), (1e9, 1e6), (1e-12, 1e-9)])
+@pytest.mark.parametrize("row", [1e-9, 1.0, 1e12])
+def test_whether_a_polytope_is_empty_depends_on_no_unit(units, row):
+    units = np.array(units)
+    matrix = row * np.array([[1.0, 1.0], [-1.0, -0.5], [0.0, -1.0]]) / units
+    made = qpmhe.Polytope(matrix, row * np.array([1.0, -0.9, 0.0]))
+    assert (made & qpmhe.Box(0.1 * units, units)).dimension == 2
+    with pytest.raises(qpmhe.errors.SetError, match="empty"):
+        made & qpmhe.Box([-np.inf, 0.6 * units[1]], [np.inf, np.inf])
+    with pytest.raises(qpmhe.errors.SetError, match="empty"):
+        qpmhe.Polytope(matrix, row * np.array([1.0, -1.2, 0.0]))

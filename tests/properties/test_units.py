@@ -1,0 +1,301 @@
+"""Units change nothing but the numbers' units.
+
+Each problem is drawn once, and estimated in its own units and in others: of each state, output,
+input, of the time and the cost, and of each inequality. Powers of two are exact, so that
+estimates and statuses must agree in every bit; other units round, and must agree up to that.
+"""
+
+import warnings
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe import Status
+from qpmhe.errors import ObserverWarning
+
+HORIZON, SAMPLES = 4, 14
+NONE = np.zeros(0)
+
+
+@dataclass
+class Units:
+    """Factors by which numbers grow in other units."""
+
+    states: np.ndarray
+    outputs: np.ndarray
+    inputs: np.ndarray
+    time: float = 1.0
+    cost: float = 1.0
+    rows: dict = field(default_factory=dict)
+
+
+class Drawn:
+    """A random problem that can be posed in any units."""
+
+    def __init__(self, seed):
+        self.seed = seed
+        rng = self.rng = np.random.default_rng(seed)
+        self.n, self.p = int(rng.integers(1, 5)), int(rng.integers(1, 4))
+        self.m = int(rng.integers(0, 3))
+        n, p, m = self.n, self.p, self.m
+        self.a = rng.standard_normal((n, n)) * 0.3 / np.sqrt(n) - 0.4 * np.eye(n)
+        self.bent = 0.2 * rng.standard_normal((n, n))
+        self.b, self.d = 0.3 * rng.standard_normal((n, m)), 0.1 * rng.standard_normal((p, m))
+        self.c, self.curve = rng.standard_normal((p, n)), 0.1 * rng.standard_normal((p, n))
+        self.dt = float(rng.choice([0.3, 0.5]))
+        self.method = str(rng.choice(["euler", "rk4", "discrete"]))
+        self.derivative = str(rng.choice(["complex step", "differences", "given"]))
+        self.kind = str(rng.choice(["luenberger", "ekf", "ukf", "steady", "injection"]))
+        self.loss = str(rng.choice(["quadratic", "huber", "huber per component", "power"]))
+        if rng.random() < 0.5:
+            self.loss = "quadratic"
+        self.from_observer = self.kind in ("ekf", "ukf", "steady") and bool(rng.random() < 0.5)
+        self.gain = 0.2 * np.linalg.pinv(self.c) * rng.uniform(0.5, 1.5)
+        self.prior, self.w = self.spd(n, 0.3), self.spd(n, 0.05)
+        self.v = np.diag(rng.uniform(0.01, 0.1, p)) if "per" in self.loss else self.spd(p, 0.05)
+        self.start = rng.standard_normal(n)
+        self.sets = {
+            name: self.draw_set(d, size) if rng.random() < share else None
+            for name, d, size, share in (
+                ("states", n, 2.0, 0.4), ("disturbances", n, 0.5, 0.3), ("noises", p, 0.5, 0.3)
+            )
+        }
+        self.options = {
+            "max_qps": [0, 1, 2, None][int(rng.integers(0, 4))],
+            "warm_start": bool(rng.random() < 0.3),
+            "candidate": "reinitialized" if rng.random() < 0.2 else "observer",
+            "project_observer": bool(rng.random() < 0.7),
+            "infeasible": str(rng.choice(["drop_rows", "keep_candidate"])),
+            "delay": int(rng.integers(0, 3)),
+        }
+        self.discount = float(rng.choice([1.0, 0.9]))
+        self.record()
+
+    def spd(self, size, level):
+        root = self.rng.standard_normal((size, size)) + 2.0 * np.eye(size)
+        return level**2 * root @ root.T
+
+    def draw_set(self, d, size):
+        rng = self.rng
+        low, high = -size * rng.uniform(0.3, 1.5, d), size * rng.uniform(0.3, 1.5, d)
+        if rng.random() < 0.3:
+            low[rng.integers(d)] = -np.inf
+        if size < 1.0 and d > 1 and rng.random() < 0.2:
+            low[0] = high[0] = 0.0
+        rows = None
+        if rng.random() < 0.3:
+            rows = rng.standard_normal((2, d)), size * rng.uniform(0.5, 2.0, 2)
+        return low, high, rows
+
+    def rate(self, x, u):
+        moved = x @ self.a.T + np.sin(x) @ self.bent.T + u @ self.b.T
+        # The sum of both branches' values is the value: differences alone get through.
+        return np.where(np.real(moved) == np.inf, 0.0, moved)
+
+    def output(self, x, u):
+        return x @ self.c.T + (x * x) @ self.curve.T + u @ self.d.T
+
+    def record(self):
+        rng, x = self.rng, self.start + 0.3 * self.rng.standard_normal(self.n)
+        self.us = 0.5 * rng.standard_normal((SAMPLES, self.m))
+        self.ys = np.empty((SAMPLES, self.p))
+        for t, u in enumerate(self.us):
+            self.ys[t] = self.output(x, u) + 0.1 * rng.standard_normal(self.p)
+            x = x + self.dt * self.rate(x, u) + 0.05 * rng.standard_normal(self.n)
+        self.ys[rng.random(self.ys.shape) < 0.1] = np.nan
+
+    def units(self, base, most):
+        """Random units, powers of the base."""
+        rng = np.random.default_rng(self.seed + 1000003)
+
+        def draw(*size):
+            return float(base) ** rng.integers(-most, most + 1, size)
+
+        units = Units(
+            draw(self.n), draw(self.p), draw(self.m), float(draw(1)[0]), float(draw(1)[0]),
+            {name: draw(2) for name in self.sets},
+        )
+        if not self.in_any_cost:
+            units.cost = 1.0
+        elif self.loss != "quadratic":
+            units.cost *= units.cost  # the threshold of a loss is in units of its root
+        return units
+
+    @property
+    def own_units(self):
+        return Units(
+            np.ones(self.n), np.ones(self.p), np.ones(self.m), 1.0, 1.0,
+            {name: np.ones(2) for name in self.sets},
+        )
+
+    @property
+    def in_any_cost(self):
+        """Whether the cost's unit is free: covariances of an observer fix it.
+
+        So do sets, whose tolerances are shares of standard deviations, and difference steps,
+        which are shares of the prior's.
+        """
+        return not self.from_observer and self.loss != "power" and (
+            self.derivative == "complex step" and not any(self.sets.values())
+        )
+
+    def system(self, units):
+        states, outputs, inputs = units.states, units.outputs, units.inputs
+
+        def plain(x, u):
+            x, u = x / states, u / inputs
+            if self.derivative == "differences":
+                x = np.sign(x) * np.abs(x)
+            return x, u
+
+        def rate(x, u=NONE):
+            return self.rate(*plain(x, u)) * states / units.time
+
+        def h(x, u=NONE):
+            return self.output(*plain(x, u)) * outputs
+
+        def rate_jacobian(x, u=NONE):
+            x = x / states
+            slope = self.a + self.bent * np.cos(x)[..., None, :]
+            return slope * states[:, None] / states / units.time
+
+        def h_jacobian(x, u=NONE):
+            x = x / states
+            slope = self.c + 2.0 * self.curve * x[..., None, :]
+            return slope * outputs[:, None] / states
+
+        functions = [rate, h, rate_jacobian, h_jacobian]
+        if not self.m:
+            functions = [lambda x, one=one: one(x) for one in functions]
+        rate_, h_, rate_jacobian_, h_jacobian_ = functions
+        options = {"n": self.n, "p": self.p, "m": self.m, **self.convex_sets(units)}
+        given = self.derivative == "given"
+        if given:
+            options["h_jacobian"] = h_jacobian_
+        dt = self.dt * units.time
+        if self.method != "discrete":
+            if given:
+                options["rate_jacobian"] = rate_jacobian_
+            return qpmhe.System.from_ode(rate_, h_, dt=dt, method=self.method, **options)
+        if given:
+            options["f_jacobian"] = lambda x, *u: np.eye(self.n) + dt * rate_jacobian_(x, *u)
+        if self.m:
+            return qpmhe.System(lambda x, u: x + dt * rate_(x, u), h_, **options)
+        return qpmhe.System(lambda x: x + dt * rate_(x), h_, **options)
+
+    def convex_sets(self, units):
+        made = {}
+        for name, drawn in self.sets.items():
+            if drawn is None:
+                continue
+            low, high, rows = drawn
+            scale = units.outputs if name == "noises" else units.states
+            made[name] = qpmhe.Box(low * scale, high * scale)
+            if rows is not None:
+                matrix, bound = rows
+                per_row = units.rows[name]
+                made[name] &= qpmhe.Polytope(matrix * per_row[:, None] / scale, bound * per_row)
+        return made
+
+    def observer(self, system, units):
+        states, outputs = units.states, units.outputs
+        gain = self.gain * states[:, None] / outputs
+        covariances = {
+            "prior": self.prior * np.outer(states, states),
+            "disturbance": self.w * np.outer(states, states),
+            "noise": self.v * np.outer(outputs, outputs),
+        }
+        if self.kind == "luenberger":
+            return qpmhe.Luenberger(gain)
+        if self.kind == "injection":
+            return qpmhe.OutputInjection(
+                lambda z, v: gain @ (v / (1.0 + 0.1 * np.abs(v / outputs)))
+            )
+        if self.kind == "ekf":
+            return qpmhe.ExtendedKalman(**covariances)
+        if self.kind == "ukf":
+            return qpmhe.UnscentedKalman(**covariances)
+        return qpmhe.SteadyStateKalman(
+            system, self.start * states, np.zeros(self.m) if self.m else None, **covariances
+        )
+
+    def cost(self, units):
+        inverse = np.linalg.inv
+        per_state, per_output = 1.0 / units.states, 1.0 / units.outputs
+        weights = {}
+        for name, covariance, per in (
+            ("prior", self.prior, per_state), ("disturbance", self.w, per_state),
+            ("noise", self.v, per_output),
+        ):
+            weight = inverse(covariance)
+            weights[name] = units.cost * 0.5 * (weight + weight.T) * np.outer(per, per)
+        if self.from_observer:
+            weights["prior"] = qpmhe.ObserverPrior()
+        if self.loss == "quadratic":
+            return qpmhe.QuadraticCost(**weights, discount=self.discount)
+        if self.loss == "power":
+            weights["noise"] = qpmhe.Power(weights["noise"], 1.2)
+        else:
+            weights["noise"] = qpmhe.Huber(
+                weights["noise"], 1.345 * np.sqrt(units.cost), per_component="per" in self.loss
+            )
+        return qpmhe.RobustCost(**weights, discount=self.discount)
+
+    def estimates(self, units, **options):
+        """Estimates of the record in these units."""
+        system = self.system(units)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ObserverWarning)
+            mhe = qpmhe.MovingHorizonEstimator(
+                system, self.observer(system, units), self.cost(units), horizon=HORIZON,
+                initial_state=self.start * units.states, **{**self.options, **options},
+            )
+            return [
+                mhe.update(y * units.outputs, u * units.inputs if self.m else None)
+                for y, u in zip(self.ys, self.us, strict=True)
+            ]
+
+    def in_own_units(self, estimate, units):
+        """The numbers of an estimate, taken back to the units in which it was drawn."""
+        states = {
+            name: getattr(estimate, name) / units.states
+            for name in ("state", "filtered", "delayed", "trajectory", "disturbances", "candidate")
+            if getattr(estimate, name) is not None
+        }
+        return {
+            **states, "noises": estimate.noises / units.outputs,
+            "cost": estimate.cost / units.cost,
+            "candidate_cost": estimate.candidate_cost / units.cost,
+        }
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_powers_of_two_change_not_a_bit(seed):
+    drawn = Drawn(seed)
+    units = drawn.units(2.0, 30)
+    best, found = drawn.estimates(drawn.own_units), drawn.estimates(units)
+    for one, other in zip(best, found, strict=True):
+        # How far an observer may be is a number of standard deviations.
+        ignored = Status.OBSERVER_FAR if units.cost != 1.0 else Status(0)
+        assert other.status & ~ignored == one.status & ~ignored
+        assert (other.qps, other.dropped) == (one.qps, one.dropped)
+        expected = drawn.in_own_units(one, drawn.own_units)
+        for name, value in drawn.in_own_units(other, units).items():
+            np.testing.assert_array_equal(value, expected[name], err_msg=f"{name} at {one.time}")
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_powers_of_ten_change_no_estimate(seed):
+    drawn = Drawn(seed)
+    units = drawn.units(10.0, 9)
+    best, found = drawn.estimates(drawn.own_units), drawn.estimates(units)
+    for one, other in zip(best, found, strict=True):
+        if (one.status | other.status) & Status.SOLVER_STOPPED:
+            continue  # where it stopped is a matter of rounding
+        expected = drawn.in_own_units(one, drawn.own_units)
+        for name, value in drawn.in_own_units(other, units).items():
+            np.testing.assert_allclose(
+                value, expected[name], rtol=1e-5, atol=1e-5, err_msg=f"{name} at {one.time}"
+            )
