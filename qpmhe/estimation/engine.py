@@ -136,9 +136,8 @@ class PythonEngine:
         """Solve the present window's problem."""
         window, settings = self._window, self._settings
         problem = self._formulation.problem(window)
-        start = self._shifted() if settings.warm_start else None
         deadline = math.inf if settings.time_budget is None else began + settings.time_budget
-        outcome = self._optimizer.improve(problem, start, deadline)
+        outcome = self._optimizer.improve(problem, self._shifted, deadline)
         trial, candidate, message = outcome.trial, problem.candidate, outcome.message
         status = Status.IMPROVED if outcome.improved else Status.CANDIDATE
         if outcome.events:

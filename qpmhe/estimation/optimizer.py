@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
 
@@ -104,12 +105,27 @@ class Optimizer:
     ) -> None:
         self._subproblem, self._solver = subproblem, solver
         self._limit, self._tolerance = settings.qp_limit, settings.tolerance
+        self._warm_start = settings.warm_start
         self._may_drop = settings.infeasible == "drop_rows"
 
     def improve(
-        self, problem: Problem, start: Array | None = None, deadline: float = math.inf
+        self,
+        problem: Problem,
+        shifted: Callable[[], Array | None],
+        deadline: float = math.inf,
     ) -> Outcome:
-        """Run the sequence; never raises, whatever solver and model do."""
+        """Run the sequence; never raises, whatever solver and model do.
+
+        Parameters
+        ----------
+        problem : Problem
+            The problem of the window.
+        shifted : callable
+            Gives the previous estimate, shifted to this window: where a warm start begins, and
+            where a feasible trajectory is looked for if there is none near the candidate.
+        deadline : float
+            Time, by `time.perf_counter`, after which no QP is begun.
+        """
         candidate = problem.candidate
         outcome = Outcome(candidate, deadline)
         feasible = candidate.violation <= FEASIBLE
@@ -118,21 +134,33 @@ class Optimizer:
         if self._limit == 0:
             outcome.events |= Status.NO_QPS
             return outcome
+        start = shifted() if self._warm_start else None
         if feasible:
             self._search(problem, outcome, start, self._limit)
             outcome.improved = outcome.trial is not candidate
         else:
-            self._restore(problem, outcome, start)
+            self._restore(problem, outcome, start, shifted)
         return outcome
 
-    def _restore(self, problem: Problem, outcome: Outcome, start: Array | None) -> None:
+    def _restore(
+        self,
+        problem: Problem,
+        outcome: Outcome,
+        start: Array | None,
+        shifted: Callable[[], Array | None],
+    ) -> None:
         """The sequence from a candidate outside of the sets."""
         candidate = problem.candidate
         outside = replace(candidate, cost=math.inf)
         outcome.trial = outside
         self._search(problem, outcome, start, self._limit)
-        if not outcome.trial.cost < math.inf and self._to_nearest_point(problem, outcome):
-            self._search(problem, outcome, None, self._limit - outcome.qps)
+        if not outcome.trial.cost < math.inf:
+            if not self._to_nearest_point(problem, outcome, outside):
+                again = shifted()
+                if again is not None:
+                    self._to_nearest_point(problem, outcome, problem.evaluate(again))
+            if outcome.trial.cost < math.inf:
+                self._search(problem, outcome, None, self._limit - outcome.qps)
         if outcome.trial.cost <= candidate.cost and outcome.trial is not outside:
             outcome.improved = True
             return
@@ -165,9 +193,13 @@ class Optimizer:
             if not self._step(problem, qp, outcome):
                 break
 
-    def _to_nearest_point(self, problem: Problem, outcome: Outcome) -> bool:
-        """Look for a feasible trajectory near an infeasible one; whether one was found."""
-        nearest = outcome.trial
+    def _to_nearest_point(self, problem: Problem, outcome: Outcome, nearest: Trial) -> bool:
+        """Look for a feasible trajectory near another one; whether one was found."""
+        if nearest.cost < math.inf:
+            outcome.trial = nearest
+            return True
+        if not math.isfinite(nearest.violation):
+            return False
         for _ in range(NEAREST_POINTS):
             qp = self._subproblem.nearest_point(problem, nearest)
             solution = None if qp is None else self._solve(qp, outcome)
