@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 __all__ = [
-    "BEYOND", "CORRECTIONS", "FEASIBLE", "LARGEST", "LENGTHS", "NEAREST_POINTS", "NEARLY",
+    "ALONG", "BEYOND", "CORRECTIONS", "FEASIBLE", "LARGEST", "LENGTHS", "NEAREST_POINTS", "NEARLY",
     "ROUNDING", "STALLED",
     "c_definitions",
 ]
@@ -11,6 +11,9 @@ __all__ = [
 #: Step lengths, tried in turn after the full step: the first for a step that leaves a set by
 #: the solver's tolerance, the last short enough for any useful direction of descent.
 LENGTHS = (0.9999, 0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)
+
+#: Step lengths along the boundary of a curved set, tried where none of these helps.
+ALONG = (0.5, 0.125, 0.03125)
 
 #: A decrease of J by less than this share of it is rounding, and no improvement.
 ROUNDING = 1e-12
@@ -29,7 +32,8 @@ CORRECTIONS = 2
 #: A second-order correction is lengthened by this share of itself, to end inside the set.
 BEYOND = 0.1
 
-#: Most QPs for a point near an infeasible candidate that satisfies all rows.
+#: Most QPs on the way to one point near an infeasible one that satisfies all rows; in all, so many
+#: for each QP of the sequence and one time more.
 NEAREST_POINTS = 5
 
 #: Largest miss of a row of a feasible trial, as a share of the row's scale: QP solvers end on the

@@ -15,6 +15,7 @@ from qpmhe_solvers.contained import ContainedSolver
 
 from .estimate import DroppedRow, Status
 from .limits import (
+    ALONG,
     CORRECTIONS,
     FEASIBLE,
     LENGTHS,
@@ -155,13 +156,13 @@ class Optimizer:
         outcome.trial = outside
         self._search(problem, outcome, start, self._limit)
         if not outcome.trial.cost < math.inf:
-            if not self._to_nearest_point(problem, outcome, outside):
-                again = shifted()
-                if again is not None:
-                    self._to_nearest_point(problem, outcome, problem.evaluate(again))
+            outcome.trial = self._feasible_near(problem, outcome, outside)
+            if not outcome.trial.cost < math.inf and (again := shifted()) is not None:
+                again = problem.clipped(again)
+                outcome.trial = self._feasible_near(problem, outcome, problem.evaluate(again))
             if outcome.trial.cost < math.inf:
                 self._search(problem, outcome, None, self._limit - outcome.qps)
-        if outcome.trial.cost <= candidate.cost and outcome.trial is not outside:
+        if outcome.trial.cost <= candidate.cost and outcome.trial.violation <= FEASIBLE:
             outcome.improved = True
             return
         outcome.trial = candidate
@@ -193,29 +194,28 @@ class Optimizer:
             if not self._step(problem, qp, outcome):
                 break
 
-    def _to_nearest_point(self, problem: Problem, outcome: Outcome, nearest: Trial) -> bool:
-        """Look for a feasible trajectory near another one; whether one was found."""
-        if nearest.cost < math.inf:
-            outcome.trial = nearest
-            return True
-        if not math.isfinite(nearest.violation):
-            return False
+    def _feasible_near(self, problem: Problem, outcome: Outcome, trial: Trial) -> Trial:
+        """A feasible trajectory near an infeasible one, by QPs in the metric of the Hessian.
+
+        The trial itself where it is feasible, or there is no way into the sets.
+        """
+        nearest = trial
         for _ in range(NEAREST_POINTS):
+            if nearest.cost < math.inf or not math.isfinite(nearest.violation):
+                return nearest
+            if outcome.nearest_points >= NEAREST_POINTS * (1 + outcome.qps):
+                break
             qp = self._subproblem.nearest_point(problem, nearest)
             solution = None if qp is None else self._solve(qp, outcome)
             if solution is None:
-                return False
+                break
             outcome.nearest_points += 1
             if solution.d is None:
-                return False
-            trial = self._trial(problem, nearest, solution.d)
-            if trial.cost < math.inf:
-                outcome.trial = trial
-                return True
-            if not trial.violation < nearest.violation:
-                return False
-            nearest = trial
-        return False
+                break
+            before, nearest = nearest, self._trial(problem, nearest, solution.d)
+            if not nearest.violation < before.violation:
+                break
+        return nearest if nearest.cost < math.inf else trial
 
     def _step(self, problem: Problem, qp: QP, outcome: Outcome) -> bool:
         """Solve one QP and take its step; whether another QP is worth solving."""
@@ -233,14 +233,16 @@ class Optimizer:
         best = outcome.trial
         # Where J is infinite, no decrease is negligible.
         negligible = self._tolerance * best.cost if best.cost < math.inf else -1.0
-        trial = self._lower(problem, qp, outcome, solution.d, negligible if solved else -1.0)
+        # The QP's decrease of J.
+        predicted = abs(float(np.vdot(qp.gradient, solution.d)))
+        useless = solved and predicted <= negligible
+        trial = self._lower(problem, qp, outcome, solution.d, useless)
         if trial.cost < _target(best):
             outcome.trial = trial
             if solved and best.cost - trial.cost <= negligible:
                 outcome.events |= Status.CONVERGED
                 return False
             return True
-        predicted = _predicted(qp, solution.d)
         at_minimum = solved and predicted <= max(
             STALLED * negligible, problem.rounding_cost(best) if best.cost < math.inf else -1.0
         )
@@ -249,33 +251,49 @@ class Optimizer:
         return False
 
     def _lower(
-        self, problem: Problem, qp: QP, outcome: Outcome, step: Array, negligible: float
+        self, problem: Problem, qp: QP, outcome: Outcome, step: Array, useless: bool
     ) -> Trial:
         """The first trial along a step whose J is below the best so far, or the last trial.
 
-        A step whose predicted decrease is negligible is not shortened: at a minimum no step
-        lowers J by more than rounding.
+        A step whose predicted decrease is negligible is useless and not shortened: at a minimum
+        no step lowers J by more than rounding.
         """
         best, target = outcome.trial, _target(outcome.trial)
         trial = self._trial(problem, best, step)
         if trial.cost < target:
             return trial
-        negligible_step = _predicted(qp, step) <= negligible
-        if 0.0 < trial.violation < math.inf and qp.rows:
+        curved = 0.0 < trial.violation < math.inf and bool(qp.rows)
+        if curved:
             missed = trial
             if trial.violation <= NEARLY:
                 trial = self._trial(problem, best, LENGTHS[0] * step)
             # If the shortened step leaves the set, too, curvature is the reason.
-            if not trial.cost < target and not negligible_step:
+            if not trial.cost < target and not useless:
                 step = step.copy()  # the correction's solve overwrites it
                 trial = self._correct(problem, qp, outcome, missed)
+                trial = self._feasible_near(problem, outcome, trial)
             if trial.cost < target:
                 return trial
         # Between two infeasible points there is no feasible one of a convex set.
-        if negligible_step or best.violation > FEASIBLE:
+        if useless or best.violation > FEASIBLE:
             return trial
         for length in LENGTHS:
             trial = self._trial(problem, best, length * step)
+            if trial.cost < target:
+                return trial
+        return self._along(problem, outcome, step) if curved else trial
+
+    def _along(self, problem: Problem, outcome: Outcome, step: Array) -> Trial:
+        """A trial along the boundary of a curved set: back into the set from a shortened step.
+
+        Of a step's length, what it lowers J by shrinks in proportion, and how far it leaves the
+        set by the square: the way back costs less than the step gains, if that is short enough.
+        """
+        best, target = outcome.trial, _target(outcome.trial)
+        trial = best
+        for length in ALONG:
+            trial = self._trial(problem, best, length * step)
+            trial = self._feasible_near(problem, outcome, trial)
             if trial.cost < target:
                 break
         return trial
@@ -316,8 +334,3 @@ class Optimizer:
 def _target(best: Trial) -> float:
     """The cost below which a trial is better than the best one."""
     return best.cost - ROUNDING * best.cost if best.cost < math.inf else math.inf
-
-
-def _predicted(qp: QP, step: Array) -> float:
-    """The decrease of J along a step, by the QP."""
-    return abs(float(np.vdot(qp.gradient, step)))
