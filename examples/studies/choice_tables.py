@@ -317,7 +317,7 @@ def sets(figures: Figures) -> str:
         if zoo not in figures.models:
             continue
         place = figures.cells(zoo, 2, knows).values()
-        dropped = [row.reasons.get("SETS_DROPPED", 0) / row.steps for row in place]
+        dropped = [row.reasons.get("ROWS_DROPPED", 0) / row.steps for row in place]
         errors = (
             number(figures.error(zoo, 2, knows, which=which, reference=ignores), 3)
             for which in (ALL, SETTLED)
