@@ -14,9 +14,9 @@ from .._version import __version__
 from ..errors import QpmheError
 from .compare import compare, study
 from .estimate import estimate
-from .export_qps import export_qps
 from .report import export, report
 from .reproduce import reproduce
+from .solve_qp import export_qps
 
 __all__ = ["app", "main"]
 
