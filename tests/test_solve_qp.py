@@ -5,7 +5,7 @@ import pytest
 from rich.console import Console
 from solvers.problems import CASES, make, registered
 
-from qpmhe.cli import export_qps, solve_qp
+from qpmhe.cli import solve_qp
 from qpmhe.errors import BackendError, InvalidInputError, OptionError
 from qpmhe_solvers import QP, Backend, RawSolution, Solver, SolverOptions, available, create
 from qpmhe_solvers.files import dump, load
@@ -145,7 +145,7 @@ def test_an_export_says_what_to_run(stored, tmp_path, monkeypatch, capsys):
     dump(spoilt, tmp_path / "spoilt.npz")
     out = tmp_path / "set"
     monkeypatch.setenv("COLUMNS", "300")
-    export_qps.export_qps([tmp_path], out)
+    solve_qp.export_qps([tmp_path], out)
     text = " ".join(capsys.readouterr().out.split())
     assert f"qpbenchmark {out}/mhe_qpbenchmark.py --results-path {out}/results.csv run" in text
     assert "wrote 1 QPs" in text

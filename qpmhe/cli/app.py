@@ -9,16 +9,35 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
+
+from qpmhe_solvers import backends
 
 from .._version import __version__
 from ..errors import QpmheError
 from .compare import compare, study
 from .estimate import estimate
-from .export_qps import export_qps
 from .report import export, report
 from .reproduce import reproduce
+from .solve_qp import export_qps
 
 __all__ = ["app", "main"]
+
+# Heading, and the capability that it stands for; the table fits into 80 columns.
+_FLAGS = {
+    "in-\neq": "inequalities",
+    "\ncap": "iteration_cap",
+    "at\ncap": "iterate_at_cap",
+    "\nx0": "warm_start",
+    "\ny0": "keeps_duals",
+    "\ntime": "time_limit",
+    "\ninf": "reports_infeasibility",
+    "\nws": "keeps_workspace",
+}
+_SHORT = {
+    "augmented Lagrangian": "augm. Lagrangian", "banded": "band",
+    "banded, then a QP": "banded, then QP",
+}
 
 app = typer.Typer(
     name="qpmhe", help="Suboptimal moving horizon estimation by sequences of convex QPs.",
@@ -49,9 +68,32 @@ app.command("export-qps")(export_qps)
 @app.command()
 def solvers() -> None:
     """Table of the QP backends: what is installed, and what each can do."""
-    from .solvers import show
-
-    show(Console())
+    table = Table(
+        title="QP backends",
+        title_justify="left",
+        caption="version: own needs no package, none is not installed (pip install it by its "
+        "name). in-eq: handles bounds and rows. cap: honours max_iterations. at cap: has an "
+        "iterate to judge when capped. x0: uses a start. y0: starts from the last multipliers. "
+        "time: honours a time limit. inf: says so where a QP is infeasible. ws: keeps its "
+        "workspace from QP to QP.",
+        caption_justify="left",
+        box=None,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    for name in ("backend", "version", "method", "reads"):
+        table.add_column(name, no_wrap=True, vertical="bottom")
+    for heading in _FLAGS:
+        table.add_column(heading, justify="center", no_wrap=True)
+    for entry in backends():
+        version = entry.version if entry.available else "none"
+        table.add_row(
+            entry.name, "own" if entry.module is None else version,
+            _SHORT.get(entry.method, entry.method), _SHORT.get(entry.matrices, entry.matrices),
+            *("x" if getattr(entry, flag) else "-" for flag in _FLAGS.values()),
+            style=None if entry.available else "dim",
+        )
+    Console().print(table)
 
 
 @app.command()

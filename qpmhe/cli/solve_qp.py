@@ -1,4 +1,4 @@
-"""``qpmhe solve-qp``: dumped QPs, solved again by any backends, side by side."""
+"""``qpmhe solve-qp`` and ``qpmhe export-qps``: dumped QPs, solved again here or by qpbenchmark."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from time import perf_counter
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
@@ -26,7 +27,9 @@ from qpmhe_solvers import (
 )
 from qpmhe_solvers.files import StoredQP, load, qp_files
 
-__all__ = ["Replay", "replay", "run"]
+from ..studies.qpbenchmark_set import Matrices, export_qpbenchmark
+
+__all__ = ["Replay", "export_qps", "replay", "run"]
 
 # A backend is timed this many times, or until this many seconds are over.
 _REPEATS, _ENOUGH = 7, 0.5
@@ -181,3 +184,32 @@ def _summary(tables: list[list[Replay]]) -> Table:
             f"{median(times):.3g}", f"{max(times):.3g}",
         )
     return table
+
+
+def export_qps(
+    files: Annotated[
+        list[Path], typer.Argument(help="Files of qpmhe.solvers.dump, or folders of them.")
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Folder of the test set.")
+    ] = Path("results/qpbenchmark"),
+    matrices: Annotated[
+        Matrices, typer.Option(help="What solvers that take both kinds are given.")
+    ] = "sparse",
+) -> None:
+    """Write dumped QPs as a test set of qpbenchmark."""
+    console = Console()
+    exported = export_qpbenchmark(files, out, matrices=matrices)
+    for path, reason in exported.skipped.items():
+        console.print(f"[yellow]left out[/] {escape(str(path))}: {reason}", highlight=False)
+    console.print(
+        f"wrote {len(exported.problems)} QPs to {escape(str(out))}; solve them with all "
+        "installed solvers, and make the report (pip install qpbenchmark):",
+        highlight=False,
+    )
+    results = exported.script.with_name("results.csv")
+    console.print(
+        f"qpbenchmark {escape(str(exported.script))} --results-path {escape(str(results))} "
+        "run --author NAME",
+        highlight=False, soft_wrap=True,
+    )

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers import Solver, create
-from qpmhe_solvers.contained import ContainedSolver
+from qpmhe_solvers.solver import ContainedSolver
 
 from .._checks import check_problem
 from ..costs import Cost

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers import QP, Solution, SolveStatus
-from qpmhe_solvers.contained import ContainedSolver
+from qpmhe_solvers.solver import ContainedSolver
 
 from .estimate import DroppedRow, Status
 from .limits import (

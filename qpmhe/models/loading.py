@@ -24,7 +24,7 @@ from ..costs import Cost
 from ..errors import ModelError, QpmheError
 from ..model.system import System
 from ..observers import Observer
-from .catalogue import catalogue
+from . import catalogue
 from .example import Example
 from .scenario import Scenario
 

@@ -1,12 +1,11 @@
 """Scripted studies: grids of estimators with their results, and the paper's example."""
 
-from .errors import StoreError, StudyError
-from .grid import Study
+from .grid import Study, StudyError
 from .paper import PaperStudy, Reproduction, reproduce
 from .qpbenchmark_set import ExportedSet, export_qpbenchmark
 from .report import write_report
 from .runner import run
-from .store import Store, export
+from .store import Store, StoreError, export
 from .summary import summarise
 
 __all__ = [

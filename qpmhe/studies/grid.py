@@ -21,18 +21,21 @@ from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import integer, shown
 
 from .._checks import count, dimension, positive
-from ..errors import BackendError, InvalidInputError
+from ..errors import BackendError, InvalidInputError, OptionError
 from ..models.loading import ModelSource, find, load
 from .cell import OBSERVER, Cell
-from .errors import StudyError
 
-__all__ = ["WORDS", "Measure", "Study"]
+__all__ = ["WORDS", "Measure", "Study", "StudyError"]
 
 Measure = Literal["both", "accuracy", "time"]
 #: Where the sequence of QPs begins: at the candidate, or warm-started where that is better.
 Start = Literal["candidate", "best"]
 #: What stands for None in files and on the command line.
 WORDS = {"qps": "converged", "solver_iterations": "none", "horizons": "default"}
+
+
+class StudyError(OptionError):
+    """A study that cannot run as it is written, or not on the cluster that it names."""
 
 
 @report_unknown_options

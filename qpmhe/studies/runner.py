@@ -23,8 +23,7 @@ from .._checks import dimension, flag, need
 from ..errors import OptionError
 from .cell import OBSERVER, Result, Task, compute, failure
 from .environment import environment, revision
-from .errors import StudyError
-from .grid import Study
+from .grid import Study, StudyError
 from .store import Store
 
 if TYPE_CHECKING:

@@ -20,12 +20,11 @@ from qpmhe_solvers.values import shown
 from .._checks import need
 from ..errors import InvalidInputError, OptionError, QpmheError
 from .cell import Cell
-from .errors import StoreError
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["Store", "Writer", "export"]
+__all__ = ["Store", "StoreError", "Writer", "export"]
 
 #: Version of the tables, and of what their columns mean.
 SCHEMA = 2
@@ -89,6 +88,10 @@ _REMEDIES = {
     "": _DAMAGED,  # text that cannot be decoded
     "SQLITE_NOTADB": "it is no SQLite file and was left as it is; name another",
 }
+
+
+class StoreError(QpmheError):
+    """A store that cannot be read or written; what it holds stays as it is."""
 
 
 class Store:

@@ -8,12 +8,11 @@ from time import perf_counter
 
 from .backend import make_solver
 from .banded import BandedSolver
-from .contained import ContainedSolver
 from .native import NATIVE
 from .options import SolverOptions
 from .qp import QP, Array
 from .solution import Solution, SolveStatus
-from .solver import Solver
+from .solver import ContainedSolver, Solver
 
 __all__ = ["AutoSolver"]
 

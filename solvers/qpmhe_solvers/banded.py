@@ -20,7 +20,8 @@ Index = NDArray[np.intp]
 # How far equality rows may be missed after a solve, in scaled numbers.
 _ROUNDING = 1e-10
 
-_COST_UNITS = 1.0, 0.5
+# By the exponent of the first number, even or odd: that of 1, 4, 16 is odd for `math.frexp`.
+_COST_UNITS = 0.5, 1.0
 
 
 class BandedSolver(Solver):

@@ -26,6 +26,7 @@ class DispatchSolver(NativeSolver):
     """
 
     package = "qpsolvers"  # imports every solver that is installed
+    kept = 8  # with and without sets, at a few phases of sampling
     _keeps, _warns = False, True
 
     def __init__(self, name: str, options: SolverOptions) -> None:

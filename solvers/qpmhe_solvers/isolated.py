@@ -16,12 +16,11 @@ from contextlib import suppress
 from typing import IO, Any, cast
 
 from .backend import Backend, make_solver
-from .contained import ContainedSolver
 from .errors import BackendError
 from .options import SolverOptions
 from .qp import QP, Array
 from .solution import Solution, SolveStatus
-from .solver import Solver
+from .solver import ContainedSolver, Solver
 
 __all__ = ["IsolatedSolver"]
 

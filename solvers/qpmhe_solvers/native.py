@@ -24,9 +24,6 @@ __all__ = ["NATIVE", "Answer", "NativeSolver"]
 
 Point = Array | None
 
-# Workspaces kept by one solver: a window of full length needs one, or one for each structure
-# that its sets have; those of a growing window are used once.
-_KEPT = 4
 # Patterns of limits whose workspace is known without looking at their structure.
 _KNOWN = 64
 
@@ -59,6 +56,9 @@ class NativeSolver(Solver):
     package: ClassVar[str]
     translation: ClassVar[str]
     style: Style
+    # Workspaces kept: a window of full length needs one, or one for each structure that its sets
+    # have; those of a growing window are used once.
+    kept: ClassVar[int] = 4
     _warns = False
 
     def __init__(self, options: SolverOptions) -> None:
@@ -128,7 +128,7 @@ class NativeSolver(Solver):
         answer = self._run(workspace.handle, layout, point, self._kept_duals(workspace, qp))
         if answer.sound and _finite(answer.x) and _finite(answer.duals):
             workspace.duals, workspace.shifts = answer.duals, self._shifts
-            if len(self._workspaces) == _KEPT:
+            if len(self._workspaces) == self.kept:
                 del self._workspaces[next(iter(self._workspaces))]  # the longest unused
             self._workspaces[key] = workspace
         bounds = rows = None

@@ -16,7 +16,6 @@ from typing import Literal, get_args
 import numpy as np
 
 from .backend import make_solver
-from .contained import ContainedSolver
 from .errors import InvalidInputError, OptionError
 from .files import dump
 from .options import SolverOptions
@@ -24,7 +23,7 @@ from .qp import QP, Array
 from .registry import backend as registered_backend
 from .registry import backends, register, unregister
 from .solution import Solution, SolveStatus
-from .solver import Solver
+from .solver import ContainedSolver, Solver
 
 __all__ = ["Recording", "RecordingWarning"]
 
@@ -184,16 +183,13 @@ class Recording:
             self._fault = f"{type(error).__name__}: {error}"
 
     def _keeps(self, solution: Solution, options: SolverOptions) -> bool:
-        status = solution.status
-        if self._only == "all" or status is SolveStatus.FAILED:
-            return True
-        if self._only == "failed":
-            return False
-        if status is SolveStatus.STOPPED:
-            return options.max_iterations is None and options.time_limit is None
-        if status is SolveStatus.UNCONSTRAINED:
-            return self._backend.inequalities
-        return status is SolveStatus.INACCURATE
+        unlimited = options.max_iterations is None and options.time_limit is None
+        suspicious = {
+            SolveStatus.STOPPED: unlimited, SolveStatus.INACCURATE: True,
+            SolveStatus.UNCONSTRAINED: self._backend.inequalities,
+        }.get(solution.status, False)
+        failed = solution.status is SolveStatus.FAILED
+        return failed or self._only == "all" or (self._only == "suspicious" and suspicious)
 
     def _write(
         self, number: int, qp: QP, start: Array | None, solution: Solution, options: SolverOptions

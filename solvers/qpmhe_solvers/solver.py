@@ -7,6 +7,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial, wraps
+from itertools import count
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -16,14 +17,15 @@ from .options import SolverOptions
 from .qp import ARRAYS, QP, Array
 from .sample_qps import sample
 from .scaling import Scale, Scaling
-from .solution import Errors, RawSolution, Solution, SolveStatus
+from .solution import Errors, RawSolution, Residuals, Solution, SolveStatus
 
-__all__ = ["Solver", "as_count", "as_iterate", "as_multipliers", "expect_qp", "failure"]
+__all__ = ["ContainedSolver", "Solver"]
 
 # A claim of success is believed while the recomputed residuals stay below this many times the
 # tolerance, since solvers measure in scaled norms of their own, but not beyond the loosest.
 _SLACK = 1e3
 _LOOSEST = 1e-3
+_NUMBERS = count(1)
 
 
 class Solver(ABC):
@@ -134,7 +136,7 @@ class Solver(ABC):
             with SystemExit has failed, too.
         """
         if type(qp) is not QP:
-            expect_qp(qp)
+            _expect_qp(qp)
         try:
             if self._judges:
                 return cast("Solution", self._solve(qp, start))
@@ -146,7 +148,7 @@ class Solver(ABC):
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # the wall; a panic of compiled code is no Exception
-            return failure(error)
+            return _failure(error)
 
     def _checked(self, qp: QP, start: Array | None) -> Solution:
         """Look at the data, solve, and judge."""
@@ -198,14 +200,14 @@ class Solver(ABC):
         if not isinstance(raw, RawSolution):
             message = f"the backend returned {type(raw).__name__}, not a RawSolution"
             return Solution(None, SolveStatus.FAILED, message=message)
-        count = as_count(raw.iterations)
-        d, message = as_iterate(raw.d, raw.message, qp)
+        count = _as_count(raw.iterations)
+        d, message = _as_iterate(raw.d, raw.message, qp)
         if d is None:
             return Solution(None, SolveStatus.FAILED, count, message=message)
         lower, upper, duals = qp.all_lower, qp.all_upper, None
         if qp.bounded or qp.rows:
-            bound_duals = as_multipliers(raw.bound_duals, qp.size)
-            row_duals = as_multipliers(raw.row_duals, qp.stages * qp.rows)
+            bound_duals = _as_multipliers(raw.bound_duals, qp.size)
+            row_duals = _as_multipliers(raw.row_duals, qp.stages * qp.rows)
             if bound_duals is not None and row_duals is not None:
                 duals = np.concatenate((bound_duals, row_duals)) if qp.rows else bound_duals
             if bound_duals is not None:
@@ -254,7 +256,94 @@ def _forgetting(forget: Callable[[Any], None]) -> Callable[[Any], None]:
     return both
 
 
-def expect_qp(qp: object) -> None:
+class ContainedSolver:
+    """A solver whose methods raise nothing but KeyboardInterrupt, whatever class it is of.
+
+    `Solver.solve` contains what `Solver._solve` does. This contains the rest: a user's class may
+    override `solve` itself, and its `shift`, `forget` and `prepare` may raise.
+
+    Several of these may share one solver. Whenever it passes from one to another, it starts
+    afresh: nothing that it keeps from one trajectory warm-starts the other.
+    """
+
+    def __init__(self, solver: Solver) -> None:
+        self.solver = solver
+        self._number = next(_NUMBERS)
+        is_contained = solver._builtin or type(solver).solve is Solver.solve
+        self._is_trusted = is_contained and "solve" not in vars(solver)
+
+    def solve(
+        self, qp: QP, start: Array | None = None, time_limit: float | None = None
+    ) -> Solution:
+        """Solve a QP; see `Solver.solve`."""
+        solver = self.solver
+        try:
+            if solver._user != self._number:
+                self._take_over(solver)
+            if time_limit is not None:
+                solver.time_limit = time_limit
+            if self._is_trusted:
+                return solver.solve(qp, start)
+            lent = None if start is None else start.copy()
+            with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
+                return _as_solution(solver.solve(qp.copy(), lent), qp)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # a panic of compiled code is no Exception
+            return _failure(error)
+
+    def _take_over(self, solver: Solver) -> None:
+        if solver._user:
+            _quietly(solver.forget)
+            solver.time_limit = solver.options.time_limit
+        solver._user = self._number
+
+    def shift(self) -> None:
+        """Say that the trajectory moved on by one stage; see `Solver.shift`."""
+        if self.solver._user in (0, self._number):  # else it keeps nothing of this trajectory
+            _quietly(self.solver.shift)
+
+    def forget(self) -> None:
+        """Drop what is kept from solve to solve; see `Solver.forget`."""
+        if self.solver._user in (0, self._number):
+            _quietly(self.solver.forget)
+
+    def prepare(self, size: int) -> None:
+        """Do beforehand what the first QPs would wait for; see `Solver.prepare`."""
+        _quietly(self.solver.prepare, size)
+
+
+def _quietly(method: Callable[..., None], *arguments: int) -> None:
+    """Call a method whose failure changes nothing that anybody relies on."""
+    try:
+        method(*arguments)
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # what a user's solver keeps is its own affair
+        pass
+
+
+def _as_solution(found: object, qp: QP) -> Solution:
+    """What an overridden `solve` returned, if it is what it should be."""
+    if not isinstance(found, Solution):
+        message = f"the backend's solve returned {type(found).__name__}, not a Solution"
+        return Solution(None, SolveStatus.FAILED, message=message)
+    count = _as_count(found.iterations)
+    status: object = found.status
+    if not isinstance(status, SolveStatus):
+        message = f"the status of the backend's Solution is {type(status).__name__}"
+        return Solution(None, SolveStatus.FAILED, count, message=f"{message}, not a SolveStatus")
+    d, message = _as_iterate(found.d, found.message, qp)
+    if d is None or status is SolveStatus.FAILED:
+        return Solution(None, SolveStatus.FAILED, count, message=message)
+    residuals = found.residuals if isinstance(found.residuals, Residuals) else None
+    return Solution(
+        d, status, count, residuals, _as_multipliers(found.bound_duals, qp.size),
+        _as_multipliers(found.row_duals, qp.stages * qp.rows), message,
+    )
+
+
+def _expect_qp(qp: object) -> None:
     """Refuse what is no QP."""
     if not isinstance(qp, QP):
         raise InvalidInputError(
@@ -263,7 +352,7 @@ def expect_qp(qp: object) -> None:
         )
 
 
-def failure(error: BaseException) -> Solution:
+def _failure(error: BaseException) -> Solution:
     """The solution of a solver that raised."""
     try:
         message = f"{type(error).__name__}: {error}"
@@ -272,7 +361,7 @@ def failure(error: BaseException) -> Solution:
     return Solution(None, SolveStatus.FAILED, message=message)
 
 
-def as_iterate(given: object, words: object, qp: QP) -> tuple[Array | None, str]:
+def _as_iterate(given: object, words: object, qp: QP) -> tuple[Array | None, str]:
     """An iterate (K, n) as a copy, and the message that goes with it; None if it is none."""
     message = words if isinstance(words, str) else f"its message is a {type(words).__name__}"
     if given is None:
@@ -288,14 +377,14 @@ def as_iterate(given: object, words: object, qp: QP) -> tuple[Array | None, str]
     return d.reshape(qp.stages, qp.n), message
 
 
-def as_count(value: object) -> int | None:
+def _as_count(value: object) -> int | None:
     """A count of iterations; None where it is none."""
     if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0:
         return int(value)
     return None
 
 
-def as_multipliers(values: object, size: int) -> Array | None:
+def _as_multipliers(values: object, size: int) -> Array | None:
     """Multipliers that can be used; None stands for all that cannot."""
     if values is None:
         return None

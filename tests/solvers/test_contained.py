@@ -17,7 +17,7 @@ from qpmhe_solvers import (
     SolveStatus,
     create,
 )
-from qpmhe_solvers.contained import ContainedSolver
+from qpmhe_solvers.solver import ContainedSolver
 
 from .problems import ARRAYS, CASES, make, numbers, registered
 

@@ -5,7 +5,7 @@ import pytest
 
 from qpmhe.errors import BackendError, ModelError, OptionError, QpmheError, UnknownOptionError
 from qpmhe.models import batch_reactor
-from qpmhe.studies.errors import StudyError
+from qpmhe.studies import StudyError
 from qpmhe.studies.grid import Study
 from qpmhe_solvers import available, backend
 
