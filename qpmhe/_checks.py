@@ -188,10 +188,17 @@ def need(module: str, purpose: str, extra: str = "studies") -> ModuleType:
         ) from error
 
 
+def checked_path(name: str, value: Any) -> Path:
+    """The name of a file or folder."""
+    if not isinstance(value, (str, Path)):
+        raise InvalidInputError(f"{name} is {shown(value)}; expected the name of a file or folder.")
+    return Path(value)
+
+
 def make_folder(path: str | Path) -> Path:
     """Make a folder where there is none."""
     try:
-        Path(path).mkdir(parents=True, exist_ok=True)
+        checked_path("the folder", path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError(f"cannot make the folder {path}: {error.strerror}.") from error
     return Path(path)

@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 
 import qpmhe
+from qpmhe._checks import make_folder
 from qpmhe.errors import InvalidInputError, OptionError, QpmheError
-from qpmhe.studies import Study, run
+from qpmhe.studies import Study, export, run, write_report
 
 
 class UnshownError(Exception):
@@ -63,7 +64,8 @@ def amended(**options):
 
 CALLS = [
     (estimator, "system observer cost horizon initial_state backend max_qps max_solver_iterations "
-     "solver_tolerance tolerance engine warm_start candidate time_budget delay isolated"),
+     "solver_tolerance tolerance engine project_observer infeasible warm_start candidate "
+     "time_budget delay isolated"),
     (lambda **options: estimator().update(**({"y": [1.0]} | options)), "y u dt noise_weight"),
     (amended, "time y"),
     (lambda **options: estimator().run(**({"measurements": [[1.0]]} | options)),
@@ -76,8 +78,8 @@ CALLS = [
     (made(qpmhe.Huber, {"weight": EYE}), "weight threshold per_component"),
     (made(qpmhe.Power, {"weight": EYE, "exponent": 1.5}), "weight exponent per_component"),
     (qpmhe.ObserverPrior, "minimum maximum"),
-    (qpmhe.Luenberger, "gain"),
-    (qpmhe.OutputInjection, "correction"),
+    (made(qpmhe.Luenberger, {"gain": [[0.1]]}), "gain metric"),
+    (made(qpmhe.OutputInjection, {"correction": np.add}), "correction metric"),
     (made(qpmhe.ExtendedKalman, WEIGHTS), "prior disturbance noise"),
     (made(qpmhe.UnscentedKalman, WEIGHTS), "prior disturbance noise spread"),
     (made(qpmhe.SteadyStateKalman, {"system": SYSTEM, "at": [3.0, 1.0], **COVARIANCES}),
@@ -107,6 +109,13 @@ CALLS = [
     (lambda **options: replace(SCENARIO, **options),
      "system initial_state initial_estimate disturbance_covariance noise_covariance dt horizon "
      "steps labels inputs settling_time resolution"),
+    (made(export, {"store": "none.sqlite", "path": "cells.csv"}), "store path"),
+    (made(write_report, {"source": "none.sqlite", "out": "report"}), "source"),
+    (make_folder, "path"),
+    (made(qpmhe.augment_parameters, {
+        "f": lambda x, theta: x * theta[0], "h": lambda x, theta: x[:1], "nominal": [1.0], "n": 2,
+        "p": 1,
+    }), "f h nominal n p m estimated parameter_bounds states disturbances"),
     (made(SCENARIO.simulate, {"seed": 0, "steps": 3}), "seed steps"),
 ]
 
@@ -120,10 +129,11 @@ def test_only_our_own_errors(value, tmp_path, monkeypatch):
                 call(**{name: value})
 
 
-@pytest.mark.parametrize("option", ["engine", "candidate"])
+@pytest.mark.parametrize("option", ["engine", "candidate", "infeasible"])
 @pytest.mark.parametrize("value", [np.array(["python", "observer"]), np.array("python")])
 def test_an_array_is_no_word(option, value):
-    with pytest.raises(OptionError, match=rf"{option} is array\(.*expected one of 'python'|'obs"):
+    words = rf"{option} is array\(.*expected one of '(python|observer|drop_rows)'"
+    with pytest.raises(OptionError, match=words):
         estimator(**{option: value})
 
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qpmhe_solvers.values import shown
+
 from .._checks import dimension, numbers
 from ..errors import InvalidInputError, ModelError, SetError, ShapeError
 from .functions import BatchedFunction, Probes, Trusted
@@ -234,7 +236,13 @@ def _chosen(estimated: ArrayLike | None, size: int) -> Index:
     """Indices of the estimated parameters."""
     if estimated is None:
         return np.arange(size)
-    given = np.atleast_1d(np.asarray(estimated))
+    refused = InvalidInputError(
+        f"estimated is {shown(estimated)}; expected indices of parameters or a boolean mask."
+    )
+    try:
+        given = np.atleast_1d(np.asarray(estimated))
+    except ValueError as error:  # rows of different lengths
+        raise refused from error
     if given.dtype == np.bool_:
         if given.shape != (size,):
             raise ShapeError(
@@ -244,10 +252,8 @@ def _chosen(estimated: ArrayLike | None, size: int) -> Index:
         return np.flatnonzero(given)
     if given.size == 0:
         return np.empty(0, np.intp)
-    if given.ndim != 1 or not np.issubdtype(given.dtype, np.integer):
-        raise InvalidInputError(
-            f"estimated is {estimated!r}; expected indices of parameters or a boolean mask."
-        )
+    if given.ndim != 1 or given.dtype.kind not in "iu":
+        raise refused
     outside = (given < 0) | (given >= size)
     if outside.any():
         raise InvalidInputError(
@@ -266,14 +272,14 @@ def _check_set(name: str, one: ConvexSet | None, dimension: int, meaning: str) -
     if one is None:
         return
     if not isinstance(one, ConvexSet):
-        raise SetError(f"{name} is {one!r}; expected a qpmhe.Box, a qpmhe.Polytope or None.")
+        raise SetError(f"{name} is {shown(one)}; expected a qpmhe.Box, a qpmhe.Polytope or None.")
     if one.dimension != dimension:
         raise SetError(f"{name} has dimension {one.dimension}; expected {dimension}, {meaning}.")
 
 
 def _check_arguments(name: str, written: Function, m: int) -> None:
     if not callable(written):
-        raise ModelError(f"{name} is {written!r}; expected a function.")
+        raise ModelError(f"{name} is {shown(written)}; expected a function.")
     arguments = ("x", "theta") if m == 0 else ("x", "u", "theta")
     try:
         signature = inspect.signature(written)

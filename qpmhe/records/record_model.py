@@ -134,7 +134,7 @@ class ModelFailures:
     def __init__(self, system: System, horizon: int, file: Path | None = None) -> None:
         self.failed = self.stale = 0
         self.is_mistake, self.place = False, ""
-        self._why = ""
+        self._why = self._then = ""
         self._system, self._file = system, file
         self._inputs: deque[tuple[Array, float | None]] = deque(maxlen=horizon)
         self._attempts = 0
@@ -149,6 +149,7 @@ class ModelFailures:
         if not self._why and self._attempts < _ATTEMPTS:
             self._attempts += 1
             self._why = self._evaluate_again(estimate)
+            self._then = self._then or estimate.message
         return self.failed == 1
 
     def _evaluate_again(self, estimate: Estimate) -> str:
@@ -195,7 +196,8 @@ class ModelFailures:
     @property
     def reason(self) -> str:
         """Where the model failed first, why, and what to do."""
-        why = self._why or "evaluated again, it has values there; is it random?"
+        then = f"{self._then.rstrip('.')}; " if self._then else ""
+        why = self._why or f"{then}evaluated again, it has values there; is it random?"
         remedy = (
             "Correct the model." if self.is_mistake
             else "Bound the states, or make the model defined on all of them."

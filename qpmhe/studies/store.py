@@ -15,9 +15,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from qpmhe_solvers.values import shown
-
-from .._checks import need
+from .._checks import checked_path, need
 from ..errors import InvalidInputError, OptionError, QpmheError
 from .cell import Cell
 
@@ -102,9 +100,7 @@ class Store:
     """
 
     def __init__(self, path: str | Path) -> None:
-        if not isinstance(path, (str, Path)):
-            raise InvalidInputError(f"the store is {shown(path)}; expected the name of a file.")
-        self.path = Path(path)
+        self.path = checked_path("the store", path)
 
     def __repr__(self) -> str:
         return f"Store({str(self.path)!r})"
@@ -248,7 +244,7 @@ def export(store: Store | str | Path, path: str | Path) -> Path:
     is replaced. Raises `OptionError` if the name ends differently, `StoreError` if the store
     cannot be read, `InvalidInputError` if the file cannot be written or a package is missing.
     """
-    target = Path(path)
+    target = checked_path("the file", path)
     if target.suffix not in (".csv", ".parquet"):
         raise OptionError(f"the file is {str(path)!r}; expected a name in .csv or .parquet.")
     frame = (store if isinstance(store, Store) else Store(store)).frame()

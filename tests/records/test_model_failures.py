@@ -39,7 +39,8 @@ MISTAKE = "    if np.any(np.real(x) > 2.5):\n        x = x + ofset"
 INFINITE = "    x = np.where(np.real(x) > 2.5, np.inf, 1.0) * x"
 WRONG_SHAPE = "    if np.any(np.real(x) > 2.5):\n        return np.zeros(2)"
 LATE_SHAPE = "    if calls > 150:\n        return np.zeros(2)"
-LATE = "    if calls > 60:\n        raise ArithmeticError('no convergence')"
+RANDOM = "    if 150 < calls < 154:\n        raise OSError('the table is away')"
+LATE = "    if calls > 100:\n        raise ArithmeticError('no convergence')"
 
 
 @pytest.fixture
@@ -87,6 +88,14 @@ def test_it_is_told(record, body, words, is_mistake, system):
     # Once, when it happens.
     assert len(told) == 1
     assert words in told[0]
+
+
+def test_what_is_raised_once_only_is_told(record):
+    name, _ = model(RANDOM)
+    summary = estimate_record(name, "record.csv", "out.csv")
+    assert summary.failed
+    assert "h raised OSError: the table is away at x = [" in summary.failure
+    assert "evaluated again, it has values there; is it random?" in summary.failure
 
 
 def test_nothing_is_told_of_a_model_that_works(record):

@@ -137,9 +137,10 @@ def write_report(
         library is missing.
     """
     check_libraries()
-    if isinstance(source, (str, Path)):
-        source = Store(source)
-    frame, meta = source if isinstance(source, tuple) else (source.frame(), source.meta())
+    held: Any = source
+    if not (isinstance(held, tuple) or hasattr(held, "frame")):
+        held = Store(held)
+    frame, meta = held if isinstance(held, tuple) else (held.frame(), held.meta())
     if not len(frame):
         raise InvalidInputError(
             "the study has no finished cell, so that there is nothing to report; run it first."
@@ -151,9 +152,9 @@ def write_report(
         Part(case, cells_of(frame, case.summary.iloc[0], PROBLEM), deadline)
         for case in cases(summary)
     ]
-    if not isinstance(source, tuple):
+    if not isinstance(held, tuple):
         for part in found:
-            part.runs = choose_runs(source, part.cells, part.case, _TRAJECTORY_BYTES // len(found))
+            part.runs = choose_runs(held, part.cells, part.case, _TRAJECTORY_BYTES // len(found))
     drawn, profile = styles(summary["backend"]), figures.profiles(frame)
     page, unfinished = folder / "index.html", folder / "index.html.part"
     try:
