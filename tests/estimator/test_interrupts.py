@@ -25,6 +25,7 @@ WITHIN = str(pathlib.Path(qpmhe.__file__).parent)
 CASES = {
     "plain": ("numpy", {}),
     "reinitialized": ("numpy", {"candidate": "reinitialized", "warm_start": True}),
+    "reinitialized in a set": ("numpy", {"candidate": "reinitialized", "sets": BOX}),
     "kalman": ("numpy", {"kalman": True, "candidate": "reinitialized"}),
     "robust": ("numpy", {"robust": True, "max_qps": 2}),
     "projected": ("numpy", {"sets": BOX, "max_qps": 2}),
