@@ -87,13 +87,16 @@ class Case:
             region.rows = None
             self.regions["states"] = region
         elif rng.random() < 0.25 and self.engine != "compiled":
-            self.regions["states"] = Region(rng, model.n, 3.0)
+            self.regions["states"] = Region(rng, model.n, one_of(rng, (0.5, 1.0, 3.0)))
         if rng.random() < 0.25:
             if rng.random() < 0.4:
                 self.fixed = (int(rng.integers(model.n)),)
             self.regions["disturbances"] = Region(rng, model.n, 0.3, self.fixed)
         if rng.random() < 0.2:
             self.regions["noises"] = Region(rng, model.p, 1.5)
+        for name, width in (("disturbances", 0.3), ("noises", 1.5)):
+            if name in self.regions and rng.random() < 0.2:
+                self.regions[name].leave_out_zero(rng, width)
         if "states" in self.regions and self.regions["states"].missed(self.start) > 0.0:
             self.start = np.zeros(model.n)
 
@@ -110,7 +113,7 @@ class Case:
         kinds = ["luenberger", "luenberger", "injection"]
         if model.kind in SMOOTH:
             kinds += ["extended", "extended", "steady"]
-        if "states" not in self.regions:
+        if "states" not in self.regions:  # into whose bounds its sigma points are drawn
             kinds += ["unscented"]
         observer = "luenberger" if engine == "compiled" else one_of(rng, kinds)
         self.watcher = Watcher(rng, model, observer, self.start)
@@ -121,12 +124,18 @@ class Case:
         prior = covariant and candidate == "observer" and rng.random() < 0.6
         quadratic = engine == "compiled" or rng.random() < 0.65
         self.price = Price(rng, model, self.watcher, prior, quadratic)
+        project = "states" in self.regions and rng.random() < 0.8
+        if project:
+            initial = self.price.prior_weight(self.watcher.P0)
+            region = self.regions["states"]
+            self.watcher.keep_inside(region, initial, self.price.weights[2])
         self.options = {
             "horizon": int(rng.integers(1, 13)),
             "backend": one_of(rng, COMPILED_BACKENDS if engine == "compiled" else BACKENDS),
             "max_qps": one_of(rng, (0, 0, 1, 1, 1, 2, 2, 2, 5, None)),
             "max_solver_iterations": one_of(rng, (None, None, 1, 3)),
-            "outside": one_of(rng, ("drop", "drop", "project", "keep")),
+            "infeasible": one_of(rng, ("drop_rows", "drop_rows", "keep_candidate")),
+            "project_observer": project or "states" not in self.regions,
             "warm_start": one_of(rng, (False, False, True)),
             "candidate": candidate,
             "engine": engine,
@@ -134,8 +143,6 @@ class Case:
         if "states" in self.regions or "disturbances" in self.regions or "noises" in self.regions:
             if self.options["backend"] == "banded":
                 self.options["backend"] = "auto"
-        elif self.options["outside"] != "drop":
-            self.options["outside"] = "drop"
         if self.options["max_qps"] is None and self.options["backend"] not in QUICK:
             self.options["max_qps"] = 3
         self.options["delay"] = int(rng.integers(0, self.options["horizon"] + 1))
@@ -274,7 +281,8 @@ class Case:
             ("cap", self.options["max_solver_iterations"]),
             ("candidate", self.options["candidate"]), ("warm_start", self.options["warm_start"]),
             ("sets", " ".join(sorted(self.regions)) or "none"),
-            ("noise-free", bool(self.fixed)), ("outside", self.options["outside"]),
+            ("noise-free", bool(self.fixed)), ("infeasible", self.options["infeasible"]),
+            ("projecting", self.watcher.region is not None),
             ("sample", "complete" if observed.all() else "partial" if observed.any() else "none"),
             ("own noise weight", own is not None), ("irregular step", dt is not None),
             ("scribbled over", self.scribble),
@@ -283,6 +291,10 @@ class Case:
         for flag in Status:
             if flag in status:
                 counts["status", flag.name] += 1
+        if Status.CANDIDATE_OUTSIDE in status:
+            rung = "b" if estimate.dropped else "a" if estimate.improved else "c"
+            counts["candidate outside, rung", rung] += 1
+            counts["nearest points"] += estimate.nearest_points
 
     def _check(self, estimate, t, K, samples, z, P, history, counts):
         status, price = estimate.status, self.price
@@ -326,11 +338,15 @@ class Case:
         y_scale = scale + float(np.nanmax(np.abs([s[0] for s in window]), initial=0.0))
         if not np.allclose(estimate.noises, v, rtol=0, atol=1e-12 * y_scale, equal_nan=True):
             raise WrongStepError("the noises are not those of the trajectory")
-        self._check_sets(estimate, w, v, cw, cv, scale)
+        self._check_sets(estimate, t + 1 - K, w, v, cw, cv, max(scale, y_scale))
         if not np.array_equal(estimate.state, estimate.trajectory[-1]):
             raise WrongStepError("state is not the last of the trajectory")
-        if not np.array_equal(estimate.filtered, estimate.trajectory[-2]):
-            raise WrongStepError("filtered is not the last but one of the trajectory")
+        expected, tolerance = estimate.trajectory[-2], 0.0
+        if Status.CANDIDATE in status:
+            expected = self.watcher.filtered(z[t], P[t], samples[-1])
+            tolerance = 0.0 if expected is z[t] else 1e-5
+        if not np.allclose(estimate.filtered, expected, rtol=0, atol=tolerance * scale):
+            raise WrongStepError(f"filtered is {estimate.filtered}, not {expected}; {status}")
         delay = self.options["delay"]
         if delay <= K and not np.array_equal(estimate.delayed, estimate.trajectory[K - delay]):
             raise WrongStepError("delayed is another state")
@@ -341,70 +357,81 @@ class Case:
 
     def _observed(self, estimate, t, K, window, z, P, history):
         """Check the candidate against the observer; the observer's own states."""
-        first = t + 1 - K
-        projected = Status.PROJECTED in estimate.status
-        found = estimate.candidate
+        first, found, status = t + 1 - K, estimate.candidate, estimate.status
         if self.options["candidate"] == "reinitialized":
             z[first] = history[first]
             again = range(K)
         else:
             again = range(K - 1, K)
-        # Past a projection the observer's states are those of the second implementation only.
-        same = np.allclose if self.unseen >= first else np.array_equal
-        if not projected and not same(found[0], z[first]):
+        if not np.array_equal(found[0], z[first]):
             raise WrongStepError(f"the candidate starts at {found[0]}, not at {z[first]}")
         tolerance = 1e-9 if self.watcher.exact else 1e-5
         for i in again:
             following, covariance = self.watcher.step(z[first + i], P[first + i], window[i])
             del z[first + i + 1 :], P[first + i + 1 :]
-            z.append(following)
             P.append(covariance)
-            if projected:
-                self.unseen = first + i + 1
-                continue
             scale = 1.0 + float(np.abs(following).max())
             if not np.allclose(found[i + 1], following, rtol=0, atol=tolerance * scale):
                 raise WrongStepError(f"the candidate goes to {found[i + 1]}, not to {following}")
-            z[-1] = found[i + 1].copy()
-        if not projected:
-            if not same(found, np.array(z[first:])):
-                raise WrongStepError("the candidate has changed within the window")
-            z[first:] = [state.copy() for state in found]
-            self.unseen = -1
+            z.append(found[i + 1].copy())
+        if not np.array_equal(found, np.array(z[first:])):
+            raise WrongStepError("the candidate has changed within the window")
+        for flag, missed in (
+            (Status.OBSERVER_PROJECTED, self.watcher.missed),
+            (Status.PREDICTION_OUTSIDE, self.watcher.predicted_missed),
+        ):
+            moved = self.watcher.missed > tolerance * scale
+            if moved and missed > tolerance * scale and flag not in status:
+                raise WrongStepError(f"{flag} is not in {status}")
+            if flag in status and not missed > 0.0 and self.watcher.exact:
+                raise WrongStepError(f"{flag} is in {status}")
         return z[first : first + K + 1]
 
-    def _check_sets(self, estimate, w, v, cw, cv, scale):
-        if not self.regions:
-            if estimate.dropped:
-                raise WrongStepError(f"dropped {estimate.dropped}, of no sets")
-            return
-        rounding = 1e-14 * scale
+    def _check_sets(self, estimate, first, w, v, cw, cv, scale):
+        weights = (
+            self.price.prior_weight(self.watcher.P0), self.price.weights[1], self.price.weights[2]
+        )
 
-        def outside(trajectory, disturbances, noises, tolerance):
-            points = dict(zip(SETS, (trajectory, disturbances, noises), strict=True))
+        def missed(points, factor, rounding):
+            """Rows that are missed by more than so much in their scale."""
             return {
-                name for name, region in self.regions.items()
-                if max(region.missed(point) for point in points[name]) > tolerance
+                (name, *row, first + k)
+                for name, several, weight in zip(SETS, points, weights, strict=True)
+                if name in self.regions
+                for k, point in enumerate(several)
+                for row, miss in self.regions[name].missed_rows(point, weight).items()
+                if miss > FEASIBLE * factor + rounding * scale * math.sqrt(np.abs(weight).max())
             }
 
-        status, policy = estimate.status, self.options["outside"]
-        of_candidate = (estimate.candidate, cw, cv)
-        surely = outside(*of_candidate, FEASIBLE * (1 + 1e-6) + rounding)
-        perhaps = outside(*of_candidate, FEASIBLE * (1 - 1e-6) - rounding)
-        if policy == "keep":
-            if surely and Status.CANDIDATE not in status:
-                raise WrongStepError("keep: the candidate is outside and not the estimate")
-            if estimate.dropped:
-                raise WrongStepError("keep: dropped")
-            return
-        if Status.PROJECTED in status:
-            if policy != "project" or surely:
-                raise WrongStepError(f"projected, and outside of {surely}")
-        elif not surely <= set(estimate.dropped) <= perhaps:
-            raise WrongStepError(f"dropped {estimate.dropped}, and not {surely}")
-        left = outside(estimate.trajectory, w, v, FEASIBLE * (1 + 1e-6) + 10.0 * rounding)
-        if not left <= set(estimate.dropped):
-            raise WrongStepError(f"outside of {left}; dropped {estimate.dropped}")
+        status, dropped = estimate.status, set(estimate.dropped)
+        of_candidate, of_estimate = (estimate.candidate, cw, cv), (estimate.trajectory, w, v)
+        surely = missed(of_candidate, 1 + 1e-6, 1e-13)
+        perhaps = missed(of_candidate, 1 - 1e-6, -1e-13)
+        left = missed(of_estimate, 1 + 1e-6, 1e-13)
+        if surely and Status.CANDIDATE_OUTSIDE not in status:
+            raise WrongStepError(f"the candidate misses {surely}, says {status}")
+        if Status.CANDIDATE_OUTSIDE in status and not perhaps:
+            raise WrongStepError(f"the candidate misses nothing, says {status}")
+        if (Status.ROWS_DROPPED in status) != bool(dropped):
+            raise WrongStepError(f"dropped {dropped}, says {status}")
+        if not dropped <= missed(of_estimate, 1 - 1e-6, -1e-13):
+            raise WrongStepError(f"dropped {dropped}, and misses {left}")
+        if not dropped <= perhaps:
+            raise WrongStepError(f"dropped {dropped}, and the candidate misses {surely}")
+        if any(row[0] == "disturbances" and row[1] in self.fixed for row in dropped):
+            raise WrongStepError(f"dropped {dropped}, with rows that are free of noise")
+        if Status.IMPROVED in status and not left <= dropped:
+            raise WrongStepError(f"misses {left}; dropped {dropped}")
+        if not perhaps and left:
+            raise WrongStepError(f"misses {left}, and the candidate nothing")
+        if self.options["infeasible"] == "keep_candidate" and dropped:
+            raise WrongStepError(f"dropped {dropped} against the option")
+        if self.watcher.region is not None:
+            weight = weights[0]
+            for point in (*estimate.trajectory, estimate.filtered, *estimate.candidate):
+                outside = self.watcher.region.missed_rows(point, weight)
+                if max(outside.values(), default=0.0) > 1.1 * FEASIBLE + 1e-13 * scale:
+                    raise WrongStepError(f"{point} is not in X: {outside}; {status}")
 
 
 def fuzz(steps, seed=0, *, source=None, writing=None, engine=None, estimators=3, report=None):

@@ -7,6 +7,8 @@ NumPy, for one state at a time, from the formulas in the paper and the documenta
 import math
 
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
+from scipy.optimize import nnls
 
 import qpmhe
 
@@ -321,6 +323,16 @@ class Watcher:
         self.spread = float(rng.uniform(0.5, 2.0))
         self.start = start
         self.exact = kind in ("luenberger", "injection", "unscented")
+        self.region = None
+        #: Of the last step: whether it and its prediction were inside, by more than rounding.
+        self.missed = self.predicted_missed = 0.0
+
+    def keep_inside(self, region, prior_weight, noise_weight):
+        """Project the observer onto a region, in the metric of its covariance or its error."""
+        self.region, self.metric = region, np.linalg.inv(prior_weight)
+        self.settled, self.prior_weight = False, prior_weight
+        self.deviations = np.sqrt(np.linalg.inv(noise_weight).diagonal())
+        self.exact = False
 
     def made(self, system):
         covariances = {"prior": self.P0, "disturbance": self.Q, "noise": self.R}
@@ -356,6 +368,56 @@ class Watcher:
 
     def step(self, z, P, sample):
         """z(t+1) and P(t+1)."""
+        following, covariance = self._free_step(z, P, sample)
+        if self.region is None:
+            return following, covariance
+        if covariance is None and not self.settled:
+            self._settle(z, sample)
+        metric = self.metric if covariance is None else covariance
+        self.missed = self.region.missed(following)
+        self.predicted_missed = self.region.missed(self.model.f(z, *sample[1:3]))
+        return self.region.nearest(following, metric), covariance
+
+    def _settle(self, z, sample):
+        """The Lyapunov metric of the error A - K C, if it is stable here."""
+        A, C = self.model.slopes(z, *sample[1:3])
+        gain = self.gain
+        if self.kind == "injection":
+            moves = self.gain @ np.diag(np.tanh(self.deviations) / self.deviations)
+            gain = moves / (1.0 + z[0] ** 2)
+        E = A - gain @ C
+        if np.abs(np.linalg.eigvals(E)).max() < 1.0:
+            self.metric = np.linalg.inv(solve_discrete_lyapunov(E.T, self.prior_weight))
+            self.settled = True
+
+    def filtered(self, z, P, sample):
+        """The estimate of x(t) with y(t), and its covariance; z for an observer without one."""
+        if P is None or self.kind in ("luenberger", "injection"):
+            return z
+        y, u, dt, own = sample
+        there = np.isfinite(y)
+        v = (y - np.array(self.model.h(z, u)))[there]
+        R = (self.R if own is None else np.linalg.inv(own))[there][:, there]
+        if self.kind == "unscented":
+            root = self.spread * np.linalg.cholesky(P)
+            moves = np.hstack((root, -root)).T
+            H = np.array([self.model.h(z + move, u) for move in moves]) - self.model.h(z, u)
+            cross = moves.T @ H[:, there] / (2.0 * self.spread**2)
+            S = H[:, there].T @ H[:, there] / (2.0 * self.spread**2) + R
+            K = cross @ np.linalg.inv(S)
+            after = P - cross @ K.T
+        else:
+            C = self.C0[there] if self.kind == "steady" else self.model.slopes(z, u, dt)[1][there]
+            K = P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
+            if self.kind == "steady":  # its gain is that of all outputs
+                S = self.C0 @ self.P0 @ self.C0.T + self.R
+                K = (self.P0 @ self.C0.T @ np.linalg.inv(S))[:, there]
+            closed = np.eye(len(z)) - K @ C
+            after = closed @ P @ closed.T + K @ R @ K.T
+        found = z + K @ v
+        return found if self.region is None else self.region.nearest(found, after)
+
+    def _free_step(self, z, P, sample):
         model = self.model
         y, u, dt, own = sample
         there = np.isfinite(y)
@@ -500,15 +562,59 @@ class Region:
         box = qpmhe.Box(self.low, self.high)
         return box if self.rows is None else box & qpmhe.Polytope(self.rows, self.side)
 
+    def leave_out_zero(self, rng, width):
+        """Move the bounds of one component beyond zero."""
+        j = int(rng.integers(len(self.low)))
+        if self.rows is None and self.low[j] < self.high[j]:
+            move = 1.5 * width if math.isfinite(self.low[j]) else -1.5 * width
+            self.low[j] += move
+            self.high[j] += move
+
+    def rows_of(self, d):
+        """Index, coefficients and sides of each inequality."""
+        for j in range(d):
+            if math.isfinite(self.low[j]) or math.isfinite(self.high[j]):
+                yield j, np.eye(d)[j], float(self.low[j]), float(self.high[j])
+        for k in range(0 if self.rows is None else len(self.rows)):
+            yield d + k, self.rows[k], -math.inf, float(self.side[k])
+
+    def missed_rows(self, point, weight=None):
+        """(index, side) of each inequality that a point misses, and by how much.
+
+        With a weight in standard deviations, or widths if less. Inequalities on components that
+        are NaN do not count.
+        """
+        found, covariance = {}, None if weight is None else np.linalg.inv(weight)
+        for j, row, low, high in self.rows_of(len(point)):
+            used = row != 0.0
+            value = float(row[used] @ point[used])
+            scale = 1.0
+            if weight is not None:
+                scale = math.sqrt(row @ covariance @ row)
+                scale = min(scale, high - low) if high > low else scale
+            for side, miss in (("lower", low - value), ("upper", value - high)):
+                if miss > 0.0:
+                    found[j, side] = miss / scale
+        return found
+
     def missed(self, point):
-        """By how much; inequalities on components that are NaN do not count."""
-        worst = 0.0
-        for j, value in enumerate(point):
-            if math.isfinite(value):
-                worst = max(worst, float(self.low[j]) - value, value - float(self.high[j]))
-        if self.rows is not None:
-            for row, side in zip(self.rows, self.side, strict=True):
-                value = sum(float(a) * float(b) for a, b in zip(row, point, strict=True))
-                if math.isfinite(value):
-                    worst = max(worst, value - float(side))
-        return worst
+        """By how much the worst inequality is missed."""
+        return max(self.missed_rows(np.asarray(point)).values(), default=0.0)
+
+    def nearest(self, point, covariance):
+        """The nearest point in the metric of a covariance: least distance programming.
+
+        Lawson and Hanson, Solving Least Squares Problems, chapter 23.
+        """
+        if not self.missed_rows(point):
+            return point
+        sides = []
+        for _, row, low, high in self.rows_of(len(point)):
+            sides += [(row, low)] * math.isfinite(low) + [(-row, -high)] * math.isfinite(high)
+        root = np.linalg.cholesky(covariance)
+        G = np.array([row @ root for row, _ in sides])
+        gaps = np.array([side - row @ point for row, side in sides])
+        E = np.vstack((G.T, gaps / np.abs(gaps).max()))
+        u, _ = nnls(E, np.append(np.zeros(len(point)), 1.0), maxiter=1000)
+        r = E @ u - np.append(np.zeros(len(point)), 1.0)
+        return point - root @ (r[:-1] / r[-1]) * np.abs(gaps).max()

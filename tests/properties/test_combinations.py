@@ -10,6 +10,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Status
+from qpmhe.errors import ObserverWarning
 from qpmhe.solvers import Backend, RawSolution, Solver, SolveStatus
 
 NAN = np.nan
@@ -88,16 +89,18 @@ def plain_cost(name, trajectory, prior, Y, U):
     return J + discount ** len(Y) * prior_loss(offset @ PRIOR @ offset)
 
 
-def missed(one, points):
-    """The most by which points leave a set, where all that an inequality needs is known."""
-    worst = 0.0
-    for point in points:
-        gaps = [*(one.lower - point), *(point - one.upper)]
-        for row, low, high in zip(one.matrix, one.row_lower, one.row_upper, strict=True):
-            value = np.dot(row[row != 0.0], point[row != 0.0])
-            gaps += [low - value, value - high]
-        worst = max(worst, np.nanmax([0.0, *gaps]))
-    return worst
+def missed(one, point, tolerance):
+    """The inequalities that a point misses, where all that they need is known."""
+    found = set()
+    for j in range(one.dimension):
+        found |= {(j, "lower")} if one.lower[j] - point[j] > tolerance else set()
+        found |= {(j, "upper")} if point[j] - one.upper[j] > tolerance else set()
+    rows = zip(one.matrix, one.row_lower, one.row_upper, strict=True)
+    for k, (row, low, high) in enumerate(rows, one.dimension):
+        value = np.dot(row[row != 0.0], point[row != 0.0])
+        found |= {(k, "lower")} if low - value > tolerance else set()
+        found |= {(k, "upper")} if value - high > tolerance else set()
+    return found
 
 
 class Case:
@@ -170,24 +173,30 @@ class Case:
         np.testing.assert_allclose(estimate.disturbances, x[1:] - predicted, rtol=0, atol=1e-12)
         fitted = [h(state, u) for state, u in zip(x[:-1], U, strict=True)]
         np.testing.assert_allclose(estimate.noises, Y - fitted, rtol=0, atol=1e-12)
-        outside = self.outside(estimate.candidate, Y, U)
-        if Status.PROJECTED not in estimate.status:
-            assert estimate.dropped == outside
-        assert bool(estimate.dropped) == (Status.SETS_DROPPED in estimate.status)
-        assert set(self.outside(x, Y, U)) <= set(estimate.dropped)
+        dropped, first = set(estimate.dropped), len(known) - length
+        outside = self.outside(estimate.candidate, Y, U, first)
+        assert (Status.CANDIDATE_OUTSIDE in estimate.status) == bool(outside)
+        assert bool(dropped) == (Status.ROWS_DROPPED in estimate.status)
+        assert dropped <= self.outside(estimate.candidate, Y, U, first, 1e-10)
+        assert dropped <= self.outside(x, Y, U, first, 1e-10)
+        assert not improved or self.outside(x, Y, U, first) <= dropped
+        fixed = self.system.disturbances.fixed_components if "disturbances" in self.sets else ()
+        assert not any(row.set == "disturbances" and row.row in fixed for row in dropped)
 
-    def outside(self, trajectory, Y, U):
-        """Names of the sets that a trajectory is outside of."""
+    def outside(self, trajectory, Y, U, first=0, tolerance=1e-8):
+        """The rows that a trajectory misses, whose first state is of this time."""
         pairs = list(zip(trajectory[:-1], U, strict=True))
         points = {
             "states": trajectory,
             "disturbances": trajectory[1:] - [f(x, u) for x, u in pairs],
             "noises": Y - [h(x, u) for x, u in pairs],
         }
-        return tuple(
-            name for name in points
-            if name in self.sets and missed(self.sets[name], points[name]) > 1e-8
-        )
+        return {
+            (name, *row, first + k)
+            for name, one in self.sets.items()
+            for k, point in enumerate(points[name])
+            for row in missed(one, point, tolerance)
+        }
 
 
 DATA, STARTS = ("complete", "missing", "late"), (False, True)
@@ -216,11 +225,11 @@ def test_the_sets_bind(sets):
         if not bound.dropped:
             length = len(unbound.noises)
             U = case.U[len(Y) - length : len(Y)]
-            crossed |= set(case.outside(unbound.trajectory, Y[-length:], U))
+            crossed |= {row[0] for row in case.outside(unbound.trajectory, Y[-length:], U)}
     assert crossed == set(case.sets)
 
 
-# Sets that the candidate leaves at times, and their names.
+# Sets that the candidate of the plain observer leaves at times.
 TIGHT = {
     "X": {"states": qpmhe.Box([0.15, -0.28, 0.34], [0.65, 0.0, 0.45])},
     "rows of X": {"states": qpmhe.Polytope([[-1.0, -1.0, 0.0]], [0.12])},
@@ -231,113 +240,126 @@ TIGHT = {
         "disturbances": qpmhe.Box([-0.05] * 3, [0.008] * 3),
         "noises": qpmhe.Box([-0.66, -0.25], [0.14, 0.17]),
     },
+    # The gain corrects what has no noise.
+    "noise-free": {"disturbances": qpmhe.Box([-0.03, -0.03, 0.0], [0.03, 0.03, 0.0])},
+    "without zero": {
+        "disturbances": qpmhe.Box([-0.1, -0.1, 0.002], [-0.002, 0.1, 0.1]),
+        "noises": qpmhe.Box([-0.6, 0.01], [0.4, 0.3]),
+    },
 }
 BACKENDS = qpmhe.solvers.available()
 INEQUALITY_BACKENDS = [b for b in BACKENDS if qpmhe.solvers.backend(b).inequalities]
+quiet = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 
 
 def tight(name, **options):
-    """Estimates of a case in tight sets, each with its data and whether its candidate is out."""
+    """Checked estimates in tight sets, each with the plain observer's and whether that is out."""
     case = Case("no sets", True, "complete", "quadratic")
+    observer = list(case.estimates(max_qps=0))
     case.sets = TIGHT[name]
     case.system = qpmhe.System(f, h, n=N, p=P, m=2, **case.sets)
-    observer = list(Case("no sets", True, "complete", "quadratic").estimates(max_qps=0))
-    found, outsiders = [], 0
-    for (estimate, known), (free, _) in zip(case.estimates(**options), observer, strict=True):
-        length = len(estimate.noises)
-        data = known[-length:], case.U[len(known) - length : len(known)]
-        outside = case.outside(free.trajectory, *data)
-        found.append((estimate, free, data, outside))
-        outsiders += bool(outside)
-    assert 2 <= outsiders <= STEPS - 2
-    return case, found
-
-
-@pytest.mark.parametrize("max_qps", [0, 1, None])
-@pytest.mark.parametrize("name", TIGHT)
-def test_drop_leaves_out_the_violated_sets_and_no_others(name, max_qps):
-    case, found = tight(name, outside="drop", max_qps=max_qps)
-    for estimate, free, data, outside in found:
-        assert estimate.dropped == outside
-        assert (Status.SETS_DROPPED in estimate.status) == bool(outside)
+    found = []
+    estimates = case.estimates(project_observer=False, **options)
+    for (estimate, known), (free, _) in zip(estimates, observer, strict=True):
+        case.check(estimate, known)
         assert estimate.candidate.tolist() == free.trajectory.tolist()
         assert estimate.candidate_cost == free.cost
-        assert set(case.outside(estimate.trajectory, *data)) <= set(outside)
-        assert estimate.improved == (max_qps != 0)
-        assert not estimate.status & (Status.PROJECTED | Status.CANDIDATE_OUTSIDE)
+        found.append((estimate, free, Status.CANDIDATE_OUTSIDE in estimate.status))
+    assert sum(outside for *_, outside in found) >= 2
+    return found
 
 
+def kept(estimate, free):
+    """Whether an estimate is the candidate, bit for bit."""
+    assert estimate.dropped == ()
+    assert estimate.cost == estimate.candidate_cost == free.cost
+    assert estimate.disturbances.tolist() == free.disturbances.tolist()
+    assert estimate.noises.tolist() == free.noises.tolist()
+    return estimate.trajectory.tolist() == free.trajectory.tolist()
+
+
+@quiet
 @pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("max_qps", [0, 1, None])
+@pytest.mark.parametrize("infeasible", ["drop_rows", "keep_candidate"])
 @pytest.mark.parametrize("name", TIGHT)
-def test_keep_returns_the_candidate_bit_for_bit(name, start):
-    case, found = tight(name, outside="keep", warm_start=start)
-    for estimate, free, data, outside in found:
-        assert estimate.dropped == ()
-        assert estimate.candidate.tolist() == free.trajectory.tolist()
-        if outside:
-            assert estimate.status == Status.CANDIDATE | Status.CANDIDATE_OUTSIDE
-            assert estimate.trajectory.tolist() == free.trajectory.tolist()
-            assert estimate.disturbances.tolist() == free.disturbances.tolist()
-            assert estimate.noises.tolist() == free.noises.tolist()
-            assert estimate.cost == estimate.candidate_cost == free.cost
-            assert estimate.qps == estimate.corrections == 0
-        else:
-            assert Status.IMPROVED in estimate.status
-            assert case.outside(estimate.trajectory, *data) == ()
+def test_the_rungs_of_the_ladder(name, infeasible, max_qps, start):
+    satisfied = 0
+    for estimate, free, outside in tight(
+        name, infeasible=infeasible, max_qps=max_qps, warm_start=start
+    ):
+        if max_qps == 0:
+            assert kept(estimate, free)
+            expected = Status.CANDIDATE_OUTSIDE if outside else Status(0)
+            assert estimate.status & ~Status.OBSERVER_FAR == (
+                Status.CANDIDATE | Status.NO_QPS | expected
+            )
+            continue
+        assert estimate.improved or kept(estimate, free)
+        assert outside or estimate.improved
+        assert outside or estimate.nearest_points == 0
+        assert not estimate.dropped or infeasible == "drop_rows"
+        # With a cap of 1, there is one QP for the rung below, too.
+        assert max_qps is None or estimate.qps <= 1 + (infeasible == "drop_rows" and outside)
+        satisfied += outside and estimate.improved and not estimate.dropped
+    assert satisfied >= 2 or max_qps == 0
 
 
+@quiet
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", TIGHT)
-def test_project_puts_the_candidate_inside(name, backend):
-    case, found = tight(name, outside="project", backend=backend)
-    for estimate, free, data, outside in found:
-        if not outside:
-            assert estimate.candidate.tolist() == free.trajectory.tolist()
-            assert estimate.dropped == ()
-            assert Status.PROJECTED not in estimate.status
-        elif backend in INEQUALITY_BACKENDS:
-            assert Status.PROJECTED in estimate.status
-            assert estimate.dropped == ()
-            assert case.outside(estimate.candidate, *data) == ()
-            # The prior is the observer's, not that of the projection.
-            prior = free.candidate[0]
-            cost = plain_cost("quadratic", estimate.candidate, prior, *data)
-            assert estimate.candidate_cost == pytest.approx(cost, rel=1e-9)
-        else:
-            # Nothing but the box of X is kept by clipping; else the sets are dropped.
-            assert (Status.PROJECTED in estimate.status) != bool(estimate.dropped)
-        assert estimate.cost <= estimate.candidate_cost
-        assert set(case.outside(estimate.trajectory, *data)) <= set(estimate.dropped)
-        assert bool(estimate.dropped) == (Status.SETS_DROPPED in estimate.status)
+def test_backends_take_the_same_rung(name, backend):
+    estimates, usual = (
+        [one for one, *_ in tight(name, backend=given, max_qps=5)] for given in (backend, "auto")
+    )
+    for estimate, expected in zip(estimates, usual, strict=True):
+        if backend in INEQUALITY_BACKENDS:
+            assert estimate.dropped == expected.dropped
+            assert estimate.cost == pytest.approx(expected.cost, rel=1e-2)
 
 
-def test_the_projection_into_a_box_of_states_is_the_nearest_point():
-    _, found = tight("X", outside="project")
-    box = TIGHT["X"]["states"]
-    for estimate, free, _, _ in found:
-        nearest = np.clip(free.trajectory, box.lower, box.upper)
-        np.testing.assert_allclose(estimate.candidate, nearest, rtol=0, atol=1e-9)
-
-
+@pytest.mark.parametrize("max_qps", [1, 3])
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_without_anything_inside_the_violated_sets_are_dropped(backend):
+def test_rows_that_exclude_all_that_is_better_are_dropped_one_by_one(backend, max_qps):
     """The states must stay in X, where y is out of reach of any noise in V."""
     system = qpmhe.System(
         lambda x: 0.9 * x, lambda x: x, n=1, p=1,
         states=qpmhe.Box(-1.0, 1.0), noises=qpmhe.Box(-2.0, 2.0),
     )
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([0.01]), qpmhe.QuadraticCost(prior=1, disturbance=1, noise=1),
-        horizon=3, initial_state=[0.5], outside="project", backend=backend, max_qps=2,
+    mhe, other = (
+        qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([0.01]), qpmhe.QuadraticCost(prior=1, disturbance=1, noise=1),
+            horizon=3, initial_state=[0.5], backend=backend, max_qps=max_qps, infeasible=infeasible,
+        )
+        for infeasible in ("drop_rows", "keep_candidate")
     )
-    assert Status.SETS_DROPPED not in mhe.update([0.7]).status
-    for _ in range(3):
-        estimate = mhe.update([5.0])
-        assert Status.SETS_DROPPED in estimate.status
-        assert Status.PROJECTED not in estimate.status
-        assert estimate.dropped == ("noises",)
+    for one in (mhe, other):
+        assert Status.CANDIDATE_OUTSIDE not in one.update([0.7]).status
+    for t in range(1, 4):
+        if t < 3:
+            estimate = mhe.update([5.0])
+        else:
+            with pytest.warns(ObserverWarning, match="dropped in 3 samples running"):
+                estimate = mhe.update([5.0])
+        kept = other.update([5.0])
+        late = [("noises", 0, "upper", s) for s in range(max(1, t - 2), t + 1)]
+        assert list(estimate.dropped) == late
         assert estimate.improved
+        assert Status.ROWS_DROPPED in estimate.status
+        assert f"upper bound of noises, row 0, at time {t}" in estimate.explain()
         assert np.abs(estimate.trajectory).max() <= 1.0
+        assert np.nanmax(estimate.noises[: -len(late)], initial=0.0) <= 2.0 + 1e-8
+        assert estimate.qps >= 2
+        assert kept.trajectory.tolist() == kept.candidate.tolist() == estimate.candidate.tolist()
+        assert kept.dropped == ()
+        assert "The estimate violates them as well." in kept.explain()
+
+
+@quiet
+def test_nearest_points_are_counted_apart():
+    found = [one for name in TIGHT for one, *_ in tight(name, max_qps=1)]
+    assert any(one.nearest_points and one.improved and not one.dropped for one in found)
+    assert all(one.nearest_points <= 5 for one in found)
 
 
 class Clock:
@@ -382,42 +404,41 @@ def test_no_qp_is_begun_when_the_time_is_up(clock, budget, sets):
         backend="ticking", max_qps=None, time_budget=budget, tolerance=1e-15
     ):
         case.check(estimate, known)
-        assert estimate.improved
-        assert estimate.step_time == estimate.solve_time == estimate.qps + estimate.corrections
+        solves = estimate.qps + estimate.corrections + estimate.nearest_points
+        assert estimate.step_time == estimate.solve_time == solves
         assert estimate.step_time < budget + 1.0
-        # Corrections included, each QP got what remained.
-        assert clock.limits == [budget - k for k in range(estimate.qps + estimate.corrections)]
+        # All included, each QP got what remained.
+        assert clock.limits == [budget - k for k in range(solves)]
         clock.limits.clear()
         up += Status.TIME_UP in estimate.status
     assert up > STEPS // 2
 
 
+@quiet
 @pytest.mark.parametrize("budget", [1.5, 2.5, 9.5])
 @pytest.mark.parametrize("name", TIGHT)
-def test_a_projection_and_what_follows_share_the_time(clock, name, budget):
-    _, found = tight(name, backend="ticking", time_budget=budget, outside="project", max_qps=3)
+def test_all_rungs_share_the_time(clock, name, budget):
     left = []
-    for estimate, *_ in found:
-        solves = round(estimate.solve_time)
+    for estimate, *_ in tight(name, backend="ticking", time_budget=budget, max_qps=3):
+        solves = estimate.qps + estimate.corrections + estimate.nearest_points
         left.extend(budget - k for k in range(solves))
-    assert any(Status.PROJECTED in estimate.status for estimate, *_ in found)
     assert clock.limits == left
     assert min(left) > 0.0
 
 
-@pytest.mark.parametrize("outside", ["drop", "project", "keep"])
+@quiet
+@pytest.mark.parametrize("infeasible", ["drop_rows", "keep_candidate"])
 @pytest.mark.parametrize("name", TIGHT)
-def test_without_time_for_any_qp_the_candidate_is_the_estimate(clock, monkeypatch, name, outside):
+def test_without_time_for_any_qp_the_candidate_is_the_estimate(
+    clock, monkeypatch, name, infeasible
+):
     monkeypatch.setattr("qpmhe.estimation.optimizer.perf_counter", lambda: clock.now + 2.0)
-    _, found = tight(name, backend="ticking", time_budget=1.0, outside=outside)
+    found = tight(name, backend="ticking", time_budget=1.0, infeasible=infeasible)
     assert clock.now == 0.0
-    for estimate, free, _, outsider in found:
-        assert estimate.trajectory.tolist() == free.trajectory.tolist()
-        assert Status.CANDIDATE in estimate.status
-        assert (Status.TIME_UP in estimate.status) == (outside != "keep" or not outsider)
-        assert Status.PROJECTED not in estimate.status
-        assert estimate.dropped == (() if outside == "keep" else outsider)
-        assert estimate.qps == 0
+    for estimate, free, _ in found:
+        assert kept(estimate, free)
+        assert Status.TIME_UP in estimate.status
+        assert estimate.qps == estimate.nearest_points == 0
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
