@@ -13,7 +13,6 @@ from .evidence import (
     NotCertifiedError,
     OutOfTimeError,
 )
-from .falsification import attack_detectability, attack_estimator, attack_observer
 from .monitor import Hypotheses, Monitor, MonitorSummary, monitor, monitored_run
 from .observer import Synthesis, certify_observer, synthesise_gain
 from .properties import Detectability, ObserverStability
@@ -25,7 +24,6 @@ __all__ = [
     "Audit", "Certificate", "CertificateError", "DecayingSums", "Detectability", "Evidence",
     "Hypotheses", "JumpError", "MismatchError", "Monitor", "MonitorSummary", "NotCertifiedError",
     "ObserverStability", "OutOfTimeError", "Region", "Report", "Sizes", "Synthesis",
-    "attack_detectability", "attack_estimator", "attack_observer", "audit", "certify",
-    "certify_detectability", "certify_model", "certify_observer", "error_and_bounds", "monitor",
-    "monitored_run", "synthesise_gain", "theorem", "tighten",
+    "audit", "certify", "certify_detectability", "certify_model", "certify_observer",
+    "error_and_bounds", "monitor", "monitored_run", "synthesise_gain", "theorem", "tighten",
 ]

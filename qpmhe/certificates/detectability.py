@@ -100,9 +100,7 @@ def _explained(search: Search, error: NotCertifiedError, eta: float | None) -> N
     if smallest is None:
         return error
     if not np.isfinite(smallest):
-        jump = search.jump()
-        if jump is not None:
-            return jump
+        search.check_jumps()
         mode = _undetected(search)
         if mode is not None:
             return NotCertifiedError(

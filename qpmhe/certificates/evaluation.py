@@ -13,11 +13,9 @@ from ..errors import ModelError
 from ..model.functions import BatchedFunction
 from ..model.system import System
 
-__all__ = ["check_values", "evaluated", "joint_jacobians", "jump_about", "jump_between"]
+__all__ = ["check_values", "evaluated", "find_jump", "joint_jacobians"]
 
 _REMEDY = "Take a smaller region, or make the model defined on all of it."
-# Beyond the steps of derivatives by differences.
-_REACH = 1e-4
 _PAIRS, _SEED = 400, 20210829
 # A function with derivatives changes on 2^-40 of an interval by about that share.
 _HALVINGS, _LEFT, _LEAST = 40, 1e-3, 1e-9
@@ -70,39 +68,29 @@ def check_values(system: System, points: Array, *, output_only: bool = False) ->
             )
 
 
-def jump_about(system: System, point: Array) -> str:
-    """Which of f and h seems to jump next to a state, in words; empty if none does."""
-    n = system.n
-    moves = _REACH * np.maximum(1.0, np.abs(point[:n]))[:, None] * np.eye(n, point.size)
-    return _jump(system, point - moves, point + moves)
+def find_jump(system: System, points: Array) -> str:
+    """Which of f and h seems to jump between some states, in words; empty if none does.
 
-
-def jump_between(system: System, points: Array) -> str:
-    """Which of f and h seems to jump between some states, in words; empty if none does."""
+    Segments between states drawn at random are halved towards the larger change.
+    """
     rng = np.random.default_rng(_SEED)
     first, second = rng.integers(len(points), size=(2, _PAIRS))
-    ends = points[first].copy(), points[second].copy()
-    ends[1][:, system.n :] = ends[0][:, system.n :]
-    return _jump(system, *ends)
-
-
-def _jump(system: System, low: Array, high: Array) -> str:
+    start, end = points[first], points[second].copy()
+    end[:, system.n :] = start[:, system.n :]
     for name, function in (("f", system.f), ("h", system.h)):
         try:
-            where, size = _traced(function, low, high, system.n)
+            where, size = _largest_jump(function, start, end, system.n)
         except Exception:  # a user's function may raise outside of the region
             continue
-        worst = int(size.argmax())
-        if size[worst] > 0.0:
-            return (
-                f"{name} seems to jump, by {size[worst]:.3g} at "
-                f"{np.round(where[worst], 6).tolist()}"
-            )
+        if size > 0.0:
+            return f"{name} seems to jump, by {size:.3g} at {np.round(where, 6).tolist()}"
     return ""
 
 
-def _traced(function: BatchedFunction, low: Array, high: Array, n: int) -> tuple[Array, Array]:
-    """Where the largest change on each segment is, and its size if it is a jump, else 0."""
+def _largest_jump(
+    function: BatchedFunction, low: Array, high: Array, n: int
+) -> tuple[Array, float]:
+    """Where on some segments the largest jump is, and its size; 0 if there is none."""
 
     def at(points: Array) -> Array:
         return np.array(function.batch(points[:, :n], points[:, n:]), np.float64)
@@ -120,7 +108,9 @@ def _traced(function: BatchedFunction, low: Array, high: Array, n: int) -> tuple
             below, above = np.where(left, below, between), np.where(left, between, above)
         size = np.abs(above - below).max(axis=1)
         least = np.maximum(_LEFT * first, _LEAST * (1.0 + np.abs(below).max(axis=1)))
-    return 0.5 * (low + high), np.where(size > least, size, 0.0)
+    size = np.where(size > least, size, 0.0)
+    worst = int(size.argmax())
+    return 0.5 * (low[worst] + high[worst]), float(size[worst])
 
 
 def joint_jacobians(system: System, points: Array) -> Array:

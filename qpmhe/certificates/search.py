@@ -13,7 +13,7 @@ from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel
-from .evaluation import joint_jacobians, jump_about, jump_between
+from .evaluation import find_jump, joint_jacobians
 from .evidence import Evidence, JumpError, NotCertifiedError, OutOfTimeError
 from .inequalities import ErrorContraction, Form, Matrices, OutputInjection, OutputWeight, definite
 from .regions import Region
@@ -32,7 +32,6 @@ _ABOVE, _ATTEMPTS = 0.01, 4
 # Between the smallest rate, where constants grow without bound, and 1, where they last.
 _SHARES = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
 _SEED = 20210829
-_STATES = 8  # those with the steepest Jacobians, next to which jumps are looked for
 # How much of the time the choice of a rate may take, and one verification; how many programs
 # the former solves; how far off the time that a program is expected to take may be.
 _CHOICE, _VERIFICATION = 0.5, 0.6
@@ -260,28 +259,18 @@ class Search:
         if not shown.all():
             broken = ~shown
             return Cover(False, 0, float(least.min()), self.points[broken], self.jacobians[broken])
-        jump = self.jump(everywhere=True)
-        if jump is not None:
-            raise jump
-        note = (
-            f"{why}; the inequality holds at {self.points.shape[0]} states of the region, and "
-            f"{_between_samples(form, self.points, self.jacobians)}"
-        )
+        self.check_jumps()
+        note = f"{why}; the inequality holds at {self.points.shape[0]} states of the region"
         return Found(form, Evidence.SAMPLED, float(least.min()), 0, (note,))
 
-    def jump(self, *, everywhere: bool = False) -> JumpError | None:
-        """A jump next to the states with the steepest Jacobians, or between all states."""
-        steepness = np.abs(self.jacobians).max(axis=(1, 2))
-        steepest = self.points[np.argsort(-steepness)[:_STATES]]
-        found = next((words for x in steepest if (words := jump_about(self.system, x))), "")
-        if everywhere:
-            found = found or jump_between(self.system, self.points)
-        if not found:
-            return None
-        return JumpError(
-            f"{found}; certificates need functions with derivatives",
-            ("a model without the jump", "a region without it"),
-        )
+    def check_jumps(self) -> None:
+        """Raise a `JumpError` where f or h seems to jump."""
+        found = find_jump(self.system, self.points)
+        if found:
+            raise JumpError(
+                f"{found}; certificates need functions with derivatives",
+                ("a model without the jump", "a region without it"),
+            )
 
     def _added(self, outcome: Cover) -> bool:
         """Take states where the inequality fails into the program; False if there are none."""
@@ -352,23 +341,3 @@ def _typical_scales(region: Region, jacobians: Array, n: int) -> Scales:
     outputs = np.abs(jacobians[:, n:] * states).sum(axis=2).max(axis=0)
     return Scales(states, np.where(outputs > 0.0, outputs, 1.0))
 
-
-def _between_samples(form: Form, points: Array, jacobians: Array) -> str:
-    """Whether the margin covers what the Jacobian is seen to do between the samples."""
-    width = np.ptp(points, axis=0)
-    width = np.where(width > 0.0, width, 1.0)
-    spacing, steepest = 0.0, np.zeros(jacobians.shape[1:])
-    for i in range(points.shape[0]):
-        away = np.linalg.norm((points - points[i]) / width, axis=1)
-        away[i] = np.inf
-        near = int(away.argmin())
-        spacing = max(spacing, float(away[near]))
-        if away[near] > 0.0:
-            steepest = np.maximum(steepest, np.abs(jacobians[near] - jacobians[i]) / away[near])
-    radius = np.broadcast_to(steepest * spacing, jacobians.shape)
-    covered = definite(form.matrices(Matrices(jacobians, radius)))[0].all()
-    verdict = "covers" if covered else "does not cover"
-    return (
-        f"its margin {verdict} what lies between them, if the Jacobian's Lipschitz constant is "
-        f"the largest one seen (entries then differ by up to {radius.max():.3g})"
-    )

@@ -185,7 +185,7 @@ def test_what_intervals_cannot_run_is_sampled_with_the_reason():
     found = certify_detectability(system, unit_box(1), eta=0.8)
     assert found.evidence is Evidence.SAMPLED
     assert "cannot be run with intervals" in found.notes[0]
-    assert "covers what lies between" in found.notes[0]
+    assert "holds at 4" in found.notes[0]
     assert found.cells == 0
 
 

@@ -1,6 +1,5 @@
 """Attempts to refute what is certified, and proof that they catch what is wrong."""
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,20 +10,12 @@ from qpmhe.certificates.certification import certify
 from qpmhe.certificates.decay import DecayingSums
 from qpmhe.certificates.detectability import certify_detectability
 from qpmhe.certificates.evidence import Evidence
-from qpmhe.certificates.falsification import (
-    NOISES,
-    attack_detectability,
-    attack_estimator,
-    attack_observer,
-    inside,
-)
 from qpmhe.certificates.observer import certify_observer, synthesise_gain
 from qpmhe.certificates.regions import bounded_region
-from qpmhe.errors import InvalidInputError, OptionError, SetError, ShapeError
 
-# The numbers of the full campaign, by the environment; small ones otherwise.
-FULL = os.environ.get("QPMHE_FULL_FALSIFICATION", "") == "1"
-PAIRS, RUNS = (10_000, 2_000) if FULL else (500, 60)
+from .attacks import attack_detectability, attack_estimator, attack_observer, inside
+
+PAIRS, RUNS = 500, 60
 
 
 def scalar():
@@ -43,7 +34,6 @@ def test_exact_constants_of_a_linear_system_are_reached_and_not_exceeded():
         attack_observer(system, region, np.array([[0.15]]), EXACT, trials=PAIRS),
     ):
         assert not attack.refuted
-        assert attack.trials == PAIRS
         assert attack.ratio == pytest.approx(1.0, abs=1e-6)
 
 
@@ -58,35 +48,6 @@ def test_a_constant_reduced_by_a_fifth_is_caught(which):
         assert attack.ratio == pytest.approx(1.25, rel=1e-2)
         # The example speaks for itself.
         assert (attack.example["error"] > 1.2 * attack.example["bound"]).any()
-
-
-def test_boxes_serve_as_regions_and_what_does_not_fit_is_named():
-    system, region = scalar()
-    gain = [[0.15]]
-    for ask in (
-        lambda place, **more: attack_detectability(system, place, EXACT, **{"trials": 40} | more),
-        lambda place, **more: attack_observer(system, place, gain, EXACT, **{"trials": 40} | more),
-    ):
-        by_box, by_region = ask(qpmhe.Box([-1.0], [1.0])), ask(region)
-        assert by_box.ratio == by_region.ratio
-        with pytest.raises(SetError, match="region is"):
-            ask(([-1.0], [1.0]))
-        with pytest.raises(SetError, match="no region"):
-            ask(None)
-        for name, value in (("trials", 2.5), ("trials", 0), ("steps", 1.5), ("polish", -1)):
-            with pytest.raises(OptionError, match=f"{name} is"):
-                ask(region, **{name: value})
-    with pytest.raises(ShapeError, match="gain has shape"):
-        attack_observer(system, region, [[0.1, 0.2]], EXACT, trials=4)
-    with pytest.raises(InvalidInputError, match="claim is 3"):
-        attack_detectability(system, region, 3, trials=4)
-    with pytest.raises(InvalidInputError, match="certificate is 3"):
-        attack_estimator(3)
-    driven = qpmhe.System(lambda x, u: 0.8 * x + u, lambda x, u: 2.0 * x, n=1, p=1, m=1)
-    box = qpmhe.Box([-1.0], [1.0])
-    assert not attack_detectability(driven, box, EXACT, trials=20, inputs=box).refuted
-    with pytest.raises(SetError, match="inputs is None"):
-        attack_detectability(driven, box, EXACT, trials=20)
 
 
 def test_a_rate_that_is_too_small_is_caught():
@@ -147,39 +108,26 @@ def constrained(name):
 @pytest.mark.parametrize("name", ["reactor", "linear"])
 def test_no_closed_run_exceeds_a_bound(name):
     certificate = constrained(name)
-    attempt = attack_estimator(certificate, trials=RUNS, seed=1)
-    assert set(attempt.attacks) == set(certificate.kinds)
-    assert not attempt.refuted
-    assert set(attempt.by_backend) == set(qpmhe.solvers.available())
-    assert attempt.lost < 0.8 * RUNS
-    comparisons = {attack.comparisons for attack in attempt.attacks.values()}
-    assert len(comparisons) == 1
-    assert comparisons.pop() > 4 * RUNS
+    attacks, lost = attack_estimator(certificate, trials=RUNS, seed=1)
+    assert set(attacks) == set(certificate.kinds)
+    assert lost < 0.8 * RUNS
+    assert attacks["paper"].compared > 4 * RUNS
     # The sharper, the closer: otherwise the attack would be of little use.
-    ratios = [attempt.attacks[kind].ratio for kind in certificate.kinds]
+    ratios = [attacks[kind].ratio for kind in certificate.kinds]
     assert ratios == sorted(ratios)
     assert ratios[-1] > 0.1
+    assert not any(attack.refuted for attack in attacks.values())
 
 
 def test_a_wrong_certificate_is_caught_by_closed_runs():
     certificate = constrained("linear")
-    attempt = attack_estimator(certificate, trials=20, backends=["auto"], seed=2)
+    attacks, _ = attack_estimator(certificate, trials=20, backends=["auto"], seed=2)
     weighted = certificate.of().weighted
     # Below what was reached, no factor may pass.
-    weighted.scales = weighted.scales * 0.8 * attempt.attacks["weighted"].ratio
-    again = attack_estimator(certificate, trials=20, backends=["auto"], seed=2)
-    assert again.attacks["weighted"].refuted
-    assert not again.attacks["summed"].refuted
-    assert again.attacks["weighted"].run.startswith("auto, cap")
-
-
-def test_noises_have_their_shape_and_size():
-    rng = np.random.default_rng(0)
-    for name, noise in NOISES.items():
-        values = noise(rng, 200, 3)
-        assert values.shape == (200, 3), name
-        assert np.isfinite(values).all()
-        assert np.abs(values).max() <= 30.0
+    weighted.scales = weighted.scales * 0.8 * attacks["weighted"].ratio
+    again, _ = attack_estimator(certificate, trials=20, backends=["auto"], seed=2)
+    assert again["weighted"].refuted
+    assert not again["summed"].refuted
 
 
 def test_points_are_drawn_into_a_polytope():
@@ -216,6 +164,6 @@ def test_models_of_the_zoo_are_certified_and_not_refuted(name):
     )
     assert not pairs.refuted
     assert pairs.ratio > 0.1
-    attempt = attack_estimator(certificate, trials=max(20, RUNS // 3), backends=["auto"])
-    assert not attempt.refuted
-    assert attempt.lost < attempt.attacks["paper"].trials
+    attacks, lost = attack_estimator(certificate, trials=20, backends=["auto"])
+    assert not any(attack.refuted for attack in attacks.values())
+    assert lost < 20
