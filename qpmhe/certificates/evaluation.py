@@ -70,10 +70,13 @@ def check_values(system: System, points: Array, *, output_only: bool = False) ->
             )
 
 
-def jump_about(system: System, point: Array) -> str:
-    """Which of f and h seems to jump next to a state, in words; empty if none does."""
+def jump_about(system: System, point: Array, widths: Array) -> str:
+    """Which of f and h seems to jump next to a state, in words; empty if none does.
+
+    The widths (n,) are those of the region.
+    """
     n = system.n
-    moves = _REACH * np.maximum(1.0, np.abs(point[:n]))[:, None] * np.eye(n, point.size)
+    moves = _REACH * np.maximum(widths, np.abs(point[:n]))[:, None] * np.eye(n, point.size)
     return _jump(system, point - moves, point + moves)
 
 
@@ -105,9 +108,12 @@ def _traced(function: BatchedFunction, low: Array, high: Array, n: int) -> tuple
     """Where the largest change on each segment is, and its size if it is a jump, else 0."""
 
     def at(points: Array) -> Array:
-        return np.array(function.batch(points[:, :n], points[:, n:]), np.float64)
+        return np.array(function.batch(points[:, :n], points[:, n:]), np.float64) / unit
 
     with np.errstate(all="ignore"):
+        unit = np.ones(())
+        sizes = np.fmax(np.abs(at(low)), np.abs(at(high))).max(axis=0)
+        unit = np.where(sizes > 0.0, sizes, 1.0)
         below, above = at(low), at(high)
         first = np.zeros(len(low))
         for _ in range(_HALVINGS):
@@ -118,9 +124,11 @@ def _traced(function: BatchedFunction, low: Array, high: Array, n: int) -> tuple
             left = (halves[0] >= halves[1])[:, None]
             low, high = np.where(left, low, middle), np.where(left, middle, high)
             below, above = np.where(left, below, between), np.where(left, between, above)
-        size = np.abs(above - below).max(axis=1)
-        least = np.maximum(_LEFT * first, _LEAST * (1.0 + np.abs(below).max(axis=1)))
-    return 0.5 * (low + high), np.where(size > least, size, 0.0)
+        jumps = np.abs(above - below)
+        size = jumps.max(axis=1)
+        least = np.maximum(_LEFT * first, _LEAST * np.abs(below).max(axis=1))
+        found = (jumps * unit)[np.arange(len(jumps)), jumps.argmax(axis=1)]
+    return 0.5 * (low + high), np.where(size > least, found, 0.0)
 
 
 def joint_jacobians(system: System, points: Array) -> Array:

@@ -30,8 +30,9 @@ __all__ = [
 
 Generator = np.random.Generator
 
-# Of two numbers computed in floating point, one exceeds the other by more than this, or not.
-_RELATIVE, _ABSOLUTE = 1e-9, 1e-12
+# Of two numbers computed in floating point, one exceeds the other by more than this, or not: of
+# the number itself, and of the states that it is a difference of.
+_RELATIVE, _OF_STATES = 1e-9, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +96,9 @@ def attack_detectability(
         move *= rng.random((*pairs.shape[:-1], 1)) < 0.3
         return inside(place, pairs + move)
 
-    states, apart, bound = _polished(states, shares, change, polish)
-    return _verdict(apart, bound, np.ones_like(apart, np.bool_), {
+    rounding = _rounding(place)
+    states, apart, bound = _polished(states, shares, change, polish, rounding)
+    return _verdict(apart, bound, np.ones_like(apart, np.bool_), rounding, {
         "first": states[0], "second": states[1], "inputs": acting,
     })
 
@@ -125,7 +127,7 @@ def attack_observer(
         raise ShapeError(f"gain has shape {K.shape}; expected {(system.n, system.p)}.")
     acting = _inputs(place, trials, steps, rng)
     truth = _pairs(system, place, trials, steps, acting, rng)[0]
-    scale = np.abs(system.h.batch(truth[:, 0], acting[:, 0])).max() + 1e-3
+    scale = _sizes_or_one(system.h.batch(truth[:, 0], acting[:, 0]))
     noises = _sizes(trials, rng) * scale * rng.standard_normal((trials, steps, system.p))
     noises *= rng.random((trials, steps, 1)) < rng.choice([0.0, 0.1, 1.0], (trials, 1, 1))
     starts = inside(place, place.sample(trials, rng)[:, : place.n])
@@ -164,8 +166,9 @@ def attack_observer(
             moved[..., part] = inside(place, moved[..., part])
         return moved
 
-    runs, error, bound = _polished(runs[None], lambda r: shares(r[0]), change, polish)
-    return _verdict(error, bound, np.isfinite(error), {
+    rounding = _rounding(place)
+    runs, error, bound = _polished(runs[None], lambda r: shares(r[0]), change, polish, rounding)
+    return _verdict(error, bound, np.isfinite(error), rounding, {
         "states": runs[0][..., :n], "noises": runs[0][:, :-1, n : n + p],
         "start": runs[0][:, 0, n + p :], "inputs": acting,
     })
@@ -263,24 +266,30 @@ def _bounds(claim: DecayingSums, start: Array, w: Array, v: Array) -> Array:
     return claim.initial * start[:, None] * decay + claim.rate * sums
 
 
-def _share(error: Array, bound: Array) -> Array:
+def _rounding(place: Region) -> float:
+    """By how much the norm of a difference of states may be wrong."""
+    return _OF_STATES * float(
+        np.linalg.norm(np.maximum(np.abs(place.lower), np.abs(place.upper))[: place.n])
+    )
+
+
+def _share(error: Array, bound: Array, rounding: float) -> Array:
     """Errors as shares of their bounds; those within rounding of nothing do not count."""
-    small = np.maximum(bound, _ABSOLUTE)
-    shares: Array = np.where(error > _ABSOLUTE, error / small, 0.0)
+    shares: Array = np.where(error > rounding, error / np.maximum(bound, rounding), 0.0)
     return np.where(np.isfinite(shares), shares, 0.0)
 
 
 def _polished(
     states: Array, shares: Callable[[Array], tuple[Array, Array]],
-    change: Callable[[Array, float], Array], rounds: int,
+    change: Callable[[Array, float], Array], rounds: int, rounding: float,
 ) -> tuple[Array, Array, Array]:
     """Change what is drawn at random, and keep what raises the largest share of each."""
     error, bound = shares(states)
-    worst = _share(error, bound).max(axis=1)
+    worst = _share(error, bound, rounding).max(axis=1)
     for i in range(rounds):
         other = change(states, 10.0 ** (-0.5 - 3.0 * i / max(1, rounds)))
         other_error, other_bound = shares(other)
-        reached = _share(other_error, other_bound).max(axis=1)
+        reached = _share(other_error, other_bound, rounding).max(axis=1)
         better = reached > worst
         keep = better.reshape((1, -1) + (1,) * (states.ndim - 2))
         states = np.where(keep, other, states)
@@ -290,12 +299,19 @@ def _polished(
     return states, error, bound
 
 
+def _sizes_or_one(values: Array) -> Array:
+    """The largest magnitude of each component of values (count, d), 1 where it is zero."""
+    sizes = np.abs(values).max(axis=0)
+    return np.where(sizes > 0.0, sizes, 1.0)
+
+
 def _verdict(
-    error: Array, bound: Array, counted: NDArray[np.bool_], parts: dict[str, Array]
+    error: Array, bound: Array, counted: NDArray[np.bool_], rounding: float,
+    parts: dict[str, Array],
 ) -> Attack:
-    share = np.where(counted, _share(error, bound), 0.0)
+    share = np.where(counted, _share(error, bound, rounding), 0.0)
     worst = int(share.max(axis=1).argmax())
-    above = np.greater(error, bound * (1.0 + _RELATIVE) + _ABSOLUTE) & counted
+    above = np.greater(error, bound * (1.0 + _RELATIVE) + rounding) & counted
     example = {name: each[worst].copy() for name, each in parts.items()}
     return Attack(
         len(error), int(counted.sum()), int(above.sum()), float(share.max()),
@@ -430,7 +446,7 @@ def _drawn(
     share = 10.0 ** rng.uniform(-3.0, 0.0)
     estimate = inside(region, start + share * (pick[1] - start))
     w = 10.0 ** rng.uniform(-4.0, -0.5) * width * NOISES[of_w](rng, steps, n)
-    size = max(1e-3, float(np.abs(system.h.batch(points[:, :n], points[:, n:])).max()))
+    size = _sizes_or_one(system.h.batch(points[:, :n], points[:, n:]))
     v = 10.0 ** rng.uniform(-4.0, -0.5) * size * NOISES[of_v](rng, steps, system.p)
     low, high = region.lower[n:], region.upper[n:]
     u = low + (high - low) * rng.random((steps, system.m))
@@ -469,8 +485,9 @@ def _played(certificate: Certificate, trial: _Trial, N: int) -> _Played:
         for kind in certificate.kinds
     }
     later = np.arange(steps + 1) > 0  # at t = 0 there is the initial error alone
+    rounding = _rounding(region)
     shares = {
-        kind: np.where(later & (error > _ABSOLUTE), error / np.maximum(bound, _ABSOLUTE), 0.0)
+        kind: np.where(later, _share(error, bound, rounding), 0.0)
         for kind, bound in bounds.items()
     }
     return _Played(error, bounds, applied, shares)
@@ -508,10 +525,11 @@ def _collected(
     certificate: Certificate, found: list[tuple[_Trial, _Played]], names: list[str]
 ) -> ClosedRuns:
     attacks: dict[Kind, Attack] = {}
+    rounding = _rounding(certificate.region)
     for kind in certificate.kinds:
         trial, played = max(found, key=lambda pair: float(pair[1].shares[kind].max()))
         above = sum(
-            int((each.error > each.bounds[kind] * (1.0 + _RELATIVE) + _ABSOLUTE).sum())
+            int((each.error > each.bounds[kind] * (1.0 + _RELATIVE) + rounding).sum())
             for _, each in found
         )
         attacks[kind] = Attack(

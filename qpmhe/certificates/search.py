@@ -273,7 +273,8 @@ class Search:
         """A jump next to the states with the steepest Jacobians, or between all states."""
         steepness = np.abs(self.jacobians).max(axis=(1, 2))
         steepest = self.points[np.argsort(-steepness)[:_STATES]]
-        found = next((words for x in steepest if (words := jump_about(self.system, x))), "")
+        widths = np.ptp(self.points[:, : self.system.n], axis=0)
+        found = next((words for x in steepest if (words := jump_about(self.system, x, widths))), "")
         if everywhere:
             found = found or jump_between(self.system, self.points)
         if not found:
