@@ -93,9 +93,12 @@ def _largest_jump(
     """Where on some segments the largest jump is, and its size; 0 if there is none."""
 
     def at(points: Array) -> Array:
-        return np.array(function.batch(points[:, :n], points[:, n:]), np.float64)
+        return np.array(function.batch(points[:, :n], points[:, n:]), np.float64) / unit
 
     with np.errstate(all="ignore"):
+        unit = np.ones(())
+        sizes = np.fmax(np.abs(at(low)), np.abs(at(high))).max(axis=0)
+        unit = np.where(sizes > 0.0, sizes, 1.0)
         below, above = at(low), at(high)
         first = np.zeros(len(low))
         for _ in range(_HALVINGS):
@@ -106,9 +109,10 @@ def _largest_jump(
             left = (halves[0] >= halves[1])[:, None]
             low, high = np.where(left, low, middle), np.where(left, middle, high)
             below, above = np.where(left, below, between), np.where(left, between, above)
-        size = np.abs(above - below).max(axis=1)
-        least = np.maximum(_LEFT * first, _LEAST * (1.0 + np.abs(below).max(axis=1)))
-    size = np.where(size > least, size, 0.0)
+        jumps = np.abs(above - below)
+        size = jumps.max(axis=1)
+        least = np.maximum(_LEFT * first, _LEAST * np.abs(below).max(axis=1))
+    size = np.where(size > least, (jumps * unit)[np.arange(len(jumps)), jumps.argmax(axis=1)], 0.0)
     worst = int(size.argmax())
     return 0.5 * (low[worst] + high[worst]), float(size[worst])
 

@@ -280,7 +280,8 @@ class Fingerprint:
             ("the Jacobian of f, h", self.jacobians, jacobians, _SLOPES),
         ):
             rows = mine.reshape(len(mine), -1), theirs.reshape(len(theirs), -1)
-            room = share * (1.0 + np.maximum(np.abs(rows[0]), np.abs(rows[1])))
+            larger = np.fmax(np.abs(rows[0]), np.abs(rows[1]))
+            room = share * (larger + np.nan_to_num(larger).max(axis=0))
             same = (np.abs(rows[0] - rows[1]) <= room) | (np.isnan(rows[0]) & np.isnan(rows[1]))
             if not same.all():
                 k = int(np.argmin(same.all(axis=1)))

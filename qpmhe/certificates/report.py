@@ -289,7 +289,8 @@ def _region(
     low, high = record.states.min(axis=0), record.states.max(axis=0)
     start = example.scenario.initial_estimate
     low, high = np.minimum(low, start), np.maximum(high, start)
-    room = _ROOM * np.maximum(high - low, 1e-6)
+    width = np.where(high > low, high - low, np.abs(high))
+    room = _ROOM * np.where(width > 0.0, width, 1.0)
     around = Box(low - room, high + room)
     return bounded_region(
         system, around if system.states is None else system.states & around, inputs

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .._linalg import unit_diagonal
 from ..errors import InvalidInputError
 from ..model.system import System
 
@@ -55,7 +56,13 @@ def window_covariances(
     if not (np.isfinite(a).all() and np.isfinite(c).all()):
         raise InvalidInputError("the Jacobians are not finite along the estimate.")
     q, eye = weights.shape[-1], np.eye(n)
-    weights = np.broadcast_to(weights, (count, q, q))
+    # In deviations of the prior, rounded to powers of two: the result then depends on no unit.
+    prior_weight, units, whole = unit_diagonal(prior_weight)
+    a, c = np.ldexp(a, units[:, None] - units), np.ldexp(c, -units)
+    unit = np.append(units, np.zeros(q - n, np.int32))
+    weights = np.broadcast_to(
+        np.ldexp(weights, -whole - unit[:, None] - unit), (count, q, q)
+    )
     noisy = np.ones(n, dtype=np.bool_)
     noisy[noise_free] = False
     block = np.ix_(noisy, noisy)
@@ -77,4 +84,5 @@ def window_covariances(
         transition = a[i] @ closed[i]
         later = gained[i] + transition.T @ later @ transition
         covariance[i] -= covariance[i] @ later @ covariance[i]
-    return 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    return np.asarray(np.ldexp(covariance, -whole - units[:, None] - units))

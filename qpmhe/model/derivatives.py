@@ -24,7 +24,7 @@ _COMPLEX_STEP = 2.0**-100
 _DIFFERENCE_STEP = float(np.finfo(np.float64).eps) ** (1 / 3)
 # Accuracy of differences: of each entry, of an entry beside the largest of its row, and of one
 # beside the function's value, where it is rounding.
-_ENTRY, _ROW, _VALUE = 1e-5, 1e-7, 1e-9
+_ENTRY, _ROW, _VALUE = 1e-5, 1e-7, 2e-10
 # A Jacobian is wrong where it is further off than differences with these many times the error.
 _SLACK = 10.0
 # How often, and by how much, a step is shortened at most where differences curve within it.
@@ -290,7 +290,7 @@ class Jacobian:
         scaled = np.abs(np.nan_to_num(slope)) * size
         magnitude = np.maximum(np.abs(value), self._outputs)[:, None]
         row = scaled.max(axis=1, keepdims=True)
-        return _SLACK * (_ENTRY * scaled + _ROW * row) + _VALUE * magnitude, size
+        return _SLACK * (_ENTRY * scaled + _ROW * row + _VALUE * magnitude), size
 
     def _wrong(self, found: Array, x: Array, value: Array, slope: Array, sizes: Array) -> Array:
         """Which entries (d, n) are not those of the differences."""

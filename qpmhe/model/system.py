@@ -124,6 +124,7 @@ class System:
         #: Typical magnitudes of the states, (n,); None if they are not known.
         self.scales: Array | None = None
         self._scales_given = False
+        self._is_timed = False
         self.states = checked_set("states", states, self.n)
         self.disturbances = checked_set("disturbances", disturbances, self.n)
         self.noises = checked_set("noises", noises, self.p)
@@ -265,7 +266,9 @@ class System:
                 "the system is discrete: steps of another length need a model in continuous "
                 "time, as System.from_ode takes it."
             )
-        return self.make_timed()
+        made = self.make_timed()
+        made._is_timed = True
+        return made
 
     def copy(self, scales: ArrayLike | None = None) -> System:
         """The same system for one estimator, which may change how its functions are called.
@@ -317,7 +320,8 @@ class System:
 
     def _take_scales(self, scales: Array) -> None:
         self.scales = scales
-        probes = probe_points(self.states, self.n, self.m, scales)
+        # Steps of a random length lead anywhere: `check` then has the first of a usual length.
+        probes = [] if self._is_timed else probe_points(self.states, self.n, self.m, scales)
         for function in (self.f, self.h):
             function.try_again(probes)
         if self.rate_jacobian is not None:  # first, to be named if it is wrong

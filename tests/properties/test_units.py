@@ -72,6 +72,10 @@ class Drawn:
         }
         self.discount = float(rng.choice([1.0, 0.9]))
         self.record()
+        # Samples with a noise weight or a step length of their own, and a late measurement.
+        self.weighted = rng.random(SAMPLES) < 0.1
+        self.irregular = (rng.random(SAMPLES) < 0.1) & (self.method != "discrete")
+        self.late = int(rng.integers(SAMPLES - HORIZON, SAMPLES)), rng.standard_normal(self.p)
 
     def spd(self, size, level):
         root = self.rng.standard_normal((size, size)) + 2.0 * np.eye(size)
@@ -137,7 +141,7 @@ class Drawn:
         So do sets, whose tolerances are shares of standard deviations, and difference steps,
         which are shares of the prior's.
         """
-        return not self.from_observer and self.loss != "power" and (
+        return self.kind in ("luenberger", "injection") and self.loss != "power" and (
             self.derivative == "complex step" and not any(self.sets.values())
         )
 
@@ -243,19 +247,28 @@ class Drawn:
             )
         return qpmhe.RobustCost(**weights, discount=self.discount)
 
-    def estimates(self, units, **options):
-        """Estimates of the record in these units."""
-        system = self.system(units)
+    def estimates(self, units):
+        """Estimates of the record in these units, and the last covariances in its own."""
+        system, cost = self.system(units), self.cost(units)
+        noise = cost.noise
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ObserverWarning)
             mhe = qpmhe.MovingHorizonEstimator(
-                system, self.observer(system, units), self.cost(units), horizon=HORIZON,
-                initial_state=self.start * units.states, **{**self.options, **options},
+                system, self.observer(system, units), cost, horizon=HORIZON,
+                initial_state=self.start * units.states, **self.options,
             )
-            return [
-                mhe.update(y * units.outputs, u * units.inputs if self.m else None)
-                for y, u in zip(self.ys, self.us, strict=True)
+            estimates = [
+                mhe.update(
+                    self.ys[t] * units.outputs, self.us[t] * units.inputs if self.m else None,
+                    dt=1.5 * self.dt * units.time if self.irregular[t] else None,
+                    noise_weight=0.5 * noise if self.weighted[t] else None,
+                )
+                for t in range(SAMPLES)
             ]
+            time, late = self.late
+            estimates.append(mhe.amend(time, late * units.outputs))
+            scale = np.outer(units.states, units.states) / units.cost
+            return estimates, mhe.covariances() / scale
 
     def in_own_units(self, estimate, units):
         """The numbers of an estimate, taken back to the units in which it was drawn."""
@@ -275,7 +288,9 @@ class Drawn:
 def test_powers_of_two_change_not_a_bit(seed):
     drawn = Drawn(seed)
     units = drawn.units(2.0, 30)
-    best, found = drawn.estimates(drawn.own_units), drawn.estimates(units)
+    best, spread = drawn.estimates(drawn.own_units)
+    found, other_spread = drawn.estimates(units)
+    np.testing.assert_array_equal(other_spread, spread)
     for one, other in zip(best, found, strict=True):
         # How far an observer may be is a number of standard deviations.
         ignored = Status.OBSERVER_FAR if units.cost != 1.0 else Status(0)
@@ -290,7 +305,8 @@ def test_powers_of_two_change_not_a_bit(seed):
 def test_powers_of_ten_change_no_estimate(seed):
     drawn = Drawn(seed)
     units = drawn.units(10.0, 9)
-    best, found = drawn.estimates(drawn.own_units), drawn.estimates(units)
+    best, _ = drawn.estimates(drawn.own_units)
+    found, _ = drawn.estimates(units)
     for one, other in zip(best, found, strict=True):
         if (one.status | other.status) & Status.SOLVER_STOPPED:
             continue  # where it stopped is a matter of rounding
