@@ -140,9 +140,9 @@ class Case:
             "candidate": candidate,
             "engine": engine,
         }
-        if "states" in self.regions or "disturbances" in self.regions or "noises" in self.regions:
-            if self.options["backend"] == "banded":
-                self.options["backend"] = "auto"
+        sets = {"states", "disturbances", "noises"} & set(self.regions)
+        if sets and self.options["backend"] == "banded":
+            self.options["backend"] = "auto"
         if self.options["max_qps"] is None and self.options["backend"] not in QUICK:
             self.options["max_qps"] = 3
         self.options["delay"] = int(rng.integers(0, self.options["horizon"] + 1))
