@@ -91,7 +91,7 @@ class BatchEstimator:
         states = _starts(initial_states, self.members, system.n)
         self.system, self.observer, self.cost = system, observer, cost
         if isinstance(observer, Observer):
-            self._checked(states)
+            states = self._checked(states)
         try:
             # A single estimator checks all that the members have in common.
             one = MovingHorizonEstimator(
@@ -313,6 +313,7 @@ class _Looped:
                 np.array([one.candidate_cost for one in found]),
                 np.array([one.status.value for one in found], np.int64),
                 np.array([one.qps for one in found], np.intp),
+                np.array([one.filtered for one in found]),
                 self._delay,
             )
         except BaseException:
@@ -336,6 +337,8 @@ class BatchEstimate:
         True cost J of both.
     flags, qps : (K,) int array
         Values of the statuses, and QPs solved.
+    filtered : (K, n) array
+        Estimates of x(t).
     delayed : (K, n) array or None
         Estimates of x(t+1-k) for the estimator's delay k.
     """
@@ -347,6 +350,7 @@ class BatchEstimate:
     candidate_costs: Array
     flags: Flags
     qps: Index
+    filtered: Array
     delay: InitVar[int] = 0
 
     def __post_init__(self, delay: int) -> None:
@@ -357,11 +361,6 @@ class BatchEstimate:
     def states(self) -> Array:
         """Estimates of x(t+1), (K, n)."""
         return self.trajectories[:, -1]
-
-    @property
-    def filtered(self) -> Array:
-        """Estimates of x(t), (K, n)."""
-        return self.trajectories[:, -2]
 
     @cached_property
     def statuses(self) -> list[Status]:

@@ -339,13 +339,11 @@ class _Rehearsal:
         self, t: int, prior: Array, candidate: Array, trajectory: Array, cost: float,
         candidate_cost: float, status: Status, residuals: Array | None = None,
     ) -> str:
-        projected = Status.CANDIDATE_OUTSIDE in status
-        reference = self._judged(t, prior, candidate, not projected)
+        reference = self._judged(t, prior, candidate, True)
         best = self._judged(t, prior, trajectory, False)
-        judged = [("the estimate", cost, best)]
-        if not (projected and residuals is None):  # whole records do not say where to
-            judged.append(("the candidate", candidate_cost, reference))
-        for name, told, one in judged:
+        for name, told, one in (
+            ("the estimate", cost, best), ("the candidate", candidate_cost, reference)
+        ):
             # NaN and infinity are the same: not a cost.
             if np.isfinite(one.cost):
                 # C takes for infinite what has no finite square.
@@ -357,17 +355,17 @@ class _Rehearsal:
                 return f"J of {name} is {told:.6g}, but CasADi's interpreter has no number"
         if np.isfinite(candidate_cost) and not cost <= candidate_cost:
             return f"J of the estimate, {cost:.6g}, is above the candidate's {candidate_cost:.6g}"
-        if not projected and reference.moved():
+        if reference.moved():
             return "the candidate does not follow f + K v of CasADi's interpreter"
         # The candidate's disturbances are L, which is known itself.
-        own = best if projected or Status.IMPROVED in status else reference
+        own = best if Status.IMPROVED in status else reference
         if residuals is not None and own.has_squares:
             seen = own.observed
             if differs(residuals[seen], own.residuals[seen], own.allowed[seen]):
                 return "the residuals differ from those of CasADi's interpreter"
         if (
-            Status.MODEL_FAILED in status and not projected and reference.has_squares
-            and best.has_squares and self._is_sound(t, candidate, trajectory)
+            Status.MODEL_FAILED in status and reference.has_squares and best.has_squares
+            and self._is_sound(t, candidate, trajectory)
         ):
             return "it says that the model failed where CasADi's interpreter does not"
         return ""

@@ -13,7 +13,7 @@ from .._checks import check_problem, positive_definite
 from ..costs import Cost
 from ..errors import InvalidInputError
 from ..estimation.covariance import window_covariances
-from ..estimation.estimate import Estimate
+from ..estimation.estimate import DroppedRow, Estimate, Status
 from ..estimation.run import Run
 from ..estimation.settings import Settings
 from ..estimation.snapshot import (
@@ -26,8 +26,7 @@ from ..estimation.snapshot import (
 )
 from ..model.system import System
 from ..observers import Observer
-from .estimate import CompiledEstimate
-from .layout import SET_NAMES
+from .estimate import WATCHED, CompiledEstimate, CompiledWatch
 from .library import EstimatorLibrary
 
 __all__ = ["CompiledEngine"]
@@ -70,9 +69,7 @@ class CompiledEngine:
         self._usual, self._result = (*self._arguments, ctypes.c_double(0.0), None, out), out
         self._amending = memory, workspace
         self._call = library.update
-        self._observer = observer
-        sets = system.disturbances
-        self._noise_free = sets.fixed_components if sets else np.empty(0, np.intp)
+        self._observer, self._watch = observer, CompiledWatch(horizon)
         self._time = self._memory["time"]
 
     def reset(self, initial_state: Array) -> None:
@@ -123,16 +120,22 @@ class CompiledEngine:
                 )
             estimate = self._collect(time)
             estimate.step_time = perf_counter() - began
+            if self._numbers[1] & WATCHED:
+                record = self._memory[0]
+                self._watch.warn(int(record["far"]), int(record["dropped"]), 3)
             return estimate
-        except BaseException:  # an interrupt: the sample is not taken
+        except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
             if self.time != time:
                 self._memory[...] = self._before
             raise
 
     def _collect(self, time: int) -> CompiledEstimate:
-        return CompiledEstimate(
-            self._block.copy(), self._numbers.tolist(), time, self._sizes, self._delay
-        )
+        block, numbers = self._block.copy(), self._numbers.tolist()
+        dropped: tuple[DroppedRow, ...] = ()
+        if numbers[1] & Status.ROWS_DROPPED.value:
+            sides = self._out[0]["dropped"][: numbers[0]]
+            dropped = self._library.layout.dropped_rows(sides, time + 1 - numbers[0])
+        return CompiledEstimate(block, numbers, time, self._sizes, self._delay, dropped)
 
     def amend(self, time: int, y: Array) -> Estimate:
         """Put a late measurement in its place, and estimate again."""
@@ -154,6 +157,7 @@ class CompiledEngine:
         """Take a whole record in without leaving C; times are means over some samples."""
         samples = len(ys)
         log, start = self._library.log((samples,)), self.state
+        dropped = self._memory["dropped"][0].copy()
         times = np.empty(samples)
         ys = np.ascontiguousarray(ys)
         us = None if us is None else np.ascontiguousarray(us)
@@ -166,6 +170,7 @@ class CompiledEngine:
                 None if us is None else us[first:].ctypes.data, log.pointers(first),
             )
             times[first : first + count] = (perf_counter() - began) / count
+        self._watch.warn(*log.watched(self._settings.horizon, dropped), 3)
         return Run(
             states=np.vstack((start, log.states)), filtered=log.filtered, costs=log.costs,
             candidate_costs=log.candidate_costs, times=times,
@@ -188,14 +193,21 @@ class CompiledEngine:
         weights[:, : system.n, : system.n] = cost.disturbance
         weights[:, system.n :, system.n :] = stages["noise_weight"]
         factors = cost.discount ** np.append(count, np.arange(count - 1, -1, -1.0))
+        model = system.timed if irregular else system
+        if irregular:
+            inputs = np.column_stack((inputs, stages["step"]))
+        trajectory = record["trajectory"][: length + 1].copy()
         with np.errstate(all="ignore"):
+            assert model.kernel is not None  # of every system with a CasADi form
+            if not np.isfinite(model.kernel.residuals(trajectory, stages["y"], inputs)).all():
+                raise InvalidInputError("the model has no finite values along the estimate.")
             return window_covariances(
-                system.timed if irregular else system,
-                record["trajectory"][: length + 1].copy(),
-                np.column_stack((inputs, stages["step"])) if irregular else inputs,
+                model,
+                trajectory,
+                inputs,
                 weights * factors[1:, None, None],
                 np.asarray(cost.prior) * factors[0],
-                self._noise_free,
+                np.empty(0, np.intp),
             )
 
     def state_dict(self) -> dict[str, Any]:
@@ -237,13 +249,12 @@ class CompiledEngine:
         """Refuse a window that is impossible, or whose stages the model does not reproduce."""
         record, n, horizon = memory[0], self._sizes[0], self._sizes[2]
         time, length, first = (int(record[name]) for name in ("time", "length", "first"))
-        sets = sum(1 << k for k, name in enumerate(SET_NAMES) if getattr(self._system, name))
         if not (
             0 <= first < (horizon if length == horizon else 1)
             and 0 <= length == min(horizon, time)
             and record["newest"] == time % (horizon + 1)
             and record["has_trajectory"] == (time > 0)
-            and record["dropped"] & ~sets == 0
+            and 0 <= record["far"] <= time and 0 <= record["dropped"] <= time
         ):
             raise ValueError("its window is impossible")
         trajectory, history = record["trajectory"][: length + 1], record["history"][: time + 1]
@@ -325,5 +336,3 @@ class CompiledEngine:
         for name, bound in bounds.items():
             if not near(found[name], expected[name], bound):
                 raise mismatch("weight of the stages' cost")
-
-

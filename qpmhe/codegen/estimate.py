@@ -3,19 +3,37 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import ObserverWarning
 from ..estimation.estimate import DroppedRow, Estimate, Status
+from ..estimation.watch import ObserverWatch
 
-__all__ = ["CompiledEstimate"]
+__all__ = ["WATCHED", "CompiledEstimate", "CompiledWatch"]
 
 Array = NDArray[np.float64]
 
 _SOLVER_FAILED = Status.SOLVER_FAILED.value
 _MESSAGE = "the factorisation failed: H is not positive definite, or not finite"
+
+
+#: Flags of what may be worth a warning.
+WATCHED = (Status.ROWS_DROPPED | Status.OBSERVER_FAR).value
+
+
+class CompiledWatch(ObserverWatch):
+    """The watch on an observer, where C counts."""
+
+    def warn(self, far: int, dropped: int, level: int) -> None:
+        """Warn at a level of the stack if so many samples running are too many, but only once."""
+        self.counts = far, dropped
+        text = self.warning()
+        if text is not None:
+            warnings.warn(text, ObserverWarning, stacklevel=level + 1)
 
 
 class CompiledEstimate(Estimate):
@@ -24,17 +42,18 @@ class CompiledEstimate(Estimate):
     __slots__ = ("_block", "_delay", "_numbers", "_sizes")
 
     def __init__(
-        self, block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int], delay: int
+        self, block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int], delay: int,
+        dropped: tuple[DroppedRow, ...] = (),
     ) -> None:
         self._block, self._numbers, self.time = block, numbers, time
-        self._sizes, self._delay = sizes, delay
+        self._sizes, self._delay, self.dropped = sizes, delay, dropped
         n = sizes[0]
         end = 2 + (numbers[0] + 1) * n
         self.state = block[end - n : end]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        arguments = self._block, self._numbers, self.time, self._sizes, self._delay
-        return _restored, (*arguments, self.step_time)
+        arguments = self._block, self._numbers, self.time, self._sizes, self._delay, self.dropped
+        return _restored, (arguments, self.step_time)
 
     def _rows(self, start: int, rows: int, width: int) -> Array:
         return self._block[start : start + rows * width].reshape(rows, width)
@@ -56,7 +75,7 @@ class CompiledEstimate(Estimate):
 
     @property
     def candidate(self) -> Array:  # type: ignore[override]
-        """The observer's trajectory, or its projection."""
+        """The observer's trajectory."""
         n, _, horizon = self._sizes
         return self._rows(2 + (horizon + 1) * n, self._numbers[0] + 1, n)
 
@@ -98,20 +117,14 @@ class CompiledEstimate(Estimate):
         return self._numbers[4]
 
     @property
-    def dropped(self) -> tuple[DroppedRow, ...]:  # type: ignore[override]
-        """None: the C step takes no sets."""
-        return ()
-
-    @property
     def nearest_points(self) -> int:  # type: ignore[override]
-        """None: the C step takes no sets."""
-        return 0
+        """QPs for a feasible trajectory near an infeasible candidate."""
+        return self._numbers[5]
 
     @property
     def filtered(self) -> Array:
-        """Estimate of x(t), the last measured time."""
-        value: Array = self.trajectory[-2]
-        return value
+        """Estimate of x(t) that has used y(t)."""
+        return self._block[self._block.size - self._sizes[0] :]
 
     @property
     def delayed(self) -> Array | None:  # type: ignore[override]
@@ -125,10 +138,7 @@ class CompiledEstimate(Estimate):
         return math.nan
 
 
-def _restored(
-    block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int], delay: int,
-    step_time: float,
-) -> CompiledEstimate:
-    estimate = CompiledEstimate(block, numbers, time, sizes, delay)
+def _restored(arguments: tuple[Any, ...], step_time: float) -> CompiledEstimate:
+    estimate = CompiledEstimate(*arguments)
     estimate.step_time = step_time
     return estimate

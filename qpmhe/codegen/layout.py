@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._linalg import inverse
 from ..costs import Cost
 from ..errors import OptionError
-from ..estimation.estimate import Status
+from ..estimation.constraints import Rows
+from ..estimation.estimate import DroppedRow, Status
 from ..estimation.limits import c_definitions
 from ..estimation.settings import Settings
 from ..model.sets import ConvexSet
@@ -22,7 +24,7 @@ __all__ = ["SET_NAMES", "Layout", "settings_record"]
 SET_NAMES = ("disturbances", "noises")
 
 _MOST = int(np.iinfo(np.int32).max)
-_POLICIES = ("drop", "project", "keep")
+_POLICIES = ("drop_rows", "keep_candidate")
 
 
 @dataclass(frozen=True)
@@ -68,17 +70,21 @@ class Layout:
         """``mhe_settings``."""
         r, n, p = self.number, self.nx, self.ny
         fields: list[Any] = [
-            ("gain", r, n * p), ("prior_weight", r, n * n), ("disturbance_weight", r, n * n),
-            ("noise_weight", r, p * p), ("discount", r), ("sample_time", r), ("tolerance", r),
+            ("gain", r, n * p), ("filter_gain", r, n * p), ("prior_weight", r, n * n),
+            ("disturbance_weight", r, n * n), ("noise_weight", r, p * p),
+            ("discount", r), ("sample_time", r), ("tolerance", r),
             ("solver_tolerance", r),
         ]
         for name, size, (_, rows) in zip(SET_NAMES, (n, p), self.sets, strict=True):
             space = max(rows, 1)
             fields.append((name, _struct([
-                ("lower", r, size), ("upper", r, size), ("rows", r, space * size),
-                ("row_lower", r, space), ("row_upper", r, space),
+                ("lower", r, size), ("upper", r, size), ("scale", r, size),
+                ("rows", r, space * size), ("row_lower", r, space), ("row_upper", r, space),
+                ("row_scale", r, space),
             ])))
-        options = ("max_qps", "max_iterations", "outside", "start_at_best", "reinitialize", "delay")
+        options = (
+            "max_qps", "max_iterations", "infeasible", "start_at_best", "reinitialize", "delay"
+        )
         fields += [(name, np.int32) for name in options]
         return _struct(fields)
 
@@ -88,10 +94,31 @@ class Layout:
         return _struct([
             ("cost", r), ("candidate_cost", r), ("trajectory", r, (count + 1, n)),
             ("candidate", r, (count + 1, n)), ("disturbances", r, (count, n)),
-            ("noises", r, (count, p)), ("time", np.int64), ("length", np.int32),
-            ("status", np.int32), ("qps", np.int32), ("iterations", np.int32),
-            ("corrections", np.int32), ("dropped", np.int32),
+            ("noises", r, (count, p)), ("filtered", r, n), ("time", np.int64),
+            ("length", np.int32), ("status", np.int32), ("qps", np.int32),
+            ("iterations", np.int32), ("corrections", np.int32), ("nearest_points", np.int32),
+            ("dropped", np.uint8, (count, max(sum(self.set_rows), 1))),
         ])
+
+    @property
+    def set_rows(self) -> tuple[int, ...]:
+        """Inequalities of each set at one stage: one for each component, then the rows."""
+        return tuple(
+            there * (size + rows)
+            for size, (there, rows) in zip((self.nx, self.ny), self.sets, strict=True)
+        )
+
+    def dropped_rows(self, sides: NDArray[np.uint8], first: int) -> tuple[DroppedRow, ...]:
+        """The rows in ``dropped`` of an estimate whose window starts at this time."""
+        found, start = [], 0
+        for name, count in zip(SET_NAMES, self.set_rows, strict=True):
+            part = sides[:, start : start + count]
+            found += [
+                DroppedRow(name, int(r), ("lower", "upper")[part[k, r] - 1], first + int(k))
+                for k, r in np.argwhere(part)
+            ]
+            start += count
+        return tuple(found)
 
     def estimator_type(self) -> np.dtype[Any]:
         """``mhe_estimator``."""
@@ -109,7 +136,7 @@ class Layout:
         return _struct([
             ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
             ("length", np.int32), ("newest", np.int32), ("has_trajectory", np.int32),
-            ("dropped", np.int32), ("unused", np.int32), ("last_good", r, n), ("z_end", r, n),
+            ("far", np.int32), ("dropped", np.int32), ("last_good", r, n), ("z_end", r, n),
             ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
             ("stages", stage, count),
         ])
@@ -135,10 +162,12 @@ def _filled(
     layout: Layout, system: System, observer: Observer, cost: Cost, settings: Settings
 ) -> NDArray[Any]:
     record = np.zeros((), layout.settings_type())
-    gain, form = observer.constant_gain, cost.c_form
+    gain, filter_gain, form = observer.constant_gain, observer.filter_gain, cost.c_form
     assert gain is not None
+    assert filter_gain is not None
     assert form is not None
-    record["gain"], record["discount"] = gain.ravel(), form.discount
+    record["gain"], record["filter_gain"] = gain.ravel(), filter_gain.ravel()
+    record["discount"] = form.discount
     for name in ("prior", "disturbance", "noise"):
         record[f"{name}_weight"] = getattr(form, name).ravel()
     record["sample_time"] = system.dt or 0.0
@@ -146,11 +175,14 @@ def _filled(
     # Single precision distinguishes less.
     record["tolerance"] = max(settings.tolerance, 1e-6 if single else 0.0)
     record["solver_tolerance"] = max(settings.solver_tolerance, 1e-4 if single else 0.0)
-    for name in SET_NAMES:
+    for name, weight in zip(SET_NAMES, (form.disturbance, form.noise), strict=True):
         one: ConvexSet | None = getattr(system, name)
         if one is None:
             continue
-        part = record[name]
+        part, scaled = record[name], Rows(name, one, inverse(weight))
+        part["scale"], part["row_scale"] = 1.0, 1.0
+        part["scale"][scaled.components] = scaled.scale[: scaled.bounds]
+        part["row_scale"][: one.matrix.shape[0]] = scaled.scale[scaled.bounds :]
         part["lower"], part["upper"] = one.lower, one.upper
         rows = one.matrix.shape[0]
         part["rows"][: one.matrix.size] = one.matrix.ravel()
@@ -158,7 +190,7 @@ def _filled(
     record["max_qps"] = min(settings.qp_limit, _MOST)
     most = settings.max_solver_iterations
     record["max_iterations"] = 0 if settings.backend == "banded" else min(most or 50, _MOST)
-    record["outside"] = 0
+    record["infeasible"] = _POLICIES.index(settings.infeasible)
     record["start_at_best"] = settings.warm_start
     record["reinitialize"] = settings.candidate == "reinitialized"
     record["delay"] = settings.delay

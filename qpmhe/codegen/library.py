@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
+from .._linalg import inverse
 from ..costs import Cost
 from ..errors import CompilationError, OptionError
+from ..estimation.estimate import Status
 from ..estimation.limits import FEASIBLE
 from ..estimation.settings import Settings
 from ..model.sets import ConvexSet
@@ -36,7 +38,7 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             "engine='compiled' does not yet project the observer onto X; take engine='python', or "
             "leave states out."
         )
-    if observer.constant_gain is None:
+    if observer.constant_gain is None or observer.filter_gain is None:
         return (
             f"{type(observer).__name__} has no C form; take an observer with constant gain "
             "(Luenberger, SteadyStateKalman, HighGain)."
@@ -45,11 +47,13 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         if cost.quadratic and cost.observer_prior is not None:
             return "a prior weight from the observer has no C form; take a constant one."
         return f"{type(cost).__name__} has no C form; take a QuadraticCost."
-    for name in SET_NAMES:
-        if getattr(system, name) is not None:
+    for name, weight in zip(SET_NAMES, (cost.disturbance, cost.noise), strict=True):
+        one = getattr(system, name)
+        if one is not None and _is_flat(one, inverse(weight)):
             return (
-                f"the compiled step does not take a set of {name} yet; take engine='python', or "
-                f"leave {name} out."
+                f"the set of {name} has a direction of zero width (equal bounds, or a polytope "
+                f"less than {FEASIBLE:g} standard deviations wide), which the interior-point "
+                "method in C cannot take; widen it."
             )
     size = _window_size(system, settings.horizon)
     if size > _MOST_BYTES:
@@ -76,13 +80,17 @@ def _window_size(system: System, horizon: int) -> int:
     return one + (horizon - 1) * (two - one)
 
 
-def _is_flat(one: ConvexSet) -> bool:
-    """Whether a set has no interior: no ball within it is wider than what counts as none."""
+def _is_flat(one: ConvexSet, covariance: NDArray[np.float64]) -> bool:
+    """Whether a set has no interior: no ball within it is wider than what counts as none.
+
+    Components are measured in standard deviations.
+    """
     if one.fixed_components.size or (one.row_lower == one.row_upper).any():
         return True
     if not one.matrix.size:
         return False
-    matrix = np.vstack((np.eye(one.dimension), one.matrix))
+    deviations = np.sqrt(covariance.diagonal())
+    matrix = np.vstack((np.eye(one.dimension), one.matrix)) * deviations
     low, high = np.append(one.lower, one.row_lower), np.append(one.upper, one.row_upper)
     norms = np.linalg.norm(matrix, axis=1)
     matrix, low, high = matrix / norms[:, None], low / norms, high / norms
@@ -138,6 +146,17 @@ class RunLog:
         )
         addresses = [array.ctypes.data + first * array.strides[0] for array in arrays]
         return (ctypes.c_void_p * len(addresses))(*addresses)
+
+    def watched(self, horizon: int, dropped: NDArray[np.int32]) -> tuple[int, int]:
+        """As `ObserverWatch.counts`, but the largest; ``dropped`` is the count at the start."""
+        flags, most = self.flags, dropped
+        if (flags & Status.ROWS_DROPPED.value).any():
+            for t in range(flags.shape[-1]):
+                kept = (flags[..., t] & Status.ROWS_DROPPED.value) == 0
+                dropped = np.where(kept, 0, dropped + 1)
+                most = np.maximum(most, dropped)
+        far = (flags & Status.OBSERVER_FAR.value).any()
+        return horizon * int(far), int(most.max())
 
 
 class EstimatorLibrary:

@@ -16,6 +16,7 @@ from ..costs import Cost
 from ..estimation.settings import Settings
 from ..model.system import System
 from ..observers import Observer
+from .estimate import WATCHED, CompiledWatch
 from .library import EstimatorLibrary
 
 __all__ = ["CompiledMembers"]
@@ -34,7 +35,8 @@ class CompiledMembers:
         threads: int | None,
     ) -> None:
         self._library = library = EstimatorLibrary(system, observer, cost, settings)
-        self._m = system.m
+        self._m, self._horizon = system.m, settings.horizon
+        self._watch = CompiledWatch(settings.horizon)
         count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         wanted = min(threads or count or 1, max(1, len(states) // _LEAST))
         ends = np.linspace(0, len(states), wanted + 1).astype(int).tolist()
@@ -82,9 +84,12 @@ class CompiledMembers:
             )
 
         self._share(work)
+        if (found["status"] & WATCHED).any():
+            far, dropped = (int(self._memory[name].max()) for name in ("far", "dropped"))
+            self._watch.warn(far, dropped, 4)
         states = slice(0, int(found["length"][0]) + 1)
         return {
-            "time": self.time - 1,
+            "time": self.time - 1, "filtered": found["filtered"],
             "trajectories": found["trajectory"][:, states], "costs": found["cost"],
             "candidates": found["candidate"][:, states],
             "candidate_costs": found["candidate_cost"],
@@ -94,7 +99,7 @@ class CompiledMembers:
     def run(self, y: Array, u: Array) -> dict[str, Any]:
         """Take records (K, T, p) and (K, T, m) in without leaving C."""
         ys, us, start = np.ascontiguousarray(y), np.ascontiguousarray(u), self.states
-        samples = ys.shape[1]
+        samples, dropped = ys.shape[1], self._memory["dropped"].copy()
         log = self._library.log(ys.shape[:2])
 
         def work(part: slice, workspace: NDArray[np.uint8]) -> None:
@@ -105,6 +110,7 @@ class CompiledMembers:
             )
 
         self._share(work)
+        self._watch.warn(*log.watched(self._horizon, dropped), 3)
         return {
             "states": np.concatenate((start[:, None], log.states), axis=1),
             "filtered": log.filtered, "delayed": log.delayed,

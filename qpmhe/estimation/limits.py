@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 __all__ = [
-    "ALONG", "BEYOND", "CORRECTIONS", "FEASIBLE", "LARGEST", "LENGTHS", "NEAREST_POINTS", "NEARLY",
-    "ROUNDING", "STALLED",
+    "ALONG", "BEYOND", "CORRECTIONS", "FAR", "FEASIBLE", "LARGEST", "LENGTHS", "NEAREST_POINTS",
+    "NEARLY", "ROUNDING", "STALLED",
     "c_definitions",
 ]
 
@@ -40,6 +40,9 @@ NEAREST_POINTS = 5
 #: boundary up to their tolerance.
 FEASIBLE = 5e-9
 
+#: Standard deviations of the prior from which on the observer is far from an estimate.
+FAR = 10.0
+
 #: A larger measurement counts as missing: its square would not be finite.
 LARGEST = 1e150
 
@@ -50,7 +53,7 @@ def c_definitions(prefix: str, real: str) -> str:
     """The same as C macros, for reals of type "double" or "float"."""
     values = {
         "ROUNDING": ROUNDING, "NEARLY": NEARLY, "STALLED": STALLED, "BEYOND": BEYOND,
-        "FEASIBLE": FEASIBLE, "LARGEST": LARGEST,
+        "FEASIBLE": FEASIBLE, "LARGEST": LARGEST, "FAR": FAR,
     }
     if real == "float":
         values |= _SINGLE

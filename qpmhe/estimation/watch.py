@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .limits import FAR
+
 __all__ = ["ObserverWatch"]
 
 Array = NDArray[np.float64]
-
-# Standard deviations of the prior from which on the observer is far from an estimate.
-_FAR = 10.0
 
 
 class ObserverWatch:
@@ -42,7 +41,7 @@ class ObserverWatch:
         """
         far, dropped = self.counts
         # A comparison with NaN is false.
-        far = far + 1 if offset.dot(prior_weight).dot(offset) > _FAR**2 else 0
+        far = far + 1 if offset.dot(prior_weight).dot(offset) > FAR**2 else 0
         self.counts = far, (dropped + 1 if dropped_rows else 0)
         return far >= self._horizon
 
@@ -60,6 +59,6 @@ class ObserverWatch:
             )
         return (
             f"the observer was far from the estimates in {far} samples running (more than "
-            f"{_FAR:g} standard deviations of the prior); take another gain or observer, or "
+            f"{FAR:g} standard deviations of the prior); take another gain or observer, or "
             "candidate='reinitialized'."
         )

@@ -94,6 +94,17 @@ class Observer(ABC):
             What else is known of the stage; overwritten at the next one.
         """
 
+    @property
+    def filter_gain(self) -> Array | None:
+        """The gain G (n, p) where `filter` gives z + G v at all times, or nothing (G = 0).
+
+        None for other observers.
+        """
+        gain = self.constant_gain
+        if gain is None or type(self).filter is not Observer.filter:
+            return None
+        return np.zeros_like(gain)
+
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array] | None:
         """The estimate of x(t) that has used y(t), and its covariance; None if there is none.
 

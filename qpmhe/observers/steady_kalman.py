@@ -111,6 +111,12 @@ class SteadyStateKalman(Observer):
         return self.gain if type(self).correct is SteadyStateKalman.correct else None
 
     @property
+    def filter_gain(self) -> Array | None:
+        """The gain of `filter`, unless a derived class filters in another way."""
+        own = type(self).filter is SteadyStateKalman.filter
+        return self._filter_gain if own and self.constant_gain is not None else None
+
+    @property
     def kappa(self) -> float:
         """The constant of (eq:kappa)."""
         return float(np.linalg.norm(self.gain, 2))

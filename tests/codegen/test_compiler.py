@@ -132,7 +132,7 @@ def test_model_sizes_and_sets_compile_anew_weights_and_options_do_not(wrapped):
     estimator()
     assert len(calls()) == 1
     for same in (
-        {"weight": 2.0}, {"max_qps": 5, "outside": "keep", "backend": "banded"},
+        {"weight": 2.0}, {"max_qps": 5, "infeasible": "keep_candidate", "backend": "banded"},
         {"warm_start": True, "delay": 1, "candidate": "reinitialized"},
     ):
         assert estimator(**same).engine == "compiled"

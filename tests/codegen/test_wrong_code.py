@@ -41,8 +41,7 @@ STEP_LIES = {
     "a step's length": "s/stage->step = step > 0 ? step :/stage->step =/",
     "a noise weight": "s/stage->has_own_noise ? stage->own_noise_weight : //",
     "failures": "s/int held = !isfinite(stage->cost)/int held = 1/",
-    "the verdict": "s/if (o->spare->cost < target) break/break/;"
-                   "s/if (!(o->spare->cost < target)) {/if (0) {/;s/= -k->gradient/= k->gradient/",
+    "the verdict": "s/if (o->spare->cost < target) {/if (1) {/;s/= -k->gradient/= k->gradient/",
 }
 
 

@@ -158,6 +158,7 @@ def test_missing_measurements(members, options, discount):
     assert Status.MISSING in flags_seen(estimates)
 
 
+@pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 def test_a_large_measurement_is_missing_only_where_its_cost_overflows():
     Y = np.zeros((3, 12, 1))
     Y[0, 4], Y[1, 5], Y[2, 6] = 1.1e150, 1e160, 1e140
@@ -472,10 +473,19 @@ def test_parts_that_are_none():
         BatchEstimator(system, qpmhe.Luenberger(np.ones((3, 1))), cost, **options)
 
 
+def test_initial_states_outside_of_the_set_are_projected_with_a_warning():
+    starts = [[0.5, 0.0], [9.5, 0.0], [0.0, 0.0]]
+    with pytest.warns(qpmhe.ObserverWarning, match=r"initial_states\[1\] is \[9.5, 0.0\]"):
+        batch = BatchEstimator(*parts(**SETS), members=3, horizon=3, initial_states=starts)
+    np.testing.assert_array_equal(batch.states, np.clip(starts, -9.0, 9.0))
+    with pytest.warns(qpmhe.ObserverWarning, match=r"initial_states\[2\]"):
+        batch.reset([*starts[:1], *starts[:1], [0.0, -20.0]])
+    np.testing.assert_array_equal(batch.states[2], [0.0, -9.0])
+
+
 @pytest.mark.parametrize(
     ("system", "starts", "fragments"),
     [
-        (SETS, [[0.5, 0.0], [9.5, 0.0], [0.0, 0.0]], ["initial_states[1]", "9.5", "outside"]),
         ({"f": silent}, [[0.5, 0.0], [0.5, 0.1], [-1.0, 0.0]], ["initial_states[2]", "nan"]),
         ({"f": plain}, [[0.5, 0.0], [-0.5, 0.1], [1.0, 0.0]], ["initial_states[1]", "raised"]),
         (
@@ -483,7 +493,7 @@ def test_parts_that_are_none():
             [[0.5, 0.0], [60.0, 0.1], [1.0, 0.0]], ["initial_states[1]", "f_jacobian[0, 0]"],
         ),
     ],
-    ids=["outside", "nan", "raises", "jacobian"],
+    ids=["nan", "raises", "jacobian"],
 )
 def test_initial_states_that_a_single_estimator_would_not_take(system, starts, fragments):
     one = parts(**system)

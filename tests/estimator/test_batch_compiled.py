@@ -41,7 +41,7 @@ def starts():
     ("sets", "options"),
     [
         ({}, {}), ({}, {"max_qps": 0}), ({}, {"max_qps": None, "warm_start": True, "delay": 3}),
-        ({"disturbances": BOX}, {"outside": "project", "max_qps": 2}),
+        ({"disturbances": BOX}, {"max_qps": 2}),
     ],
     ids=["one", "none", "converged", "sets"],
 )

@@ -158,9 +158,8 @@ ARRAYS = ("state", "filtered", "trajectory", "candidate", "disturbances", "noise
 
 def close(expected, found, tolerance=1e-10):
     """Equality up to rounding of all that two estimates of a window tell."""
-    assert (found.status, found.qps, found.dropped, found.time, found.corrections) == (
-        expected.status, expected.qps, expected.dropped, expected.time, expected.corrections
-    )
+    for name in ("status", "qps", "dropped", "time", "corrections", "nearest_points"):
+        assert getattr(found, name) == getattr(expected, name), name
     for name in ARRAYS:
         one, other = getattr(expected, name), getattr(found, name)
         assert (one is None) == (other is None), name

@@ -13,7 +13,10 @@ from .plain import spd
 from .test_compiled import STEPS, both, close, estimator, input_at, made, model_of, system_of
 
 casadi = pytest.importorskip("casadi")
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+pytestmark = [
+    pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler"),
+    pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning"),
+]
 
 Status = qpmhe.Status
 WAYS = {

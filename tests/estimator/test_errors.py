@@ -152,10 +152,9 @@ def test_an_initial_state_outside_of_the_state_set_is_projected(kind, project):
         mhe.reset(given)
     np.testing.assert_array_equal(mhe.state, start)
     mhe.update([1.0])
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), pytest.raises(ObserverWarning):
         warnings.simplefilter("error")
-        with pytest.raises(ObserverWarning):
-            mhe.reset(given)
+        mhe.reset(given)
     assert mhe.time == 1  # as it was
 
 

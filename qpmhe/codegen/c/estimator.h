@@ -53,25 +53,32 @@ enum {
 $status
 };
 
-/* What to do where the candidate is outside of the sets. */
-enum { MHE_DROP = 0, MHE_PROJECT = 1, MHE_KEEP = 2 };
+/* What to do where no trajectory in the sets costs at most what the candidate does. */
+enum { MHE_DROP_ROWS = 0, MHE_KEEP_CANDIDATE = 1 };
 
-/* A convex set: lower <= s <= upper, row_lower <= rows s <= row_upper. */
+/* Sides of an inequality, as bits. */
+enum { MHE_LOWER = 1, MHE_UPPER = 2 };
+
+/* A convex set: lower <= s <= upper, row_lower <= rows s <= row_upper. A miss of an inequality
+ * counts as a share of its scale, in the same unit: its width, or a standard deviation. */
 typedef struct {
-    mhe_real lower[MHE_NX], upper[MHE_NX];
+    mhe_real lower[MHE_NX], upper[MHE_NX], scale[MHE_NX];
     mhe_real rows[MHE_SIZE(MHE_W_ROWS) * MHE_NX];
     mhe_real row_lower[MHE_SIZE(MHE_W_ROWS)], row_upper[MHE_SIZE(MHE_W_ROWS)];
+    mhe_real row_scale[MHE_SIZE(MHE_W_ROWS)];
 } mhe_w_set;
 
 typedef struct {
-    mhe_real lower[MHE_NY], upper[MHE_NY];
+    mhe_real lower[MHE_NY], upper[MHE_NY], scale[MHE_NY];
     mhe_real rows[MHE_SIZE(MHE_V_ROWS) * MHE_NY];
     mhe_real row_lower[MHE_SIZE(MHE_V_ROWS)], row_upper[MHE_SIZE(MHE_V_ROWS)];
+    mhe_real row_scale[MHE_SIZE(MHE_V_ROWS)];
 } mhe_v_set;
 
 /* Matrices are stored by rows. Weights are inverse covariances. */
 typedef struct {
     mhe_real gain[MHE_NX * MHE_NY];
+    mhe_real filter_gain[MHE_NX * MHE_NY]; /* of the observer's own measurement update */
     mhe_real prior_weight[MHE_NX * MHE_NX];
     mhe_real disturbance_weight[MHE_NX * MHE_NX];
     mhe_real noise_weight[MHE_NY * MHE_NY];
@@ -83,7 +90,7 @@ typedef struct {
     mhe_v_set noises;
     int32_t max_qps;           /* QPs for each sample */
     int32_t max_iterations;    /* interior-point iterations in each; 0: no inequalities */
-    int32_t outside;           /* MHE_DROP, MHE_PROJECT or MHE_KEEP */
+    int32_t infeasible;        /* MHE_DROP_ROWS or MHE_KEEP_CANDIDATE */
     int32_t start_at_best;     /* start at the shifted previous estimate where it is better */
     int32_t reinitialize;      /* observer restarted at the estimate of the window's start */
     int32_t delay;             /* of the delayed estimates that mhe_run writes */
@@ -113,7 +120,8 @@ typedef struct {
     const mhe_settings *settings;
     int64_t time;                  /* samples taken */
     int32_t first, length;         /* the window in the ring of stages */
-    int32_t newest, has_trajectory, dropped, unused;
+    int32_t newest, has_trajectory;
+    int32_t far, dropped;          /* samples running with a far observer, with rows dropped */
     mhe_real last_good[MHE_NX];    /* of the stages that have left the window */
     mhe_real z_end[MHE_NX];        /* the observer's state behind the last stage */
     mhe_real history[(MHE_HORIZON + 1) * MHE_NX]; /* ring of estimates of x(t), newest last */
@@ -127,8 +135,11 @@ typedef struct {
     mhe_real candidate[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real disturbances[MHE_HORIZON * MHE_NX];
     mhe_real noises[MHE_HORIZON * MHE_NY];
+    mhe_real filtered[MHE_NX];     /* estimate of x(t) that has used y(t) */
     int64_t time;                  /* of the newest sample */
-    int32_t length, status, qps, iterations, corrections, dropped;
+    int32_t length, status, qps, iterations, corrections, nearest_points;
+    /* Sides that were dropped and are violated, by stage: components of W, its rows, those of V. */
+    uint8_t dropped[MHE_HORIZON * MHE_SIZE(MHE_STAGE_ROWS)];
 } mhe_estimate;
 
 typedef struct {
@@ -138,7 +149,7 @@ typedef struct {
 
 /* Rows of a constrained QP and the interior point's variables on each of them. */
 typedef struct {
-    mhe_real low, high;
+    mhe_real low, high, scale;
     mhe_real slack_low, slack_high, dual_low, dual_high;
     mhe_real residual_low, residual_high, correction_low, correction_high;
     mhe_real inverse_low, inverse_high, value, weight, load;
@@ -155,6 +166,7 @@ typedef struct {
     mhe_real residual[(MHE_HORIZON + 1) * MHE_NX], direction[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real product[(MHE_HORIZON + 1) * MHE_NX];
     mhe_row rows[MHE_HORIZON * MHE_SIZE(MHE_STAGE_ROWS)];
+    uint8_t left_out[MHE_HORIZON * MHE_SIZE(MHE_STAGE_ROWS)]; /* sides that no trial must keep */
 } mhe_workspace;
 
 /* Where mhe_run writes; a null pointer leaves out. One entry for each sample. */

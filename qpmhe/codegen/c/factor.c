@@ -129,18 +129,9 @@ static int mhe_solve(const mhe_workspace *k, int count, real *restrict b)
     return mhe_all_finite((count + 1) * NX, b);
 }
 
-/* The QP of the point nearest to the trajectory: H = I, g = 0. */
-static void mhe_assemble_nearest(const mhe_estimator *e, mhe_workspace *k)
-{
-    memset(k->panels, 0, sizeof k->panels);
-    memset(k->gradient, 0, sizeof k->gradient);
-    for (int j = 0; j < (e->length + 1) * NX; j++) k->panels[j * WIDTH + j % NX] = 1;
-}
-
+/* The QP, or that of the nearest point that satisfies the rows, in the metric of its Hessian. */
 static void mhe_build(const mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest)
 {
-    if (nearest)
-        mhe_assemble_nearest(e, k);
-    else
-        mhe_assemble(e, k, offset);
+    mhe_assemble(e, k, offset);
+    if (nearest) memset(k->gradient, 0, sizeof k->gradient);
 }

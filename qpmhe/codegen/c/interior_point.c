@@ -10,52 +10,29 @@ enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED };
 
 #if CONSTRAINED
 
-#define ROWS MHE_STAGE_ROWS
-#define W_COUNT (MHE_W_SET * (NX + MHE_W_ROWS))
-#define V_COUNT (MHE_V_SET * (NY + MHE_V_ROWS))
-
-/* Limits of the rows of one set about the point q where the QP is built. */
-static void mhe_limit(int n, int count, const real *q, const real *lower, const real *upper,
-                      const real *rows, const real *row_lower, const real *row_upper,
-                      const uint8_t *known, int active, mhe_row *out)
-{
-    for (int j = 0; j < n; j++) {
-        const int there = active && (!known || known[j]);
-        out[j].low = there ? lower[j] - q[j] : -INFINITY;
-        out[j].high = there ? upper[j] - q[j] : INFINITY;
-    }
-    for (int i = 0; i < count; i++) {
-        int there = active;
-        for (int j = 0; j < n; j++)
-            if (known && !known[j] && rows[i * n + j] != 0) there = 0;
-        const real value = mhe_dot(n, rows + i * n, q);
-        out[n + i].low = there ? row_lower[i] - value : -INFINITY;
-        out[n + i].high = there ? row_upper[i] - value : INFINITY;
-    }
-}
-
-#define LIMIT(set, n, count, q, known, active, out) \
-    mhe_limit(n, count, q, (set).lower, (set).upper, (set).rows, (set).row_lower, \
-              (set).row_upper, known, active, out)
-
 /* Limits of all rows about a trajectory with residuals w and v. */
-static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, int sets, const real *w,
-                           const real *v)
+static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *w, const real *v)
 {
     const mhe_settings *s = e->settings;
+    real low[ROWS], high[ROWS];
     for (int i = 0; i < e->length; i++) {
         mhe_row *rows = k->rows + i * ROWS;
+        mhe_stage_distances(e, i, w, v, low, high);
+        for (int r = 0; r < ROWS; r++) {
+            const int out = k->left_out[i * ROWS + r];
+            rows[r].low = out & MHE_LOWER ? -INFINITY : low[r];
+            rows[r].high = out & MHE_UPPER ? INFINITY : high[r];
+        }
 #if MHE_W_SET
-        LIMIT(s->disturbances, NX, MHE_W_ROWS, w + i * NX, 0, sets & DISTURBANCES, rows);
+        for (int j = 0; j < NX; j++) rows[j].scale = s->disturbances.scale[j];
+        for (int j = 0; j < MHE_W_ROWS; j++) rows[NX + j].scale = s->disturbances.row_scale[j];
         rows += W_COUNT;
 #endif
 #if MHE_V_SET
-        const mhe_stage *stage = mhe_stage_at(e, i);
-        LIMIT(s->noises, NY, MHE_V_ROWS, v + i * NY, stage->is_complete ? 0 : stage->is_observed,
-              sets & NOISES, rows);
+        for (int j = 0; j < NY; j++) rows[j].scale = s->noises.scale[j];
+        for (int j = 0; j < MHE_V_ROWS; j++) rows[NY + j].scale = s->noises.row_scale[j];
 #endif
     }
-    (void)w; (void)v;
 }
 
 static void mhe_values_of(int n, int count, const real *q, const real *rows, mhe_row *out)
@@ -184,16 +161,15 @@ static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
     (void)s;
 }
 
-/* The largest amount by which a row is missed; rows.value = c(d) afterwards. */
+/* The largest miss of a row in its scale; rows.value = c(d) afterwards. */
 static real mhe_row_violation(const mhe_estimator *e, mhe_workspace *k, const real *d)
 {
     real worst = 0;
     mhe_rows_times(e, k, d);
-    for (int i = 0; i < e->length; i++)
-        for (int r = 0; r < ROWS; r++) {
-            const mhe_row *row = k->rows + i * ROWS + r;
-            worst = fmax(worst, fmax(row->low - row->value, row->value - row->high));
-        }
+    for (int i = 0; i < e->length * ROWS; i++) {
+        const mhe_row *row = k->rows + i;
+        worst = fmax(worst, fmax(row->low - row->value, row->value - row->high) / row->scale);
+    }
     return worst;
 }
 
@@ -233,17 +209,16 @@ static void mhe_meet(mhe_ratio *worst, real variable, real change)
 /* Right-hand side of the Newton equations for a target of the complementarity products. */
 static void mhe_set_loads(const mhe_estimator *e, mhe_workspace *k, real target)
 {
-    for (int i = 0; i < e->length; i++)
-        for (int r = 0; r < ROWS; r++) {
-            mhe_row *q = k->rows + i * ROWS + r;
-            q->load = 0;
-            if (q->dual_low > 0)
-                q->load += (target - q->correction_low - q->dual_low * q->residual_low) *
-                               q->inverse_low - q->dual_low;
-            if (q->dual_high > 0)
-                q->load -= (target - q->correction_high - q->dual_high * q->residual_high) *
-                               q->inverse_high - q->dual_high;
-        }
+    for (int i = 0; i < e->length * ROWS; i++) {
+        mhe_row *q = k->rows + i;
+        q->load = 0;
+        if (q->dual_low > 0)
+            q->load += (target - q->correction_low - q->dual_low * q->residual_low) *
+                           q->inverse_low - q->dual_low;
+        if (q->dual_high > 0)
+            q->load -= (target - q->correction_high - q->dual_high * q->residual_high) *
+                           q->inverse_high - q->dual_high;
+    }
     memcpy(k->direction, k->residual, sizeof(real) * (size_t)(e->length + 1) * NX);
     mhe_add_loads(e, k, k->direction);
 }
@@ -265,70 +240,73 @@ static void mhe_changes(const mhe_row *q, real target, real *changes)
 }
 
 /* Solve the QP whose limits and terms are in place; `step` holds the minimiser without
- * inequalities and `promise` its |g'd|. A dual variable of 0 marks a side that is not there. */
+ * inequalities and `promise` its |g'd|. A dual variable of 0 marks a side that is not there.
+ * No unit matters: rows are compared with their scales, products of slacks and duals with what
+ * the objective has to gain or to pay, gradients with the roots of the Hessian's diagonal. */
 static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const real *offset,
                               int nearest, real promise, int limit, int *iterations)
 {
     const mhe_settings *s = e->settings;
-    const int count = e->length, size = (count + 1) * NX;
+    const int count = e->length, size = (count + 1) * NX, rows = count * ROWS;
     const real missed = mhe_row_violation(e, k, k->step);
-    const real scale = nearest ? missed * missed : promise;
-    const real primal_tolerance = s->solver_tolerance / 100;
-    real steepest = 0, products = 0;
+    real products = 0;
     int sides = 0;
-    for (int i = 0; i < count; i++)
-        for (int r = 0; r < ROWS; r++) {
-            mhe_row *q = k->rows + i * ROWS + r;
-            q->dual_low = q->dual_high = 0;
-            q->slack_low = q->slack_high = 1;
-            q->residual_low = q->residual_high = 0;
-            if (isfinite(q->low)) q->slack_low = fmax(-q->low, missed), sides++;
-            if (isfinite(q->high)) q->slack_high = fmax(q->high, missed), sides++;
-        }
-    if (!sides) return SOLVED;
+    memset(k->step, 0, sizeof(real) * (size_t)size);
+    const real outside = mhe_row_violation(e, k, k->step);
+    const real scale = fmax(promise, outside * outside);
     /* Generous products: from smaller ones it creeps on some QPs. */
     const real start = fmax(scale, EPSILON * EPSILON);
-    for (int i = 0; i < count; i++)
-        for (int r = 0; r < ROWS; r++) {
-            mhe_row *q = k->rows + i * ROWS + r;
-            if (isfinite(q->low)) q->dual_low = start / q->slack_low;
-            if (isfinite(q->high)) q->dual_high = start / q->slack_high;
+    for (int i = 0; i < rows; i++) {
+        mhe_row *q = k->rows + i;
+        q->dual_low = q->dual_high = 0;
+        q->slack_low = q->slack_high = 1;
+        q->residual_low = q->residual_high = 0;
+        if (isfinite(q->low)) {
+            q->slack_low = fmax(-q->low, missed * q->scale);
+            q->dual_low = start / q->slack_low;
+            sides++;
         }
-    memset(k->step, 0, sizeof(real) * (size_t)size);
+        if (isfinite(q->high)) {
+            q->slack_high = fmax(q->high, missed * q->scale);
+            q->dual_high = start / q->slack_high;
+            sides++;
+        }
+    }
+    if (!sides) return SOLVED;
     for (*iterations = 0;; ++*iterations) {
         real infeasible = 0, unbalanced = 0, length = 1, after = 0;
         mhe_build(e, k, offset, nearest);
         mhe_hessian_times(k, count, k->step, k->product);
         mhe_rows_times(e, k, k->step);
         products = 0;
-        for (int i = 0; i < count; i++)
-            for (int r = 0; r < ROWS; r++) {
-                mhe_row *q = k->rows + i * ROWS + r;
-                q->correction_low = q->correction_high = 0;
-                q->weight = 0;
-                if (q->dual_low > 0) {
-                    q->residual_low = q->value - q->low - q->slack_low;
-                    infeasible = fmax(infeasible, fabs(q->residual_low));
-                    products += q->slack_low * q->dual_low;
-                    q->inverse_low = 1 / q->slack_low;
-                    q->weight += q->dual_low * q->inverse_low;
-                }
-                if (q->dual_high > 0) {
-                    q->residual_high = q->high - q->value - q->slack_high;
-                    infeasible = fmax(infeasible, fabs(q->residual_high));
-                    products += q->slack_high * q->dual_high;
-                    q->inverse_high = 1 / q->slack_high;
-                    q->weight += q->dual_high * q->inverse_high;
-                }
-                q->load = q->dual_low - q->dual_high;
+        for (int i = 0; i < rows; i++) {
+            mhe_row *q = k->rows + i;
+            q->correction_low = q->correction_high = 0;
+            q->weight = 0;
+            if (q->dual_low > 0) {
+                q->residual_low = q->value - q->low - q->slack_low;
+                infeasible = fmax(infeasible, fabs(q->residual_low) / q->scale);
+                products += q->slack_low * q->dual_low;
+                q->inverse_low = 1 / q->slack_low;
+                q->weight += q->dual_low * q->inverse_low;
             }
-        for (int j = 0; j < size; j++) {
-            k->residual[j] = -k->product[j] - k->gradient[j];
-            steepest = fmax(steepest, fabs(k->gradient[j]));
+            if (q->dual_high > 0) {
+                q->residual_high = q->high - q->value - q->slack_high;
+                infeasible = fmax(infeasible, fabs(q->residual_high) / q->scale);
+                products += q->slack_high * q->dual_high;
+                q->inverse_high = 1 / q->slack_high;
+                q->weight += q->dual_high * q->inverse_high;
+            }
+            q->load = q->dual_low - q->dual_high;
         }
+        for (int j = 0; j < size; j++) k->residual[j] = -k->product[j] - k->gradient[j];
         mhe_add_loads(e, k, k->residual);
-        for (int j = 0; j < size; j++) unbalanced = fmax(unbalanced, fabs(k->residual[j]));
-        if (infeasible <= primal_tolerance && unbalanced <= s->solver_tolerance * (1 + steepest) &&
+        for (int j = 0; j < size; j++) {
+            const real curvature = k->panels[j * WIDTH + j % NX];
+            unbalanced = fmax(unbalanced, k->residual[j] * k->residual[j] / curvature);
+        }
+        if (infeasible <= s->solver_tolerance / 100 &&
+            unbalanced <= s->solver_tolerance * s->solver_tolerance * scale &&
             products <= s->solver_tolerance / 1000 * scale)
             return SOLVED;
         if (*iterations >= limit) return STOPPED;
@@ -340,55 +318,52 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
             if (!mhe_solve(k, count, k->direction)) return *iterations ? STOPPED : FAILED;
             mhe_rows_times(e, k, k->direction);
             mhe_ratio worst = {1, 1};
-            for (int i = 0; i < count; i++)
-                for (int r = 0; r < ROWS; r++) {
-                    const mhe_row *q = k->rows + i * ROWS + r;
-                    real change[4];
-                    mhe_changes(q, target, change);
-                    mhe_meet(&worst, q->slack_low, change[0]);
-                    mhe_meet(&worst, q->dual_low, change[1]);
-                    mhe_meet(&worst, q->slack_high, change[2]);
-                    mhe_meet(&worst, q->dual_high, change[3]);
-                }
+            for (int i = 0; i < rows; i++) {
+                const mhe_row *q = k->rows + i;
+                real change[4];
+                mhe_changes(q, target, change);
+                mhe_meet(&worst, q->slack_low, change[0]);
+                mhe_meet(&worst, q->dual_low, change[1]);
+                mhe_meet(&worst, q->slack_high, change[2]);
+                mhe_meet(&worst, q->dual_high, change[3]);
+            }
             length = worst.variable / worst.decrease;
             if (corrector) break;
             after = 0;
-            for (int i = 0; i < count; i++)
-                for (int r = 0; r < ROWS; r++) {
-                    mhe_row *q = k->rows + i * ROWS + r;
-                    real change[4];
-                    mhe_changes(q, target, change);
-                    if (q->dual_low > 0)
-                        after += (q->slack_low + length * change[0]) *
-                                 (q->dual_low + length * change[1]);
-                    if (q->dual_high > 0)
-                        after += (q->slack_high + length * change[2]) *
-                                 (q->dual_high + length * change[3]);
-                    /* Of a step that was cut short, the second order would be misleading:
-                     * with the whole of it there are QPs on which it cycles. */
-                    q->correction_low = length * length * change[0] * change[1];
-                    q->correction_high = length * length * change[2] * change[3];
-                }
+            for (int i = 0; i < rows; i++) {
+                mhe_row *q = k->rows + i;
+                real change[4];
+                mhe_changes(q, target, change);
+                if (q->dual_low > 0)
+                    after += (q->slack_low + length * change[0]) *
+                             (q->dual_low + length * change[1]);
+                if (q->dual_high > 0)
+                    after += (q->slack_high + length * change[2]) *
+                             (q->dual_high + length * change[3]);
+                /* Of a step that was cut short, the second order would be misleading:
+                 * with the whole of it there are QPs on which it cycles. */
+                q->correction_low = length * length * change[0] * change[1];
+                q->correction_high = length * length * change[2] * change[3];
+            }
             const real ratio = after / products;
             target = ratio * ratio * ratio * products / sides;
         }
         length *= (real)0.995;
         if (!(length > 1e-10)) return STOPPED;
         for (int j = 0; j < size; j++) k->step[j] += length * k->direction[j];
-        for (int i = 0; i < count; i++)
-            for (int r = 0; r < ROWS; r++) {
-                mhe_row *q = k->rows + i * ROWS + r;
-                real change[4];
-                mhe_changes(q, target, change);
-                if (q->dual_low > 0) {
-                    q->slack_low += length * change[0];
-                    q->dual_low += length * change[1];
-                }
-                if (q->dual_high > 0) {
-                    q->slack_high += length * change[2];
-                    q->dual_high += length * change[3];
-                }
+        for (int i = 0; i < rows; i++) {
+            mhe_row *q = k->rows + i;
+            real change[4];
+            mhe_changes(q, target, change);
+            if (q->dual_low > 0) {
+                q->slack_low += length * change[0];
+                q->dual_low += length * change[1];
             }
+            if (q->dual_high > 0) {
+                q->slack_high += length * change[2];
+                q->dual_high += length * change[3];
+            }
+        }
     }
 }
 

@@ -3,13 +3,22 @@
 static const real mhe_lengths[] = MHE_LENGTHS;
 
 typedef struct {
-    mhe_trial *reference, *best, *spare; /* best may be the reference */
-    int events, qps, iterations, corrections, dropped, sets;
+    mhe_trial *candidate, *best, *spare; /* best may be the candidate */
+    int outside; /* the candidate misses rows: as a trial, it has no finite cost */
+    int events, qps, iterations, corrections, nearest_points, rows_dropped;
 } mhe_outcome;
 
-static real mhe_target(const mhe_trial *best)
+/* Cost of the best trajectory as a trial. */
+static real mhe_best_cost(const mhe_outcome *o)
 {
-    return isfinite(best->cost) ? best->cost - MHE_ROUNDING * best->cost : INFINITY;
+    return o->outside && o->best == o->candidate ? INFINITY : o->best->cost;
+}
+
+/* The cost below which a trial is better than the best one. */
+static real mhe_target(const mhe_outcome *o)
+{
+    const real cost = mhe_best_cost(o);
+    return isfinite(cost) ? cost - MHE_ROUNDING * cost : INFINITY;
 }
 
 /* Judge best + length * step. */
@@ -17,29 +26,30 @@ static void mhe_try(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o, re
 {
     for (int j = 0; j < (e->length + 1) * NX; j++)
         o->spare->x[j] = o->best->x[j] + length * k->step[j];
-    mhe_evaluate(e, k->factors, o->sets, o->spare);
+    mhe_evaluate(e, k, o->spare);
 }
 
 /* The spare trial becomes the best one. */
 static void mhe_take(mhe_workspace *k, mhe_outcome *o)
 {
     mhe_trial *free = o->best;
-    if (free == o->reference)
+    if (free == o->candidate)
         for (int i = 0; i < 3; i++)
-            if (k->trials + i != o->reference && k->trials + i != o->spare) free = k->trials + i;
+            if (k->trials + i != o->candidate && k->trials + i != o->spare) free = k->trials + i;
     o->best = o->spare;
     o->spare = free;
 }
 
-/* Terms along the best trajectory; whether the model has finite Jacobians there. */
-static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o, int candidate)
+/* Terms along the best trajectory, where the candidate's are known; whether the model has finite
+ * Jacobians there. */
+static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
 {
     for (int i = 0; i < e->length; i++) {
         mhe_stage *stage = mhe_stage_at(e, i);
         mhe_terms *t = k->terms + i;
         real next[NX], output[NY];
-        k->at[i] = candidate ? &stage->terms : t;
-        if (candidate) continue;
+        k->at[i] = o->best == o->candidate ? &stage->terms : t;
+        if (o->best == o->candidate) continue;
         mhe_f_jacobian(o->best->x + i * NX, stage->u, stage->step, next, t->f_jacobian);
         mhe_h_jacobian(o->best->x + i * NX, stage->u, output, t->h_jacobian);
         if (!mhe_all_finite(NX * NX, t->f_jacobian) || !mhe_all_finite(NY * NX, t->h_jacobian))
@@ -47,14 +57,19 @@ static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *
         mhe_set_terms(e->settings, stage->noise_weight, o->best->w + i * NX,
                       o->best->v + i * NY, t);
     }
+#if CONSTRAINED
+    mhe_set_limits(e, k, o->best->w, o->best->v);
+#endif
     return 1;
 }
 
 /* Solve the QP around the best trajectory; the increments are in k->step. */
-static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, const real *offset,
-                        int nearest)
+static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int nearest)
 {
     const int size = (e->length + 1) * NX;
+    const real *prior = mhe_stage_at(e, 0)->z;
+    real offset[NX];
+    for (int j = 0; j < NX; j++) offset[j] = o->best->x[j] - prior[j];
     mhe_build(e, k, offset, nearest);
     for (int j = 0; j < size; j++) k->step[j] = -k->gradient[j];
     if (!mhe_factorise(k, e->length) || !mhe_solve(k, e->length, k->step)) return FAILED;
@@ -69,8 +84,6 @@ static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, cons
         o->iterations += iterations;
         return status;
     }
-#else
-    (void)o;
 #endif
     return SOLVED;
 }
@@ -83,7 +96,11 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
     const int count = e->length;
     real *w = k->bent.w, *v = k->bent.v, *d = k->product;
     for (int j = 0; j < (count + 1) * NX; j++) d[j] = o->spare->x[j] - o->best->x[j];
-    const real missed = 2 * mhe_row_violation(e, k, d);
+    mhe_rows_times(e, k, d);
+    for (int i = 0; i < count * ROWS; i++) {
+        mhe_row *row = k->rows + i;
+        row->load = 2 * fmax(0, fmax(row->low - row->value, row->value - row->high));
+    }
     for (int i = 0; i < count; i++) {
         const mhe_terms *t = k->at[i];
         for (int j = 0; j < NX; j++) {
@@ -99,123 +116,174 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
             v[at] = o->best->v[at] + (o->spare->v[at] - linear);
         }
     }
-    mhe_set_limits(e, k, o->sets, w, v);
+    mhe_set_limits(e, k, w, v);
     for (int i = 0; i < count; i++) {
         mhe_row *rows = k->rows + i * ROWS;
-        for (int r = 0; r < ROWS; r++) rows[r].load = missed;
 #if MHE_W_SET
         real disturbance[NX];
         for (int j = 0; j < NX; j++) disturbance[j] = w[i * NX + j] - o->best->w[i * NX + j];
         mhe_values_of(NX, MHE_W_ROWS, disturbance, e->settings->disturbances.rows, rows);
-        for (int r = 0; r < W_COUNT; r++) rows[r].load += MHE_BEYOND * fabs(rows[r].value);
 #endif
 #if MHE_V_SET
-        mhe_row *own = rows + W_COUNT;
         real noise[NY];
         for (int j = 0; j < NY; j++) noise[j] = v[i * NY + j] - o->best->v[i * NY + j];
-        mhe_values_of(NY, MHE_V_ROWS, noise, e->settings->noises.rows, own);
-        for (int r = 0; r < V_COUNT; r++) own[r].load += MHE_BEYOND * fabs(own[r].value);
+        mhe_values_of(NY, MHE_V_ROWS, noise, e->settings->noises.rows, rows + W_COUNT);
 #endif
-        for (int r = 0; r < ROWS; r++)
+        for (int r = 0; r < ROWS; r++) {
+            rows[r].load += MHE_BEYOND * fabs(rows[r].value);
             if (rows[r].high - rows[r].low > 4 * rows[r].load) {
                 rows[r].low += rows[r].load;
                 rows[r].high -= rows[r].load;
             }
+        }
     }
 }
 
-/* The nearest trajectory that satisfies the linearised sets; whether it does the true ones. */
-static int mhe_project(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, const real *offset)
+/* Second-order corrections of the spare trial, which curvature takes out of a set. */
+static void mhe_correct(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
 {
-    mhe_linearize(e, k, o, 1);
-    mhe_set_limits(e, k, o->sets, o->best->w, o->best->v);
-    for (int attempt = 0;; attempt++) {
-        if (mhe_solve_qp(e, k, o, offset, 1) == FAILED) return 0;
-        mhe_try(e, k, o, 1);
-        if (isfinite(o->spare->cost)) return 1;
-        if (!isfinite(o->spare->violation) || attempt == MHE_CORRECTIONS) return 0;
+    memcpy(k->bent.x, k->step, sizeof k->step);
+    for (int i = 0; i < MHE_CORRECTIONS; i++) {
         mhe_bend(e, k, o);
+        const int failed = mhe_solve_qp(e, k, o, 0) == FAILED;
         o->corrections++;
+        if (failed) break;
+        mhe_try(e, k, o, 1);
+        if (isfinite(o->spare->cost) || !isfinite(o->spare->violation)) break;
     }
+    memcpy(k->step, k->bent.x, sizeof k->step);
 }
 #endif
 
-/* Solve one QP and judge its iterate; whether another QP is worth while. */
-static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int candidate)
+/* Make the spare trial the first one along the step whose cost is below the best so far, or the
+ * last one. A negligible step is not shortened: at a minimum none lowers the cost by more than
+ * rounding. */
+static void mhe_lower(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int negligible)
 {
-    const mhe_settings *s = e->settings;
-    const real *prior = mhe_stage_at(e, 0)->z;
-    real offset[NX];
-    if (!mhe_linearize(e, k, o, candidate)) {
+    const int count = (int)(sizeof mhe_lengths / sizeof *mhe_lengths);
+    const real target = mhe_target(o);
+    mhe_try(e, k, o, 1);
+    if (o->spare->cost < target) return;
+#if CONSTRAINED
+    if (o->spare->violation > 0 && isfinite(o->spare->violation)) {
+        const int nearly = o->spare->violation <= MHE_NEARLY;
+        if (nearly) mhe_try(e, k, o, mhe_lengths[0]);
+        /* If the shortened step leaves the set, too, curvature is the reason. */
+        if (!(o->spare->cost < target) && !negligible) {
+            if (nearly) mhe_try(e, k, o, 1);
+            mhe_correct(e, k, o);
+        }
+        if (o->spare->cost < target) return;
+    }
+    /* Between two infeasible points there is no feasible one of a convex set. */
+    if (o->best->violation > MHE_FEASIBLE) return;
+#endif
+    for (int i = 0; i < count && !negligible; i++) {
+        mhe_try(e, k, o, mhe_lengths[i]);
+        if (o->spare->cost < target) return;
+    }
+}
+
+/* Solve one QP and take its step; whether another QP is worth while. */
+static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
+{
+    if (!mhe_linearize(e, k, o)) {
         o->events |= MHE_MODEL_FAILED;
         return 0;
     }
-    for (int j = 0; j < NX; j++) offset[j] = o->best->x[j] - prior[j];
-#if CONSTRAINED
-    mhe_set_limits(e, k, o->sets, o->best->w, o->best->v);
-#endif
-    const int status = mhe_solve_qp(e, k, o, offset, 0);
+    const int status = mhe_solve_qp(e, k, o, 0), solved = status == SOLVED;
     o->qps++;
     if (status == FAILED) {
         o->events |= MHE_SOLVER_FAILED;
         return 0;
     }
-    const int solved = status == SOLVED;
-    const real before = o->best->cost, target = mhe_target(o->best);
-    real enough = s->tolerance * (before + s->tolerance);
-    if (!isfinite(enough)) enough = -1; /* nothing converges to what cannot be judged */
     if (!solved) o->events |= MHE_SOLVER_STOPPED;
+    const real before = mhe_best_cost(o), target = mhe_target(o);
+    /* Where the cost is infinite, no decrease is negligible. */
+    const real negligible = isfinite(before) ? e->settings->tolerance * before : -1;
     const real promised = fabs(mhe_dot((e->length + 1) * NX, k->gradient, k->step));
-    mhe_try(e, k, o, 1);
-#if CONSTRAINED
-    if (!(o->spare->cost < target) && o->spare->violation > 0 &&
-        isfinite(o->spare->violation)) {
-        int bend = 1;
-        if (o->spare->violation <= MHE_NEARLY) {
-            mhe_try(e, k, o, mhe_lengths[0]);
-            bend = !(o->spare->cost < target);
-            if (bend) mhe_try(e, k, o, 1);
-        }
-        if (bend && !(solved && promised <= enough)) {
-            memcpy(k->bent.x, k->step, sizeof k->step);
-            for (int i = 0; i < MHE_CORRECTIONS; i++) {
-                mhe_bend(e, k, o);
-                const int failed = mhe_solve_qp(e, k, o, offset, 0) == FAILED;
-                o->corrections++;
-                if (failed) break;
-                mhe_try(e, k, o, 1);
-                if (isfinite(o->spare->cost) || !isfinite(o->spare->violation)) break;
-            }
-            memcpy(k->step, k->bent.x, sizeof k->step);
-        }
-    }
-#endif
-    if (!(o->spare->cost < target)) {
-        const int count = (int)(sizeof mhe_lengths / sizeof *mhe_lengths);
-        int i = 0;
-        /* Near a minimum the cost cannot be lowered beyond its rounding: not a failure. */
-        if (solved && promised <= enough) {
-            o->events |= MHE_CONVERGED;
-            return 0;
-        }
-        for (; i < count; i++) {
-            mhe_try(e, k, o, mhe_lengths[i]);
-            if (o->spare->cost < target) break;
-        }
-        if (i == count) {
-            const int stalled = solved && promised <= MHE_STALLED * enough;
-            o->events |= stalled ? MHE_CONVERGED : MHE_NO_DECREASE;
-            return 0;
-        }
-    }
-    mhe_take(k, o);
-    o->events |= MHE_IMPROVED;
-    if (solved && before - o->best->cost <= enough) {
+    mhe_lower(e, k, o, solved && promised <= negligible);
+    if (o->spare->cost < target) {
+        const real lowered = before - o->spare->cost;
+        mhe_take(k, o);
+        if (!solved || !(lowered <= negligible)) return 1;
         o->events |= MHE_CONVERGED;
         return 0;
     }
-    return 1;
+    real little = MHE_STALLED * negligible;
+    if (isfinite(before)) little = fmax(little, mhe_rounding_cost(e, k, o->best));
+    o->events |= solved && promised <= little ? MHE_CONVERGED : MHE_NO_DECREASE;
+    return 0;
 }
+
+/* The previous estimate, moved on by one step of the model; whether it is worth a start. */
+static int mhe_shift(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
+{
+    const int count = e->length, skipped = before + 2 - (count + 1);
+    mhe_stage *last = mhe_stage_at(e, count - 1);
+    real *x = o->spare->x;
+    memcpy(x, e->trajectory + skipped * NX, sizeof(real) * (size_t)count * NX);
+    mhe_f(x + (count - 1) * NX, last->u, last->step, x + count * NX);
+    mhe_evaluate(e, k, o->spare);
+    return o->spare->cost < mhe_target(o);
+}
+
+/* At most so many QPs, each around the best trajectory so far. `before`: stages of the window
+ * that the kept trajectory belongs to, -1 if there is none to start at. */
+static void mhe_search(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before, int limit)
+{
+    if (before >= 0 && mhe_shift(e, k, o, before)) mhe_take(k, o);
+    while (limit-- > 0 && mhe_improve_once(e, k, o)) continue;
+}
+
+#if CONSTRAINED
+/* Go back to the candidate. */
+static void mhe_give_up(mhe_workspace *k, mhe_outcome *o)
+{
+    o->best = o->candidate;
+    o->spare = k->trials + 1;
+}
+
+/* Look for a feasible trajectory near the infeasible candidate; whether one was found. */
+static int mhe_to_nearest_point(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
+{
+    for (int i = 0; i < MHE_NEAREST_POINTS; i++) {
+        if (!mhe_linearize(e, k, o)) break;
+        const int status = mhe_solve_qp(e, k, o, 1);
+        o->nearest_points++;
+        if (status == FAILED) break;
+        mhe_try(e, k, o, 1);
+        const int feasible = isfinite(o->spare->cost);
+        if (!feasible && !(o->spare->violation < o->best->violation)) break;
+        mhe_take(k, o);
+        if (feasible) return 1;
+    }
+    mhe_give_up(k, o);
+    return 0;
+}
+
+/* The sequence from a candidate outside of the sets. */
+static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
+{
+    const int limit = e->settings->max_qps;
+    o->outside = 1;
+    mhe_search(e, k, o, before, limit);
+    if (!isfinite(mhe_best_cost(o)) && mhe_to_nearest_point(e, k, o))
+        mhe_search(e, k, o, -1, limit - o->qps);
+    o->outside = 0;
+    if (o->best != o->candidate && o->best->cost <= o->candidate->cost) return;
+    mhe_give_up(k, o);
+    if (e->settings->infeasible == MHE_KEEP_CANDIDATE) return;
+    o->events &= ~(MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED);
+    mhe_violation(e, o->candidate, 0, k->left_out);
+    mhe_search(e, k, o, before, limit > o->qps + 1 ? limit - o->qps : 1);
+    memset(k->left_out, 0, sizeof k->left_out);
+    if (o->best == o->candidate || !(mhe_violation(e, o->best, 0, k->left_out) > MHE_FEASIBLE))
+        return;
+    o->rows_dropped = 1;
+    o->events |= MHE_ROWS_DROPPED;
+}
+#endif
 
 /* The candidate as a trial: its cost is known already. */
 static void mhe_set_candidate(mhe_estimator *e, mhe_workspace *k, mhe_trial *trial)
@@ -233,22 +301,13 @@ static void mhe_set_candidate(mhe_estimator *e, mhe_workspace *k, mhe_trial *tri
     /* No cost is NaN, but 0 times infinity is where a discount underflows. */
     if (isnan(trial->cost)) trial->cost = INFINITY;
     memcpy(trial->x + count * NX, e->z_end, sizeof e->z_end);
+#if CONSTRAINED
+    memset(k->left_out, 0, sizeof k->left_out);
+    trial->violation = mhe_violation(e, trial, 0, 0);
+#endif
 }
 
-/* The previous estimate, moved on by one step of the model; whether it is worth a start. */
-static int mhe_shift(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
-{
-    const int count = e->length, skipped = before + 2 - (count + 1);
-    mhe_stage *last = mhe_stage_at(e, count - 1);
-    real *x = o->spare->x;
-    memcpy(x, e->trajectory + skipped * NX, sizeof(real) * (size_t)count * NX);
-    mhe_f(x + (count - 1) * NX, last->u, last->step, x + count * NX);
-    mhe_evaluate(e, k->factors, o->sets, o->spare);
-    return o->spare->cost < mhe_target(o->best);
-}
-
-/* Solve the window's problem as it stands. `before`: stages of the window that the kept
- * trajectory belongs to, -1 if there is none to start at. */
+/* Solve the window's problem as it stands; `before` as for the search. */
 static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
 {
     const mhe_settings *s = e->settings;
@@ -258,42 +317,19 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
         factor *= s->discount;
     }
     k->factors[0] = factor;
-    o->reference = o->best = k->trials;
+    memset(o, 0, sizeof *o);
+    o->candidate = o->best = k->trials;
     o->spare = k->trials + 1;
-    o->events = o->qps = o->iterations = o->corrections = o->dropped = 0;
-    o->sets = ALL_SETS;
-    mhe_set_candidate(e, k, o->reference);
-    int candidate = 1;
+    mhe_set_candidate(e, k, o->candidate);
 #if CONSTRAINED
-    int violated;
-    mhe_violation(e, o->best, ALL_SETS, &violated);
-    if (violated && s->outside == MHE_KEEP) {
-        o->events |= MHE_CANDIDATE | MHE_CANDIDATE_OUTSIDE;
-        return;
-    }
-    if (violated) {
-        const real offset[NX] = {0};
-        if (s->outside == MHE_PROJECT && s->max_qps > 0 && mhe_project(e, k, o, offset)) {
-            o->reference = o->best = o->spare;
-            o->spare = k->trials + 2;
-            o->events |= MHE_CANDIDATE_OUTSIDE;
-            candidate = 0;
-        } else {
-            o->sets &= ~violated;
-            o->dropped = violated;
-            o->events |= MHE_ROWS_DROPPED;
-        }
-    }
+    const int feasible = o->candidate->violation <= MHE_FEASIBLE;
+    if (!feasible) o->events |= MHE_CANDIDATE_OUTSIDE;
+    if (!feasible && s->max_qps > 0) mhe_restore(e, k, o, before);
+    else
 #endif
-    if (s->max_qps == 0) {
-        o->events |= MHE_CANDIDATE | MHE_NO_QPS;
-        return;
-    }
-    if (before >= 0 && mhe_shift(e, k, o, before)) {
-        mhe_take(k, o);
-        o->events |= MHE_IMPROVED;
-        candidate = 0;
-    }
-    while (o->qps < s->max_qps && mhe_improve_once(e, k, o, candidate)) candidate = 0;
-    if (!(o->events & MHE_IMPROVED)) o->events |= MHE_CANDIDATE;
+    if (s->max_qps == 0)
+        o->events |= MHE_NO_QPS;
+    else
+        mhe_search(e, k, o, before, s->max_qps);
+    o->events |= o->best != o->candidate ? MHE_IMPROVED : MHE_CANDIDATE;
 }

@@ -6,6 +6,18 @@ static void mhe_remember(mhe_estimator *e, const real *state)
     memcpy(e->history + e->newest * NX, state, sizeof(real) * NX);
 }
 
+/* Count for how many samples running the observer was far from the estimate, or rows dropped. */
+static void mhe_watch(mhe_estimator *e, mhe_outcome *o)
+{
+    real offset[NX];
+    for (int j = 0; j < NX; j++)
+        offset[j] = o->best->x[e->length * NX + j] - o->candidate->x[e->length * NX + j];
+    const int far = mhe_form(NX, e->settings->prior_weight, offset) > MHE_FAR * MHE_FAR;
+    e->far = far ? e->far + (e->far < INT32_MAX) : 0;
+    e->dropped = o->rows_dropped ? e->dropped + (e->dropped < INT32_MAX) : 0;
+    if (e->far >= MHE_HORIZON) o->events |= MHE_OBSERVER_FAR;
+}
+
 /* Estimate on the window as it stands, and keep what the next step needs. */
 static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int failed,
                              int before)
@@ -13,18 +25,27 @@ static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
     const mhe_stage *newest = mhe_stage_at(e, e->length - 1);
     const size_t size = sizeof(real) * (size_t)(e->length + 1) * NX;
     mhe_improve(e, k, o, before);
-    const int held = !isfinite(newest->cost), judged = isfinite(o->reference->cost);
     if (!newest->is_complete) o->events |= MHE_MISSING;
-    if (held || failed)
-        o->events |= MHE_MODEL_FAILED;
-    else if (!judged)
-        o->events |= MHE_FAILED_STAGE;
-    if (!judged) o->events &= ~MHE_NO_DECREASE;
+    o->events |= failed;
+    if (!isfinite(o->candidate->cost)) {
+        o->events &= ~MHE_NO_DECREASE; /* the model failed, not the solver */
+        if (!(o->events & MHE_MODEL_FAILED)) o->events |= MHE_FAILED_STAGE;
+    }
+    mhe_watch(e, o);
     memcpy(e->trajectory, o->best->x, size);
     e->has_trajectory = 1;
-    e->dropped = o->dropped;
-    if (held && o->best != o->reference)
+    if (!isfinite(newest->cost) && o->best != o->candidate)
         memcpy(e->z_end, o->best->x + e->length * NX, sizeof e->z_end);
+}
+
+/* The estimate of x(t) that has used y(t): of a kept candidate, the observer's own. */
+static void mhe_filtered(mhe_estimator *e, const mhe_outcome *o, real *out)
+{
+    const mhe_stage *newest = mhe_stage_at(e, e->length - 1);
+    const int kept = o->best == o->candidate;
+    for (int j = 0; j < NX; j++)
+        out[j] = o->best->x[(e->length - 1) * NX + j] +
+                 (kept ? mhe_dot(NY, e->settings->filter_gain + j * NY, newest->v) : 0);
 }
 
 static void mhe_step(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u,
@@ -43,13 +64,14 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const real *y, const re
     mhe_remember(e, o->best->x + e->length * NX);
 }
 
-static void mhe_fill(mhe_estimator *e, const mhe_outcome *o, mhe_estimate *out)
+static void mhe_fill(mhe_estimator *e, const mhe_workspace *k, const mhe_outcome *o,
+                     mhe_estimate *out)
 {
     const int count = e->length;
     const mhe_trial *best = o->best;
     const size_t states = sizeof(real) * (size_t)(count + 1) * NX;
     memcpy(out->trajectory, best->x, states);
-    memcpy(out->candidate, o->reference->x, states);
+    memcpy(out->candidate, o->candidate->x, states);
     memcpy(out->disturbances, best->w, sizeof(real) * (size_t)count * NX);
     memcpy(out->noises, best->v, sizeof(real) * (size_t)count * NY);
     for (int i = 0; i < count; i++) {
@@ -59,14 +81,23 @@ static void mhe_fill(mhe_estimator *e, const mhe_outcome *o, mhe_estimate *out)
             if (!stage->is_observed[j]) out->noises[i * NY + j] = NAN;
     }
     out->cost = best->cost;
-    out->candidate_cost = o->reference->cost;
+    out->candidate_cost = o->candidate->cost;
     out->time = e->time - 1;
     out->length = count;
     out->status = o->events;
     out->qps = o->qps;
     out->iterations = o->iterations;
     out->corrections = o->corrections;
-    out->dropped = o->dropped;
+    out->nearest_points = o->nearest_points;
+    mhe_filtered(e, o, out->filtered);
+#if CONSTRAINED
+    if (o->rows_dropped)
+        memcpy(out->dropped, k->left_out, sizeof out->dropped);
+    else
+        memset(out->dropped, 0, sizeof out->dropped);
+#else
+    (void)k;
+#endif
 }
 
 void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
@@ -83,7 +114,7 @@ void mhe_update_special(mhe_estimator *e, mhe_workspace *k, const real *y, const
 {
     mhe_outcome outcome;
     mhe_step(e, k, y, u, step, noise_weight, &outcome);
-    mhe_fill(e, &outcome, out);
+    mhe_fill(e, k, &outcome, out);
 }
 
 void mhe_update(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u,
@@ -121,11 +152,11 @@ int mhe_amend(mhe_estimator *e, mhe_workspace *k, int64_t time, const real *y,
             stage->is_observed[j] = 1;
         }
     mhe_set_noise_weight(e->settings, stage);
-    mhe_replay(e, i);
+    const int failed = mhe_replay(e, i);
     /* The kept trajectory does not belong to the window before this one. */
-    mhe_estimate_now(e, k, &outcome, 0, -1);
+    mhe_estimate_now(e, k, &outcome, failed, -1);
     memcpy(e->history + e->newest * NX, outcome.best->x + e->length * NX, sizeof(real) * NX);
-    mhe_fill(e, &outcome, out);
+    mhe_fill(e, k, &outcome, out);
     return 0;
 }
 
@@ -142,12 +173,12 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64
             const real *newest = o.best->x + count * NX;
             for (int j = 0; j < NX; j++) {
                 if (log->states) log->states[at * NX + j] = newest[j];
-                if (log->filtered) log->filtered[at * NX + j] = newest[j - NX];
                 if (log->delayed)
                     log->delayed[at * NX + j] = delay <= count ? newest[j - delay * NX] : NAN;
             }
+            if (log->filtered) mhe_filtered(e, &o, log->filtered + at * NX);
             if (log->costs) log->costs[at] = o.best->cost;
-            if (log->candidate_costs) log->candidate_costs[at] = o.reference->cost;
+            if (log->candidate_costs) log->candidate_costs[at] = o.candidate->cost;
             if (log->status) log->status[at] = o.events;
             if (log->qps) log->qps[at] = o.qps;
             if (log->iterations) log->iterations[at] = o.iterations;

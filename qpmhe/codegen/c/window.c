@@ -192,86 +192,110 @@ static int mhe_push(mhe_estimator *e, const real *y, const real *u, real step,
     return outcome;
 }
 
-enum { DISTURBANCES = 1, NOISES = 2, ALL_SETS = 3 };
-
 #define CONSTRAINED (MHE_W_SET || MHE_V_SET)
 
 #if CONSTRAINED
-/* The largest amount by which s leaves a set, less the rounding of a box's component. */
-static real mhe_missed(int n, int count, const real *point, const real *lower,
-                       const real *upper, const real *rows, const real *row_lower,
-                       const real *row_upper, const uint8_t *known, real rounding)
+#define ROWS MHE_STAGE_ROWS
+#define W_COUNT (MHE_W_SET * (NX + MHE_W_ROWS))
+#define V_COUNT (MHE_V_SET * (NY + MHE_V_ROWS))
+
+/* How far a point q is from each side of a set: low <= 0 <= high where it is inside. */
+static void mhe_distances(int n, int count, const real *q, const real *lower, const real *upper,
+                          const real *rows, const real *row_lower, const real *row_upper,
+                          const uint8_t *known, real *low, real *high)
 {
-    real worst = 0;
     for (int j = 0; j < n; j++) {
-        if (known && !known[j]) continue;
-        const real low = lower[j] - point[j] - rounding, high = point[j] - upper[j] - rounding;
-        if (!(low <= worst)) worst = low;
-        if (isnan(worst)) return INFINITY;
-        if (!(high <= worst)) worst = high;
-        if (isnan(worst)) return INFINITY;
+        const int there = !known || known[j];
+        low[j] = there ? lower[j] - q[j] : -INFINITY;
+        high[j] = there ? upper[j] - q[j] : INFINITY;
     }
     for (int i = 0; i < count; i++) {
-        int touched = 0;
-        real value = 0;
-        for (int j = 0; j < n; j++) {
-            value += rows[i * n + j] * point[j];
-            touched |= known && !known[j] && rows[i * n + j] != 0;
-        }
-        if (touched) continue;
-        const real low = row_lower[i] - value - rounding, high = value - row_upper[i] - rounding;
-        if (!(low <= worst)) worst = low;
-        if (isnan(worst)) return INFINITY;
-        if (!(high <= worst)) worst = high;
-        if (isnan(worst)) return INFINITY;
+        const real value = mhe_dot(n, rows + i * n, q);
+        int there = 1;
+        for (int j = 0; j < n; j++)
+            if (known && !known[j] && rows[i * n + j] != 0) there = 0;
+        low[n + i] = there ? row_lower[i] - value : -INFINITY;
+        high[n + i] = there ? row_upper[i] - value : INFINITY;
+    }
+}
+
+#define DISTANCES(set, n, count, q, known, low, high) \
+    mhe_distances(n, count, q, (set).lower, (set).upper, (set).rows, (set).row_lower, \
+                  (set).row_upper, known, low, high)
+
+/* The same for all rows of stage i, about residuals w and v of a trajectory. */
+static void mhe_stage_distances(mhe_estimator *e, int i, const real *w, const real *v, real *low,
+                                real *high)
+{
+#if MHE_W_SET
+    DISTANCES(e->settings->disturbances, NX, MHE_W_ROWS, w + i * NX, 0, low, high);
+#endif
+#if MHE_V_SET
+    const mhe_stage *stage = mhe_stage_at(e, i);
+    DISTANCES(e->settings->noises, NY, MHE_V_ROWS, v + i * NY,
+              stage->is_complete ? 0 : stage->is_observed, low + W_COUNT, high + W_COUNT);
+#endif
+    (void)w; (void)v;
+}
+
+/* The largest miss among rows of one set, in their scales. `sizes`: of the numbers whose
+ * differences the rows are of, for rounding. `missed` gets the sides that are. */
+static real mhe_missed(int n, int count, const real *low, const real *high, const real *rows,
+                       const real *scale, const real *row_scale, const real *sizes,
+                       const uint8_t *left_out, uint8_t *missed)
+{
+    real worst = 0;
+    for (int r = 0; r < n + count; r++) {
+        const int side = low[r] > 0 ? MHE_LOWER : high[r] < 0 ? MHE_UPPER : 0;
+        if (isnan(low[r]) || isnan(high[r])) return INFINITY;
+        if (!side || (left_out && left_out[r] & side)) continue;
+        real size = 0;
+        if (r < n)
+            size = fabs(sizes[r]);
+        else
+            for (int j = 0; j < n; j++) size += fabs(rows[(r - n) * n + j] * sizes[j]);
+        const real miss = (side == MHE_LOWER ? low[r] : -high[r]) - 8 * EPSILON * size;
+        const real share = miss / (r < n ? scale[r] : row_scale[r - n]);
+        if (isnan(share)) return INFINITY;
+        worst = fmax(worst, share);
+        if (missed && share > MHE_FEASIBLE) missed[r] = (uint8_t)side;
     }
     return worst;
 }
 
-#define MISSED(set, n, count, point, known, rounding) \
-    mhe_missed(n, count, point, (set).lower, (set).upper, (set).rows, (set).row_lower, \
-               (set).row_upper, known, rounding)
+#define MISSED(set, n, count, low, high, sizes, left_out, missed) \
+    mhe_missed(n, count, low, high, (set).rows, (set).scale, (set).row_scale, sizes, left_out, \
+               missed)
 
-/* How far a trial is outside of the sets of the mask; `violated` names those that it leaves. */
-static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, int sets, int *violated)
+/* The largest miss of a trial in the rows' scales, without the sides that are left out. */
+static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const uint8_t *left_out,
+                          uint8_t *missed)
 {
-    const mhe_settings *s = e->settings;
-    real worst[2] = {0, 0};
+    real worst = 0, low[ROWS], high[ROWS];
     for (int i = 0; i < e->length; i++) {
+        const uint8_t *out = left_out ? left_out + i * ROWS : 0;
+        uint8_t *in = missed ? missed + i * ROWS : 0;
+        mhe_stage_distances(e, i, trial->w, trial->v, low, high);
 #if MHE_W_SET
-        if (sets & DISTURBANCES) {
-            real rounding = 0;
-            for (int j = 0; j < NX; j++) rounding = fmax(rounding, fabs(trial->x[(i + 1) * NX + j]));
-            /* Of a candidate L is known itself, not as a difference of states. */
-            rounding *= violated ? 0 : 8 * EPSILON;
-            worst[0] = fmax(worst[0], MISSED(s->disturbances, NX, MHE_W_ROWS,
-                                             trial->w + i * NX, 0, rounding));
-        }
+        worst = fmax(worst, MISSED(e->settings->disturbances, NX, MHE_W_ROWS, low, high,
+                                   trial->x + (i + 1) * NX, out, in));
 #endif
 #if MHE_V_SET
-        if (sets & NOISES) {
-            const mhe_stage *stage = mhe_stage_at(e, i);
-            worst[1] = fmax(worst[1],
-                            MISSED(s->noises, NY, MHE_V_ROWS, trial->v + i * NY,
-                                   stage->is_complete ? 0 : stage->is_observed, 0));
-        }
+        worst = fmax(worst, MISSED(e->settings->noises, NY, MHE_V_ROWS, low + W_COUNT,
+                                   high + W_COUNT, mhe_stage_at(e, i)->y,
+                                   out ? out + W_COUNT : 0, in ? in + W_COUNT : 0));
 #endif
     }
-    if (violated) {
-        *violated = 0;
-        for (int i = 0; i < 2; i++)
-            if (worst[i] > MHE_FEASIBLE) *violated |= 1 << i;
-    }
-    return fmax(worst[0], worst[1]);
+    return worst;
 }
 #endif
 
 /* Judge the trajectory of a trial by the true model: infinite cost where the model is not
- * finite or a set of the mask is missed. */
-static void mhe_evaluate(mhe_estimator *e, const real *factors, int sets, mhe_trial *trial)
+ * finite or a row is missed. */
+static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
 {
     const mhe_settings *s = e->settings;
-    const real *prior = mhe_stage_at(e, 0)->z;
+    const real *prior = mhe_stage_at(e, 0)->z, *factors = k->factors;
     real offset[NX], cost = 0;
     for (int i = 0; i < e->length; i++) {
         const mhe_stage *stage = mhe_stage_at(e, i);
@@ -294,9 +318,25 @@ static void mhe_evaluate(mhe_estimator *e, const real *factors, int sets, mhe_tr
         return;
     }
 #if CONSTRAINED
-    trial->violation = mhe_violation(e, trial, sets, 0);
+    trial->violation = mhe_violation(e, trial, k->left_out, 0);
     if (trial->violation > MHE_FEASIBLE) trial->cost = INFINITY;
-#else
-    (void)sets;
 #endif
+}
+
+/* What rounding of the residuals of a trial can contribute to its cost. */
+static real mhe_rounding_cost(mhe_estimator *e, const mhe_workspace *k, const mhe_trial *trial)
+{
+    real cost = 0;
+    for (int i = 0; i < e->length; i++) {
+        const mhe_stage *stage = mhe_stage_at(e, i);
+        const real *Q = e->settings->disturbance_weight, *R = stage->noise_weight;
+        const real *x = trial->x + (i + 1) * NX, *y = stage->y;
+        real sum = 0;
+        for (int j = 0; j < NX; j++)
+            for (int l = 0; l < NX; l++) sum += fabs(x[j] * Q[j * NX + l] * x[l]);
+        for (int j = 0; j < NY; j++)
+            for (int l = 0; l < NY; l++) sum += fabs(y[j] * R[j * NY + l] * y[l]);
+        cost += k->factors[i + 1] * sum;
+    }
+    return 64 * EPSILON * EPSILON * cost;
 }
