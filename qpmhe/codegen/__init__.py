@@ -52,8 +52,8 @@ def write(
         Name of the files and prefix of all public names: a C identifier of at most 60 letters,
         and not the name of a system's header, such as ``math``.
     real : {"double", "float"}
-        Precision. In single precision sets are kept to 1e-5, and tolerances are no smaller than
-        what can be told apart.
+        Precision. In single precision inequalities are kept to 1e-5 of their scale, and
+        tolerances are no smaller than what can be distinguished.
 
     Returns
     -------

@@ -258,6 +258,18 @@ def test_steady_state_kalman(name):
         model.system, model.start, disturbance=0.01 * np.eye(n), noise=0.1 * np.eye(p)
     )
     follow(model, both(model, observer=observer))
+    # Where the candidate is kept, the filtered estimate is the filter's own update of it.
+    pair, updated = both(model, observer=observer, max_qps=0), False
+    Y = model.Y[:12].copy()
+    Y[3, 0] = Y[5] = np.nan
+    for t, y in enumerate(Y):
+        weight = 3.0 * np.eye(p) if t == 7 else None
+        expected, found = (one.update(y, noise_weight=weight) for one in pair)
+        close(expected, found)
+        updated |= not np.array_equal(found.filtered, found.trajectory[-2])
+    assert updated
+    runs = [one.run(Y) for one in both(model, observer=observer, max_qps=0)]
+    np.testing.assert_allclose(runs[1].filtered, runs[0].filtered, rtol=1e-10)
 
 
 @pytest.mark.parametrize("method", ["euler", "rk4"])

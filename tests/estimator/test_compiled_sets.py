@@ -327,3 +327,61 @@ def test_sets_of_less_width_than_they_are_kept_to(width):
             system, qpmhe.Luenberger(np.array([[0.05], [-0.05]])), case.cost, horizon=6,
             initial_state=case.start, engine="compiled",
         )
+
+
+def in_units(name, kind, x_unit, y_unit):
+    """A compiled estimator of the same case in other units."""
+    case, _ = case_of(name, kind)
+    S, T, functions = np.asarray(x_unit), np.asarray(y_unit), case.symbolic()
+    system = qpmhe.from_casadi(
+        lambda x: S * functions["f"](x / S), lambda x: T * functions["h"](x / S), n=case.n,
+        compiled=False,
+        **{
+            label: one and qpmhe.model.sets.ConvexSet(
+                one.lower * unit, one.upper * unit, one.matrix / unit, one.row_lower, one.row_upper
+            )
+            for label, one, unit in zip(
+                ("disturbances", "noises"), case.sets[kind][1:], (S, T), strict=True
+            )
+        },
+    )
+    cost = qpmhe.QuadraticCost(
+        prior=case.cost.prior / np.outer(S, S), disturbance=case.cost.disturbance / np.outer(S, S),
+        noise=case.cost.noise / np.outer(T, T),
+    )
+    return qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(case.gain * S[:, None] / T), cost, horizon=case.horizon,
+        initial_state=case.start * S, engine="compiled", max_qps=3,
+    )
+
+
+@pytest.mark.parametrize(("name", "kind"), [("stirred_tank", "tight"), ("van_der_pol", "polytope")])
+def test_no_unit_matters(name, kind):
+    """A compiler may contract the model's operations in other ways: the same up to rounding."""
+    case, _ = case_of(name, kind)
+    generator, n, p = np.random.default_rng(5), case.n, case.p
+    usual, Y = in_units(name, kind, np.ones(n), np.ones(p)), case.record(0, STEPS)
+    expected, flags = [usual.update(y) for y in Y], Status(0)
+    for _ in range(2):
+        S, T = (2.0 ** generator.integers(-30, 31, size) for size in (n, p))
+        other = in_units(name, kind, S, T)
+        for y, one in zip(Y, expected, strict=True):
+            estimate = other.update(y * T)
+            np.testing.assert_allclose(estimate.trajectory / S, one.trajectory, rtol=1e-9)
+            assert estimate.cost == pytest.approx(one.cost, rel=1e-10)
+            for field in ("status", "qps", "nearest_points", "dropped"):
+                assert getattr(estimate, field) == getattr(one, field), field
+            flags |= estimate.status
+    assert Status.CANDIDATE_OUTSIDE in flags
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+@pytest.mark.parametrize("whole", [False, True])
+def test_rows_dropped_for_long_are_worth_a_warning(engine, whole):
+    case, _ = case_of("pendulum", "tight")
+    mhe, Y = estimator("pendulum", "tight", engine), case.record(1, STEPS)
+    take = mhe.run if whole else lambda ys: [mhe.update(y) for y in ys]
+    with pytest.warns(qpmhe.ObserverWarning, match="inequalities were dropped in") as caught:
+        take(Y)
+    assert len(caught) == 1
+    assert caught[0].filename == __file__ or (engine, whole) == ("python", True)
