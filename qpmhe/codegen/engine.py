@@ -33,6 +33,7 @@ __all__ = ["CompiledEngine"]
 
 Array = NDArray[np.float64]
 
+_ROWS_DROPPED = Status.ROWS_DROPPED.value
 # So that a long record can be interrupted, and its times are means of pieces.
 _PIECE = 256
 
@@ -132,7 +133,7 @@ class CompiledEngine:
     def _collect(self, time: int) -> CompiledEstimate:
         block, numbers = self._block.copy(), self._numbers.tolist()
         dropped: tuple[DroppedRow, ...] = ()
-        if numbers[1] & Status.ROWS_DROPPED.value:
+        if numbers[1] & _ROWS_DROPPED:
             sides = self._out[0]["dropped"][: numbers[0]]
             dropped = self._library.layout.dropped_rows(sides, time + 1 - numbers[0])
         return CompiledEstimate(block, numbers, time, self._sizes, self._delay, dropped)

@@ -216,8 +216,9 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
     return 0;
 }
 
-/* The previous estimate, moved on by one step of the model; whether it is worth a start. */
-static int mhe_shift(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
+/* Make the spare trial the previous estimate, moved on by one step of the model. `before`: stages
+ * of the window that it belongs to. */
+static void mhe_shift(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
 {
     const int count = e->length, skipped = before + 2 - (count + 1);
     mhe_stage *last = mhe_stage_at(e, count - 1);
@@ -225,14 +226,16 @@ static int mhe_shift(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int bef
     memcpy(x, e->trajectory + skipped * NX, sizeof(real) * (size_t)count * NX);
     mhe_f(x + (count - 1) * NX, last->u, last->step, x + count * NX);
     mhe_evaluate(e, k, o->spare);
-    return o->spare->cost < mhe_target(o);
 }
 
-/* At most so many QPs, each around the best trajectory so far. `before`: stages of the window
- * that the kept trajectory belongs to, -1 if there is none to start at. */
+/* At most so many QPs, each around the best trajectory so far. `before`: as for the shift, -1 not
+ * to start there. */
 static void mhe_search(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before, int limit)
 {
-    if (before >= 0 && mhe_shift(e, k, o, before)) mhe_take(k, o);
+    if (before >= 0) {
+        mhe_shift(e, k, o, before);
+        if (o->spare->cost < mhe_target(o)) mhe_take(k, o);
+    }
     while (limit-- > 0 && mhe_improve_once(e, k, o)) continue;
 }
 
@@ -244,10 +247,11 @@ static void mhe_give_up(mhe_workspace *k, mhe_outcome *o)
     o->spare = k->trials + 1;
 }
 
-/* Look for a feasible trajectory near the infeasible candidate; whether one was found. */
+/* Look for a feasible trajectory near the best one; whether one was found. */
 static int mhe_to_nearest_point(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
 {
-    for (int i = 0; i < MHE_NEAREST_POINTS; i++) {
+    if (isfinite(mhe_best_cost(o))) return 1;
+    for (int i = 0; i < MHE_NEAREST_POINTS && isfinite(o->best->violation); i++) {
         if (!mhe_linearize(e, k, o)) break;
         const int status = mhe_solve_qp(e, k, o, 1);
         o->nearest_points++;
@@ -265,18 +269,25 @@ static int mhe_to_nearest_point(mhe_estimator *e, mhe_workspace *k, mhe_outcome 
 /* The sequence from a candidate outside of the sets. */
 static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
 {
-    const int limit = e->settings->max_qps;
+    const int limit = e->settings->max_qps, start = e->settings->start_at_best ? before : -1;
     o->outside = 1;
-    mhe_search(e, k, o, before, limit);
-    if (!isfinite(mhe_best_cost(o)) && mhe_to_nearest_point(e, k, o))
-        mhe_search(e, k, o, -1, limit - o->qps);
+    mhe_search(e, k, o, start, limit);
+    if (!isfinite(mhe_best_cost(o))) {
+        int found = mhe_to_nearest_point(e, k, o);
+        if (!found && before >= 0) {
+            mhe_shift(e, k, o, before);
+            mhe_take(k, o);
+            found = mhe_to_nearest_point(e, k, o);
+        }
+        if (found) mhe_search(e, k, o, -1, limit - o->qps);
+    }
     o->outside = 0;
     if (o->best != o->candidate && o->best->cost <= o->candidate->cost) return;
     mhe_give_up(k, o);
     if (e->settings->infeasible == MHE_KEEP_CANDIDATE) return;
     o->events &= ~(MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED);
     mhe_violation(e, o->candidate, 0, k->left_out);
-    mhe_search(e, k, o, before, limit > o->qps + 1 ? limit - o->qps : 1);
+    mhe_search(e, k, o, start, limit > o->qps + 1 ? limit - o->qps : 1);
     memset(k->left_out, 0, sizeof k->left_out);
     if (o->best == o->candidate || !(mhe_violation(e, o->best, 0, k->left_out) > MHE_FEASIBLE))
         return;
@@ -307,7 +318,8 @@ static void mhe_set_candidate(mhe_estimator *e, mhe_workspace *k, mhe_trial *tri
 #endif
 }
 
-/* Solve the window's problem as it stands; `before` as for the search. */
+/* Solve the window's problem as it stands. `before`: stages of the window that the kept
+ * trajectory belongs to, -1 if there is none. */
 static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
 {
     const mhe_settings *s = e->settings;
@@ -330,6 +342,6 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     if (s->max_qps == 0)
         o->events |= MHE_NO_QPS;
     else
-        mhe_search(e, k, o, before, s->max_qps);
+        mhe_search(e, k, o, s->start_at_best ? before : -1, s->max_qps);
     o->events |= o->best != o->candidate ? MHE_IMPROVED : MHE_CANDIDATE;
 }

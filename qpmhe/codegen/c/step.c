@@ -51,7 +51,7 @@ static void mhe_filtered(mhe_estimator *e, const mhe_outcome *o, real *out)
 static void mhe_step(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u,
                      real step, const real *noise_weight, mhe_outcome *o)
 {
-    const int before = e->settings->start_at_best && e->has_trajectory ? e->length : -1;
+    const int before = e->has_trajectory ? e->length : -1;
     int failed = mhe_push(e, y, u, step, noise_weight);
     if (e->settings->reinitialize) {
         /* The ring of estimates reaches back to that of the window's first state. */
