@@ -60,6 +60,7 @@ def c_definitions(prefix: str, real: str) -> str:
     lines = [f"#define {prefix}_{name} (({real}){value!r})" for name, value in values.items()]
     lines.append(f"#define {prefix}_CORRECTIONS {CORRECTIONS}")
     lines.append(f"#define {prefix}_NEAREST_POINTS {NEAREST_POINTS}")
-    lengths = ", ".join(f"({real}){length!r}" for length in LENGTHS)
-    lines.append(f"#define {prefix}_LENGTHS {{{lengths}}}")
+    for name, lengths in (("LENGTHS", LENGTHS), ("ALONG", ALONG)):
+        listed = ", ".join(f"({real}){length!r}" for length in lengths)
+        lines.append(f"#define {prefix}_{name} {{{listed}}}")
     return "\n".join(lines)

@@ -361,7 +361,7 @@ def test_curved_sets_of_more_outputs_than_states(horizon, tmp_path):
         ca.Function("f", [x], [0.9 * x + 0.2 * ca.sin(x)]), ca.Function("h", [x], [h]),
         compiled=False, noises=box(3, 0.12),
     )
-    mhe = estimator(system, horizon, max_qps=5)
+    mhe = estimator(system, horizon, max_qps=None)
     program = compiled(mhe, tmp_path)
     state, commands, expected = np.array([0.4]), [], []
     for _ in range(20):

@@ -156,7 +156,7 @@ typedef struct {
 } mhe_row;
 
 typedef struct {
-    mhe_trial trials[3], bent;
+    mhe_trial trials[4], bent;
     mhe_terms terms[MHE_HORIZON];
     const mhe_terms *at[MHE_HORIZON]; /* the terms of the present QP */
     mhe_real factors[MHE_HORIZON + 1]; /* discounts: of the prior, then of each stage */

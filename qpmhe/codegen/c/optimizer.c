@@ -1,9 +1,12 @@
 /* The sequence of QPs; only what the true cost approves is accepted. */
 
 static const real mhe_lengths[] = MHE_LENGTHS;
+#if CONSTRAINED
+static const real mhe_along[] = MHE_ALONG;
+#endif
 
 typedef struct {
-    mhe_trial *candidate, *best, *spare; /* best may be the candidate */
+    mhe_trial *candidate, *best, *spare, *other; /* best may be the candidate */
     int outside; /* the candidate misses rows: as a trial, it has no finite cost */
     int events, qps, iterations, corrections, nearest_points, rows_dropped;
 } mhe_outcome;
@@ -21,12 +24,19 @@ static real mhe_target(const mhe_outcome *o)
     return isfinite(cost) ? cost - MHE_ROUNDING * cost : INFINITY;
 }
 
-/* Judge best + length * step. */
-static void mhe_try(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o, real length)
+/* Make a trial, and judge it: another one + length * step. */
+static void mhe_step_from(mhe_estimator *e, mhe_workspace *k, const mhe_trial *around, real length,
+                          mhe_trial *trial)
 {
     for (int j = 0; j < (e->length + 1) * NX; j++)
-        o->spare->x[j] = o->best->x[j] + length * k->step[j];
-    mhe_evaluate(e, k, o->spare);
+        trial->x[j] = around->x[j] + length * k->step[j];
+    mhe_evaluate(e, k, trial);
+}
+
+/* Make the spare trial best + length * step. */
+static void mhe_try(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o, real length)
+{
+    mhe_step_from(e, k, o->best, length, o->spare);
 }
 
 /* The spare trial becomes the best one. */
@@ -34,42 +44,46 @@ static void mhe_take(mhe_workspace *k, mhe_outcome *o)
 {
     mhe_trial *free = o->best;
     if (free == o->candidate)
-        for (int i = 0; i < 3; i++)
-            if (k->trials + i != o->candidate && k->trials + i != o->spare) free = k->trials + i;
+        for (int i = 0; i < 4; i++) {
+            mhe_trial *one = k->trials + i;
+            if (one != o->candidate && one != o->spare && one != o->other) free = one;
+        }
     o->best = o->spare;
     o->spare = free;
 }
 
-/* Terms along the best trajectory, where the candidate's are known; whether the model has finite
- * Jacobians there. */
-static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
+/* Terms and limits of the QP around a trial, where the candidate's terms are known; whether the
+ * model has finite Jacobians there. */
+static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o,
+                         const mhe_trial *around)
 {
     for (int i = 0; i < e->length; i++) {
         mhe_stage *stage = mhe_stage_at(e, i);
         mhe_terms *t = k->terms + i;
         real next[NX], output[NY];
-        k->at[i] = o->best == o->candidate ? &stage->terms : t;
-        if (o->best == o->candidate) continue;
-        mhe_f_jacobian(o->best->x + i * NX, stage->u, stage->step, next, t->f_jacobian);
-        mhe_h_jacobian(o->best->x + i * NX, stage->u, output, t->h_jacobian);
+        k->at[i] = around == o->candidate ? &stage->terms : t;
+        if (around == o->candidate) continue;
+        mhe_f_jacobian(around->x + i * NX, stage->u, stage->step, next, t->f_jacobian);
+        mhe_h_jacobian(around->x + i * NX, stage->u, output, t->h_jacobian);
         if (!mhe_all_finite(NX * NX, t->f_jacobian) || !mhe_all_finite(NY * NX, t->h_jacobian))
             return 0;
-        mhe_set_terms(e->settings, stage->noise_weight, o->best->w + i * NX,
-                      o->best->v + i * NY, t);
+        mhe_set_terms(e->settings, stage->noise_weight, around->w + i * NX,
+                      around->v + i * NY, t);
     }
 #if CONSTRAINED
-    mhe_set_limits(e, k, o->best->w, o->best->v);
+    mhe_set_limits(e, k, around->w, around->v);
 #endif
     return 1;
 }
 
-/* Solve the QP around the best trajectory; the increments are in k->step. */
-static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int nearest)
+/* Solve the QP around a trial; the increments are in k->step. */
+static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
+                        const mhe_trial *around, int nearest)
 {
     const int size = (e->length + 1) * NX;
     const real *prior = mhe_stage_at(e, 0)->z;
     real offset[NX];
-    for (int j = 0; j < NX; j++) offset[j] = o->best->x[j] - prior[j];
+    for (int j = 0; j < NX; j++) offset[j] = around->x[j] - prior[j];
     mhe_build(e, k, offset, nearest);
     for (int j = 0; j < size; j++) k->step[j] = -k->gradient[j];
     if (!mhe_factorise(k, e->length) || !mhe_solve(k, e->length, k->step)) return FAILED;
@@ -142,56 +156,93 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
 /* Second-order corrections of the spare trial, which curvature takes out of a set. */
 static void mhe_correct(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
 {
-    memcpy(k->bent.x, k->step, sizeof k->step);
     for (int i = 0; i < MHE_CORRECTIONS; i++) {
         mhe_bend(e, k, o);
-        const int failed = mhe_solve_qp(e, k, o, 0) == FAILED;
+        const int failed = mhe_solve_qp(e, k, o, o->best, 0) == FAILED;
         o->corrections++;
         if (failed) break;
         mhe_try(e, k, o, 1);
         if (isfinite(o->spare->cost) || !isfinite(o->spare->violation)) break;
     }
-    memcpy(k->step, k->bent.x, sizeof k->step);
+}
+
+/* Look for a feasible trajectory near a trial outside of the sets, by QPs in the metric of the
+ * Hessian; whether one was found. It is the spare trial then. */
+static int mhe_feasible_near(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
+                             const mhe_trial *around)
+{
+    for (int i = 0; i < MHE_NEAREST_POINTS; i++) {
+        mhe_trial *trial = around == o->spare ? o->other : o->spare;
+        if (!isfinite(around->violation) || !mhe_linearize(e, k, o, around)) break;
+        const int status = mhe_solve_qp(e, k, o, around, 1);
+        o->nearest_points++;
+        if (status == FAILED) break;
+        mhe_step_from(e, k, around, 1, trial);
+        if (isfinite(trial->cost)) {
+            if (trial == o->other) o->other = o->spare;
+            o->spare = trial;
+            return 1;
+        }
+        if (!(trial->violation < around->violation)) break;
+        around = trial;
+    }
+    o->spare->cost = INFINITY;
+    return 0;
 }
 #endif
 
 /* Make the spare trial the first one along the step whose cost is below the best so far, or the
- * last one. A negligible step is not shortened: at a minimum none lowers the cost by more than
- * rounding. */
-static void mhe_lower(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int negligible)
+ * last one. A useless step, whose promised decrease is negligible, is not shortened: at a minimum
+ * none lowers the cost by more than rounding. */
+static void mhe_lower(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int useless)
 {
     const int count = (int)(sizeof mhe_lengths / sizeof *mhe_lengths);
     const real target = mhe_target(o);
     mhe_try(e, k, o, 1);
     if (o->spare->cost < target) return;
 #if CONSTRAINED
-    if (o->spare->violation > 0 && isfinite(o->spare->violation)) {
+    const int along = (int)(sizeof mhe_along / sizeof *mhe_along);
+    const int curved = o->spare->violation > 0 && isfinite(o->spare->violation);
+    memcpy(k->bent.x, k->step, sizeof k->step); /* other QPs overwrite it */
+    if (curved) {
         const int nearly = o->spare->violation <= MHE_NEARLY;
         if (nearly) mhe_try(e, k, o, mhe_lengths[0]);
         /* If the shortened step leaves the set, too, curvature is the reason. */
-        if (!(o->spare->cost < target) && !negligible) {
+        if (!(o->spare->cost < target) && !useless) {
             if (nearly) mhe_try(e, k, o, 1);
             mhe_correct(e, k, o);
+            if (!isfinite(o->spare->cost)) mhe_feasible_near(e, k, o, o->spare);
+            memcpy(k->step, k->bent.x, sizeof k->step);
         }
         if (o->spare->cost < target) return;
     }
     /* Between two infeasible points there is no feasible one of a convex set. */
     if (o->best->violation > MHE_FEASIBLE) return;
 #endif
-    for (int i = 0; i < count && !negligible; i++) {
+    for (int i = 0; i < count && !useless; i++) {
         mhe_try(e, k, o, mhe_lengths[i]);
         if (o->spare->cost < target) return;
     }
+#if CONSTRAINED
+    /* Along the boundary of a curved set: of a step's length, what it lowers the cost by shrinks
+     * in proportion, and how far it leaves the set by the square. */
+    for (int i = 0; i < along && curved && !useless; i++) {
+        memcpy(k->step, k->bent.x, sizeof k->step);
+        mhe_try(e, k, o, mhe_along[i]);
+        if (!isfinite(o->spare->cost)) mhe_feasible_near(e, k, o, o->spare);
+        if (o->spare->cost < target) return;
+    }
+#endif
 }
 
 /* Solve one QP and take its step; whether another QP is worth while. */
 static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
 {
-    if (!mhe_linearize(e, k, o)) {
+    if (!mhe_linearize(e, k, o, o->best)) {
         o->events |= MHE_MODEL_FAILED;
         return 0;
     }
-    const int status = mhe_solve_qp(e, k, o, 0), solved = status == SOLVED;
+    const int status = mhe_solve_qp(e, k, o, o->best, 0), solved = status == SOLVED;
     o->qps++;
     if (status == FAILED) {
         o->events |= MHE_SOLVER_FAILED;
@@ -240,32 +291,6 @@ static void mhe_search(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int b
 }
 
 #if CONSTRAINED
-/* Go back to the candidate. */
-static void mhe_give_up(mhe_workspace *k, mhe_outcome *o)
-{
-    o->best = o->candidate;
-    o->spare = k->trials + 1;
-}
-
-/* Look for a feasible trajectory near the best one; whether one was found. */
-static int mhe_to_nearest_point(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
-{
-    if (isfinite(mhe_best_cost(o))) return 1;
-    for (int i = 0; i < MHE_NEAREST_POINTS && isfinite(o->best->violation); i++) {
-        if (!mhe_linearize(e, k, o)) break;
-        const int status = mhe_solve_qp(e, k, o, 1);
-        o->nearest_points++;
-        if (status == FAILED) break;
-        mhe_try(e, k, o, 1);
-        const int feasible = isfinite(o->spare->cost);
-        if (!feasible && !(o->spare->violation < o->best->violation)) break;
-        mhe_take(k, o);
-        if (feasible) return 1;
-    }
-    mhe_give_up(k, o);
-    return 0;
-}
-
 /* The sequence from a candidate outside of the sets. */
 static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
 {
@@ -273,17 +298,20 @@ static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     o->outside = 1;
     mhe_search(e, k, o, start, limit);
     if (!isfinite(mhe_best_cost(o))) {
-        int found = mhe_to_nearest_point(e, k, o);
+        int found = mhe_feasible_near(e, k, o, o->candidate);
         if (!found && before >= 0) {
             mhe_shift(e, k, o, before);
-            mhe_take(k, o);
-            found = mhe_to_nearest_point(e, k, o);
+            found = isfinite(o->spare->cost) || mhe_feasible_near(e, k, o, o->spare);
         }
-        if (found) mhe_search(e, k, o, -1, limit - o->qps);
+        if (found) {
+            mhe_take(k, o);
+            mhe_search(e, k, o, -1, limit - o->qps);
+        }
     }
     o->outside = 0;
     if (o->best != o->candidate && o->best->cost <= o->candidate->cost) return;
-    mhe_give_up(k, o);
+    if (o->best != o->candidate) o->spare = o->best;
+    o->best = o->candidate;
     if (e->settings->infeasible == MHE_KEEP_CANDIDATE) return;
     o->events &= ~(MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED);
     mhe_violation(e, o->candidate, 0, k->left_out);
@@ -332,6 +360,7 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     memset(o, 0, sizeof *o);
     o->candidate = o->best = k->trials;
     o->spare = k->trials + 1;
+    o->other = k->trials + 2;
     mhe_set_candidate(e, k, o->candidate);
 #if CONSTRAINED
     const int feasible = o->candidate->violation <= MHE_FEASIBLE;
