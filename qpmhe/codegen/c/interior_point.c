@@ -8,6 +8,9 @@
 
 enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED };
 
+/* Iterations after which rows are compared with what they were. */
+#define STALL 8
+
 #if CONSTRAINED
 
 /* Limits of all rows about a trajectory with residuals w and v. */
@@ -249,7 +252,7 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
     const mhe_settings *s = e->settings;
     const int count = e->length, size = (count + 1) * NX, rows = count * ROWS;
     const real missed = mhe_row_violation(e, k, k->step);
-    real products = 0;
+    real products = 0, far = INFINITY;
     int sides = 0;
     memset(k->step, 0, sizeof(real) * (size_t)size);
     const real outside = mhe_row_violation(e, k, k->step);
@@ -310,6 +313,11 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
             products <= s->solver_tolerance / 1000 * scale)
             return SOLVED;
         if (*iterations >= limit) return STOPPED;
+        /* Of rows that exclude each other, residuals hardly shrink. */
+        if (*iterations % STALL == 0) {
+            if (infeasible > s->solver_tolerance / 100 && infeasible > far / 2) return STOPPED;
+            far = infeasible;
+        }
         mhe_add_weights(e, k);
         if (!mhe_factorise(k, count)) return *iterations ? STOPPED : FAILED;
         real target = 0;
