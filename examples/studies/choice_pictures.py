@@ -84,7 +84,7 @@ def observers(figures: Figures, path: Path) -> None:
                         markerfacecolor="white" if qps == 0 else color,
                         label=f"{name}, {'alone' if qps == 0 else '2 QPs'}",
                     )
-            scale(axes, zoo, (0.5, 1.0, 2.0, 5.0), lost if np.isinf([
+            scale(axes, zoo, (0.5, 1.0, 2.0, 5.0, 10.0), lost if np.isinf([
                 line for (model, *_), line in errors.items() if model == zoo
             ]).any() else None)
             axes.set_xticks(range(len(distances)), [f"{d:g}" for d in distances])

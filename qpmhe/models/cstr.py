@@ -83,8 +83,8 @@ def cstr(method: str = "rk4") -> Example:
 
     The observer has the constant gain of the stationary Kalman predictor about (0.5, 350), for
     disturbances of 1 K. It converges from within 0.3 mol/L and 5 K, not from everywhere: from
-    far too much concentration, its own temperature runs away before the correction holds it.
-    The smaller gain for 0.3 K holds less.
+    far too much concentration, its own temperature runs away before the correction holds it, and
+    only the projection onto X brings it back. The smaller gain for 0.3 K holds less.
 
     Parameters
     ----------
