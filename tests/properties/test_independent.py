@@ -6,9 +6,12 @@ A few hundred steps by default, ``--fuzz-steps 100000`` for as many as one likes
 import copy
 from collections import Counter
 
+import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.estimation.problem import Problem
+from qpmhe.observers.projection import NearestPoint
 
 from .fuzz_independent import WRITINGS, Case, WrongStepError, fuzz, table
 
@@ -102,3 +105,20 @@ def test_memory_of_the_estimator_that_is_handed_out_is_noticed(monkeypatch):
     monkeypatch.setattr(qpmhe.MovingHorizonEstimator, "update", careless)
     _, failures = fuzz(400, SEED, source="numpy", writing="batched")
     assert any("handed out" in failure for failure in failures)
+
+
+def test_a_projection_in_another_metric_is_noticed(monkeypatch):
+    nearest = NearestPoint.__call__
+
+    def clipping(self, point, covariance):
+        return nearest(self, point, np.eye(point.size))
+
+    monkeypatch.setattr(NearestPoint, "__call__", clipping)
+    _, failures = fuzz(500, SEED, source="numpy", writing="batched", estimators=1)
+    assert any("the candidate goes to" in failure for failure in failures)
+
+
+def test_a_row_that_is_dropped_in_secret_is_noticed(monkeypatch):
+    monkeypatch.setattr(Problem, "missed_rows", lambda self, trial: ())
+    _, failures = fuzz(800, SEED, source="numpy", writing="batched", estimators=1)
+    assert any("dropped set()" in failure for failure in failures)

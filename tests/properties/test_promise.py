@@ -10,6 +10,7 @@ from qpmhe import Status
 
 from .plain import observer_path, there, true_cost
 
+pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 KINDS = ("linear", "smooth", "kinked", "cubic", "exponential", "raising", "branching")
 SPECIALS = (np.nan, np.inf, -np.inf, 1e3, -1e6, 1e30, 1e200)
 
