@@ -303,6 +303,19 @@ def test_an_observer_that_failed_calls_the_model_where_it_works():
     np.testing.assert_array_equal(observers.failed, [True, False, False])
 
 
+def test_all_observers_forget_a_measurement_that_is_huge():
+    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1)
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1e3)
+    mhe, twin = (estimator(system, [0.3], cost, 3) for _ in range(2))
+    came = watched(mhe)
+    for t in range(8):
+        y = 1e154 if t == 4 else 0.1 * t
+        estimate, expected = mhe.update([y]), twin.update([y if t != 4 else None])
+        np.testing.assert_allclose(estimate.candidate, expected.candidate, rtol=1e-12)
+        assert estimate.status == expected.status
+    assert came == [True] * 5 + [False] + [True] * 3
+
+
 def test_a_metric_that_is_found_late():
     """As long as the observer's error is unstable, each window is replayed."""
     system = qpmhe.System(
