@@ -8,7 +8,11 @@ import pytest
 import qpmhe
 from qpmhe import Status
 
+from qpmhe.estimation.running import RunningObservers
+from qpmhe.observers import Sample
+
 from .plain import spd
+from .test_interrupts import Interruption
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 DT = 0.1
@@ -127,6 +131,13 @@ def assert_same(mhe, estimate, other, expected):
     assert estimate.message == expected.message
 
 
+def assert_same_failures(mhe, other):
+    """Of all observers, once there are N."""
+    one, two = mhe._engine._window, other._engine._window
+    if one.length == one.horizon:
+        np.testing.assert_array_equal(one._observers.failed, two._observers.failed)
+
+
 def assert_close(mhe, estimate, other, expected):
     """Equal up to the rounding of sums, as a share of the terms in them."""
     differences = "finite differences" in mhe.system.derivatives.values()
@@ -195,6 +206,30 @@ def test_one_call_of_the_model_advances_all_observers():
         assert calls == [(20, 2)]
 
 
+@pytest.mark.parametrize("sets", ["free", "box"])
+def test_another_sample_after_an_interrupt(sets):
+    generator = np.random.default_rng(1)
+    system = random_system(generator, "discrete", sets)
+    cost = random_cost(generator, system, False, 1.0)
+    gain = 0.3 * np.linalg.pinv(system.h_jacobian(np.zeros(system.n), np.zeros(system.m)))
+    mhe, twin = (estimator(system, gain, cost, 3, max_qps=0) for _ in range(2))
+    interrupts = 0
+    for _ in range(15):
+        for after in generator.integers(1, 250, 8):
+            arguments, own = random_sample(generator, system)
+            with Interruption(after) as interruption:
+                try:
+                    mhe.update(*arguments, **own)
+                except KeyboardInterrupt:
+                    interrupts += 1
+                else:  # it was done before
+                    assert interruption.count < after
+                    twin.update(*arguments, **own)
+        arguments, own = random_sample(generator, system)
+        assert_same(mhe, mhe.update(*arguments, **own), twin, twin.update(*arguments, **own))
+    assert interrupts > 40
+
+
 # Where the model, an observer or the cost fails
 
 
@@ -237,6 +272,7 @@ def test_failures_are_those_of_a_replay(where, function, seed):
             y[0] = generator.choice([np.nan, 1e160, -np.inf])
         estimate, again, expected = (one.update(y) for one in (mhe, resumed, full))
         assert_same(mhe, estimate, resumed, again)
+        assert_same_failures(mhe, resumed)
         if came[-1]:
             assert_close(mhe, estimate, full, expected)
         else:
@@ -247,6 +283,37 @@ def test_failures_are_those_of_a_replay(where, function, seed):
             late = generator.normal(1.0, 0.2, 1)
             assert_same(mhe, mhe.amend(time, late), resumed, resumed.amend(time, late))
     assert 3 < failures < 37
+
+
+def test_an_observer_that_failed_calls_the_model_where_it_works():
+    calls = []
+
+    def f(x):
+        calls.append(math.sqrt(x[0]))
+        return [calls[-1]]
+
+    system = qpmhe.System(f, lambda x: x, n=1, p=1, f_jacobian=root_jacobian)
+    observers = RunningObservers(np.array([[0.5]]), 3, None, None)
+    counts = []
+    for time, y in enumerate([-5.0, 1.0, 1.0]):
+        calls.clear()
+        observers.advance(time, np.ones(1), np.array([y]), Sample(system, np.zeros(0)))
+        counts.append(len(calls))
+    assert counts == [3, 2, 3]  # one of three raises at the second sample
+    np.testing.assert_array_equal(observers.failed, [True, False, False])
+
+
+def test_all_observers_forget_a_measurement_that_is_huge():
+    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1)
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1e3)
+    mhe, twin = (estimator(system, [0.3], cost, 3) for _ in range(2))
+    came = watched(mhe)
+    for t in range(8):
+        y = 1e154 if t == 4 else 0.1 * t
+        estimate, expected = mhe.update([y]), twin.update([y if t != 4 else None])
+        np.testing.assert_allclose(estimate.candidate, expected.candidate, rtol=1e-12)
+        assert estimate.status == expected.status
+    assert came == [True] * 5 + [False] + [True] * 3
 
 
 def test_a_metric_that_is_found_late():
