@@ -1,12 +1,13 @@
 """QP backends for trajectories: convex QPs in, judged solutions out, estimation unknown."""
 
+from .backend import Backend
 from .conformance import Capabilities, Conformance, Finding, check, measure
 from .errors import BackendError, InvalidInputError, OptionError, QpmheError, ShapeError
 from .files import StoredQP, dump, load
 from .options import SolverOptions
 from .qp import QP, band_index
 from .recorder import Recording, RecordingWarning
-from .registry import Backend, available, backend, backends, create, register, unregister
+from .registry import available, backend, backends, create, register, unregister
 from .solution import RawSolution, Residuals, Solution, SolveStatus
 from .solver import Solver
 

@@ -9,9 +9,10 @@ from functools import partial
 
 import numpy as np
 
+from .backend import Backend
 from .options import SolverOptions
 from .qp import ARRAYS, QP, Array
-from .registry import Backend, backend, create
+from .registry import backend, create
 from .sample_qps import Bounds, Sides, contradiction, sample
 from .solution import Solution, SolveStatus
 from .solver import Solver

@@ -249,13 +249,8 @@ class QP:
 
     def violation(self, d: Array) -> float:
         """The largest amount by which increments ``d`` (K, n) miss a bound or a row."""
-        worst = 0.0
-        if self.bounded:
-            worst = float(np.maximum(self.lower - d, d - self.upper).max())
-        if self.rows:
-            value = self.rows_times(d)
-            missed = np.maximum(self.row_lower - value, value - self.row_upper)
-            worst = float(np.maximum(worst, missed.max()))
+        value = np.concatenate((d, self.rows_times(d)), axis=None) if self.rows else d.reshape(-1)
+        worst = float(np.maximum(self.all_lower - value, value - self.all_upper).max())
         # Comparisons with NaN are false: a NaN among the numbers must not pass as feasible.
         return math.inf if math.isnan(worst) else max(worst, 0.0)
 

@@ -96,11 +96,7 @@ class Residuals:
         duals = None
         if bound_duals is not None and row_duals is not None:
             duals = np.concatenate((bound_duals, row_duals), axis=None)
-        lower = upper = _NOTHING
-        if qp.bounded or qp.rows:
-            lower = np.concatenate((qp.lower, qp.row_lower), axis=None)
-            upper = np.concatenate((qp.upper, qp.row_upper), axis=None)
-        return Residuals(*Errors(qp, d, duals, lower, upper).largest())
+        return Residuals(*Errors(qp, d, duals).largest())
 
 
 class Errors:
@@ -119,21 +115,19 @@ class Errors:
 
     __slots__ = ("force", "gap", "missed")
 
-    def __init__(
-        self, qp: QP, d: Array, duals: Array | None, lower: Array, upper: Array
-    ) -> None:
-        size, point = qp.size, d.reshape(-1)
+    def __init__(self, qp: QP, d: Array, duals: Array | None) -> None:
+        size, point, limited = qp.size, d.reshape(-1), qp.bounded or qp.rows > 0
         self.missed, self.force, self.gap = _NOTHING, None, math.nan
-        if lower.size:
+        if limited:
             value = np.concatenate((d, qp.rows_times(d)), axis=None) if qp.rows else point
-            self.missed = np.maximum(lower - value, value - upper)
+            self.missed = np.maximum(qp.all_lower - value, value - qp.all_upper)
         if duals is None:
             return
         force = qp.hessian_times(d).reshape(-1)
         force += qp.gradient.reshape(-1)
         gap = float(point.dot(force))
-        if lower.size:
-            side = np.where(duals > 0.0, upper, lower)
+        if limited:
+            side = np.where(duals > 0.0, qp.all_upper, qp.all_lower)
             # Multipliers of absent limits are dropped, and then show as a dual residual.
             there = np.isfinite(side)
             duals = duals * there

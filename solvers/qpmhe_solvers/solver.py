@@ -204,7 +204,7 @@ class Solver(ABC):
         d, message = _as_iterate(raw.d, raw.message, qp)
         if d is None:
             return Solution(None, SolveStatus.FAILED, count, message=message)
-        lower, upper, duals = qp.all_lower, qp.all_upper, None
+        duals = None
         if qp.bounded or qp.rows:
             bound_duals = _as_multipliers(raw.bound_duals, qp.size)
             row_duals = _as_multipliers(raw.row_duals, qp.stages * qp.rows)
@@ -216,8 +216,8 @@ class Solver(ABC):
                 row_duals *= scale.duals[qp.size :]
         else:  # there is nothing to weigh
             bound_duals, row_duals = np.zeros(qp.size), np.zeros(0)
-            duals = lower = upper = row_duals
-        errors = Errors(qp, d, duals, lower, upper)
+            duals = row_duals
+        errors = Errors(qp, d, duals)
         if not (isinstance(raw.claimed, (bool, np.bool_)) and raw.claimed):
             status = SolveStatus.STOPPED
         elif self._confirmed(qp, d, errors.largest()):
