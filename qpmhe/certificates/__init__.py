@@ -3,7 +3,7 @@
 from .audit import Audit, audit
 from .certificate import Certificate
 from .certification import certify
-from .decay import DecayingSums
+from .decay import DecayingSums, Sizes
 from .detectability import certify_detectability
 from .evidence import (
     CertificateError,
@@ -18,12 +18,12 @@ from .observer import Synthesis, certify_observer, synthesise_gain
 from .properties import Detectability, ObserverStability
 from .regions import Region
 from .report import Report, certify_model, error_and_bounds
-from .theorem import Sizes, theorem, tighten
+from .theorem import theorem
 
 __all__ = [
     "Audit", "Certificate", "CertificateError", "DecayingSums", "Detectability", "Evidence",
     "Hypotheses", "JumpError", "MismatchError", "Monitor", "MonitorSummary", "NotCertifiedError",
     "ObserverStability", "OutOfTimeError", "Region", "Report", "Sizes", "Synthesis",
     "audit", "certify", "certify_detectability", "certify_model", "certify_observer",
-    "error_and_bounds", "monitor", "monitored_run", "synthesise_gain", "theorem", "tighten",
+    "error_and_bounds", "monitor", "monitored_run", "synthesise_gain", "theorem",
 ]

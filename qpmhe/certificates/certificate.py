@@ -19,13 +19,12 @@ from ..estimation.run import Run
 from ..model.system import System
 from ..observers import Observer
 from .audit import Audit
-from .decay import checked_length
+from .decay import Sizes, checked_length
 from .evidence import Evidence, MismatchError, weakest
-from .horizon_bounds import HorizonBounds, Kind, window_bound
+from .horizon_bounds import HorizonBounds, Kind
 from .observer import gain_if_constant
-from .properties import Detectability, ObserverStability, fitting, json_ready
+from .properties import Detectability, ObserverStability, json_ready
 from .regions import Region
-from .theorem import Sizes
 
 __all__ = ["ASSUMED", "Certificate", "CheckedRun"]
 
@@ -66,7 +65,7 @@ class CheckedRun(Protocol):
 class Certificate:
     """The theorem's constants for a system, an observer and a cost on a set of states.
 
-    Made by `certify`.
+    Made by `certify`; one that is made or changed by hand is assumed.
 
     Parameters
     ----------
@@ -74,50 +73,33 @@ class Certificate:
         What the estimator is made of.
     audit : Audit
         The assumptions, one by one.
-    detectabilities, stabilities : tuple
-        What was certified of system and observer, at several rates; each bound uses those
-        that make it tightest.
+    detectability, stability
+        What was certified of system and observer.
     bounds : mapping of int to HorizonBounds
         For each horizon.
     sizes : Sizes
-        For which errors the bounds are tight.
-    origin : tuple
-        What `certify` made it of. Certificates made or changed by hand are assumed.
-
-    Raises
-    ------
-    MismatchError
-        If a part is of another system or gain, or does not hold on the whole region.
+        For which disturbances and noises the bounds are called vacuous or not.
     """
 
     system: System
     observer: Observer
     cost: Cost
     audit: Audit
-    detectabilities: tuple[Detectability, ...]
-    stabilities: tuple[ObserverStability, ...]
+    detectability: Detectability
+    stability: ObserverStability
     bounds: Mapping[int, HorizonBounds]
     sizes: Sizes
-    origin: tuple[Any, ...] = field(default=(), repr=False)
+    _certified: bool = field(default=False, init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        for detected in self.detectabilities:
-            fitting(detected, self.system, self.region, self.gain, thorough=False)
-        for observed in self.stabilities:
-            fitting(observed, self.system, self.region, self.gain, thorough=False)
+    def sealed(self) -> Certificate:
+        """The certificate itself, whose evidence is from now on its parts'."""
+        object.__setattr__(self, "_certified", True)
+        return self
 
     @cached_property
     def gain(self) -> Array | None:
         """The observer's constant gain, if it has one."""
         return gain_if_constant(self.observer, self.system)
-
-    @property
-    def ingredients(self) -> tuple[Any, ...]:
-        """All that a certificate is made of, to be compared with its origin."""
-        return (
-            self.system, self.observer, self.cost, self.audit, self.bounds, self.sizes,
-            *self.detectabilities, *self.stabilities,
-        )
 
     @property
     def region(self) -> Region:
@@ -127,18 +109,14 @@ class Certificate:
     @cached_property
     def evidence(self) -> Evidence:
         """What the bounds rest on: the weakest evidence among their ingredients'."""
-        mine = self.ingredients
-        if len(mine) != len(self.origin) or any(
-            one is not other for one, other in zip(mine, self.origin, strict=True)
-        ):
+        if not self._certified:
             return Evidence.ASSUMED
         used = [self.audit[name].evidence for name in (
             "output Lipschitz", "no correction without error", "correction bound", "cost bounds"
         )]
         return weakest([
             *(each for each in used if each is not None),
-            *(each.evidence for each in self.detectabilities),
-            *(each.evidence for each in self.stabilities),
+            self.detectability.evidence, self.stability.evidence,
         ])
 
     @property
@@ -154,15 +132,7 @@ class Certificate:
     @property
     def kinds(self) -> tuple[Kind, ...]:
         """The kinds of bounds that there are, the sharpest last."""
-        first = self.bounds[self.horizons[0]]
-        kinds: list[Kind] = ["paper"]
-        if first.summed is not None:
-            kinds.append("summed")
-        if first.weighted is not None:
-            kinds.append("weighted")
-        if len(kinds) > 1:
-            kinds.append("measured")
-        return tuple(kinds)
+        return self.bounds[self.horizons[0]].kinds
 
     def bound(
         self, run: Run | None, disturbances: ArrayLike, noises: ArrayLike, *,
@@ -185,8 +155,8 @@ class Certificate:
             N; the source's, or the only one, if left out.
         kind : {"paper", "summed", "weighted", "measured"}
             The right-hand side of (eq:RGES_result) with the paper's constants, or beyond the
-            paper: with the proof's sums kept, with its norms kept as well, or with the
-            estimates' own costs in place of their bound.
+            paper: with the proof's norms kept, where those are not known with its sums kept,
+            and with the estimates' own costs in place of their bound.
         source : MovingHorizonEstimator or Monitor, optional
             The estimator that made the run, as the run left it, or the monitor that checked
             all its estimates, for the horizon and cost of the run. Needed for
@@ -226,7 +196,7 @@ class Certificate:
             )
         if kind != "measured":
             costs = None
-        return _OUTWARD * window_bound(chosen, kind, self.kinds).bound(start, w, v, costs=costs)
+        return _OUTWARD * chosen.beyond(kind).bound(start, w, v, costs=costs)
 
     def funnel(
         self, w_max: float, v_max: float, *, initial_error: float, steps: int,
@@ -270,7 +240,7 @@ class Certificate:
         chosen = self.of(horizon)
         if kind == "paper":
             return _OUTWARD * chosen.paper.result.limit(w, v)
-        return _OUTWARD * window_bound(chosen, kind, self.kinds).limit(w, v)
+        return _OUTWARD * chosen.beyond(kind).limit(w, v)
 
     def vacuous(
         self, w_max: float | None = None, v_max: float | None = None, *, horizon: int | None = None,
@@ -318,8 +288,8 @@ class Certificate:
             "evidence": self.evidence.value,
             "assumed": list(ASSUMED),
             "assumptions": self.audit.to_dict(),
-            "detectability": [each.to_dict() for each in self.detectabilities],
-            "observer": [each.to_dict() for each in self.stabilities],
+            "detectability": self.detectability.to_dict(),
+            "observer": self.stability.to_dict(),
             "sizes": vars(self.sizes),
             "horizons": [each.to_dict(self.sizes) for each in bounds.values()],
             "vacuous": {

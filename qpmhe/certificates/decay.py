@@ -14,7 +14,23 @@ from qpmhe_solvers.values import finite, shown
 from .._checks import Array, numbers, positive
 from ..errors import OptionError, ShapeError
 
-__all__ = ["DecayingSums"]
+__all__ = ["DecayingSums", "Sizes"]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Largest |w| and |v| for which bounds are made tight, and called vacuous or not.
+
+    An `OptionError` is raised if one is negative or not finite, or both are zero.
+    """
+
+    disturbance: float = 1.0
+    noise: float = 1.0
+
+    def __post_init__(self) -> None:
+        w = checked_length("disturbance", self.disturbance)
+        if not (checked_length("noise", self.noise) or w):
+            raise OptionError("disturbance and noise are both 0; expected one of them above 0.")
 
 
 @dataclass(frozen=True)
@@ -110,28 +126,9 @@ class DecayingSums:
         gain = self.rate / (1.0 - self.rate)
         return gain * (self.disturbance * disturbance + self.noise * noise)
 
-    def slower(self, rate: float) -> DecayingSums:
-        r"""Constants of a slower bound that follows from this one.
-
-        Since :math:`\tau \ge 1` in the sums, :math:`c\, r^\tau \le (c\, r / s) s^\tau` for a
-        rate s >= r: the disturbance's and noise's constants become smaller. An `OptionError`
-        is raised unless the rate, s, is at least the present one and below 1.
-        """
-        if not self.rate <= rate < 1.0:
-            raise OptionError(
-                f"rate is {rate!r}; expected at least {self.rate!r}, the proved one, and below 1."
-            )
-        share = self.rate / rate
-        return DecayingSums(rate, self.initial, share * self.disturbance, share * self.noise)
-
 
 def decaying_sums(rate: float, entering: Array) -> Array:
     """s(t) = sum of rate^(tau - 1) entering(t - tau) over tau = 1, ..., t; at t = 0, ..., T."""
-    if entering.ndim > 1:
-        several = np.zeros((*entering.shape[:-1], entering.shape[-1] + 1))
-        for t in range(entering.shape[-1]):
-            several[..., t + 1] = rate * several[..., t] + entering[..., t]
-        return several
     sums = np.zeros(entering.size + 1)
     for t, value in enumerate(entering.tolist()):
         sums[t + 1] = rate * sums[t] + value

@@ -296,10 +296,9 @@ def monitor(
         complete = not estimate.status & _BROKEN and bool(
             np.isfinite(w).all() and np.isfinite(y).all() and np.isfinite(fit).all()
         )
-        kappa = max(each.kappa for each in certificate.stabilities)
         # What is missing is reported as that alone: the observer takes it for a fit.
         known = np.nan_to_num(fit, nan=0.0)
-        allowed = kappa * np.linalg.norm(known, axis=1) * (1.0 + _RELATIVE)
+        allowed = certificate.stability.kappa * np.linalg.norm(known, axis=1) * (1.0 + _RELATIVE)
         rounding = 1e-12 * np.abs(estimate.candidate).max(axis=0)
         bounded = bool(
             (np.linalg.norm(corrections, axis=1) <= allowed + np.linalg.norm(rounding)).all()

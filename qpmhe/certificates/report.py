@@ -20,8 +20,9 @@ from ..models.scenario import Record
 from ..plots.style import LIGHT, STYLES, panels, save
 from .audit import Audit, audit
 from .certificate import Certificate
-from .certification import certify
+from .certification import composed, estimate_weights, horizons_of, noise_weights
 from .deadline import DEFAULT_SECONDS, Deadline
+from .decay import Sizes
 from .detectability import certify_detectability
 from .evidence import CertificateError, NotCertifiedError
 from .monitor import MonitorSummary, monitored_run
@@ -29,7 +30,6 @@ from .observer import certify_observer
 from .properties import Detectability, ObserverStability
 from .regions import Region, bounded_region
 from .sdp import started
-from .theorem import Sizes
 
 __all__ = ["LABELS", "Report", "certify_model", "error_and_bounds"]
 
@@ -47,6 +47,8 @@ LABELS = {
 _ROOM = 0.5
 _SIGMAS = 3.0
 _QPS = 2  # a sample, in the run on the simulated record
+# How much of the time left each part takes; the run on the record is not counted.
+_AUDIT, _DETECTABILITY, _OBSERVER = 0.2, 0.5, 0.9
 
 
 @dataclass(eq=False)
@@ -64,7 +66,7 @@ class Report:
     certificate : Certificate or None
         None where the error could not be bounded.
     detectability, stability : Detectability and ObserverStability, or None
-        Constants of the first horizon's bound, or those that could be certified alone.
+        What could be certified of the system and of its observer.
     errors : dict of str to QpmheError
         What could not be certified, and why; empty with a certificate.
     run, summary, estimator : Run, MonitorSummary and MovingHorizonEstimator, or None
@@ -115,8 +117,8 @@ class Report:
                 for name, what in (("eta", "detectability"), ("rho", "the observer"))
             },
             "assumptions": self.audit.to_dict(),
-            "detectability": [] if self.detectability is None else [self.detectability.to_dict()],
-            "observer": [] if self.stability is None else [self.stability.to_dict()],
+            "detectability": self.detectability and self.detectability.to_dict(),
+            "observer": self.stability and self.stability.to_dict(),
         }
 
     def draw(self, axes: Any = None) -> Any:
@@ -171,14 +173,14 @@ def certify_model(
 ) -> Report:
     """Certify a model as far as possible, and monitor its estimator on a simulated record.
 
-    Where there is no certificate, the assumptions, detectability and the observer are each
-    examined alone; if both are certified then, the certificate is made from them.
+    The assumptions, detectability and the observer are each examined, whatever is found of the
+    others; the certificate is made from them.
 
     Parameters
     ----------
     example : Example
-        System, observer, cost and scenario, as `qpmhe.models` returns them. The bounds are
-        tight for three standard deviations of the scenario's noises and its initial error.
+        System, observer, cost and scenario, as `qpmhe.models` returns them. Bounds are judged
+        for three standard deviations of the scenario's noises.
     horizon : int or list of int, optional
         N, or several of them; the scenario's if left out.
     region : Box, Polytope or Region, optional
@@ -203,48 +205,13 @@ def certify_model(
     record = scenario.simulate(seed)
     place = _region(example, record, region, inputs)
     name = name or scenario.title
-
-    def attempt(share: float, **parts: Any) -> Certificate:
-        return certify(
-            system, observer, cost, horizon=[scenario.horizon] if horizon is None else horizon,
-            region=place, sizes=_sizes(example), run=record,
-            initial_state=scenario.initial_estimate, seconds=deadline.part(share), **parts,
-        )
-
-    try:
-        certificate = attempt(0.5)
-    except (NotCertifiedError, CertificateError) as error:
-        report = _parts(name, example, record, place, error, deadline)
-        if report.detectability is None or report.stability is None:
-            return report
-        try:
-            certificate = attempt(
-                1.0, detectability=report.detectability, stability=report.stability
-            )
-        except (NotCertifiedError, CertificateError):
-            return report
-    estimator = MovingHorizonEstimator(
-        system, observer, cost, horizon=certificate.horizons[-1],
-        initial_state=scenario.initial_estimate, max_qps=_QPS,
-    )
-    run, summary = monitored_run(certificate, estimator, record.measurements, record.inputs)
-    return Report(
-        name, example, record, certificate.audit, certificate, *_used(certificate), {}, run,
-        summary, estimator,
-    )
-
-
-def _parts(
-    name: str, example: Example, record: Record, region: Region, reason: QpmheError,
-    deadline: Deadline,
-) -> Report:
-    """The assumptions, detectability and the observer, each examined alone."""
-    system, observer, cost, scenario = example
+    horizons = horizons_of(scenario.horizon if horizon is None else horizon)
+    sizes, errors = _sizes(example), dict[str, QpmheError]()
     findings = audit(
-        system, observer, cost, region, record, initial_state=scenario.initial_estimate,
-        seconds=deadline.part(0.2),
+        system, observer, cost, place, record, initial_state=scenario.initial_estimate,
+        seconds=deadline.part(_AUDIT),
     )
-    errors: dict[str, QpmheError] = {}
+    weights = (1.0, 1.0) if findings.constants is None else estimate_weights(findings.constants)
 
     def attempt(what: str, question: Callable[[], Result]) -> Result | None:
         try:
@@ -254,22 +221,23 @@ def _parts(
             return None
 
     detected = attempt("detectability", lambda: certify_detectability(
-        system, region, seconds=deadline.part(0.5)))
+        system, place, weights=weights, seconds=deadline.part(_DETECTABILITY)))
     observed = attempt("the observer", lambda: certify_observer(
-        system, observer, region, seconds=deadline.part(0.9)))
-    return Report(name, example, record, findings, None, detected, observed, errors or {"": reason})
-
-
-def _used(certificate: Certificate) -> tuple[Detectability, ObserverStability]:
-    """The parts that the theorem's constants for the first horizon are made of."""
-    paper = certificate.of(certificate.horizons[0]).paper
-    return (
-        min(certificate.detectabilities, key=lambda one: abs(one.eta - paper.detectability.rate)),
-        # Its constants may be those of a slower rate than the proved one.
-        min(
-            certificate.stabilities,
-            key=lambda one: (one.C_p != paper.observer.initial, one.rho > paper.observer.rate),
-        ),
+        system, observer, place, weights=noise_weights(sizes), seconds=deadline.part(_OBSERVER)))
+    certificate = None
+    if detected is not None and observed is not None:
+        certificate = attempt("", lambda: composed(
+            system, observer, cost, findings, detected, observed, horizons, sizes))
+    if certificate is None:
+        return Report(name, example, record, findings, None, detected, observed, errors)
+    estimator = MovingHorizonEstimator(
+        system, observer, cost, horizon=certificate.horizons[-1],
+        initial_state=scenario.initial_estimate, max_qps=_QPS,
+    )
+    run, summary = monitored_run(certificate, estimator, record.measurements, record.inputs)
+    return Report(
+        name, example, record, findings, certificate, detected, observed, {}, run, summary,
+        estimator,
     )
 
 
@@ -298,13 +266,13 @@ def _region(
 
 
 def _sizes(example: Example) -> Sizes:
-    """Three standard deviations of the scenario's noises, and its initial error."""
+    """Three standard deviations of the scenario's noises."""
     scenario = example.scenario
     w, v = (
         _SIGMAS * float(np.sqrt(np.linalg.eigvalsh(matrix)[-1]))
         for matrix in (scenario.disturbance_covariance, scenario.noise_covariance)
     )
-    return Sizes(float(np.linalg.norm(scenario.initial_state - scenario.initial_estimate)), w, v)
+    return Sizes(w, v)
 
 
 def error_and_bounds(

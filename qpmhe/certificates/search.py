@@ -30,7 +30,7 @@ _LARGEST_RATE = 0.9999
 # to go three times as far.
 _ABOVE, _ATTEMPTS = 0.01, 4
 # Between the smallest rate, where constants grow without bound, and 1, where they last.
-_SHARES = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
+_SHARES = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
 _SEED = 20210829
 # How much of the time the choice of a rate may take, and one verification; how many programs
 # the former solves; how far off the time that a program is expected to take may be.

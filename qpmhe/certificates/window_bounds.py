@@ -1,25 +1,23 @@
-"""Bounds beyond the paper: its proof with the sums kept, and with the norms kept."""
+"""Bounds beyond the paper: its proof with the norms kept, or at least the sums."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .._checks import Array, count, numbers, positive, positive_definite
+from .._checks import Array, count, numbers, positive_definite
 from ..costs import Cost
 from ..errors import OptionError, ShapeError
-from .decay import DecayingSums, checked_length, decaying_sums
+from .decay import checked_length, decaying_sums
 from .theorem import TheoremConstants
 
 __all__ = ["Parts", "SummedBound", "WeightedBound", "WindowBound", "fit_weight", "largest"]
-
-# About as many numbers of windows are held at once.
-_ENTRIES = 4e6
 
 
 @dataclass(frozen=True)
@@ -28,10 +26,10 @@ class Parts:
 
     observer_start: float  # the initial error in the observer's bound
     window_start: float  # the initial error in detectability's bound
-    entering: Array  # (..., T): what enters the observer's error at each sample
-    misfit: Array  # (..., T): the noises in the candidate's cost
-    disturbances: Array  # (..., T): in detectability's bound
-    noises: Array  # (..., T): in detectability's bound
+    entering: Array  # (T,): what enters the observer's error at each sample
+    misfit: Array  # (T,): the noises in the candidate's cost
+    disturbances: Array  # (T,): in detectability's bound
+    noises: Array  # (T,): in detectability's bound
 
 
 class WindowBound(ABC):
@@ -53,6 +51,8 @@ class WindowBound(ABC):
     :math:`\alpha_k` the most that it makes of estimated ones that cost 1. See the page "What
     is guaranteed, and what is not" for the derivation.
     """
+
+    kind: ClassVar[Literal["summed", "weighted"]]
 
     def __init__(
         self, *, horizon: int, rho: float, eta: float, exponent: float, slope: float, entry: float,
@@ -117,29 +117,28 @@ class WindowBound(ABC):
         return self.along(self.parts(start, w, v), costs)
 
     def along(self, parts: Parts, costs: ArrayLike | None = None) -> Array:
-        """The bound in the norm of detectability, at t = 0, ..., T, (..., T + 1)."""
-        N, a = self.horizon, self.exponent
-        several, steps = parts.disturbances.shape[:-1], parts.disturbances.shape[-1]
+        """The bound in the norm of detectability, at t = 0, ..., T, (T + 1,)."""
+        N, a, steps = self.horizon, self.exponent, parts.disturbances.size
         lengths = np.minimum(np.arange(steps + 1), N)
         decay: Array = self.rho ** np.arange(steps + 1.0)
         error = parts.observer_start * decay + decaying_sums(self.rho, parts.entering)
-        fit = (self.slope * error[..., :-1] + parts.misfit) ** a
+        fit = (self.slope * error[:-1] + parts.misfit) ** a
         roots: Array = _window_sums(fit, N) ** (1.0 / a)
         if costs is not None:
             known = numbers("costs", costs, finite=False)
             if known.shape != (steps,):
                 raise ShapeError(f"costs have shape {known.shape}; expected ({steps},).")
             # NaN is no cost: fmin leaves the bound in its place.
-            roots[..., 1:] = np.fmin(roots[..., 1:], np.maximum(known, 0.0) ** (1.0 / a))
-        entry = np.full((*several, steps + 1), parts.window_start)
-        entry[..., N + 1 :] = self.entry * error[..., 1 : max(1, steps + 1 - N)]
-        padded = np.zeros((2, *several, N + steps))
-        padded[..., N:] = parts.disturbances, parts.noises
+            roots[1:] = np.fmin(roots[1:], np.maximum(known, 0.0) ** (1.0 / a))
+        entry = np.full(steps + 1, parts.window_start)
+        entry[N + 1 :] = self.entry * error[1 : max(1, steps + 1 - N)]
+        padded = np.zeros((2, N + steps))
+        padded[:, N:] = parts.disturbances, parts.noises
         own = np.where(lengths == 0, entry, 0.0)
         for j in range(N):  # a shorter window begins later
             own = np.where(lengths == N - j, entry, own)
-            own = self._advance(own, *padded[..., j : j + steps + 1])
-        own[..., 0] = parts.window_start
+            own = self._advance(own, *padded[:, j : j + steps + 1])
+        own[0] = parts.window_start
         return self.alphas[lengths] * roots + own
 
     def funnel(self, initial: float, disturbance: float, noise: float, steps: int) -> Array:
@@ -159,62 +158,11 @@ class WindowBound(ABC):
         root = self.horizon ** (1.0 / self.exponent) * fit
         return float(self.scales[0] * (self.alphas[-1] * root + own)[0])
 
-    def result(self, rate: float | None = None) -> DecayingSums:
-        """The smallest constants C_1, C_2, C_3 with which (eq:RGES_result) follows.
-
-        The bound is sublinear, so its value for a sum of impulses is below the sum of its
-        values for each. Impulses are tried at each time before the window is full, and until
-        they have left it; from then on their effect decays with rho.
-        """
-        lam = max(self.eta, self.rho) if rate is None else positive("rate", rate)
-        if not self.rho <= lam < 1.0:
-            raise OptionError(f"rate is {lam!r}; expected at least rho = {self.rho!r}, below 1.")
-        N = self.horizon
-        # At N + 1 the observer's bound takes the place of the initial error.
-        nothing = np.zeros(N + 1)
-        first = _over_powers(self.bound(1.0, nothing, nothing), lam, 0)
-        second = third = 0.0
-        rows = max(1, int(_ENTRIES / (N * (2 * N + 1))))
-        for least in range(0, N + 1, rows):
-            starts = np.arange(least, min(least + rows, N + 1))
-            of_w, of_v = self._impulses(starts)
-            second = max(second, _over_powers(of_w, lam, 1))
-            third = max(third, _over_powers(of_v, lam, 1))
-        return DecayingSums(lam, max(1.0, first), second, third)
-
-    def _impulses(self, starts: NDArray[np.intp]) -> tuple[Array, Array]:
-        """What unit impulses of w and of v at these times make of the N + 1 times after each."""
-        N = self.horizon
-        shape = len(starts), 2 * N + 1
-        impulses, nothing = np.zeros(shape), np.zeros(shape)
-        impulses[np.arange(len(starts)), starts] = 1.0
-        which = np.arange(len(starts))[:, None], starts[:, None] + np.arange(1, N + 2)
-        of_w, of_v = (
-            self.scales[0] * self.along(self._lengths(w, v))[which]
-            for w, v in ((impulses, nothing), (nothing, impulses))
-        )
-        return of_w, of_v
-
-    def _lengths(self, w: Array, v: Array) -> Parts:
-        """`parts` of several runs without initial error, given the lengths (K, T)."""
-        flat = self.parts(np.zeros(()), w.ravel(), v.ravel())
-        return replace(flat, **{
-            name: getattr(flat, name).reshape(w.shape)
-            for name in ("entering", "misfit", "disturbances", "noises")
-        })
-
-
-def _over_powers(values: Array, rate: float, first: int) -> float:
-    """The largest of values[..., i] / rate^(first + i); infinite where the power vanishes."""
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        shares = values / rate ** np.arange(first, first + float(values.shape[-1]))
-    return float(np.where(values > 0.0, shares, 0.0).max())
-
 
 def _window_sums(values: Array, width: int) -> Array:
     """Sums over the last values before t = 0, ..., T."""
-    padded = np.concatenate((np.zeros((*values.shape[:-1], width)), values), axis=-1)
-    sums: Array = sliding_window_view(padded, width, axis=-1).sum(axis=-1)
+    padded = np.concatenate((np.zeros(width), values))
+    sums: Array = sliding_window_view(padded, width).sum(axis=1)
     return sums
 
 
@@ -245,6 +193,8 @@ class SummedBound(WindowBound):
             (c_w \eta^\tau \underline c_w^{-1/a})^b + (c_v \eta^\tau \underline c_v^{-1/a})^b
         \big)
     """
+
+    kind = "summed"
 
     def __init__(self, constants: TheoremConstants) -> None:
         self.constants = constants
@@ -308,6 +258,8 @@ class WeightedBound(WindowBound):
 
     where lambda is the largest eigenvalue.
     """
+
+    kind = "weighted"
 
     def __init__(
         self, cost: Cost, *, horizon: int, P: ArrayLike, eta: float,

@@ -141,7 +141,7 @@ def _ingredients_table(
     """The constants of detectability and of the observer."""
     table = _table(
         "Detectability and observer", "Rate per step; constants of initial error, disturbance and "
-        "noise. The bounds below for other N may use other rates.",
+        "noise.",
     )
     rows = []
     if detected is not None:
@@ -159,30 +159,24 @@ def _ingredients_table(
 def _bounds_table(certificate: Certificate) -> Table:
     """The constants of the bounds, and what they come to."""
     sizes = certificate.sizes
-    largest = {N: bounds.paper.dominating()[1] for N, bounds in certificate.bounds.items()}
-    terms = "; ".join(
-        f"{term} (N = {', '.join(str(N) for N in largest if largest[N] == term)})"
-        for term in dict.fromkeys(largest.values())
-    )
     table = _table(
         "Bounds of the error (eq:RGES_result)",
         f"Limit: for |w| <= {sizes.disturbance:.3g} and |v| <= {sizes.noise:.3g} at all "
-        f"times. Vacuous: no less than {certificate.diameter:.4g}, the diameter of the set. Only "
-        f"the first row of each N is the paper's; its largest term in C_2: {terms}. Evidence of "
-        f"all: {certificate.evidence}.",
+        f"times. Vacuous: no less than {certificate.diameter:.4g}, the diameter of the set. "
+        f"Evidence of all: {certificate.evidence}.",
     )
     rows: list[tuple[Any, ...]] = []
     for N, bounds in certificate.bounds.items():
         for kind in certificate.kinds:
             if kind == "measured":
                 continue
-            window = {"summed": bounds.summed, "weighted": bounds.weighted}.get(kind)
-            result = bounds.paper.result if window is None else window.result()
+            paper = bounds.paper.result
+            constants = (*paper.constants, paper.rate) if kind == "paper" else ("",) * 4
             limit = certificate.limit(sizes.disturbance, sizes.noise, horizon=N, kind=kind)
             vacuous = certificate.vacuous(horizon=N, kind=kind)
             rows.append((
-                str(N) if kind == "paper" else "", LABELS[kind], *result.constants, result.rate,
-                limit, "[yellow]vacuous[/]" if vacuous else "",
+                str(N) if kind == "paper" else "", LABELS[kind], *constants, limit,
+                "[yellow]vacuous[/]" if vacuous else "",
             ))
     _fill(table, ("N", "bound", "C_1", "C_2", "C_3", "lambda", "limit", ""), rows)
     return table

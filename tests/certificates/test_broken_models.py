@@ -162,7 +162,7 @@ def test_the_slope_of_the_output_is_that_of_the_enclosure():
     slope = certify(
         right, qpmhe.Luenberger([[0.4]]), COST, horizon=3, region=region,
         detectability=detected, stability=observed,
-    ).of().weighted.slope
+    ).of().window.slope
     # |dh|_M / |dx|_O with M = 0.4^2 + 1.
     expected = np.sqrt(1.16 / observed.P[0, 0])
     assert slope == pytest.approx(expected, rel=1e-7)

@@ -68,7 +68,7 @@ def test_the_initial_constant_is_caught_where_it_is_sharp():
 
 def test_the_reactors_detectability_and_observer_are_not_refuted(reactor):
     certificate, _ = reactor
-    detected, observed = certificate.detectabilities[0], certificate.stabilities[0]
+    detected, observed = certificate.detectability, certificate.stability
     pairs = attack_detectability(
         certificate.system, certificate.region,
         DecayingSums(detected.eta, detected.c_p, detected.c_w, detected.c_v), trials=PAIRS,
@@ -122,12 +122,12 @@ def test_no_closed_run_exceeds_a_bound(name):
 def test_a_wrong_certificate_is_caught_by_closed_runs():
     certificate = constrained("linear")
     attacks, _ = attack_estimator(certificate, trials=20, backends=["auto"], seed=2)
-    weighted = certificate.of().weighted
+    weighted = certificate.of().window
     # Below what was reached, no factor may pass.
     weighted.scales = weighted.scales * 0.8 * attacks["weighted"].ratio
     again, _ = attack_estimator(certificate, trials=20, backends=["auto"], seed=2)
     assert again["weighted"].refuted
-    assert not again["summed"].refuted
+    assert not again["paper"].refuted
 
 
 def test_points_are_drawn_into_a_polytope():
@@ -157,7 +157,7 @@ def test_models_of_the_zoo_are_certified_and_not_refuted(name):
         stability=certify_observer(system, observer, region, rho=rates[1]),
     )
     assert certificate.evidence is Evidence.PROVED
-    detected = certificate.detectabilities[0]
+    detected = certificate.detectability
     pairs = attack_detectability(
         system, certificate.region,
         DecayingSums(detected.eta, detected.c_p, detected.c_w, detected.c_v), trials=PAIRS,

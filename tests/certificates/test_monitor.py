@@ -107,6 +107,15 @@ def test_violated_sets_are_reported_but_not_needed():
     assert "the bound needs no sets" in str(summary)
 
 
+def test_a_projected_candidate_is_no_observer_trajectory():
+    certificate = made(sets={"states": qpmhe.Box([-1.0], [1.0])}, gain=0.9, kappa=0.9)
+    mhe = estimator(certificate)
+    mhe.update(5.0)
+    check = monitor(certificate, mhe.update(0.0))
+    assert not check.observer_candidate
+    assert "observer_candidate" in check.failed
+
+
 @pytest.mark.parametrize("which", ["cost", "candidate_cost"])
 def test_costs_that_are_not_those_of_the_trajectories_are_seen(which):
     certificate = made()

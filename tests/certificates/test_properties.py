@@ -133,7 +133,7 @@ def test_a_system_that_only_behaves_alike_weakens_the_label(parts):
             stability=given[1],
         )
         assert certificate.evidence is Evidence.SAMPLED
-        assert "another System object" in certificate.detectabilities[0].notes[-1]
+        assert "another System object" in certificate.detectability.notes[-1]
     other = qpmhe.System(lambda x: 0.5 * x, output, n=1, p=1)
     with pytest.raises(MismatchError, match="another system"):
         certify(other, observer, COST, horizon=2, region=box(0.3), detectability=copied[0])
@@ -157,7 +157,7 @@ def test_what_is_stated_by_hand_is_assumed(parts):
     assert replace(rough, evidence=Evidence.PROVED).evidence is Evidence.SAMPLED
 
 
-def test_a_certificate_changed_by_hand_is_assumed_or_refused(parts):
+def test_a_certificate_changed_by_hand_is_assumed(parts):
     system, observer, detected, observed = parts
     certificate = certify(
         system, observer, COST, horizon=2, region=box(0.3), detectability=detected,
@@ -167,8 +167,8 @@ def test_a_certificate_changed_by_hand_is_assumed_or_refused(parts):
     assert certificate.evidence is Evidence.PROVED
     assert replace(certificate, cost=other).evidence is Evidence.ASSUMED
     assert replace(certificate, bounds={}).evidence is Evidence.ASSUMED
-    with pytest.raises(MismatchError, match="gain"):
-        replace(certificate, observer=qpmhe.Luenberger([[0.9]]))
+    other = replace(certificate, observer=qpmhe.Luenberger([[0.9]]))
+    assert other.evidence is Evidence.ASSUMED
     restored = pickle.loads(pickle.dumps(certificate))
     assert restored.evidence is Evidence.PROVED
 

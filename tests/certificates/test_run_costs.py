@@ -108,7 +108,7 @@ def test_a_monitor_serves_as_well_and_knows_its_run(certificate):
         measured(certificate, estimator().run(record(1)[1]), source=watch)
     other = certify(
         SYSTEM, OBSERVER, COST, horizon=5, region=certificate.region,
-        detectability=certificate.detectabilities[0], stability=certificate.stabilities[0],
+        detectability=certificate.detectability, stability=certificate.stability,
     )
     with pytest.raises(MismatchError, match="another certificate"):
         measured(other, run, source=watch)
