@@ -24,9 +24,11 @@ _COMPLEX_STEP = 2.0**-100
 _DIFFERENCE_STEP = float(np.finfo(np.float64).eps) ** (1 / 3)
 # Accuracy of differences: of each entry, of an entry beside the largest of its row, and of one
 # beside the function's value, where it is rounding.
-_ENTRY, _ROW, _VALUE = 1e-5, 1e-7, 2e-10
+_ENTRY, _ROW, _VALUE = 1e-5, 1e-7, 5e-10
 # A Jacobian is wrong where it is further off than differences with these many times the error.
 _SLACK = 10.0
+# Steps that must agree, not in phase with what oscillates, as shares of the first.
+_PARTS = (1.0, 0.62, 0.23)
 # How often, and by how much, a step is shortened at most where differences curve within it.
 _SHORTER = [2.0 ** (-4 * k) for k in range(11)]
 
@@ -180,26 +182,25 @@ class Jacobian:
     def _settled(
         self, x: Array, u: Array, value: Array, size: Array, columns: list[int]
     ) -> dict[int, Array]:
-        """The columns that steps of this size and half of it agree on."""
+        """The columns that steps of this size and shorter ones agree on."""
         step = _DIFFERENCE_STEP * size
-        found = {}
+        found: dict[int, Array] = {}
         for j in columns:
             try:
                 with np.errstate(all="ignore"):
-                    whole, half = (
-                        self._quotients(x[None], u[None], length, slice(j, j + 1))[0, :, 0]
-                        for length in (step[None], 0.5 * step[None])
-                    )
+                    found[j] = size[j] * np.array([
+                        self._quotients(x[None], u[None], part * step[None], slice(j, j + 1))[0]
+                        for part in _PARTS
+                    ])[:, :, 0]
             except Exception:  # outside the function's domain
                 continue
-            found[j] = whole, half
         if not found:
             return {}
-        row = np.max([np.abs(half) * size[j] for j, (_, half) in found.items()], axis=0)
+        row = np.max([np.abs(slopes[-1]) for slopes in found.values()], axis=0)
         floor = _ROW * row + _VALUE * np.maximum(np.abs(value), self._outputs)
         return {
-            j: whole for j, (whole, half) in found.items()
-            if np.all(np.abs(whole - half) * size[j] <= _ENTRY * np.abs(half) * size[j] + floor)
+            j: slopes[0] / size[j] for j, slopes in found.items()
+            if np.all(np.ptp(slopes, axis=0) <= _ENTRY * np.abs(slopes[-1]) + floor)
         }
 
     def _choose(self, probes: Probes) -> None:

