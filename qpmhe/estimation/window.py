@@ -240,7 +240,8 @@ class Window(Stages):
             self._set_weight(k, time)
         elif not self.unusual or self._observed[k].all():
             return None
-        return self._observed[k]
+        observed: NDArray[np.bool_] = self._observed[k]
+        return observed
 
     def _set_weight(self, k: int, time: int) -> None:
         """Set the weight of stage k from its observed components and its noise weight."""
@@ -361,7 +362,8 @@ class Window(Stages):
         nearest, events = self._nearest, _PROJECTED
         if self.metric is not None:
             covariance = self.metric.covariance
-        assert nearest is not None and covariance is not None
+        assert nearest is not None
+        assert covariance is not None
         found = nearest(z_next, covariance)
         if not nearest.contains(predicted):
             events |= _PREDICTION_OUTSIDE

@@ -96,9 +96,9 @@ class Observer(ABC):
 
     @property
     def filter_gain(self) -> Array | None:
-        """The gain G (n, p) where `filter` gives z + G v at all times, or nothing (G = 0).
+        """The gain G (n, p) of an observer whose estimate of x(t) is z + G v at all times.
 
-        None for other observers.
+        Zero without a measurement update; None for observers with another one.
         """
         gain = self.constant_gain
         if gain is None or type(self).filter is not Observer.filter:

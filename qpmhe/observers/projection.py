@@ -77,7 +77,7 @@ class NearestPoint:
     def contains(self, points: Array) -> NDArray[np.bool_]:
         """Whether each of the points (..., n) is in the set, up to rounding in general rows."""
         # Comparisons with NaN are false: a NaN is no member.
-        inside: NDArray[np.bool_] = ((self._lower <= points) & (points <= self._upper)).all(-1)
+        inside = np.asarray(((self._lower <= points) & (points <= self._upper)).all(-1))
         return inside & ~(self._misses(points) > 0.0).any(-1) if self._has_rows else inside
 
     def _misses(self, points: Array) -> Array:

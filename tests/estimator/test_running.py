@@ -7,7 +7,6 @@ import pytest
 
 import qpmhe
 from qpmhe import Status
-
 from qpmhe.estimation.running import RunningObservers
 from qpmhe.observers import Sample
 
