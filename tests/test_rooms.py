@@ -11,7 +11,7 @@ import qpmhe_solvers
 
 ROOTS = [Path(package.__file__).parent for package in (qpmhe, qpmhe_solvers)]
 # A private part of a dotted name, other than the modules that all rooms share.
-PRIVATE = re.compile(r"^(?!qpmhe\._(checks|version)\b).*\._(?!_)")
+PRIVATE = re.compile(r"^(?!qpmhe\._(checks|linalg|version)\b).*\._(?!_)")
 
 
 def private_names(file, text):
