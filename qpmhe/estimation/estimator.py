@@ -297,10 +297,13 @@ class MovingHorizonEstimator:
 
     def _check_step_length(self, dt: float) -> None:
         """Check once, before a sample is taken, that the model takes step lengths."""
-        if "timed" not in self._own_system.__dict__:
-            timed = self.system.timed.copy(self._own_system.scales)
-            timed.check(self._initial_state, np.append(self._no_input, dt))
-            self._own_system.__dict__["timed"] = timed
+        own = self._own_system
+        if "timed" not in own.__dict__:
+            try:
+                own.timed.check(self._initial_state, np.append(self._no_input, dt))
+            except BaseException:
+                own.__dict__.pop("timed", None)
+                raise
 
     def amend(self, time: int, y: ArrayLike) -> Estimate:
         """Insert a late measurement, run the observer again from there, and estimate.

@@ -261,6 +261,11 @@ class Jacobian:
             self.method = method
             self.batch = self._complex if method == "complex step" else self._differences
 
+    def follow(self, other: Jacobian) -> None:
+        """Compute as another Jacobian of the same function does."""
+        self.use(other.method)
+        self._undecided = False
+
     def _compare(self, probes: Probes) -> None:
         """Raise where a given Jacobian is not the derivative."""
         given = self._given

@@ -287,7 +287,14 @@ class System:
             other.rate_jacobian = self.rate_jacobian.copy(self.rate_jacobian.function)
         other.__dict__.pop("timed", None)
         if self.make_timed is not None:
-            other.make_timed = lambda: self.timed.copy(other.scales)
+
+            def timed() -> System:
+                made = self.timed.copy(other.scales)
+                made.f_jacobian.follow(other.f_jacobian)
+                made.h_jacobian.follow(other.h_jacobian)
+                return made
+
+            other.make_timed = timed
         if scales is not None:
             other.use_scales(scales)
         return other
