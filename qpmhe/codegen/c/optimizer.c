@@ -98,6 +98,8 @@ static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
         o->iterations += iterations;
         return status;
     }
+#else
+    (void)o;
 #endif
     return SOLVED;
 }
