@@ -363,9 +363,8 @@ class PythonEngine:
             if not isinstance(found, (list, tuple)) or len(found) != len(known):
                 raise ValueError(f"{name} is {found!r}; expected {len(known)} of them")
             for one, mine in zip(found, known, strict=True):
-                usual = isinstance(one, str) and one in (mine, slowest)
                 # Found out at other states; the stages that are computed again judge it.
                 other = {"unknown": ("batched", "columns"), slowest: ("complex step",)}
-                if not usual and one not in other.get(mine, ()):
+                if not isinstance(one, str) or one not in (mine, slowest, *other.get(mine, ())):
                     raise ValueError(f"{name} is {found!r}; expected {known}")
         return tuple(modes), tuple(methods)

@@ -15,6 +15,8 @@ WEIGHTS = (1e3 * np.eye(2), 1e4 * np.eye(2), 2500.0 * np.eye(1))
 GOOD = 0.1  # what the error of a healthy estimator stays below on these records
 HORIZON, Z0 = 5, np.array([0.5, 0.0])
 
+pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
+
 
 def f(x):
     return x @ A.T
