@@ -11,7 +11,7 @@ import numpy as np
 from .._checks import choice
 from ..costs import Cost, CostConstants
 from ..errors import OptionError
-from .decay import DecayingSums, Sizes
+from .decay import Sizes
 from .inequalities import Matrices
 from .properties import Detectability, ObserverStability
 from .theorem import TheoremConstants, theorem
@@ -82,14 +82,13 @@ def bounds_for(
     constants: CostConstants, *, lipschitz: float, output: Matrices | None = None,
 ) -> HorizonBounds:
     """The bounds that follow from what was certified."""
-    d, o = detectability, stability
     paper = theorem(
-        DecayingSums(d.eta, d.c_p, d.c_w, d.c_v), DecayingSums(o.rho, o.C_p, o.C_w, o.C_v),
-        constants, kappa=o.kappa, lipschitz=lipschitz, horizon=horizon,
+        detectability.sums, stability.sums, constants, kappa=stability.kappa,
+        lipschitz=lipschitz, horizon=horizon,
     )
     window: WindowBound | None = None
     if cost.quadratic and cost.discount == 1.0:
-        window = _weighted(cost, d, o, lipschitz, horizon, output)
+        window = _weighted(cost, detectability, stability, lipschitz, horizon, output)
     if window is None and constants.exponent >= 1.0:
         window = SummedBound(paper)
     return HorizonBounds(paper, window)

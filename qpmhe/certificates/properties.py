@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array, numbers, positive
-from ..errors import OptionError
 from ..model.sets import ConvexSet
 from ..model.system import System
-from .decay import checked_rate
+from .decay import DecayingSums, checked_rate
 from .evaluation import evaluated
-from .evidence import CertificateError, Evidence, MismatchError, weakest
+from .evidence import Evidence, MismatchError, weakest
 from .regions import Region, beyond, stated_region
 
 __all__ = ["Detectability", "ObserverStability", "Subject", "fitting", "json_ready", "sealed"]
@@ -25,21 +24,50 @@ _POINTS, _SEED = 24, 20210829
 _ROUNDING = 1e-9  # another compiler or library may round otherwise
 
 
-def _bound(rate: float, constants: tuple[float, ...], **vectors: ArrayLike) -> Array:
-    r"""The bound :math:`a \rho^t + \sum_{\tau=1}^t \rho^\tau (b(t-\tau) + c(t-\tau))`."""
-    start, first, second = (
-        constant * np.linalg.norm(numbers(name, value), axis=-1)
-        for constant, (name, value) in zip(constants, vectors.items(), strict=True)
-    )
-    bound = np.empty((first.shape[0] + 1, *first.shape[1:]))
-    bound[0] = start
-    for t in range(first.shape[0]):
-        bound[t + 1] = rate * (bound[t] + first[t] + second[t])
-    return bound
+class _Certified:
+    """What detectability and the observer's stability share."""
+
+    evidence: Evidence
+
+    @property
+    def sums(self) -> DecayingSums:
+        """The rate and the constants of the bound."""
+        raise NotImplementedError
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but the region, in types that JSON knows; infinite numbers become None."""
+        values = vars(self) | {"evidence": str(self.evidence)}
+        content: dict[str, Any] = json_ready({
+            name: value for name, value in values.items() if name not in ("region", "subject")
+        })
+        return content
+
+    def bound(self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike) -> Array:
+        """The right-hand side of the definition at t = 0, ..., T, (T + 1, ...).
+
+        Parameters
+        ----------
+        initial : (..., n) array_like
+            The initial error, or difference of states.
+        disturbances, noises : (T, ..., n) and (T, ..., p) array_like
+            w and v, or the differences of w and of h(x), at t = 0, ..., T - 1.
+        """
+        sums = self.sums
+        start, w, v = (
+            constant * np.linalg.norm(numbers(name, value), axis=-1)
+            for constant, name, value in zip(
+                sums.constants, ("initial", "disturbances", "noises"),
+                (initial, disturbances, noises), strict=True,
+            )
+        )
+        bound = [start]
+        for entering in w + v:
+            bound.append(sums.rate * (bound[-1] + entering))
+        return np.array(bound)
 
 
 @dataclass(frozen=True, eq=False)
-class Detectability:
+class Detectability(_Certified):
     r"""Incremental exponential input/output-to-state stability, Definition def:eIOSS.
 
     For any two trajectories within the region, of the same inputs,
@@ -114,53 +142,14 @@ class Detectability:
             positive("c_v", c_v), stated_region(region),
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """All but the region, in types that JSON knows; infinite numbers become None."""
-        return _to_dict(self)
-
-    def bound(self, initial: ArrayLike, disturbances: ArrayLike, outputs: ArrayLike) -> Array:
-        """The right-hand side of the definition along a pair of trajectories, (T + 1, ...).
-
-        Parameters
-        ----------
-        initial : (..., n) array_like
-            Differences of the initial states.
-        disturbances, outputs : (T, ..., n) and (T, ..., p) array_like
-            Differences of the disturbances and of h(x), at t = 0, ..., T - 1.
-        """
-        return _bound(
-            self.eta, (self.c_p, self.c_w, self.c_v), initial=initial, disturbances=disturbances,
-            outputs=outputs,
-        )
-
-    def squared(self, rate: float) -> tuple[float, Array, Array]:
-        r"""The dissipation inequality in squares, for a rate r in (eta, 1): returns r^2, W_2, V_2.
-
-        .. math::
-            |x_1^+ - x_2^+|_P^2 \le r^2 |x_1 - x_2|_P^2 + |\delta w|_{W_2}^2
-            + |\delta h|_{V_2}^2
-
-        The verified inequality is :math:`|A \delta x|_P^2 \le \eta^2 |\delta x|_P^2
-        + |\delta h|_V^2`; with :math:`1 + \epsilon = (r/\eta)^2` and Young's inequality for
-        the disturbance, :math:`W_2 = (1 + 1/\epsilon) P` and :math:`V_2 = (1 + \epsilon) V`.
-
-        Raises
-        ------
-        OptionError
-            If the rate is out of range.
-        CertificateError
-            If there is no P.
-        """
-        if self.P is None or self.V is None:
-            raise CertificateError("assumed constants have no dissipation inequality behind them.")
-        if not self.eta < rate < 1.0:
-            raise OptionError(f"rate is {rate!r}; expected a number in ({self.eta!r}, 1).")
-        more = (rate / self.eta) ** 2
-        return rate * rate, more / (more - 1.0) * self.P, more * self.V
+    @property
+    def sums(self) -> DecayingSums:
+        """eta, c_p, c_w and c_v."""
+        return DecayingSums(self.eta, self.c_p, self.c_w, self.c_v)
 
 
 @dataclass(frozen=True, eq=False)
-class ObserverStability:
+class ObserverStability(_Certified):
     r"""Robust global exponential stability of the auxiliary observer, Definition def:RGES.
 
     As long as state and observer state stay within the region,
@@ -217,24 +206,10 @@ class ObserverStability:
             positive("C_v", C_v), positive("kappa", kappa), stated_region(region),
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """All but the region, in types that JSON knows; infinite numbers become None."""
-        return _to_dict(self)
-
-    def bound(self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike) -> Array:
-        """The right-hand side of (eq:RGES) along a run, (T + 1, ...).
-
-        Parameters
-        ----------
-        initial : (..., n) array_like
-            The initial error.
-        disturbances, noises : (T, ..., n) and (T, ..., p) array_like
-            w and v at t = 0, ..., T - 1.
-        """
-        return _bound(
-            self.rho, (self.C_p, self.C_w, self.C_v), initial=initial, disturbances=disturbances,
-            noises=noises,
-        )
+    @property
+    def sums(self) -> DecayingSums:
+        """rho, C_p, C_w and C_v."""
+        return DecayingSums(self.rho, self.C_p, self.C_w, self.C_v)
 
 
 Result = TypeVar("Result", "Detectability", "ObserverStability")
@@ -333,14 +308,6 @@ def fitting(
     )
     weaker = replace(part, notes=(*part.notes, note))
     return sealed(weaker, part.subject, weakest((part.evidence, Evidence.SAMPLED)))
-
-
-def _to_dict(result: Detectability | ObserverStability) -> dict[str, Any]:
-    values = vars(result) | {"evidence": result.evidence.value}
-    content: dict[str, Any] = json_ready({
-        name: value for name, value in values.items() if name not in ("region", "subject")
-    })
-    return content
 
 
 def json_ready(value: Any) -> Any:
