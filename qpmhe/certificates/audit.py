@@ -8,14 +8,12 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from .._checks import Array, record, vector
+from .._checks import Array
 from ..costs import Cost, CostConstants
-from ..errors import InvalidInputError, ModelError, ShapeError
+from ..errors import InvalidInputError, ShapeError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
-from ..models.scenario import Record
 from ..observers import Observer, Sample
 from .branch_and_bound import output_lipschitz
 from .deadline import PART_SECONDS, Deadline
@@ -116,9 +114,7 @@ def _no_correction_finding(system: System, observer: Observer, region: Region) -
     return found(True, Evidence.SAMPLED, f"L(z, 0) = 0 at {points.shape[0]} states")
 
 
-def _kappa_finding(
-    system: System, observer: Observer, region: Region, run: _ObserverRun | None
-) -> Finding:
+def _kappa_finding(system: System, observer: Observer, region: Region) -> Finding:
     """The bound on the correction."""
     found = partial(Finding, "correction bound", "eq:kappa")
     gain = gain_if_constant(observer, system)
@@ -126,20 +122,14 @@ def _kappa_finding(
         kappa = float(norm_bound(Matrices.exact(gain[None]))[0])
         return found(True, Evidence.PROVED, f"kappa = |L| = {kappa:.6g}, of a constant gain", kappa)
     correction = _correction(system, observer)
-    if correction is not None:
-        worst, z, v = _steepest(correction, system, region)
-        how = f"the largest |L(z, v)| / |v| tried, at z = {z.tolist()}, v = {v.tolist()}"
-    elif run is not None:
-        sizes = np.linalg.norm(run.noises, axis=1)
-        ratios = np.linalg.norm(run.corrections, axis=1)[sizes > 0.0] / sizes[sizes > 0.0]
-        worst = float(ratios.max(initial=0.0))
-        how = f"the largest |L(t)| / |v_z(t)| on a run of {sizes.size} samples"
-    else:
+    if correction is None:
         return found(
             None, None,
-            f"{type(observer).__name__} has a gain that follows from what was measured: pass a "
-            "run to see how large it gets",
+            f"{type(observer).__name__} has a gain that follows from what was measured: state its "
+            "bound, ObserverStability.assumed(kappa=...)",
         )
+    worst, z, v = _steepest(correction, system, region)
+    how = f"the largest |L(z, v)| / |v| tried, at z = {z.tolist()}, v = {v.tolist()}"
     if not np.isfinite(worst):
         return found(False, Evidence.SAMPLED, f"kappa is infinite: {how}")
     return found(True, Evidence.SAMPLED, f"kappa = {worst:.6g}, {how}", worst)
@@ -241,48 +231,12 @@ def _invariance_finding(system: System, region: Region) -> Finding:
     )
 
 
-def _candidate_finding(system: System, region: Region, run: _ObserverRun | None) -> Finding:
-    """Whether the candidate lies in X, W and V along a run."""
+def _candidate_finding(system: System) -> Finding:
+    """Whether the candidate lies in X, W and V."""
     found = partial(Finding, "candidate in the sets", "ass:observer")
-    sets = (("X", "z", system.states), ("W", "L", system.disturbances), ("V", "v_z", system.noises))
-    if all(one is None for _, _, one in sets):
-        return found(
-            True, Evidence.PROVED, "X, W and V are the whole space"
-            + ("" if run is None else f"; {_within(region, run)}"),
-        )
-    if run is None:
-        return found(None, None, "pass a run, to check the candidate along it")
-    outside: list[str] = []
-    counterexample: dict[str, Any] = {}
-    for letter, symbol, one in sets:
-        if one is None:
-            continue
-        values = {"z": run.states, "L": run.corrections, "v_z": run.noises}[symbol]
-        missed = np.array([one.violation(value) for value in values])
-        if missed.max() > 0.0:
-            t = int(np.argmax(missed > 0.0))
-            outside.append(
-                f"{symbol}({t}) = {values[t].tolist()} is not in {letter}, by {missed[t]:.6g}; it "
-                f"is outside {int((missed > 0.0).sum())} times of {missed.size}"
-            )
-            counterexample = counterexample or {
-                "t": t, symbol: values[t], "missed by": float(missed[t])
-            }
-    if outside:
-        return found(False, Evidence.PROVED, ". ".join(outside), None, counterexample)
-    return found(
-        True, Evidence.SAMPLED,
-        f"z, L and v_z are in X, W and V on a run of {run.noises.shape[0]} samples; "
-        f"{_within(region, run)}",
-    )
-
-
-def _within(region: Region, run: _ObserverRun) -> str:
-    inside = region.contains(run.states)
-    if inside.all():
-        return "the observer stays in the region on the run"
-    t = int(np.argmin(inside))
-    return f"the observer leaves the region: z({t}) = {run.states[t].tolist()}"
+    if all(one is None for one in (system.states, system.disturbances, system.noises)):
+        return found(True, Evidence.PROVED, "X, W and V are the whole space")
+    return found(None, None, "the monitor checks it at each step of a run")
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,8 +285,7 @@ class Audit:
 
 
 def audit(
-    system: System, observer: Observer, cost: Cost, region: ConvexSet | Region | None = None,
-    run: Record | ArrayLike | None = None, *, initial_state: ArrayLike | None = None,
+    system: System, observer: Observer, cost: Cost, region: ConvexSet | Region | None = None, *,
     inputs: Box | None = None, seconds: float | Deadline = PART_SECONDS,
 ) -> Audit:
     """Check each assumption of the theorem, and show where it fails.
@@ -341,11 +294,6 @@ def audit(
     ----------
     system, observer, cost, region, inputs
         As for `certify`.
-    run : Record or (T, p) array_like, optional
-        A record, simulated or measured, along which the candidate is checked; a record with
-        inputs is needed for a system with inputs.
-    initial_state : (n,) array_like, optional
-        z(0) of that run; needed with it.
     seconds : float or Deadline
         How long the output's Lipschitz constant may take, about.
 
@@ -358,76 +306,16 @@ def audit(
     checked_ingredients(system, observer, cost)
     deadline = Deadline.of(seconds)
     place = bounded_region(system, region, inputs)
-    observed = _observed(system, observer, run, initial_state)
     constants, about_cost = _cost_finding(cost)
     findings = (
         _lipschitz_finding(system, place, deadline),
         _no_correction_finding(system, observer, place),
-        _kappa_finding(system, observer, place, observed),
+        _kappa_finding(system, observer, place),
         about_cost,
         _invariance_finding(system, place),
-        _candidate_finding(system, place, observed),
+        _candidate_finding(system),
     )
     return Audit(findings, constants, place)
-
-
-def _observed(
-    system: System, observer: Observer, run: Record | ArrayLike | None,
-    initial_state: ArrayLike | None,
-) -> _ObserverRun | None:
-    if run is None:
-        return None
-    if initial_state is None:
-        raise InvalidInputError(
-            "initial_state is missing; expected z(0), where the observer starts on the run."
-        )
-    y, u = (run.measurements, run.inputs) if isinstance(run, Record) else (run, None)
-    if u is None and system.m:
-        raise InvalidInputError(
-            "the run has no inputs, but the system does; pass a record with inputs."
-        )
-    measured = record("run", y, system.p)
-    used = np.empty((measured.shape[0], 0)) if u is None else record("inputs", u, system.m)
-    start = vector("initial_state", initial_state, system.n)
-    return _observe(system, observer, start, measured, used)
-
-
-@dataclass(frozen=True, eq=False)
-class _ObserverRun:
-    """What the observer did."""
-
-    states: Array  # (T + 1, n): z(0), ..., z(T)
-    corrections: Array  # (T, n): L(t)
-    noises: Array  # (T, p): v_z(t)
-
-
-def _observe(
-    system: System, observer: Observer, initial_state: Array, y: Array, u: Array
-) -> _ObserverRun:
-    """Run an observer on complete measurements, (eq:observer)."""
-    observer.check(system, initial_state)
-    steps = y.shape[0]
-    states = np.empty((steps + 1, system.n))
-    corrections, noises = np.empty((steps, system.n)), np.empty((steps, system.p))
-    states[0], covariance = initial_state, observer.initial_covariance()
-    with np.errstate(all="ignore"):
-        for t in range(steps):
-            z = states[t]
-            try:
-                noises[t] = y[t] - system.h(z, u[t])
-                sample = Sample(system, u[t], covariance=covariance)
-                if observer.needs_jacobians:
-                    sample.f_jacobian = system.f_jacobian(z, u[t])
-                    sample.h_jacobian = system.h_jacobian(z, u[t])
-                corrections[t], covariance = observer.correct(z, noises[t], sample)
-                states[t + 1] = system.f(z, u[t]) + corrections[t]
-            except Exception as error:  # a user's function may raise anything
-                raise ModelError(
-                    f"the model or the observer raises {type(error).__name__} along the run, at "
-                    f"z({t}) = {z.tolist()}: {error}. Leave the run out, or make the model defined "
-                    "there."
-                ) from error
-    return _ObserverRun(states, corrections, noises)
 
 
 def checked_ingredients(system: Any, observer: Any, cost: Any) -> None:

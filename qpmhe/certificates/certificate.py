@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .._checks import Array, count, numbers, vector
 from ..costs import Cost
@@ -26,7 +26,7 @@ from .observer import gain_if_constant
 from .properties import Detectability, ObserverStability, json_ready
 from .regions import Region
 
-__all__ = ["ASSUMED", "Certificate", "CheckedRun"]
+__all__ = ["ASSUMED", "Certificate"]
 
 # The constants are upper bounds, what is computed from them is not: this covers its rounding.
 _OUTWARD = 1.0 + 1e-9
@@ -38,27 +38,6 @@ ASSUMED = (
 )
 # A window without all its measurements has another cost.
 _BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
-
-
-@runtime_checkable
-class CheckedRun(Protocol):
-    """What a `Monitor` knows of the run that it checked."""
-
-    @property
-    def certificate(self) -> Certificate:
-        """The certificate that it was checked against."""
-
-    @property
-    def horizon(self) -> int:
-        """The estimator's horizon."""
-
-    @property
-    def costs(self) -> Array:
-        """The costs that the estimates state, (T,)."""
-
-    @property
-    def confirmed(self) -> NDArray[np.bool_]:
-        """Which of these costs were found to be the true ones, (T,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +116,7 @@ class Certificate:
     def bound(
         self, run: Run | None, disturbances: ArrayLike, noises: ArrayLike, *,
         initial_error: ArrayLike, horizon: int | None = None, kind: Kind = "paper",
-        source: MovingHorizonEstimator | CheckedRun | None = None,
+        source: MovingHorizonEstimator | None = None,
     ) -> Array:
         """The bound of the error |x(t) - x_hat(t)| along a run at t = 0, ..., T, (T + 1,).
 
@@ -157,11 +136,10 @@ class Certificate:
             The right-hand side of (eq:RGES_result) with the paper's constants, or beyond the
             paper: with the proof's norms kept, where those are not known with its sums kept,
             and with the estimates' own costs in place of their bound.
-        source : MovingHorizonEstimator or Monitor, optional
-            The estimator that made the run, as the run left it, or the monitor that checked
-            all its estimates, for the horizon and cost of the run. Needed for
-            ``kind="measured"``; without one, the bound is that of an estimator with this
-            certificate's cost and this horizon, whatever the run.
+        source : MovingHorizonEstimator, optional
+            The estimator that made the run, as the run left it, for the horizon and cost of
+            the run. Needed for ``kind="measured"``; without one, the bound is that of an
+            estimator with this certificate's cost and this horizon, whatever the run.
 
         Raises
         ------
@@ -186,8 +164,7 @@ class Certificate:
         elif kind == "measured":
             raise InvalidInputError(
                 "the measured bound has no source, and a run does not say its horizon and "
-                "cost; pass the estimator that made it (source=estimator), or the monitor "
-                "that checked it (source=monitor)."
+                "cost; pass the estimator that made it (source=estimator)."
             )
         if kind == "paper":
             lengths = [x if x.ndim == 1 else np.linalg.norm(x, axis=1) for x in (w, v)]
@@ -350,40 +327,30 @@ def _signals(
 
 
 def _checked_costs(
-    certificate: Certificate, source: MovingHorizonEstimator | CheckedRun, run: Run | None,
-    horizon: int,
+    certificate: Certificate, source: MovingHorizonEstimator, run: Run | None, horizon: int
 ) -> Array:
     """The costs of a run's estimates; NaN where a window is not what the bound is of."""
     if run is None:
         raise InvalidInputError("a source is given, but no run; pass the run that it made.")
-    if isinstance(source, CheckedRun):
-        if source.certificate is not certificate:
-            raise MismatchError("the monitor is of another certificate; pass one of this one.")
-        same = np.array_equal(source.costs, run.costs, equal_nan=True)
-    elif isinstance(source, MovingHorizonEstimator):
-        certificate.check_estimator(source)
-        same = source.time == len(run) and np.array_equal(
-            source.state, run.states[-1], equal_nan=True
-        )
-    else:
+    if not isinstance(source, MovingHorizonEstimator):
         raise InvalidInputError(
-            f"source is {source!r}; expected the estimator that made the run, or the Monitor that "
-            "checked it."
+            f"source is {source!r}; expected the estimator that made the run."
         )
+    certificate.check_estimator(source)
     if source.horizon != horizon:
         raise MismatchError(
             f"horizon is {horizon}, but the run's estimator has {source.horizon}; take the "
             "bound for its horizon, and certify again if there is none."
         )
-    if not same:
+    if source.time != len(run) or not np.array_equal(
+        source.state, run.states[-1], equal_nan=True
+    ):
         raise MismatchError(
             "the source is not at the end of this run: it has seen another one, or more or less "
-            "of it. Pass the estimator right after its run from the start, or a Monitor of it."
+            "of it. Pass the estimator right after its run from the start."
         )
     costs = np.array(run.costs, np.float64)
     broken = (run.flags & _BROKEN.value) != 0
     for t in np.flatnonzero(broken):
         costs[t : t + horizon] = np.nan
-    if isinstance(source, CheckedRun):
-        costs[~source.confirmed] = np.nan
     return costs

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from numpy.typing import ArrayLike
-
 from .._checks import count
 from ..costs import Cost, CostConstants
 from ..errors import OptionError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
-from ..models.scenario import Record
 from ..observers import Observer
 from .audit import Audit, audit, checked_ingredients
 from .branch_and_bound import constant_output
@@ -39,7 +36,6 @@ def certify(
     system: System, observer: Observer, cost: Cost, *, horizon: int | Sequence[int],
     region: ConvexSet | Region | None = None, inputs: Box | None = None, sizes: Sizes | None = None,
     detectability: Detectability | None = None, stability: ObserverStability | None = None,
-    run: Record | ArrayLike | None = None, initial_state: ArrayLike | None = None,
     seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Certificate:
     """Check the theorem's assumptions on a set of states, and bound the estimator's error.
@@ -61,8 +57,6 @@ def certify(
     detectability, stability : optional
         Constants to take instead of looking for them, such as assumed ones, or those that
         were certified of this system and gain on a set that contains the region.
-    run, initial_state : optional
-        A record along which the candidate is checked against the sets; see `audit`.
     seconds : float or Deadline
         How long the audit and the search for constants may take, about, from when the solvers
         are loaded. What is not proved when its share is over rests on samples, and says so.
@@ -95,10 +89,7 @@ def certify(
     if stability is not None:
         stability = fitting(stability, system, place, gain)
     deadline = started(seconds)
-    findings = audit(
-        system, observer, cost, place, run, initial_state=initial_state,
-        seconds=deadline.part(_AUDIT),
-    )
+    findings = audit(system, observer, cost, place, seconds=deadline.part(_AUDIT))
     constants, _ = _needed(findings)
     wanted = cost_sizes(constants) if sizes is None else sizes
     if detectability is None:

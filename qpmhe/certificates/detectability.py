@@ -10,7 +10,7 @@ from .deadline import PART_SECONDS, Deadline
 from .decay import checked_rate
 from .evidence import NotCertifiedError
 from .inequalities import OutputInjection, OutputWeight, euclidean_constants
-from .properties import Detectability, sealed
+from .properties import Detectability, Subject, sealed
 from .regions import Region, bounded_region
 from .sdp import started
 from .search import Search, checked_weights
@@ -88,10 +88,10 @@ def certify_detectability(
         )
     return sealed(
         Detectability(
-            form.rate, c_p, c_w, c_v, found.evidence, search.region, notes, form.P, form.P,
-            form.R, search.kind, found.margin, found.cells,
+            form.rate, c_p, c_w, c_v, search.region, notes, form.P, form.P, form.R, search.kind,
+            found.margin, found.cells,
         ),
-        system, found.evidence,
+        Subject.of(system, search.region), found.evidence,
     )
 
 

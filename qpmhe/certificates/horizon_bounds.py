@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from .._checks import choice
 from ..costs import Cost, CostConstants
 from ..errors import OptionError
-from .decay import DecayingSums, Sizes
+from .decay import Sizes
 from .inequalities import Matrices
 from .properties import Detectability, ObserverStability
 from .theorem import TheoremConstants, theorem
@@ -82,16 +82,19 @@ def bounds_for(
     constants: CostConstants, *, lipschitz: float, output: Matrices | None = None,
 ) -> HorizonBounds:
     """The bounds that follow from what was certified."""
-    d, o = detectability, stability
-    paper = theorem(
-        DecayingSums(d.eta, d.c_p, d.c_w, d.c_v), DecayingSums(o.rho, o.C_p, o.C_w, o.C_v),
-        constants, kappa=o.kappa, lipschitz=lipschitz, horizon=horizon,
+    plain = theorem(
+        detectability.sums, stability.sums, constants, kappa=stability.kappa,
+        lipschitz=lipschitz, horizon=horizon,
     )
+    paper = plain
+    if lipschitz > 0.0:  # a larger C_v holds as well, and from 1 / L_h on L_bar is L_h
+        larger = max(plain.observer.noise, 1.0 / lipschitz)
+        paper = replace(plain, observer=replace(plain.observer, noise=larger))
     window: WindowBound | None = None
     if cost.quadratic and cost.discount == 1.0:
-        window = _weighted(cost, d, o, lipschitz, horizon, output)
+        window = _weighted(cost, detectability, stability, lipschitz, horizon, output)
     if window is None and constants.exponent >= 1.0:
-        window = SummedBound(paper)
+        window = SummedBound(plain)
     return HorizonBounds(paper, window)
 
 

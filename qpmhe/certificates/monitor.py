@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .._checks import Array, count, record
 from ..errors import InvalidInputError, OptionError, ShapeError
@@ -173,7 +173,6 @@ class Monitor:
     def __init__(self, certificate: Certificate, horizon: int) -> None:
         self.horizon = certificate.of(count("horizon", horizon, 1)).paper.horizon
         self.certificate = certificate
-        self._costs: list[float] = []
         self._inputs: deque[Array] = deque(maxlen=horizon)
         self._checks: list[Hypotheses] = []
 
@@ -221,7 +220,6 @@ class Monitor:
         self._inputs.append(given)
         found = monitor(self.certificate, estimate, np.array(self._inputs))
         self._checks.append(found)
-        self._costs.append(float(estimate.cost))
         return found
 
     def _check_next(self, estimate: Estimate) -> None:
@@ -237,16 +235,6 @@ class Monitor:
                 f"the estimate's window has {stages} stages at time {t}; expected {expected}, for "
                 f"the horizon {self.horizon}. Make the monitor for the estimator's horizon."
             )
-
-    @property
-    def costs(self) -> Array:
-        """The costs that the estimates so far state, (T,)."""
-        return np.array(self._costs)
-
-    @property
-    def confirmed(self) -> NDArray[np.bool_]:
-        """Which of these costs were found to be those of the trajectories, (T,)."""
-        return np.array([check.cost_decrease and check.complete for check in self._checks], bool)
 
     @property
     def applies(self) -> bool:

@@ -16,7 +16,7 @@ from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
 from .decay import checked_rate
 from .evidence import CertificateError, NotCertifiedError
 from .inequalities import ErrorContraction, Matrices, euclidean_constants, norm_bound
-from .properties import ObserverStability, sealed
+from .properties import ObserverStability, Subject, sealed
 from .regions import Region, bounded_region
 from .sdp import started
 from .search import Found, Search, checked_weights
@@ -113,11 +113,10 @@ def stability(search: Search, found: Found) -> ObserverStability:
     kappa = float(norm_bound(Matrices.exact(form.gain[None]))[0])
     return sealed(
         ObserverStability(
-            form.rate, c_p, c_w, c_v, kappa, found.evidence, search.region,
-            (*found.notes, _STAY), form.P, form.P, V + allowance * np.eye(V.shape[0]), form.gain,
-            found.margin, found.cells,
+            form.rate, c_p, c_w, c_v, kappa, search.region, (*found.notes, _STAY), form.P, form.P,
+            V + allowance * np.eye(V.shape[0]), form.gain, found.margin, found.cells,
         ),
-        search.system, found.evidence,
+        Subject.of(search.system, search.region), found.evidence,
     )
 
 

@@ -2,47 +2,72 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array, numbers, positive
-from ..errors import OptionError
 from ..model.sets import ConvexSet
 from ..model.system import System
-from .decay import checked_rate
+from .decay import DecayingSums, checked_rate
 from .evaluation import evaluated
-from .evidence import CertificateError, Evidence, MismatchError, weakest
+from .evidence import Evidence, MismatchError, weakest
 from .regions import Region, beyond, stated_region
 
 __all__ = ["Detectability", "ObserverStability", "Subject", "fitting", "json_ready", "sealed"]
 
 _POINTS, _SEED = 24, 20210829
-_MOST_CORNERS = 8
-# Another compiler or library may round otherwise; derivatives by differences are worse.
-_VALUES, _SLOPES = 1e-9, 1e-5
+_ROUNDING = 1e-9  # another compiler or library may round otherwise
 
 
-def _bound(rate: float, constants: tuple[float, ...], **vectors: ArrayLike) -> Array:
-    r"""The bound :math:`a \rho^t + \sum_{\tau=1}^t \rho^\tau (b(t-\tau) + c(t-\tau))`."""
-    start, first, second = (
-        constant * np.linalg.norm(numbers(name, value), axis=-1)
-        for constant, (name, value) in zip(constants, vectors.items(), strict=True)
-    )
-    bound = np.empty((first.shape[0] + 1, *first.shape[1:]))
-    bound[0] = start
-    for t in range(first.shape[0]):
-        bound[t + 1] = rate * (bound[t] + first[t] + second[t])
-    return bound
+class _Certified:
+    """What detectability and the observer's stability share."""
+
+    evidence: Evidence
+
+    @property
+    def sums(self) -> DecayingSums:
+        """The rate and the constants of the bound."""
+        raise NotImplementedError
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but the region, in types that JSON knows; infinite numbers become None."""
+        values = vars(self) | {"evidence": str(self.evidence)}
+        content: dict[str, Any] = json_ready({
+            name: value for name, value in values.items() if name not in ("region", "subject")
+        })
+        return content
+
+    def bound(self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike) -> Array:
+        """The right-hand side of the definition at t = 0, ..., T, (T + 1, ...).
+
+        Parameters
+        ----------
+        initial : (..., n) array_like
+            The initial error, or difference of states.
+        disturbances, noises : (T, ..., n) and (T, ..., p) array_like
+            w and v, or the differences of w and of h(x), at t = 0, ..., T - 1.
+        """
+        sums = self.sums
+        start, w, v = (
+            constant * np.linalg.norm(numbers(name, value), axis=-1)
+            for constant, name, value in zip(
+                sums.constants, ("initial", "disturbances", "noises"),
+                (initial, disturbances, noises), strict=True,
+            )
+        )
+        bound = [start]
+        for entering in w + v:
+            bound.append(sums.rate * (bound[-1] + entering))
+        return np.array(bound)
 
 
 @dataclass(frozen=True, eq=False)
-class Detectability:
+class Detectability(_Certified):
     r"""Incremental exponential input/output-to-state stability, Definition def:eIOSS.
 
     For any two trajectories within the region, of the same inputs,
@@ -65,7 +90,7 @@ class Detectability:
     c_p, c_w, c_v : float
         The constants; c_v has units of the state per unit of the output.
     evidence : Evidence
-        What they rest on.
+        What they rest on; made or changed by hand, they are assumed.
     region : Region or None
         The set in which both trajectories must stay; None for constants assumed everywhere.
     notes : tuple of str
@@ -80,15 +105,14 @@ class Detectability:
     cells : int
         In how many pieces of the region the inequality was verified; 0 if in none.
     subject : Subject or None
-        What it was certified of; None for constants stated by hand, which are assumed
-        whatever evidence is claimed, as are certified ones that were changed.
+        What it was certified of; None for constants made or changed by hand.
     """
 
     eta: float
     c_p: float
     c_w: float
     c_v: float
-    evidence: Evidence
+    evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
     region: Region | None
     notes: tuple[str, ...] = ()
     P: Array | None = None
@@ -97,10 +121,7 @@ class Detectability:
     form: str = "assumed"
     margin: float = math.nan
     cells: int = 0
-    subject: Subject | None = field(default=None, repr=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "evidence", _founded(self))
+    subject: Subject | None = field(default=None, init=False, repr=False)
 
     @classmethod
     def assumed(
@@ -118,56 +139,17 @@ class Detectability:
         """
         return cls(
             checked_rate("eta", eta), positive("c_p", c_p), positive("c_w", c_w),
-            positive("c_v", c_v), Evidence.ASSUMED, stated_region(region),
+            positive("c_v", c_v), stated_region(region),
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """All but the region, in types that JSON knows; infinite numbers become None."""
-        return _to_dict(self)
-
-    def bound(self, initial: ArrayLike, disturbances: ArrayLike, outputs: ArrayLike) -> Array:
-        """The right-hand side of the definition along a pair of trajectories, (T + 1, ...).
-
-        Parameters
-        ----------
-        initial : (..., n) array_like
-            Differences of the initial states.
-        disturbances, outputs : (T, ..., n) and (T, ..., p) array_like
-            Differences of the disturbances and of h(x), at t = 0, ..., T - 1.
-        """
-        return _bound(
-            self.eta, (self.c_p, self.c_w, self.c_v), initial=initial, disturbances=disturbances,
-            outputs=outputs,
-        )
-
-    def squared(self, rate: float) -> tuple[float, Array, Array]:
-        r"""The dissipation inequality in squares, for a rate r in (eta, 1): returns r^2, W_2, V_2.
-
-        .. math::
-            |x_1^+ - x_2^+|_P^2 \le r^2 |x_1 - x_2|_P^2 + |\delta w|_{W_2}^2
-            + |\delta h|_{V_2}^2
-
-        The verified inequality is :math:`|A \delta x|_P^2 \le \eta^2 |\delta x|_P^2
-        + |\delta h|_V^2`; with :math:`1 + \epsilon = (r/\eta)^2` and Young's inequality for
-        the disturbance, :math:`W_2 = (1 + 1/\epsilon) P` and :math:`V_2 = (1 + \epsilon) V`.
-
-        Raises
-        ------
-        OptionError
-            If the rate is out of range.
-        CertificateError
-            If there is no P.
-        """
-        if self.P is None or self.V is None:
-            raise CertificateError("assumed constants have no dissipation inequality behind them.")
-        if not self.eta < rate < 1.0:
-            raise OptionError(f"rate is {rate!r}; expected a number in ({self.eta!r}, 1).")
-        more = (rate / self.eta) ** 2
-        return rate * rate, more / (more - 1.0) * self.P, more * self.V
+    @property
+    def sums(self) -> DecayingSums:
+        """eta, c_p, c_w and c_v."""
+        return DecayingSums(self.eta, self.c_p, self.c_w, self.c_v)
 
 
 @dataclass(frozen=True, eq=False)
-class ObserverStability:
+class ObserverStability(_Certified):
     r"""Robust global exponential stability of the auxiliary observer, Definition def:RGES.
 
     As long as state and observer state stay within the region,
@@ -202,7 +184,7 @@ class ObserverStability:
     C_w: float
     C_v: float
     kappa: float
-    evidence: Evidence
+    evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
     region: Region | None
     notes: tuple[str, ...] = ()
     P: Array | None = None
@@ -211,10 +193,7 @@ class ObserverStability:
     gain: Array | None = None
     margin: float = math.nan
     cells: int = 0
-    subject: Subject | None = field(default=None, repr=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "evidence", _founded(self))
+    subject: Subject | None = field(default=None, init=False, repr=False)
 
     @classmethod
     def assumed(
@@ -224,135 +203,79 @@ class ObserverStability:
         """Constants that the user states without proof; see `Detectability.assumed`."""
         return cls(
             checked_rate("rho", rho), positive("C_p", C_p), positive("C_w", C_w),
-            positive("C_v", C_v), positive("kappa", kappa), Evidence.ASSUMED, stated_region(region),
+            positive("C_v", C_v), positive("kappa", kappa), stated_region(region),
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """All but the region, in types that JSON knows; infinite numbers become None."""
-        return _to_dict(self)
-
-    def bound(self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike) -> Array:
-        """The right-hand side of (eq:RGES) along a run, (T + 1, ...).
-
-        Parameters
-        ----------
-        initial : (..., n) array_like
-            The initial error.
-        disturbances, noises : (T, ..., n) and (T, ..., p) array_like
-            w and v at t = 0, ..., T - 1.
-        """
-        return _bound(
-            self.rho, (self.C_p, self.C_w, self.C_v), initial=initial, disturbances=disturbances,
-            noises=noises,
-        )
+    @property
+    def sums(self) -> DecayingSums:
+        """rho, C_p, C_w and C_v."""
+        return DecayingSums(self.rho, self.C_p, self.C_w, self.C_v)
 
 
 Result = TypeVar("Result", "Detectability", "ObserverStability")
 
 
 @dataclass(frozen=True, eq=False)
-class Fingerprint:
-    """What a system does at some points of a region."""
+class Subject:
+    """What a result is about: a system, and what it does at some points of a region."""
 
+    system: System | None  # None once it was copied or pickled
     sizes: tuple[int, int, int]  # n, p and m
     points: Array  # (K, n + m): states and inputs
     values: Array  # (K, n + p): f and h there
-    jacobians: Array  # (K, n + p, n)
 
     @classmethod
-    def of(cls, system: System, region: Region) -> Fingerprint:
-        """The fingerprint of a system on a region."""
-        drawn = region.sample(_POINTS, np.random.default_rng(_SEED))
-        points = np.vstack((drawn[: 1 + _MOST_CORNERS], drawn[1 + _MOST_CORNERS :][-_POINTS:]))
-        return cls((system.n, system.p, system.m), points, *_behaviour(system, points))
+    def of(cls, system: System, region: Region) -> Subject:
+        """A system, seen on a region."""
+        points = region.sample(_POINTS, np.random.default_rng(_SEED))
+        return cls(system, (system.n, system.p, system.m), points, _values(system, points))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the system, whose functions often cannot be pickled."""
+        return vars(self) | {"system": None}
 
     def difference(self, system: System) -> str:
         """What a system does otherwise, in words; empty if nothing."""
         sizes = system.n, system.p, system.m
         if sizes != self.sizes:
             return f"(n, p, m) is {sizes} instead of {self.sizes}"
+        mine = self.values
         try:
-            values, jacobians = _behaviour(system, self.points)
+            theirs = _values(system, self.points)
         except Exception as error:  # a user's function may raise anything
             return f"it fails where the other one does not ({type(error).__name__}: {error})"
-        for name, mine, theirs, share in (
-            ("f, h", self.values, values, _VALUES),
-            ("the Jacobian of f, h", self.jacobians, jacobians, _SLOPES),
-        ):
-            rows = mine.reshape(len(mine), -1), theirs.reshape(len(theirs), -1)
-            larger = np.fmax(np.abs(rows[0]), np.abs(rows[1]))
-            room = share * (larger + np.nan_to_num(larger).max(axis=0))
-            same = (np.abs(rows[0] - rows[1]) <= room) | (np.isnan(rows[0]) & np.isnan(rows[1]))
-            if not same.all():
-                k = int(np.argmin(same.all(axis=1)))
-                return (
-                    f"{name} at {np.round(self.points[k], 6).tolist()} is {theirs[k].tolist()} "
-                    f"instead of {mine[k].tolist()}"
-                )
-        return ""
+        larger = np.fmax(np.abs(mine), np.abs(theirs))
+        room = _ROUNDING * (larger + np.nan_to_num(larger).max(axis=0))
+        same = (np.abs(mine - theirs) <= room) | (np.isnan(mine) & np.isnan(theirs))
+        if same.all():
+            return ""
+        k = int(np.argmin(same.all(axis=1)))
+        return (
+            f"f, h at {np.round(self.points[k], 6).tolist()} is {theirs[k].tolist()} instead of "
+            f"{mine[k].tolist()}"
+        )
 
 
-def _behaviour(system: System, points: Array) -> tuple[Array, Array]:
+def _values(system: System, points: Array) -> Array:
     x, u = points[:, : system.n], points[:, system.n :]
     values = [evaluated(name, one, x, u) for name, one in (("f", system.f), ("h", system.h))]
-    slopes = [
-        evaluated(f"the Jacobian of {name}", one, x, u)
-        for name, one in (("f", system.f_jacobian), ("h", system.h_jacobian))
-    ]
-    return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
+    return np.concatenate(values, axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class Subject:
-    """What a result is about."""
-
-    fingerprint: Fingerprint
-    digest: str  # of the numbers that were certified
-    evidence: Evidence  # what they rested on
-    system: System | None  # None once it was copied or pickled
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the system, whose functions often cannot be pickled."""
-        return vars(self) | {"system": None}
-
-
-def sealed(result: Result, system: System, evidence: Evidence) -> Result:
-    """A result with what it is about, and with its evidence."""
-    assert result.region is not None
-    fingerprint = Fingerprint.of(system, result.region)
-    subject = Subject(fingerprint, _digest(result), evidence, system)
-    return replace(result, subject=subject, evidence=evidence)
-
-
-def _founded(result: Detectability | ObserverStability) -> Evidence:
-    """The evidence that a result may claim: numbers stated by hand are assumed."""
-    subject = result.subject
-    if subject is None or subject.digest != _digest(result):
-        return Evidence.ASSUMED
-    return weakest((result.evidence, subject.evidence))
-
-
-def _digest(result: Detectability | ObserverStability) -> str:
-    found = hashlib.sha256()
-    for each in fields(result):
-        if each.name in ("subject", "evidence", "notes"):
-            continue
-        value = getattr(result, each.name)
-        if isinstance(value, Region):
-            states = value.states
-            parts: tuple[Any, ...] = (
-                value.lower, value.upper, states.matrix, states.row_lower, states.row_upper
-            )
-        else:
-            parts = (value,)
-        for part in parts:
-            text = repr(part.tolist()) if isinstance(part, np.ndarray) else repr(part)
-            found.update(f"{each.name}={text};".encode())
-    return found.hexdigest()
+def sealed(result: Result, subject: Subject, evidence: Evidence) -> Result:
+    """The result itself, with what it is about and what it rests on; its arrays are fixed."""
+    object.__setattr__(result, "subject", subject)
+    object.__setattr__(result, "evidence", evidence)
+    for name, value in list(vars(result).items()):
+        if isinstance(value, np.ndarray):
+            own = value.copy()
+            own.setflags(write=False)
+            object.__setattr__(result, name, own)
+    return result
 
 
 def fitting(
-    part: Result, system: System, region: Region, gain: Array | None, *, thorough: bool = True
+    part: Result, system: System, region: Region, gain: Array | None
 ) -> Result:
     """A part of a certificate, if it is about this system, region and gain."""
     what = "detectability" if hasattr(part, "eta") else "stability"
@@ -370,9 +293,9 @@ def fitting(
             f"the {what} that was passed is of the gain {own.tolist()}; the observer's is "
             f"{theirs}. Certify this observer."
         )
-    if part.subject is None or (part.subject.system is system and not thorough):
+    if part.subject is None:
         return part
-    difference = part.subject.fingerprint.difference(system)
+    difference = part.subject.difference(system)
     if difference:
         raise MismatchError(
             f"the {what} that was passed is of another system: {difference}. Certify this system."
@@ -381,19 +304,10 @@ def fitting(
         return part
     note = (
         "certified of another System object; this one does the same at "
-        f"{len(part.subject.fingerprint.points)} states"
+        f"{len(part.subject.points)} states"
     )
-    return replace(
-        part, evidence=weakest((part.evidence, Evidence.SAMPLED)), notes=(*part.notes, note)
-    )
-
-
-def _to_dict(result: Detectability | ObserverStability) -> dict[str, Any]:
-    values = vars(result) | {"evidence": result.evidence.value}
-    content: dict[str, Any] = json_ready({
-        name: value for name, value in values.items() if name not in ("region", "subject")
-    })
-    return content
+    weaker = replace(part, notes=(*part.notes, note))
+    return sealed(weaker, part.subject, weakest((part.evidence, Evidence.SAMPLED)))
 
 
 def json_ready(value: Any) -> Any:

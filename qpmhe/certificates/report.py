@@ -207,10 +207,7 @@ def certify_model(
     name = name or scenario.title
     horizons = horizons_of(scenario.horizon if horizon is None else horizon)
     sizes, errors = _sizes(example), dict[str, QpmheError]()
-    findings = audit(
-        system, observer, cost, place, record, initial_state=scenario.initial_estimate,
-        seconds=deadline.part(_AUDIT),
-    )
+    findings = audit(system, observer, cost, place, seconds=deadline.part(_AUDIT))
     weights = (1.0, 1.0) if findings.constants is None else estimate_weights(findings.constants)
 
     def attempt(what: str, question: Callable[[], Result]) -> Result | None:

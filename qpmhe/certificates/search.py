@@ -114,7 +114,12 @@ class Search:
         return high
 
     def explaining_rate(self, error: NotCertifiedError) -> float | None:
-        """`smallest_rate`, where an error does not say enough; None where the time is over."""
+        """`smallest_rate`, where an error does not say enough; None where the time is over.
+
+        A `JumpError` says more than that the time was over.
+        """
+        if isinstance(error, OutOfTimeError):
+            self.check_jumps()
         if isinstance(error, (OutOfTimeError, JumpError)):
             return None
         try:

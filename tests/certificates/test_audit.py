@@ -16,11 +16,8 @@ from .test_detectability import REACTOR, linear, unit_box
 
 
 def test_reactor_passes():
-    system, observer, cost, scenario = qpmhe.models.batch_reactor()
-    report = audit(
-        system, observer, cost, REACTOR, scenario.simulate(1),
-        initial_state=scenario.initial_estimate,
-    )
+    system, observer, cost, _ = qpmhe.models.batch_reactor()
+    report = audit(system, observer, cost, REACTOR)
     assert report.violated == ()
     assert all(finding.evidence is Evidence.PROVED for finding in report.findings)
     np.testing.assert_allclose([report.lipschitz, report.kappa], [np.sqrt(2), np.sqrt(2) * 0.05])
@@ -88,17 +85,13 @@ def test_kappa_of_a_nonlinear_correction_is_sampled():
     assert report["no correction without error"].evidence is Evidence.SAMPLED
 
 
-def test_kalman_gain_is_seen_on_a_run_only():
-    system, _, cost, scenario = qpmhe.models.batch_reactor()
+def test_a_gain_that_follows_from_measurements_has_no_bound():
+    system, _, cost, _ = qpmhe.models.batch_reactor()
     eye = np.eye(2)
     observer = qpmhe.ExtendedKalman(prior=eye, disturbance=0.01 * eye, noise=0.04 * np.eye(1))
-    assert audit(system, observer, cost, REACTOR)["correction bound"].holds is None
-    report = audit(
-        system, observer, cost, REACTOR, scenario.simulate(1),
-        initial_state=scenario.initial_estimate,
-    )
-    assert report["correction bound"].evidence is Evidence.SAMPLED
-    assert 0.0 < report.kappa < 2.0
+    finding = audit(system, observer, cost, REACTOR)["correction bound"]
+    assert finding.holds is None
+    assert "kappa" in finding.text
 
 
 def test_costs_without_constants():
@@ -131,36 +124,12 @@ def test_map_that_leaves_its_set_is_shown_where():
     assert finding.evidence is Evidence.SAMPLED
 
 
-def test_candidate_outside_the_sets_is_shown_when():
+def test_candidates_in_sets_are_left_to_the_monitor():
     system = qpmhe.System(
         lambda x: 0.5 * x, lambda x: x, n=1, p=1, disturbances=qpmhe.Box([-0.1], [0.1])
     )
-    y = np.array([0.0, 0.2, 3.0, 0.1])
-    report = audit(
-        system, qpmhe.Luenberger([0.2]), unit_cost(), unit_box(1), y, initial_state=[0.0]
-    )
-    finding = report["candidate in the sets"]
-    assert finding.holds is False
-    z = 0.2 * 0.2  # z(2) after v(1) = 0.2
-    assert finding.counterexample["t"] == 2
-    np.testing.assert_allclose(finding.counterexample["L"], 0.2 * (3.0 - z))
-    assert audit(system, qpmhe.Luenberger([0.2]), unit_cost(), unit_box(1))[
+    finding = audit(system, qpmhe.Luenberger([0.2]), unit_cost(), unit_box(1))[
         "candidate in the sets"
-    ].holds is None
-
-
-def test_run_needs_its_start_and_its_inputs():
-    system, observer, cost, scenario = qpmhe.models.cstr()
-    box, u = qpmhe.Box([0.4, 345.0], [0.6, 355.0]), qpmhe.Box([270.0], [330.0])
-    record = scenario.simulate(1)
-    with pytest.raises(InvalidInputError, match="initial_state is missing"):
-        audit(system, observer, cost, box, record, inputs=u)
-    with pytest.raises(InvalidInputError, match="no inputs"):
-        audit(
-            system, observer, cost, box, record.measurements,
-            initial_state=scenario.initial_estimate, inputs=u,
-        )
-    report = audit(
-        system, observer, cost, box, record, initial_state=scenario.initial_estimate, inputs=u
-    )
-    assert "leaves the region" in report["candidate in the sets"].text
+    ]
+    assert finding.holds is None
+    assert "monitor" in finding.text

@@ -32,7 +32,7 @@ def test_the_reactors_constants_are_the_theorems(reactor):
         paper = certificate.of(N).paper
         again = theorem(
             DecayingSums(0.9, detected.c_p, detected.c_w, detected.c_v),
-            DecayingSums(0.95, observed.C_p, observed.C_w, observed.C_v),
+            DecayingSums(0.95, observed.C_p, observed.C_w, np.sqrt(0.5)),  # 1 / L_h
             certificate.audit.constants, kappa=np.sqrt(0.005), lipschitz=np.sqrt(2.0), horizon=N,
         )
         assert pytest.approx(again.C, rel=1e-9) == paper.C

@@ -70,12 +70,11 @@ def test_the_reactors_detectability_and_observer_are_not_refuted(reactor):
     certificate, _ = reactor
     detected, observed = certificate.detectability, certificate.stability
     pairs = attack_detectability(
-        certificate.system, certificate.region,
-        DecayingSums(detected.eta, detected.c_p, detected.c_w, detected.c_v), trials=PAIRS,
+        certificate.system, certificate.region, detected.sums, trials=PAIRS
     )
     runs = attack_observer(
-        certificate.system, certificate.region, certificate.observer.gain,
-        DecayingSums(observed.rho, observed.C_p, observed.C_w, observed.C_v), trials=PAIRS,
+        certificate.system, certificate.region, certificate.observer.gain, observed.sums,
+        trials=PAIRS,
     )
     assert not pairs.refuted
     assert not runs.refuted
@@ -157,11 +156,8 @@ def test_models_of_the_zoo_are_certified_and_not_refuted(name):
         stability=certify_observer(system, observer, region, rho=rates[1]),
     )
     assert certificate.evidence is Evidence.PROVED
-    detected = certificate.detectability
-    pairs = attack_detectability(
-        system, certificate.region,
-        DecayingSums(detected.eta, detected.c_p, detected.c_w, detected.c_v), trials=PAIRS,
-    )
+    claim = certificate.detectability.sums
+    pairs = attack_detectability(system, certificate.region, claim, trials=PAIRS)
     assert not pairs.refuted
     assert pairs.ratio > 0.1
     attacks, lost = attack_estimator(certificate, trials=20, backends=["auto"])

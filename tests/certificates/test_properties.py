@@ -141,20 +141,16 @@ def test_a_system_that_only_behaves_alike_weakens_the_label(parts):
 
 def test_what_is_stated_by_hand_is_assumed(parts):
     _, _, detected, observed = parts
-    by_hand = Detectability(0.5, 1.0, 1.0, 1.0, Evidence.PROVED, detected.region)
+    by_hand = Detectability(0.5, 1.0, 1.0, 1.0, detected.region)
     assert by_hand.evidence is Evidence.ASSUMED
     assert replace(detected, c_w=0.5 * detected.c_w).evidence is Evidence.ASSUMED
     assert replace(detected, region=bounded_region(cubic(), box(9.0))).evidence is Evidence.ASSUMED
     assert replace(observed, P=2.0 * observed.P).evidence is Evidence.ASSUMED
-    assert replace(detected, notes=()).evidence is Evidence.PROVED
-    # What was only sampled is not proved by saying so.
-    weak = replace(detected, evidence=Evidence.SAMPLED)
-    assert weak.evidence is Evidence.SAMPLED
-    rough = certify_detectability(
-        qpmhe.System(lambda x: 0.5 * np.abs(x), output, n=1, p=1), box(1.0), eta=0.9
-    )
-    assert rough.evidence is Evidence.SAMPLED
-    assert replace(rough, evidence=Evidence.PROVED).evidence is Evidence.SAMPLED
+    for weak in (detected, observed):
+        with pytest.raises(ValueError, match="evidence"):
+            replace(weak, c_p=1.0, evidence=Evidence.PROVED)
+        with pytest.raises(ValueError, match="read-only"):
+            weak.P[0, 0] = 0.0
 
 
 def test_a_certificate_changed_by_hand_is_assumed(parts):

@@ -9,7 +9,6 @@ from qpmhe.certificates.evidence import MismatchError
 from qpmhe.certificates.monitor import Monitor, monitor
 from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.errors import InvalidInputError
-from qpmhe.estimation.run import Run
 
 COST = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
 SYSTEM = qpmhe.System(lambda x: 1.1 * x, lambda x: 1.0 * x, n=1, p=1)
@@ -90,32 +89,6 @@ def test_an_estimator_that_did_not_make_the_run_is_refused(certificate):
     mhe.update(0.0)
     with pytest.raises(MismatchError, match="not at the end of this run"):
         measured(certificate, run, source=mhe)
-
-
-def test_a_monitor_serves_as_well_and_knows_its_run(certificate):
-    mhe = estimator()
-    watch, start = Monitor.of(certificate, mhe), mhe.state.copy()
-    estimates = []
-    for y in record()[1]:
-        estimates.append(mhe.update(y))
-        watch.check(estimates[-1])
-    run = Run.of(start, estimates)
-    by_monitor = measured(certificate, run, source=watch)
-    np.testing.assert_array_equal(by_monitor, measured(certificate, run, source=mhe))
-    error = np.abs(record()[0] - run.states)[:, 0]
-    assert (error <= by_monitor).all()
-    with pytest.raises(MismatchError, match="not at the end"):
-        measured(certificate, estimator().run(record(1)[1]), source=watch)
-    other = certify(
-        SYSTEM, OBSERVER, COST, horizon=5, region=certificate.region,
-        detectability=certificate.detectability, stability=certificate.stability,
-    )
-    with pytest.raises(MismatchError, match="another certificate"):
-        measured(other, run, source=watch)
-    with pytest.raises(InvalidInputError, match="source is 3"):
-        measured(certificate, run, horizon=5, source=3)
-    with pytest.raises(InvalidInputError, match="no run"):
-        certificate.bound(None, np.zeros(3), 0.1, initial_error=1.0, source=mhe)
 
 
 def test_costs_of_broken_windows_are_not_used(certificate):
