@@ -326,7 +326,7 @@ class Case:
             raise WrongStepError(f"truly, J {J!r} is above {candidate_J!r}")
         equal = estimate.cost == estimate.candidate_cost
         # Within the sets at the same cost is better, too.
-        if Status.IMPROVED in status and equal and Status.CANDIDATE_OUTSIDE not in status or (
+        if (Status.IMPROVED in status and equal and Status.CANDIDATE_OUTSIDE not in status) or (
             Status.CANDIDATE in status and not equal
         ):
             raise WrongStepError(f"{status} with {estimate.cost!r} and {estimate.candidate_cost!r}")
