@@ -62,7 +62,8 @@ class MovingHorizonEstimator:
         whenever it passes from one to another.
     max_qps : int or None
         QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence,
-        with at most 100.
+        with at most 100. Where rows of sets are dropped, at least one QP is solved without them,
+        beyond the cap if need be.
     max_solver_iterations : int or None
         Cap on the solver's own iterations in each QP; None leaves the solver's default, or the
         cap of the solver given as ``backend``.

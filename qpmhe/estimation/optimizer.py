@@ -170,8 +170,9 @@ class Optimizer:
             return
         outcome.events &= ~(Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED)
         relaxed = problem.without_violated()
+        outcome.trial = relaxed.candidate
         self._search(relaxed, outcome, start, max(1, self._limit - outcome.qps))
-        outcome.improved = outcome.trial is not candidate
+        outcome.improved = outcome.trial is not relaxed.candidate
         if outcome.improved:
             outcome.dropped = problem.missed_rows(outcome.trial)
             if outcome.dropped:
@@ -328,7 +329,8 @@ class Optimizer:
 
     @staticmethod
     def _trial(problem: Problem, best: Trial, step: Array) -> Trial:
-        return problem.evaluate(problem.clipped(best.trajectory + step))
+        trajectory = best.trajectory + step
+        return problem.evaluate(problem.clipped(trajectory) if problem.constrained else trajectory)
 
 
 def _target(best: Trial) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,7 @@ class Formulation:
         self.prior_weight: Array = cost.initial_weight(observer.initial_covariance())
         self.prior_band = band_of(self.prior_weight)
         self.constraints = Constraints(system, cost, inverse(self.prior_weight))
+        self.constrained = bool(self.constraints)
 
     def problem(self, window: Window) -> Problem:
         """The problem of the present window."""
@@ -112,6 +113,8 @@ class Problem:
         "prior_weight", "span", "stage_weights", "time",
     )
 
+    _clip: tuple[Array, Array] | None
+
     def __init__(self, formulation: Formulation, window: Window) -> None:
         self._formulation, view, cost = formulation, window.view, formulation.cost
         self.prior, self.measurements, self.span = view.prior, view.measurements, view.span
@@ -137,16 +140,19 @@ class Problem:
         self.candidate = Trial(
             view.candidate, view.residuals, weights, window.candidate_cost_of(view)
         )
-        self._constrain(formulation.constraints)
+        self.constraints, self.constrained = formulation.constraints, formulation.constrained
+        self._has_noise_free, self._clip = False, None
         if self.constrained:
+            constraints = formulation.constraints
             if self.observed is not None:
-                self._constrain(formulation.constraints.observed(self.observed))
+                constraints = constraints.observed(self.observed)
+            self._constrain(constraints)
             self.candidate.violation = self._violation(self.candidate)
 
     def _constrain(self, constraints: Constraints) -> None:
-        self.constraints, self.constrained = constraints, bool(constraints)
+        self.constraints = constraints
         self._has_noise_free = bool(constraints.noise_free.size)
-        self._clip: tuple[Array, Array] | None = None
+        self._clip = None
         states = constraints.states
         if states is not None and states.bounds:
             shape = (*states.lower.shape[:-1], self.prior.size)
@@ -163,6 +169,7 @@ class Problem:
                 candidate.trajectory, candidate.residuals, self.measurements
             )
         )
+        other.candidate = replace(candidate, violation=other._violation(candidate))
         return other
 
     def missed_rows(self, trial: Trial) -> tuple[DroppedRow, ...]:

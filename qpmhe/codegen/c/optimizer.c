@@ -317,6 +317,7 @@ static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     if (e->settings->infeasible == MHE_KEEP_CANDIDATE) return;
     o->events &= ~(MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED);
     mhe_violation(e, o->candidate, 0, k->left_out);
+    o->candidate->violation = 0;
     mhe_search(e, k, o, start, limit > o->qps + 1 ? limit - o->qps : 1);
     memset(k->left_out, 0, sizeof k->left_out);
     if (o->best == o->candidate || !(mhe_violation(e, o->best, 0, k->left_out) > MHE_FEASIBLE))
