@@ -662,6 +662,7 @@ def test_rootfinders_that_do_not_tell_are_not_compiled():
     assert np.isnan(system.h(np.array([3.0, 0.0]), NONE)[0])
 
 
+@pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 @pytest.mark.parametrize("case", FALLING)
 def test_a_step_in_which_the_evaluation_breaks_off(case):
     f, h, _ = falling(case)
