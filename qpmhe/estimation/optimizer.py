@@ -162,7 +162,7 @@ class Optimizer:
                 outcome.trial = self._feasible_near(problem, outcome, problem.evaluate(again))
             if outcome.trial.cost < math.inf:
                 self._search(problem, outcome, None, self._limit - outcome.qps)
-        if outcome.trial.cost <= candidate.cost and outcome.trial.violation <= FEASIBLE:
+        if outcome.trial.cost < candidate.cost and outcome.trial.violation <= FEASIBLE:
             outcome.improved = True
             return
         outcome.trial = candidate

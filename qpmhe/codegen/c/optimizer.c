@@ -311,7 +311,7 @@ static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
         }
     }
     o->outside = 0;
-    if (o->best != o->candidate && o->best->cost <= o->candidate->cost) return;
+    if (o->best != o->candidate && o->best->cost < o->candidate->cost) return;
     if (o->best != o->candidate) o->spare = o->best;
     o->best = o->candidate;
     if (e->settings->infeasible == MHE_KEEP_CANDIDATE) return;
