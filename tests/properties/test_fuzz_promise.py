@@ -1,0 +1,32 @@
+"""The promise on some thousand cheap random steps; the script takes as many as there is time for."""
+
+import numpy as np
+import pytest
+
+from tests.properties import fuzz_promise
+
+
+@pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
+@pytest.mark.parametrize("seed", [7, 8])
+def test_no_step_breaks_the_promise(seed):
+    counts, faults = fuzz_promise.run(1000, seed)
+    assert faults == []
+    assert counts["steps"] >= 1000
+    assert counts["IMPROVED"] > 100
+    assert counts["CANDIDATE_OUTSIDE"] > 100
+
+
+@pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
+def test_the_judge_sees_a_broken_promise():
+    seen = set()
+    for seed in range(40):
+        draw = np.random.default_rng(seed)
+        mhe, system, cost = fuzz_promise.case(draw)
+        estimate = mhe.update(np.full(system.p, 0.3))
+        assert fuzz_promise.broken(mhe, system, cost, estimate, 0.3) == []
+        estimate.cost = estimate.candidate_cost + 1.0
+        estimate.dropped = () if estimate.dropped else ("a row",)
+        if system.states is not None:
+            estimate.trajectory[:] = system.states.upper + 1.0
+        seen |= set(fuzz_promise.broken(mhe, system, cost, estimate, 0.3))
+    assert seen >= {"cost above the candidate's", "rows dropped in secret", "outside of X"}
