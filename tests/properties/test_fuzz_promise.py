@@ -1,4 +1,4 @@
-"""The promise on some thousand cheap random steps; the script takes as many as there is time for."""
+"""The promise on some thousand cheap random steps; the script takes as many as there is time."""
 
 import numpy as np
 import pytest
