@@ -108,7 +108,14 @@ class Observer(ABC):
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array] | None:
         """The estimate of x(t) that has used y(t), and its covariance; None if there is none.
 
-        Parameters are those of `correct`. A Kalman filter's measurement update.
+        A Kalman filter's measurement update.
+
+        Parameters
+        ----------
+        z, v : (n,) and (p,) array
+            As for `correct`.
+        sample : Sample
+            As for `correct`.
         """
         return None
 

@@ -82,7 +82,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
     ),
     "proxqp": Translation(
         "augmented Lagrangian", "proxsuite", "dense", "box", "max_iter", ("eps_abs",),
-        ("eps_rel",), default_cap=200, reports_infeasibility=True, objective=2.0**10,
+        ("eps_rel",), default_cap=200, reports_infeasibility=True, objective=2.0**9,
     ),
     "qpalm": Translation(
         "augmented Lagrangian", "qpalm", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),

@@ -25,6 +25,7 @@ def estimator(system, name, **options):
     )
 
 
+@pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
 @pytest.mark.parametrize(
     ("name", "system"),
     [("auto", SYSTEM), ("banded", SYSTEM), *((name, CONSTRAINED) for name in available())],

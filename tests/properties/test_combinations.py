@@ -313,7 +313,8 @@ def test_backends_take_the_same_rung(name, backend):
         [one for one, *_ in tight(name, backend=given, max_qps=5)] for given in (backend, "auto")
     )
     for estimate, expected in zip(estimates, usual, strict=True):
-        if backend in INEQUALITY_BACKENDS:
+        # Where linearised rows exclude each other, what a solver ends at is its own.
+        if backend in INEQUALITY_BACKENDS and Status.SOLVER_STOPPED not in expected.status:
             assert estimate.dropped == expected.dropped
             assert estimate.cost == pytest.approx(expected.cost, rel=1e-2)
 

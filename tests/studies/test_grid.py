@@ -71,7 +71,7 @@ def test_lists_may_be_any_iterable_and_single_values_stand_for_lists():
     [
         ({"models": []}, StudyError, "models is empty"),
         ({"models": ["reactor"]}, ModelError, "expected one of batch_reactor"),
-        ({"models": [3]}, ModelError, "the model is 3"),
+        ({"models": [3]}, StudyError, "models has 3; expected the name"),
         ({"models": ["chain_of_masses(2)"]}, ModelError, "plain values by keyword"),
         ({"models": ["chain_of_masses(masses=open)"]}, ModelError, "plain values"),
         ({"models": ["chain_of_masses(mases=2)"]}, ModelError, "mases"),
