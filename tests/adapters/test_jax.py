@@ -630,7 +630,7 @@ def test_a_wrong_derivative_is_refused():
         ({"p": 1.5}, OptionError, "p is 1.5"),
         ({"m": -1}, OptionError, "m is -1"),
         ({"dt": 0.0}, OptionError, "dt is 0.0"),
-        ({"dt": 0.1, "method": "heun"}, OptionError, "method is 'heun'; expected one of 'euler', 'rk4'"),
+        ({"dt": 0.1, "method": "heun"}, OptionError, "'heun'; expected one of 'euler', 'rk4'"),
         ({"method": "heun"}, OptionError, "method is 'heun'"),
         ({"states": qpmhe.Box([0.0], [1.0])}, SetError, "states has dimension 1"),
     ],
