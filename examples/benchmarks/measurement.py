@@ -14,6 +14,7 @@ from peers import Array, Peer, UnavailableError, WindowData
 from problems import Problem
 from stopwatch import timed
 
+from qpmhe.estimation.problem import Formulation
 from qpmhe.estimation.problem import Problem as TrueProblem
 from qpmhe.estimation.window import Window
 
@@ -179,8 +180,9 @@ def _samples(problem: Problem, seed: int, steps: int) -> list[_Sample]:
     record = problem.scenario.simulate(seed, steps)
     window = Window(
         problem.system, problem.observer, problem.cost, problem.horizon,
-        problem.scenario.initial_estimate, False,
+        problem.scenario.initial_estimate, False, True,
     )
+    formulation = Formulation(problem.system, problem.observer, problem.cost)
     samples = []
     for y, truth in zip(record.measurements, record.states[1:], strict=True):
         window.push(y, np.zeros(0))
@@ -188,8 +190,8 @@ def _samples(problem: Problem, seed: int, steps: int) -> list[_Sample]:
             y.copy(), window.candidate[0].copy(), window.measurements.copy(),
             window.candidate.copy(), window.residuals[:, : problem.n].copy(),
         )
-        judge = TrueProblem(problem.system, problem.cost)
-        judge.bind(window)
+        judge = formulation.problem(window)
+        # The window goes on: what the judge reads is copied.
         judge.prior, judge.measurements = data.prior, data.measurements
         judge.inputs = judge.inputs.copy()
         samples.append(_Sample(data, judge, truth))
