@@ -72,7 +72,7 @@ class Multistage(Solver):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=100, help="samples of the record")
-    parser.add_argument("--width", type=float, default=3.0, help="of W, in standard deviations")
+    parser.add_argument("--width", type=float, default=0.3, help="of W, in standard deviations")
     parser.add_argument("--out", type=Path, default=Path("results/benchmarks"), help="folder")
     arguments = parser.parse_args()
 
@@ -84,7 +84,7 @@ def main() -> None:
         casadi_rate(MASSES, DIMENSION), casadi_output(MASSES, DIMENSION), dt=scenario.dt,
         n=plain.system.n,
         disturbances=qpmhe.Box(-arguments.width * spread[0], arguments.width * spread[0]),
-        noises=qpmhe.Box(-3 * spread[1], 3 * spread[1]),
+        noises=qpmhe.Box(-2.5 * spread[1], 2.5 * spread[1]),
     )
     solvers: list[Multistage] = []
 
