@@ -13,7 +13,7 @@ import pytest
 
 SEED = 1
 # Cases that every test keeps, and the share of its further cases.
-HANDFUL, SHARE = 5, 0.1
+HANDFUL, SHARE = 4, 0.04
 WHOLE = {"oracles", "properties"}  # folders that keep every value of every parameter
 LEFT_OUT = pytest.StashKey[int]()
 COLLECTED = pytest.StashKey[int]()
