@@ -16,9 +16,9 @@ Array = NDArray[np.float64]
 class Status(enum.Flag):
     """Outcome of a step, and everything that happened in it.
 
-    Exactly one of IMPROVED and CANDIDATE is always set; the others are added where they
-    apply, so that ``Status.IMPROVED in estimate.status`` asks for the outcome.
-    `explain` says what each one means and what to do about it.
+    Either IMPROVED or CANDIDATE is always set, and any others that apply:
+    ``Status.IMPROVED in estimate.status`` asks for the outcome. `explain` says what each one
+    means and what to do about it.
     """
 
     IMPROVED = enum.auto()

@@ -156,6 +156,7 @@ class Optimizer:
         candidate = problem.candidate
         outside = replace(candidate, cost=math.inf)  # any feasible trial is better
         outcome.trial = outside
+        # (a) As usual; else from a feasible trajectory near the candidate or the last estimate.
         self._search(problem, outcome, start, self._limit)
         if not outcome.trial.cost < math.inf:
             outcome.trial = self._feasible_near(problem, outcome, outside)
@@ -167,11 +168,11 @@ class Optimizer:
         if outcome.trial.cost < candidate.cost and outcome.trial.violation <= FEASIBLE:
             outcome.improved = True
             return
-        outcome.trial = candidate
+        outcome.trial = candidate  # (c), if dropping rows is not allowed or does not help
         if not self._may_drop or outcome.time_is_up():
             return
         outcome.events &= ~(Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED)
-        relaxed = problem.without_violated()
+        relaxed = problem.without_violated()  # (b)
         outcome.trial = relaxed.candidate
         self._search(relaxed, outcome, start, max(1, self._limit - outcome.qps))
         outcome.improved = outcome.trial is not relaxed.candidate

@@ -163,7 +163,7 @@ class Window(Stages):
 
     @property
     def _observers_ready(self) -> bool:
-        """Whether observers run side by side, and in a final metric: as `replay` would now."""
+        """Whether observers run side by side; not before their metric is final."""
         return self._observers is not None and (self.metric is None or self.metric.settled)
 
     def _follow(self, estimates: Sequence[Array]) -> bool:
@@ -235,7 +235,7 @@ class Window(Stages):
             self.events |= _MODEL_FAILED
 
     def _find_observed(self, k: int, time: int) -> NDArray[np.bool_] | None:
-        """Mark the missing components of y at stage k; return the others, None for all."""
+        """Mark the missing components of y at stage k; return which are there, or None for all."""
         y = self._stage_views[k].y
         if not math.isfinite(y.dot(y)):
             self._observed[k] = np.abs(y) < LARGEST  # False for NaN, too
