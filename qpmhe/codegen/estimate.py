@@ -29,7 +29,7 @@ class CompiledWatch(ObserverWatch):
     """The watch on an observer, where C counts."""
 
     def warn(self, far: int, dropped: int, level: int) -> None:
-        """Warn at a level of the stack if so many samples running are too many, but only once."""
+        """Warn once, at a level of the stack, if so many consecutive samples are too many."""
         self.counts = far, dropped
         text = self.warning()
         if text is not None:

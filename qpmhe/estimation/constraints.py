@@ -1,4 +1,4 @@
-"""The sets X, W and V as rows, one for each inequality at each stage (eq:constraints)."""
+"""The sets X, W and V as rows: one inequality at one stage each (eq:constraints)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ __all__ = ["Constraints", "Rows"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# A residual is a difference, whose rounding comes on top of the tolerance.
+# Rounding of a difference, as a share of its terms: a residual may miss a row by that much more.
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
 
 class Rows:
-    """Inequalities ``lower <= M s <= upper`` of one set, at all stages or at each.
+    """Inequalities ``lower <= M s <= upper`` of one set.
+
+    s is a state, a disturbance or a noise. The sides are the same at all stages, or differ.
 
     Bounds of components come first, then the general inequalities.
 
@@ -40,12 +42,13 @@ class Rows:
     lower, upper : (r,) or (K, r) array
         Sides, infinite where there is none.
     scale : (r,) array
-        The width of a row, or the standard deviation of M s if that is less: what a miss is
-        measured by, so that no unit matters.
+        The unit in which a miss of the row is measured: its width, or the standard deviation of
+        M s if that is less.
     """
 
     __slots__ = (
-        "_columns", "_sizes", "bounds", "components", "lower", "matrix", "name", "scale", "upper",
+        "_columns", "_magnitudes", "bounds", "components", "lower", "matrix", "name", "scale",
+        "upper",
     )
 
     def __init__(self, name: str, convex_set: ConvexSet, covariance: Array) -> None:
@@ -57,7 +60,7 @@ class Rows:
         deviation = np.sqrt(np.einsum("ri,ij,rj->r", self.matrix, covariance, self.matrix))
         width = self.upper - self.lower
         self.scale: Array = np.where(width > 0.0, np.minimum(width, deviation), deviation)
-        self._sizes = np.abs(self.matrix).T
+        self._magnitudes = np.abs(self.matrix).T
         # Without general inequalities M s is a part of s, mostly the whole of it.
         self._columns: slice | NDArray[np.intp] | None = None
         if not convex_set.matrix.shape[0]:
@@ -71,19 +74,19 @@ class Rows:
         return chosen
 
     def misses(self, points: Array, sizes: Array) -> Array | None:
-        """By how much points (K, d) miss each row (K, r), in its scale; None if none does.
+        """By how much points (K, d) miss each row (K, r), in its scale; None if none misses any.
 
-        ``sizes`` (K, d) are those of the numbers whose difference s is.
+        ``sizes`` (K, d) are numbers whose rounding is in the points: for w = x - f, those of x.
         """
         values = self.values(points)
         missed = np.maximum(self.lower - values, values - self.upper)
         if missed.max(initial=0.0) <= 0.0:
             return None
-        missed -= _ROUNDING * (np.abs(sizes) @ self._sizes)
+        missed -= _ROUNDING * (np.abs(sizes) @ self._magnitudes)
         return np.asarray(np.maximum(missed, 0.0) / self.scale)
 
     def without(self, left_out: Mask, points: Array | None = None) -> Rows:
-        """The rows without some at some stages (K, r): both sides, or those that points miss."""
+        """A copy without rows (K, r) at some stages: both sides, or those that points miss."""
         other = self._copy()
         lower, upper = left_out, left_out
         if points is not None:
@@ -95,7 +98,7 @@ class Rows:
 
     def touching(self, components: Mask) -> Mask:
         """Which rows (K, r) have a nonzero coefficient on these components (K, d)."""
-        touched: Mask = (components @ (self._sizes != 0.0).astype(np.intp)) > 0
+        touched: Mask = (components @ (self._magnitudes != 0.0).astype(np.intp)) > 0
         return touched
 
     def _copy(self) -> Rows:
@@ -137,7 +140,7 @@ class Constraints:
     def _parts(
         self, trajectory: Array, residuals: Array, measurements: Array
     ) -> Iterator[tuple[Rows, Array, Array]]:
-        """Each set's rows, its points, and the sizes of what these are differences of."""
+        """Each set's rows, the points to test, and the ``sizes`` of `Rows.misses`."""
         n = trajectory.shape[1]
         if self.states is not None:
             yield self.states, trajectory, trajectory
@@ -158,7 +161,7 @@ class Constraints:
         return worst
 
     def observed(self, observed: Mask) -> Constraints:
-        """The constraints without rows of V on missing outputs, (K, p) bool."""
+        """The constraints without the rows of V on missing outputs; ``observed`` is (K, p) bool."""
         if self.noises is None:
             return self
         return self._replaced(noises=self.noises.without(self.noises.touching(~observed)))
@@ -166,7 +169,7 @@ class Constraints:
     def without_violated(
         self, trajectory: Array, residuals: Array, measurements: Array
     ) -> Constraints:
-        """The constraints without the rows that a trajectory misses, but for noise-free ones."""
+        """The constraints without the rows that a trajectory misses; noise-free ones stay."""
         left = {
             rows.name: rows.without(self._droppable(rows, misses), points)
             for rows, points, sizes in self._parts(trajectory, residuals, measurements)
@@ -177,19 +180,19 @@ class Constraints:
     def missed_rows(
         self, trajectory: Array, residuals: Array, measurements: Array, first: int
     ) -> tuple[DroppedRow, ...]:
-        """The rows that a trajectory misses, whose first state is of this time."""
+        """The rows that a trajectory misses; its first state has the time ``first``."""
         found = []
         for rows, points, sizes in self._parts(trajectory, residuals, measurements):
             misses = rows.misses(points, sizes)
             if misses is None:
                 continue
-            names = np.append(
+            numbers = np.append(  # as in `DroppedRow.row`
                 rows.components, rows.matrix.shape[1] + np.arange(len(rows.matrix) - rows.bounds)
             )
             below = rows.values(points) < rows.lower
             found += [
                 DroppedRow(
-                    rows.name, int(names[r]), "lower" if below[k, r] else "upper", first + int(k)
+                    rows.name, int(numbers[r]), "lower" if below[k, r] else "upper", first + int(k)
                 )
                 for k, r in np.argwhere(misses > FEASIBLE)
             ]

@@ -39,8 +39,7 @@ Array = NDArray[np.float64]
 class PythonEngine:
     """The step in Python: window, problem, optimizer, estimate.
 
-    `MovingHorizonEstimator` validates all arguments; its methods of the same names document
-    those here.
+    `MovingHorizonEstimator` validates all arguments, and documents the methods of the same names.
     """
 
     name = "python"
@@ -74,7 +73,8 @@ class PythonEngine:
         self._known_modes = system.call_modes()  # as found at construction
         self._undo_point: tuple[Mark, Array | None, tuple[int, int], tuple[Array, ...]]
         self._trajectory: Array | None = None  # of the last estimate
-        # Estimates of x(t-N), ..., x(t), each made at its own time; otherwise of x(t) only.
+        # The last estimates, each made at its own time: of x(t-N), ..., x(t) for re-initialised
+        # candidates, else of x(t) alone.
         self._history: deque[Array] = deque(
             [initial_state.copy()], maxlen=settings.horizon + 1 if self._reinitialized else 1
         )
@@ -107,7 +107,7 @@ class PythonEngine:
         """Take the sample y(t), u(t), and estimate x(t+1)."""
         window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
-            window.make_room()  # `undo` cannot cross it
+            window.make_room()  # before the undo point: `undo` cannot reverse it
         self._set_undo_point(reinitialized)
         try:
             with np.errstate(all="ignore"):
@@ -119,7 +119,7 @@ class PythonEngine:
                 estimate = self._estimate(began)
             assert self._trajectory is not None
             state = self._trajectory[-1]
-            # A view keeps its whole trajectory in memory: one may, N may not.
+            # A view keeps its whole trajectory in memory. N of these are too many: copy.
             self._history.append(state.copy() if reinitialized else state)
             self._warn()
             return estimate
@@ -157,7 +157,7 @@ class PythonEngine:
                 status |= Status.OBSERVER_FAR
         else:
             self._watch.counts = 0, 0
-            # They are views of the window.
+            # The candidate's arrays are views of the window: copy.
             trajectory, residuals = trajectory.copy(), residuals.copy()
             filtered = window.filtered()
         if problem.observed is not None:
@@ -333,7 +333,7 @@ class PythonEngine:
             raise ValueError(f"history has {len(history)} states; expected {count}")
         trajectory = state["trajectory"]
         if (trajectory is None) != (loaded.time == 0):
-            raise TypeError("trajectory is there exactly if there was a measurement")
+            raise TypeError("there must be a trajectory if and only if there was a measurement")
         if trajectory is not None:
             trajectory = checked_array("trajectory", trajectory, (loaded.length + 1, n))
             if not np.array_equal(trajectory[-1], history[-1]):
@@ -363,7 +363,8 @@ class PythonEngine:
             if not isinstance(found, (list, tuple)) or len(found) != len(known):
                 raise ValueError(f"{name} is {found!r}; expected {len(known)} of them")
             for one, mine in zip(found, known, strict=True):
-                # Found out at other states; the stages that are computed again judge it.
+                # The saved estimator may have found another way to call the model, at other states.
+                # Computing the stages again shows whether it gives the same here.
                 other = {"unknown": ("batched", "columns"), slowest: ("complex step",)}
                 if not isinstance(one, str) or one not in (mine, slowest, *other.get(mine, ())):
                     raise ValueError(f"{name} is {found!r}; expected {known}")

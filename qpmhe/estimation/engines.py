@@ -79,7 +79,7 @@ def register_engine(
 def engine_for(
     system: System, observer: Observer, cost: Cost, settings: Settings, initial_state: Array
 ) -> Engine:
-    """The engine that the settings ask for, or the Python one where it cannot be compiled."""
+    """The engine that the settings ask for, or the Python one where compilation fails."""
     try:
         return _ENGINES[settings.engine](system, observer, cost, settings, initial_state)
     except CompilationError as error:

@@ -16,9 +16,9 @@ Array = NDArray[np.float64]
 class Status(enum.Flag):
     """Outcome of a step, and everything that happened in it.
 
-    Exactly one of IMPROVED and CANDIDATE is always set; the others are added where they
-    apply, so that ``Status.IMPROVED in estimate.status`` asks for the outcome.
-    `explain` says what each one means and what to do about it.
+    Either IMPROVED or CANDIDATE is always set, and any others that apply:
+    ``Status.IMPROVED in estimate.status`` asks for the outcome. `explain` says what each one
+    means and what to do about it.
     """
 
     IMPROVED = enum.auto()
@@ -50,14 +50,14 @@ _TEXTS = {
     Status.NO_QPS: "No QP was asked for; raise max_qps to improve on the observer.",
     Status.CONVERGED: "The sequence of QPs converged.",
     Status.NO_DECREASE: (
-        "The last trial did not lower the true cost at any step length and was dropped; "
+        "The last trial did not lower the true cost at any step length and was rejected; "
         "raise max_solver_iterations or take another backend if this is frequent."
     ),
     Status.SOLVER_FAILED: (
-        "The QP solver brought back no usable iterate; see the estimate's message."
+        "The QP solver returned no usable iterate; see the estimate's message."
     ),
     Status.SOLVER_STOPPED: (
-        "A QP was not solved to tolerance, and its iterate was judged all the same; raise "
+        "A QP was not solved to tolerance; its iterate was evaluated all the same. Raise "
         "max_solver_iterations if the cost is too far from the converged one."
     ),
     Status.MODEL_FAILED: (
@@ -138,8 +138,8 @@ class Estimate:
         Estimate of x(t+1), the paper's estimate: a prediction one step ahead of the newest
         measurement.
     filtered : (n,) array
-        Estimate of x(t) that has used y(t). Where the candidate was kept it is the observer's own
-        measurement update, and z(t) for an observer without one.
+        Estimate of x(t) that has used y(t). Where the candidate is the estimate, it is the
+        observer's own measurement update, and z(t) for an observer without one.
     trajectory : (N_t + 1, n) array
         Estimates of all states in the window.
     disturbances : (N_t, n) array
@@ -226,7 +226,7 @@ class Estimate:
         return self._residuals[:, self.trajectory.shape[1] :]
 
     def explain(self) -> str:
-        """What happened, and what can be done about it, in sentences; names dropped rows."""
+        """What happened, and what can be done about it, in sentences; with any dropped rows."""
         text = self.status.explain()
         if self.dropped:
             text += f" Dropped: {'; '.join(map(str, self.dropped))}."

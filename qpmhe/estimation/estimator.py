@@ -30,16 +30,18 @@ __all__ = ["MovingHorizonEstimator", "check_start"]
 
 Array = NDArray[np.float64]
 
+
 @report_unknown_options
 class MovingHorizonEstimator:
     r"""Suboptimal moving horizon estimation with an observer-based candidate.
 
-    At each measurement the auxiliary observer is advanced; its last N steps are a feasible
-    candidate for the estimation problem (eq:optiMHE) and its state z(t-N) is the prior. A
+    Each measurement advances the auxiliary observer. Its last N steps are the candidate for the
+    estimation problem (eq:optiMHE), and the state at which they begin is the prior. A
     sequence of convex QPs then improves the candidate. An iterate is accepted only if it
     satisfies the constraints and its true cost J is no greater than the candidate's
-    (eq:estimator); otherwise the candidate is the estimate. Under the assumptions of the
-    paper's theorem this is robustly exponentially stable for every horizon, solver and cap.
+    (eq:estimator); otherwise the candidate is the estimate. ``infeasible`` says what happens
+    where the candidate itself violates a set. Under the assumptions of the paper's theorem the
+    estimator is robustly exponentially stable for every horizon, solver and cap.
 
     Parameters
     ----------
@@ -50,20 +52,20 @@ class MovingHorizonEstimator:
     cost : Cost
         `QuadraticCost` or `RobustCost`.
     horizon : int
-        N >= 1. Before N samples have come, all are used (Remark rem:emtpyN).
+        N >= 1. While there are fewer than N samples, all are used (Remark rem:emtpyN).
     initial_state : (n,) array_like
-        Estimate of x(0), the state at the first measurement. Outside of the state set it is
-        projected onto it, with an `ObserverWarning`.
+        Estimate of x(0), the state at the first measurement. One outside of the state set is
+        projected onto the set, with an `ObserverWarning`.
     backend : str or Solver
         QP solver, one of ``qpmhe.solvers.available()``. ``auto`` uses a banded Cholesky
-        factorisation and another solver only where inequalities bind; a named backend solves
-        every QP. Or a solver made by ``qpmhe.solvers.create``, which brings its own
+        factorisation and another solver only where inequalities are active; a named backend
+        solves every QP. Or a solver made by ``qpmhe.solvers.create``, which brings its own
         cap and tolerances. It may serve several estimators of one thread, and starts afresh
         whenever it passes from one to another.
     max_qps : int or None
         QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence,
-        with at most 100. Where rows of sets are dropped, at least one QP is solved without them,
-        beyond the cap if need be.
+        with at most 100 QPs. Where inequalities are dropped, at least one QP is solved without
+        them, beyond the cap if need be.
     max_solver_iterations : int or None
         Cap on the solver's own iterations in each QP; None leaves the solver's default, or the
         cap of the solver given as ``backend``.
@@ -71,8 +73,8 @@ class MovingHorizonEstimator:
         Tolerance on the QP's residuals in scaled numbers, which have no unit; see
         `qpmhe.solvers.SolverOptions`. If left out, a solver given as ``backend`` keeps its own.
     tolerance : float
-        The sequence of QPs has converged when a QP that was solved lowers J by less than
-        this share of it.
+        The sequence of QPs has converged when a QP that was solved to its own tolerance
+        lowers J by less than this share of J.
     engine : {"python", "compiled"}
         What runs the step. ``compiled`` generates C code for the whole step from a system
         made by `qpmhe.from_casadi` without a set of states, a quadratic cost and an observer with
@@ -85,18 +87,18 @@ class MovingHorizonEstimator:
         linearised error. False gives the paper's plain observer, which may leave X.
     infeasible : {"drop_rows", "keep_candidate"}
         What to do where the candidate violates a set and no trajectory is found that satisfies
-        all sets at a cost not above the candidate's: ``drop_rows`` leaves out the inequalities
-        that the candidate violates, one by one and in this step only; ``keep_candidate``
-        returns the candidate.
+        all sets at a cost not above the candidate's: ``drop_rows`` leaves out, in this step only,
+        those inequalities of the sets that the candidate violates; ``keep_candidate`` returns
+        the candidate.
     warm_start : bool
-        Whether the sequence starts at the shifted previous estimate where its true J is lower
-        than the candidate's. What beats the candidate is accepted in either case.
+        Whether the sequence starts at the previous estimate, shifted by one step, where this has
+        a lower true J than the candidate. Either way J(estimate) <= J(candidate).
     candidate : {"observer", "reinitialized"}
         The paper's candidate, or the trajectory of an observer that at each sample starts
-        anew from the estimate of x(t-N) made at time t-N: the paper's outlook, which its
-        theorem does not cover.
+        anew from the estimate made N samples ago: the paper's outlook, which its theorem
+        does not cover.
     time_budget : float or None
-        Seconds for one update: no QP is begun later, and backends with a clock stop.
+        Seconds for one update: no QP begins later, and backends with a clock stop.
     delay : int
         ``estimate.delayed`` is the estimate of the state this many steps before
         ``estimate.state``; at most N.
@@ -164,7 +166,7 @@ class MovingHorizonEstimator:
                 "has no covariance; take a Kalman-type observer, such as qpmhe.ExtendedKalman, "
                 "or give a constant weight."
             )
-        # A copy, because this estimator may change how the model is called.
+        # A copy: this estimator may change how f and h are called (batched, or one by one).
         self._own_system = system.copy(cost.prior_deviations(observer.initial_covariance()))
         self._initial_state: Array = self._checked_start(initial_state)
         self._no_input = np.zeros(system.m)
@@ -195,14 +197,14 @@ class MovingHorizonEstimator:
         InvalidInputError
             If the state does not fit; the estimator is left as it was.
         """
-        before = self._initial_state, self._own_system.call_modes()
+        before, modes = self._initial_state, self._own_system.call_modes()
         try:
             if initial_state is not None:
                 self._initial_state = self._checked_start(initial_state)
             self._engine.reset(self._initial_state)
         except BaseException:
-            self._initial_state, calling = before
-            self._own_system.use_call_modes(calling)
+            self._initial_state = before
+            self._own_system.use_call_modes(modes)
             raise
 
     @property
@@ -248,11 +250,11 @@ class MovingHorizonEstimator:
         Parameters
         ----------
         y : (p,) array_like
-            y(t); components that are not finite (or so large that their square is not), None,
-            pandas' NA, NaT or masked are missing. A scalar if p is 1.
+            y(t), or a scalar if p is 1. Components count as missing if they are masked, None,
+            pandas' NA or NaT, not finite, or so large that their square is not finite.
         u : (m,) array_like, optional
             u(t), the input that acts from t to t+1 (and on y(t), if h depends on it), and any
-            known parameters of that time. Required exactly if the system has inputs.
+            known parameters of that time. Required if and only if the system has inputs.
         dt : float, optional
             Length of the step from t to t+1 if not the sampling time; for a system made by
             `System.from_ode`.
@@ -381,9 +383,9 @@ class MovingHorizonEstimator:
                 )
         elif self.system.m:
             self._input(None)
-        whole = None if covariances else self._engine.run(ys, us)
-        if whole is not None:
-            return whole
+        at_once = None if covariances else self._engine.run(ys, us)
+        if at_once is not None:
+            return at_once
         start, estimates, collected = self.state.copy(), [], []
         for y, u in zip(ys, [None] * len(ys) if us is None else us, strict=True):
             estimates.append(self.update(y, u))
@@ -445,12 +447,12 @@ class MovingHorizonEstimator:
         ------
         InvalidInputError
             If it is not such a state: damaged, or of an estimator with another model,
-            observer, cost, sets or candidate. The estimator is left as it was. QP caps,
-            backend, tolerances and policies may differ.
+            observer, cost, sets or candidate. The estimator is left as it was. QP caps, backend,
+            tolerances, ``infeasible`` and ``warm_start`` may differ.
 
         Notes
         -----
-        Every stored stage is computed again and compared.
+        It computes every stored stage again and compares the results.
         """
         self._engine.load_state_dict(state)
 
@@ -512,7 +514,7 @@ def _inside(
     if weight is None:
         weight = cost.initial_weight(observer.initial_covariance())
     if weight.shape[0] != system.n:
-        return state  # the check of the observer says so
+        return state  # `Observer.check` then reports the wrong size
     inside = nearest(state, inverse(weight)).point
     warnings.warn(
         f"{name} is {state.tolist()}, outside of the state set {system.states!r}; the estimator "

@@ -26,21 +26,21 @@ NEARLY = 1e-6
 #: sequence has converged if the QP predicted less than this many times the tolerance.
 STALLED = 1e3
 
-#: Most second-order corrections of a step that leaves a curved set.
+#: Largest number of second-order corrections of a step that leaves a curved set.
 CORRECTIONS = 2
 
 #: A second-order correction is lengthened by this share of itself, to end inside the set.
 BEYOND = 0.1
 
-#: Most QPs on the way to one point near an infeasible one that satisfies all rows; in all, so many
-#: for each QP of the sequence and one time more.
+#: Largest number of QPs for one feasible trajectory near an infeasible one. A whole step solves at
+#: most this many for each QP of its sequence, and this many more.
 NEAREST_POINTS = 5
 
 #: Largest miss of a row of a feasible trial, as a share of the row's scale: QP solvers end on the
 #: boundary up to their tolerance.
 FEASIBLE = 5e-9
 
-#: Standard deviations of the prior from which on the observer is far from an estimate.
+#: An observer more than this many standard deviations of the prior from an estimate is far.
 FAR = 10.0
 
 #: A larger measurement counts as missing: its square would not be finite.

@@ -1,4 +1,4 @@
-"""Gauss-Newton terms of the stages: what each adds to the QP's Hessian and gradient."""
+"""Gauss-Newton terms of the stages: what each stage adds to the QP's Hessian and gradient."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Stage:
 
 
 class Span:
-    """Views of successive stages of `StageTerms`, in the parts that a QP sums up.
+    """Views of successive stages of `StageTerms`, cut into the parts that a QP adds up.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class StageTerms:
         self._square = self._flat[: (1 + n) ** 2].reshape(1 + n, 1 + n)
         self._weighted = self._flat[(1 + n) ** 2 : -1].reshape(q, 1 + n)
         self._zeros = np.zeros(self._flat.size)
-        # -G^T W r is the first column of M^T W M below its corner; Q w starts that of W M.
+        # First columns: that of M^T W M is -G^T W r below its corner, that of W M begins with Q w.
         self._gradient_column, self._next_column = self._square[1:, 0], self._weighted[:n, 0]
         self._panel_index = _panel_index(n, p)
 
@@ -144,7 +144,7 @@ class StageTerms:
         return costs
 
     def copy_scaled(self, span: Span, factors: Array) -> None:
-        """Copy stages to the first ones here, each with its cost times a factor."""
+        """Copy the terms of a span to the first stages here, each times a factor of its cost."""
         count = factors.size
         self.linear[:count, :, 1:] = span.minus_jacobian
         np.multiply(span.panel, factors[:, None, None], out=self.panel[:count])

@@ -71,7 +71,7 @@ class Outcome:
         return late
 
     def remaining(self, now: float) -> float | None:
-        """Seconds left, None without a deadline; adds to the events if there are none."""
+        """Seconds left, None without a deadline; adds to the events if the time is up."""
         if self.deadline == math.inf:
             return None
         left = self.deadline - now
@@ -91,13 +91,14 @@ class Outcome:
 class Optimizer:
     """Gauss-Newton steps from the candidate, each judged by the true problem.
 
-    A step that does not lower J below the best so far is shortened, and dropped if no length
+    A step that does not lower J below the best so far is shortened, and rejected if no length
     helps. So J of the result is never above the candidate's, whatever the solver returns.
 
     Where the candidate satisfies all rows, so does the result. Where it does not, the result is
 
     (a) a trajectory that satisfies all rows, with J no greater than the candidate's; else
-    (b) one that satisfies all but the rows that the candidate violates, with such a J; else
+    (b) one that satisfies all rows but those that the candidate violates, with such a J (only
+        with ``infeasible="drop_rows"``); else
     (c) the candidate.
     """
 
@@ -122,10 +123,11 @@ class Optimizer:
         problem : Problem
             The problem of the window.
         shifted : callable
-            Gives the previous estimate, shifted to this window: where a warm start begins, and
-            where a feasible trajectory is looked for if there is none near the candidate.
+            Returns the previous estimate, shifted to this window, or None. A warm start begins
+            there; and if no feasible trajectory is found near the candidate, the search for one
+            goes on there.
         deadline : float
-            Time, by `time.perf_counter`, after which no QP is begun.
+            Time, by `time.perf_counter`, after which no QP begins.
         """
         candidate = problem.candidate
         outcome = Outcome(candidate, deadline)
@@ -150,26 +152,27 @@ class Optimizer:
         start: Array | None,
         shifted: Callable[[], Array | None],
     ) -> None:
-        """The sequence from a candidate outside of the sets."""
+        """The sequence of QPs from a candidate that violates a set."""
         candidate = problem.candidate
-        outside = replace(candidate, cost=math.inf)
+        outside = replace(candidate, cost=math.inf)  # any feasible trial is better
         outcome.trial = outside
+        # (a) As usual; else from a feasible trajectory near the candidate or the last estimate.
         self._search(problem, outcome, start, self._limit)
         if not outcome.trial.cost < math.inf:
             outcome.trial = self._feasible_near(problem, outcome, outside)
-            if not outcome.trial.cost < math.inf and (again := shifted()) is not None:
-                again = problem.clipped(again)
-                outcome.trial = self._feasible_near(problem, outcome, problem.evaluate(again))
+            if not outcome.trial.cost < math.inf and (previous := shifted()) is not None:
+                trial = problem.evaluate(problem.clipped(previous))
+                outcome.trial = self._feasible_near(problem, outcome, trial)
             if outcome.trial.cost < math.inf:
                 self._search(problem, outcome, None, self._limit - outcome.qps)
         if outcome.trial.cost < candidate.cost and outcome.trial.violation <= FEASIBLE:
             outcome.improved = True
             return
-        outcome.trial = candidate
+        outcome.trial = candidate  # (c), if dropping rows is not allowed or does not help
         if not self._may_drop or outcome.time_is_up():
             return
         outcome.events &= ~(Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED)
-        relaxed = problem.without_violated()
+        relaxed = problem.without_violated()  # (b)
         outcome.trial = relaxed.candidate
         self._search(relaxed, outcome, start, max(1, self._limit - outcome.qps))
         outcome.improved = outcome.trial is not relaxed.candidate
@@ -179,7 +182,7 @@ class Optimizer:
                 outcome.events |= Status.ROWS_DROPPED
 
     def _search(self, problem: Problem, outcome: Outcome, start: Array | None, limit: int) -> None:
-        """At most so many QPs, each around the best trajectory so far."""
+        """Solve at most ``limit`` QPs, each around the best trajectory so far."""
         if start is not None:
             trial = problem.evaluate(problem.clipped(start.copy()))
             if trial.cost < _target(outcome.trial):
@@ -198,7 +201,7 @@ class Optimizer:
     def _feasible_near(self, problem: Problem, outcome: Outcome, trial: Trial) -> Trial:
         """A feasible trajectory near an infeasible one, by QPs in the metric of the Hessian.
 
-        The trial itself where it is feasible, or there is no way into the sets.
+        The trial itself where it is feasible, or where no feasible trajectory is found.
         """
         nearest = trial
         for _ in range(NEAREST_POINTS):
@@ -234,10 +237,10 @@ class Optimizer:
         best = outcome.trial
         # Where J is infinite, no decrease is negligible.
         negligible = self._tolerance * best.cost if best.cost < math.inf else -1.0
-        # The QP's decrease of J.
+        # The decrease of J that the QP predicts: its objective is J/2.
         predicted = abs(float(np.vdot(qp.gradient, solution.d)))
         useless = solved and predicted <= negligible
-        trial = self._lower(problem, qp, outcome, solution.d, useless)
+        trial = self._line_search(problem, qp, outcome, solution.d, useless)
         if trial.cost < _target(best):
             outcome.trial = trial
             if solved and best.cost - trial.cost <= negligible:
@@ -251,13 +254,13 @@ class Optimizer:
         outcome.message = problem.failure(trial)
         return False
 
-    def _lower(
+    def _line_search(
         self, problem: Problem, qp: QP, outcome: Outcome, step: Array, useless: bool
     ) -> Trial:
-        """The first trial along a step whose J is below the best so far, or the last trial.
+        """The first trial along a step with J below the best so far; the last one if none is.
 
-        A step whose predicted decrease is negligible is useless and not shortened: at a minimum
-        no step lowers J by more than rounding.
+        A step whose predicted decrease is negligible is ``useless`` and not shortened: at a
+        minimum no step lowers J by more than rounding.
         """
         best, target = outcome.trial, _target(outcome.trial)
         trial = self._trial(problem, best, step)
@@ -275,20 +278,21 @@ class Optimizer:
                 trial = self._feasible_near(problem, outcome, trial)
             if trial.cost < target:
                 return trial
-        # Between two infeasible points there is no feasible one of a convex set.
+        # From outside, a full step ends as a rule on the boundary of the linearised sets: shorter
+        # ones stay outside.
         if useless or best.violation > FEASIBLE:
             return trial
         for length in LENGTHS:
             trial = self._trial(problem, best, length * step)
             if trial.cost < target:
                 return trial
-        return self._along(problem, outcome, step) if curved else trial
+        return self._boundary_search(problem, outcome, step) if curved else trial
 
-    def _along(self, problem: Problem, outcome: Outcome, step: Array) -> Trial:
+    def _boundary_search(self, problem: Problem, outcome: Outcome, step: Array) -> Trial:
         """A trial along the boundary of a curved set: back into the set from a shortened step.
 
-        Of a step's length, what it lowers J by shrinks in proportion, and how far it leaves the
-        set by the square: the way back costs less than the step gains, if that is short enough.
+        The decrease of J is proportional to the length of a short step, the distance from the set
+        to its square. So the way back costs less than a step gains, if the step is short enough.
         """
         best, target = outcome.trial, _target(outcome.trial)
         trial = best
@@ -318,7 +322,7 @@ class Optimizer:
         return trial
 
     def _solve(self, qp: QP, outcome: Outcome) -> Solution | None:
-        """The solver's solution of a QP within the time left; None if none is left."""
+        """Solve a QP within the time left; None if no time is left."""
         began = perf_counter()
         left = outcome.remaining(began)
         if left is not None and left <= 0.0:

@@ -26,7 +26,8 @@ __all__ = ["Formulation", "Problem", "Trial"]
 
 Array = NDArray[np.float64]
 
-_EPS = 8.0 * float(np.finfo(np.float64).eps)
+# Rounding of a residual, as a share of the numbers that it is computed from.
+_ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
 
 @dataclass(slots=True)
@@ -38,9 +39,10 @@ class Trial:
     trajectory, residuals : array
         States (K + 1, n), and joint residuals (w, v) of the stages (K, n + p).
     weights : (n + p, n + p) or (K, n + p, n + p) array
-        Of the quadratic form that majorises the stages' cost here, discount included.
+        Weights of the quadratic form that majorises the stages' cost here, discount included.
     cost : float
-        J, or infinity if a constraint is violated or the model fails.
+        J, or infinity if a constraint is violated or the model fails. The candidate's is its
+        true J in any case.
     violation : float
         The largest violation of a row in its scale (see `Rows`), infinity if the model fails.
     error : Exception or None
@@ -89,14 +91,14 @@ class Problem:
     Parameters
     ----------
     formulation : Formulation
-        What it has in common with other windows' problems.
+        What the problems of all windows have in common.
     window : Window
         The data, with the prior z(t-N) of (eq:prior).
 
     Attributes
     ----------
     candidate : Trial
-        The observer's trajectory (eq:warmstart), with its true J whether it is feasible or not.
+        The observer's trajectory (eq:warmstart), with its true J even if it is infeasible.
     constraints : Constraints
         The rows that a trial must satisfy.
     prior, inputs, measurements : array
@@ -105,6 +107,16 @@ class Problem:
         Which components of y are not missing; None if none is missing.
     prior_weight : (n, n) array
         Weight of the initial error, before discount and majorisation.
+    discounts : (K + 1,) array or None
+        Factors of the prior's cost and of the stages'; None without a discount.
+    stage_weights : array
+        Weights of the stages' cost, before discount and majorisation; one, or one for each stage.
+    model : System
+        The model that takes these inputs, whose last column may be the length of the step.
+    span : Span
+        The candidate's linearised stages.
+    time : int
+        Time of the first state.
     """
 
     __slots__ = (
@@ -120,7 +132,7 @@ class Problem:
         self.prior, self.measurements, self.span = view.prior, view.measurements, view.span
         self.time = window.time - window.length
         self.observed: NDArray[np.bool_] | None = None
-        # `unusual` stays set for longer, and a snapshot sets it: no result may depend on it.
+        # `unusual` only saves time: it stays set for too long, and loading a snapshot sets it.
         if window.unusual and (window.has_special_weights or window.has_irregular_steps):
             self.inputs, self.model = window.inputs, window.model
             self.stage_weights = window.stage_weights
@@ -162,7 +174,7 @@ class Problem:
             self._clip = lower, upper
 
     def without_violated(self) -> Problem:
-        """The problem without the rows that the candidate violates, but for noise-free ones."""
+        """The problem without the rows that the candidate violates; noise-free ones stay."""
         other, candidate = copy(self), self.candidate
         other._constrain(
             self.constraints.without_violated(
@@ -179,7 +191,7 @@ class Problem:
         )
 
     def clipped(self, trajectory: Array) -> Array:
-        """A trajectory with each state in its bounds; written in place."""
+        """Clip each state to its bounds, in place; return the trajectory."""
         if self._clip is not None:
             np.clip(trajectory, *self._clip, out=trajectory)
         return trajectory
@@ -263,13 +275,14 @@ class Problem:
         return weights, float(costs.sum())
 
     def rounding_cost(self, trial: Trial) -> float:
-        """What rounding of the residuals of a trial can contribute to J."""
-        sizes = np.abs(np.concatenate((trial.trajectory[1:], self.measurements), axis=1)) * _EPS
+        """The part of a trial's J that rounding of its residuals can explain."""
+        sizes = np.abs(np.concatenate((trial.trajectory[1:], self.measurements), axis=1))
+        sizes = sizes * _ROUNDING
         weights = np.broadcast_to(np.abs(trial.weights), (len(sizes), *trial.weights.shape[-2:]))
         return float(np.einsum("ki,kij,kj->", sizes, weights, sizes))
 
     def prior_weight_at(self, offset: Array) -> Array:
-        """Weight (n, n) of the form that majorises the prior's cost at x_0 - prior = offset."""
+        """Weight (n, n) of the form that majorises the prior's cost where x_0 - prior = offset."""
         weight, formulation = self.prior_weight, self._formulation
         if not formulation.quadratic:
             weight = formulation.cost.majorise_prior(offset, weight)

@@ -17,12 +17,12 @@ Array = NDArray[np.float64]
 
 
 class RunningObservers:
-    """N observers with a constant gain, of which one starts at each sample and lasts N samples.
+    """N observers with a constant gain; one starts at each sample and runs for N samples.
 
     Each sample advances all of them by one call of f and one of h, always with N rows; the
     observer that starts at time s has row s mod N. So a row's numbers depend on its start and
-    its samples alone, and observers that are advanced through the samples of a window again
-    have the numbers of those that ran on.
+    its samples alone: an observer that runs through the samples of a window a second time
+    gives the same numbers.
 
     ``keep_inside(predicted, state, correction)`` projects one state and returns flags of `Status`.
     """
@@ -39,7 +39,7 @@ class RunningObservers:
         self._residuals = np.zeros((horizon, horizon, n + p))
         self._predicted = np.zeros((horizon, n))
         self._events = [0] * horizon  # flags at the last sample
-        #: Which rows have no observer at which the model works.
+        #: Rows whose observer the model has failed, or that have no observer yet.
         self.failed = np.ones(horizon, np.bool_)
 
     def advance(self, time: int, start: Array, y: Array, sample: Sample) -> None:
@@ -50,7 +50,7 @@ class RunningObservers:
         correction, error = residuals[:, :n], residuals[:, n:]
         now[time % count], failed[time % count] = start, False
         if failed.any():
-            now[failed] = start  # where the model works, if anywhere
+            now[failed] = start  # a state at which the model is likely to work
         self._evaluate(sample.system.h, now, sample.u, error)
         np.subtract(y, error, error)
         if sample.observed is not None:
@@ -58,7 +58,7 @@ class RunningObservers:
         self._evaluate(sample.system.f, now, sample.u, predicted)
         np.matmul(error, self._transposed_gain, correction)
         np.add(predicted, correction, ahead)
-        failed |= ~np.isfinite(np.einsum("ij,ij->i", ahead, ahead))  # as its cost overflows
+        failed |= ~np.isfinite(np.einsum("ij,ij->i", ahead, ahead))  # its cost would overflow
         if self._nearest is None:
             return
         self._events = [0] * count
@@ -73,7 +73,7 @@ class RunningObservers:
         try:
             np.copyto(values, function.batch(states, np.broadcast_to(u, (self._count, u.size))))
         except Exception:
-            # Functions that raise at some states are called one by one within a batch, too.
+            # One by one, as a batch calls functions that raise at some states: same numbers.
             for i, state in enumerate(states):
                 try:
                     np.copyto(values[i], function(state, u))

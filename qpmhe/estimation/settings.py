@@ -41,10 +41,10 @@ class Settings:
     isolated: bool = False
 
     def __post_init__(self) -> None:
-        # As Python's int: not everything that gets them accepts NumPy's integers.
+        # Stored as Python's int: not all code that reads them accepts NumPy's integers.
         object.__setattr__(self, "horizon", dimension("horizon", self.horizon, 1))
         if self.max_qps is not None:
-            count("max_qps", self.max_qps, 0, " None stands for convergence.")
+            count("max_qps", self.max_qps, 0, " None iterates to convergence.")
         if self.max_solver_iterations is not None:
             count(
                 "max_solver_iterations", self.max_solver_iterations, 1,
@@ -77,7 +77,7 @@ class Settings:
             self._take_limits_of(self.backend)
 
     def _take_limits_of(self, solver: Solver) -> None:
-        """Let the limits be those of a solver, and refuse others."""
+        """Take the limits of a solver, and reject settings that contradict them."""
         options = getattr(solver, "options", None)
         if not isinstance(options, SolverOptions):
             raise BackendError(

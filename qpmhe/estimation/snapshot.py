@@ -24,8 +24,8 @@ Array = NDArray[Any]
 
 SET_NAMES = ("states", "disturbances", "noises")
 
-# Largest difference between two machines that compute the same, as a share of a number's size,
-# and as a share of the largest entry of its array.
+# Two machines compute the same number with at most this difference: as a share of its size, and
+# as a share of the largest entry of its array.
 _ROUNDING, _FLOOR = 1e-7, 1e-10
 
 
@@ -35,8 +35,8 @@ def described(
     """Model, observer and cost as arrays, numbers and names, to compare with another's.
 
     f and h are described by their values at some points; other differences show when the
-    stored stages are computed again. Caps, backend and policies of the QPs are left out: they
-    may change between snapshot and restart.
+    stored stages are computed again. Options that may change between saving and loading are left
+    out: caps, backend and tolerances of the QPs, ``infeasible`` and ``warm_start``.
     """
     found: dict[str, Any] = {"candidate": settings.candidate, "sampling time": system.dt}
     for name in SET_NAMES:
@@ -80,7 +80,7 @@ def _describe(name: str, value: Any, found: dict[str, Any]) -> None:
 
 
 def check_description(found: Any, mine: dict[str, Any]) -> None:
-    """Raise for the state of an estimator that differs, naming the difference."""
+    """Raise if the state is of an estimator that differs, and name the difference."""
     if not isinstance(found, dict):
         raise TypeError("the estimator is not described")
     for name in (*mine, *found):
@@ -117,7 +117,7 @@ class _OtherEstimatorError(InvalidInputError):
 
 
 def mismatch(what: str) -> InvalidInputError:
-    """The error for the state of an estimator that differs in this."""
+    """The error to raise where the estimators differ in ``what``."""
     return _OtherEstimatorError(
         f"the state is of an estimator with another {what} (or it is damaged); make this one "
         "with the arguments of the one that it was taken from."

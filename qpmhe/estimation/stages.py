@@ -78,7 +78,7 @@ class Stages:
         self._u[:, m] = step
         self._irregular = np.zeros(room, dtype=np.bool_)
         self._observed = np.ones((room, p), dtype=np.bool_)
-        # Because y is missing in part, or has a noise weight of its own.
+        # Stages where y is missing in part, or has a noise weight of its own.
         self._special = np.zeros(room, dtype=np.bool_)
         self._own_noise: dict[int, Array] = {}  # noise weights given with a sample, by time
         self._usual_weight = stage_weight
@@ -108,9 +108,10 @@ class Stages:
         self.metric: ErrorMetric | None = None
         self.time = 0  # number of samples pushed: the window ends at x(time)
         self.start = self.end = 0
+        # Times of the last stages of each kind; at first, long ago.
         self._last_special = self._last_irregular = -self.horizon - 1
-        # Up to where running observers have taken the samples; -1 where samples have changed.
-        self._run_to = -1
+        # Time up to which running observers have taken the samples; -1 makes them start again.
+        self._advanced_to = -1
         # Before the first stage in the arrays: the last state at which the model worked.
         self._earlier_state = initial_state.copy()
         self._earlier_covariance = None if covariance is None else covariance.copy()
@@ -220,7 +221,7 @@ class Stages:
             array[first : first + len(part)] = part
 
     def mark(self, whole: bool) -> Mark:
-        """What `roll_back` needs."""
+        """What `roll_back` needs; all stages if ``whole``."""
         return Mark(
             self.start, self.end, self.time, self._last_special, self._last_irregular,
             self.unusual, self._own_noise.copy() if self._own_noise else None,
@@ -230,7 +231,7 @@ class Stages:
 
     def roll_back(self, mark: Mark) -> None:
         """Undo all changes since a mark, which must be later than the last `make_room`."""
-        self._run_to = -1
+        self._advanced_to = -1
         self.start, self.end, self.time = mark.start, mark.end, mark.time
         self._last_special, self._last_irregular = mark.last_special, mark.last_irregular
         self._own_noise = mark.own_noise or {}

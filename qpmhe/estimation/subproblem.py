@@ -56,17 +56,17 @@ class Subproblem:
         self._rows = int(ends[-1])
         self._w, self._v, self._x = (slice(a, b) for a, b in pairwise(ends))
         self._qp: QP | None = None
-        #: Why `at` found no QP the last time.
+        #: Why `at` returned None the last time.
         self.failure = ""
         # Added to the stages' panels: the band of the prior's weight, then the band of each Q_i.
         self._added_bands: Array
-        # What they hold: whether one Q for all stages, and which band of the prior.
+        # What these bands hold now: the same Q for all stages or not, and which prior's band.
         self._uniform, self._prior_band = False, _NO_BAND
 
     def at(self, problem: Problem, trial: Trial) -> QP | None:
-        """The QP around a trajectory; None, and `failure`, where it has no Jacobians there.
+        """The QP around a trajectory; None, and why in `failure`, where the Jacobians fail.
 
-        The candidate's terms are in the window already.
+        The window holds the candidate's terms already.
         """
         if trial.trajectory is problem.candidate.trajectory:
             span = problem.span
@@ -110,8 +110,8 @@ class Subproblem:
         """Shift the rows of the QP around a trajectory by its linearisation error at a trial.
 
         With the same matrices, W and V then hold for the true residuals of a point near the
-        trial up to third order: a second-order correction. The rows are tightened by a share
-        of the shift, for the third order, and by twice the solver's violation.
+        trial up to third order: a second-order correction. The rows are also tightened: by a
+        share of the shift, for the third order, and by twice what the solver's step misses.
         """
         n, step = self._n, trial.trajectory - around.trajectory
         linearised = around.residuals + np.matmul(self._minus_jacobian, step[:-1, :, None])[:, :, 0]
@@ -198,12 +198,12 @@ class Subproblem:
             (self._x, constraints.states, trajectory),
         ):
             if rows is not None and place.start < place.stop:
-                _set_sides(qp, slice(0, len(points)), place, rows, points)
+                _set_sides(qp, place, rows, points)
 
 
-def _set_sides(qp: QP, stages: slice, place: slice, rows: Rows, points: Array) -> None:
-    """Write the sides of a set's last rows, as many as the QP has place for."""
-    values = rows.values(points)
+def _set_sides(qp: QP, place: slice, rows: Rows, points: Array) -> None:
+    """Write the sides of a set's rows that are rows of the QP: the last ones, or all of them."""
+    values, stages = rows.values(points), slice(0, len(points))
     last = slice(values.shape[1] - (place.stop - place.start), None)
     qp.row_lower[stages, place] = (rows.lower - values)[:, last]
     qp.row_upper[stages, place] = (rows.upper - values)[:, last]

@@ -13,17 +13,17 @@ Array = NDArray[np.float64]
 
 
 class ObserverWatch:
-    """Counts for how many samples running the observer was far from the estimate, or rows dropped.
+    """Counts consecutive samples in which the observer was far from the estimate, or rows dropped.
 
     Parameters
     ----------
     horizon : int
-        So many samples running are long.
+        Number of consecutive samples that count as long.
     """
 
     def __init__(self, horizon: int) -> None:
         self._horizon = horizon
-        #: Samples running with the observer far away, and with rows dropped.
+        #: Consecutive samples with the observer far away, and with rows dropped.
         self.counts: tuple[int, int] = (0, 0)
         self._warned = False
 
@@ -37,7 +37,7 @@ class ObserverWatch:
         prior_weight : (n, n) array
             Weight of an initial error of the observer.
         dropped_rows : bool
-            Whether the estimate violates inequalities.
+            Whether the step dropped rows.
         """
         far, dropped = self.counts
         # A comparison with NaN is false.
@@ -46,19 +46,19 @@ class ObserverWatch:
         return far >= self._horizon
 
     def warning(self) -> str | None:
-        """What to warn of, the first time that there is something; None otherwise."""
+        """The warning, the first time that there is reason for it; None otherwise."""
         far, dropped = self.counts
         if self._warned or max(far, dropped) < self._horizon:
             return None
         self._warned = True
         if dropped >= self._horizon:
             return (
-                f"inequalities were dropped in {dropped} samples running, because the observer's "
-                "candidate violates them and no better trajectory satisfies them all; see "
-                "estimate.dropped. Widen these sets, raise max_qps, or take another observer."
+                f"inequalities were dropped in {dropped} consecutive samples, because the "
+                "observer's candidate violates them and no better trajectory satisfies them all; "
+                "see estimate.dropped. Widen these sets, raise max_qps, or take another observer."
             )
         return (
-            f"the observer was far from the estimates in {far} samples running (more than "
+            f"the observer was far from the estimates in {far} consecutive samples (more than "
             f"{FAR:g} standard deviations of the prior); take another gain or observer, or "
             "candidate='reinitialized'."
         )

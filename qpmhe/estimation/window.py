@@ -30,18 +30,20 @@ _MISSING, _MODEL_FAILED = Status.MISSING.value, Status.MODEL_FAILED.value
 _PROJECTED, _PREDICTION_OUTSIDE, _METRIC_SINGULAR = (
     Status.OBSERVER_PROJECTED.value, Status.PREDICTION_OUTSIDE.value, Status.METRIC_SINGULAR.value
 )
-# N observers that run side by side hold at most so many numbers.
+# Observers run side by side if they hold at most this many numbers; otherwise `replay` does it.
 _MOST_RUNNING = 2**23
 
 
 class Window(Stages):
     """Samples y(t-N), ..., y(t-1) with the observer's states z(t-N), ..., z(t).
 
+    Here t is ``time``, the number of samples taken: y(t-1) is the newest, and x(t) is estimated.
+
     The observer's trajectory changes only with a late measurement or a restart. What depends
     on it alone is therefore computed once, when a stage enters the window: the residuals
     :math:`(L(i), v_z(i))`, their cost, the Jacobians and the Gauss-Newton terms.
 
-    ``events`` and ``failure`` say what happened at the stage computed last, which is the newest.
+    ``events`` and ``failure`` say what happened at the stage computed last, the newest one.
     """
 
     def __init__(
@@ -65,10 +67,10 @@ class Window(Stages):
             cost.quadratic, system.dt or 0.0,
         )
         self._sample = Sample(system, np.zeros(m))
-        self._running = ""  # what is being evaluated
+        self._evaluating = ""  # for messages: the function that is being evaluated
         #: Flags of `Status` for the stage computed last.
         self.events: int = 0
-        self._nearest: NearestPoint | None = None  # where the observer is kept in X
+        self._nearest: NearestPoint | None = None  # projects the observer onto X
         if project and system.states is not None:
             self._nearest = NearestPoint(system.states)
             if self._covariances is None or observer.metric is not None:
@@ -125,8 +127,8 @@ class Window(Stages):
         if noise_weight is not None:
             self._own_noise[self.time] = noise_weight
             self._set_weight(k, self.time)
-        if self._runs:
-            self._components(k, self.time)
+        if self._observers_ready:
+            self._find_observed(k, self.time)
         else:
             self._compute_stage(k, self.time)
         self.end = k + 1
@@ -137,8 +139,8 @@ class Window(Stages):
                 self._own_noise.pop(self.time - self.horizon - 1, None)
 
     def amend(self, time: int, y: Array) -> None:
-        """Fill the finite components of y into a sample of the window, and redo what follows."""
-        self._run_to = min(self._run_to, time)
+        """Fill the finite components of y into a sample, and redo the stages from there on."""
+        self._advanced_to = min(self._advanced_to, time)
         k = self.end - (self.time - time)
         new = np.abs(y) < LARGEST
         self._y[k, new] = y[new]
@@ -156,26 +158,26 @@ class Window(Stages):
 
     def reinitialize(self, estimates: Sequence[Array]) -> None:
         """Replay the window from its first estimate; the last ones are x(t-N), ..., x(t-1)."""
-        if not self._runs or not self._follow(estimates):
+        if not self._observers_ready or not self._follow(estimates):
             self.replay(self.length, estimates[-self.length])
 
     @property
-    def _runs(self) -> bool:
-        """Whether observers run, as `replay` would make them run now."""
+    def _observers_ready(self) -> bool:
+        """Whether observers run side by side; not before their metric is final."""
         return self._observers is not None and (self.metric is None or self.metric.settled)
 
     def _follow(self, estimates: Sequence[Array]) -> bool:
         """Take the candidate from a running observer; False where `replay` has to make it."""
         observers, now, first = self._observers, self.time, self.time - self.length
         assert observers is not None
-        # What failed may not fail with other samples.
-        if self._run_to < first or (self._run_to < now - 1 and observers.failed.any()):
-            observers.failed[:], self._run_to = True, first
-        for time in range(self._run_to, now):
+        # With samples that have changed, an observer that failed may work: run all of them again.
+        if self._advanced_to < first or (self._advanced_to < now - 1 and observers.failed.any()):
+            observers.failed[:], self._advanced_to = True, first
+        for time in range(self._advanced_to, now):
             k = self.end - (now - time)
-            self._describe(k, self._components(k, time))
+            self._fill_sample(k, self._find_observed(k, time))
             observers.advance(time, estimates[time - now], self._y[k], self._sample)
-        self._run_to = now
+        self._advanced_to = now
         self._z[self.start : self.end + 1], self.residuals[...], self.events = (
             observers.trajectory(first, now)
         )
@@ -209,13 +211,13 @@ class Window(Stages):
 
     def _compute_stage(self, k: int, time: int) -> None:
         """Compute stage k, of this time, from its sample and the observer's state."""
-        y, observed = self._stage_views[k].y, self._components(k, time)
+        y, observed = self._stage_views[k].y, self._find_observed(k, time)
         self.failure = ""
         cost = self._evaluate_stage(k, time, observed)
         if not math.isfinite(cost) and observed is None:
             small = np.abs(y) < LARGEST
             if not small.all():  # a huge component may be the reason: without it
-                self._run_to = min(self._run_to, time)
+                self._advanced_to = min(self._advanced_to, time)
                 self._observed[k] = observed = small
                 self._set_weight(k, time)
                 cost = self._evaluate_stage(k, time, observed)
@@ -232,8 +234,8 @@ class Window(Stages):
         if model_failed or jacobian_failed:
             self.events |= _MODEL_FAILED
 
-    def _components(self, k: int, time: int) -> NDArray[np.bool_] | None:
-        """Which components of y are there at stage k; None for all."""
+    def _find_observed(self, k: int, time: int) -> NDArray[np.bool_] | None:
+        """Mark the missing components of y at stage k; return which are there, or None for all."""
         y = self._stage_views[k].y
         if not math.isfinite(y.dot(y)):
             self._observed[k] = np.abs(y) < LARGEST  # False for NaN, too
@@ -265,15 +267,15 @@ class Window(Stages):
         self.events = 0
         try:
             self._evaluate_model(k, view, observed)
-            self._running = "the observer's correction"
+            self._evaluating = "the observer's correction"
             if not self._advance_observer(k, time, view):
                 return math.inf
         except Exception as raising:  # a model function outside its domain: not bad input
-            self.failure = raised(self._running, raising, view.z)
+            self.failure = raised(self._evaluating, raising, view.z)
             return math.inf
         self._jacobians_finite = True
         if self._quadratic:
-            # Even without terms: so the cost is the same to the last digit.
+            # Also where no QP needs terms: so the cost is the same to the last digit.
             cost = self.terms.set_stage(view.terms, view.weight)
             if math.isfinite(cost):
                 return cost
@@ -282,19 +284,19 @@ class Window(Stages):
     def _evaluate_model(
         self, k: int, view: StageView, observed: NDArray[np.bool_] | None
     ) -> None:
-        """Write y - h(z), the Jacobians and, as z(t+1), f(z); describe the stage in the sample."""
+        """Write y - h(z), the Jacobians and, as z(t+1), f(z); fill the observer's `Sample`."""
         terms = view.terms
-        self._running = "the model"
-        model, u = self._describe(k, observed)
+        self._evaluating = "the model"
+        model, u = self._fill_sample(k, observed)
         kernel = model.kernel if self._with_jacobians else None
         if kernel is None:
             usual = model is self._system
             arguments = view.arguments if usual else (view.arguments[0], u)
             f, h = self._functions if usual else (model.f, model.h)
             # Used at once: the functions may return the same array at each call.
-            self._running = "h"
+            self._evaluating = "h"
             np.subtract(view.y, h(*arguments), terms.noise)
-            self._running = "f"
+            self._evaluating = "f"
             view.z_next[...] = f(*arguments)
             if self._with_jacobians:
                 self._differentiate(
@@ -309,8 +311,8 @@ class Window(Stages):
         if observed is not None:
             terms.noise[~observed] = 0.0
 
-    def _describe(self, k: int, observed: NDArray[np.bool_] | None) -> tuple[System, Array]:
-        """Describe stage k in the sample; return its model and input."""
+    def _fill_sample(self, k: int, observed: NDArray[np.bool_] | None) -> tuple[System, Array]:
+        """Fill the `Sample` that the observer gets for stage k; return its model and input."""
         model, u, sample = self._system, self._stage_views[k].u, self._sample
         if self.unusual and self._irregular[k]:
             model, u = self._system.timed, self._u[k]
@@ -341,7 +343,7 @@ class Window(Stages):
         return True
 
     def _project(self, view: StageView, predicted: Array, covariance: Array | None) -> None:
-        """Project z(t+1) onto X in the observer's metric, and set its correction to match."""
+        """Settle the metric if need be, and keep z(t+1) in X."""
         nearest, metric, z_next = self._nearest, self.metric, view.z_next
         assert nearest is not None
         if metric is not None and not metric.settled:
@@ -358,7 +360,7 @@ class Window(Stages):
     def _keep_inside(
         self, predicted: Array, z_next: Array, correction: Array, covariance: Array | None = None
     ) -> int:
-        """Project z(t+1) onto X, set its correction to match; return flags of `Status`."""
+        """Project z(t+1) onto X, and set its correction to match; return flags of `Status`."""
         nearest, events = self._nearest, _PROJECTED
         if self.metric is not None:
             covariance = self.metric.covariance
@@ -368,8 +370,8 @@ class Window(Stages):
         if not nearest.contains(predicted):
             events |= _PREDICTION_OUTSIDE
             if found.reached and nearest.is_beyond(z_next, found.point, covariance):
-                # Every point of X is nearer to the truth than z_next is. That prediction says
-                # nothing, but would drown the correction.
+                # Every point of X is nearer to the truth than z_next is. The prediction is then
+                # so far off that it would hide the correction: correct its projection instead.
                 inside = nearest(predicted, covariance).point
                 found = nearest(inside + correction, covariance)
         z_next[...] = found.point
@@ -390,7 +392,7 @@ class Window(Stages):
                 return None
             if self._nearest is not None and not self._nearest.contains(state):
                 state = self._nearest(state, found[1]).point
-        except Exception:  # a user's observer: z(t) is there
+        except Exception:  # a user's observer: z(t) serves instead
             return None
         return state
 
@@ -409,7 +411,7 @@ class Window(Stages):
             terms.linear[:, 1:] = np.nan
 
     def _cost_and_terms(self, k: int) -> float:
-        """The cost of stage k, or infinity, and its terms: for all but finite quadratic ones."""
+        """Compute the cost of stage k, or infinity, and the terms that are still missing."""
         weight, stage = self._read_only_weights[k], self._stage_views[k].terms
         terms, residual = self.terms, self._read_only_residuals[k]
         try:
@@ -510,7 +512,7 @@ class Window(Stages):
                     self._check_stage(k, loaded, terms)
                 elif loaded.terms.residuals[k, :n].any():  # no correction at a failed stage
                     raise mismatch("model")
-                # A restart sets it after a failed stage; elsewhere it has been compared.
+                # After a failed stage, `restart` may have set it; elsewhere it has been compared.
                 self._z[k + 1] = loaded._z[k + 1]
                 if self._covariances is not None and loaded._covariances is not None:
                     self._covariances[k + 1] = loaded._covariances[k + 1]

@@ -27,7 +27,8 @@ class Sample:
     f_jacobian, h_jacobian : (n, n) and (p, n) array or None
         Jacobians at z, if `Observer.needs_jacobians`.
     observed, noise_weight : (p,) bool and (p, p) array or None
-        Which components of y are there, and the weight of its noise; None as usual.
+        Which components of y are not missing, and this sample's own noise weight; None if all
+        are there, or it has none.
     covariance : (n, n) array or None
         Covariance of x(t) - z(t), if the observer has one.
     """
@@ -66,7 +67,7 @@ class Observer(ABC):
     def metric(self) -> Array | None:
         """A metric M (n, n) in which the error is proved to contract; None if none is known.
 
-        The observer is projected onto X in it: only then does the proof hold with X, too.
+        The observer is projected onto X in this metric, so that the proof holds with X, too.
         """
         return self._metric
 

@@ -1,4 +1,4 @@
-"""The observer kept in X: the nearest point of X in the observer's own metric."""
+"""Projection of the observer onto X: the nearest point in the observer's own metric."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ __all__ = ["ErrorMetric", "NearestPoint", "Projected"]
 
 _EPS = float(np.finfo(np.float64).eps)
 
-# A sum of rows whose variance is below this share of the largest possible one has none.
+# A variance below this share of the largest possible one counts as zero.
 _SINGULAR = 1e-12
 
-# Rows miss by at most this share of the terms that they sum up, or they are violated.
+# A miss of a row by less than this share of the terms that it sums up is rounding.
 _ROUNDING = 16.0 * _EPS
 
-# Each takes as many digits off a miss as a number has.
+# At most this many corrections put a point on its active rows. Each takes as many digits off the
+# miss as a number has.
 _REFINEMENTS = 4
 
 # E^(2^k) of a stable matrix has vanished by then, unless its spectral radius rounds to 1.
@@ -89,8 +90,8 @@ class NearestPoint:
     def __call__(self, point: Array, covariance: Array) -> Projected:
         """The nearest point in the metric of a covariance (n, n), positive semidefinite.
 
-        Where a singular covariance leads to no point of the set, the sizes of the components
-        serve as standard deviations beside it.
+        Where a singular covariance leads to no point of the set, the metric is diagonal, with the
+        sizes of the components as standard deviations.
         """
         found = self._nearest(point, covariance)
         if found is not None:
@@ -110,7 +111,7 @@ class NearestPoint:
         except np.linalg.LinAlgError:
             return False
         offset = point - nearest
-        # From below and from above: |e_i| <= w_i implies e' M e <= w' |M| w.
+        # Within the set |e_i| <= w_i, so that e' M e <= w' |M| w: larger than any distance in it.
         return bool(offset @ metric @ offset > self._widths @ np.abs(metric) @ self._widths)
 
     def _nearest(self, point: Array, covariance: Array) -> Array | None:
@@ -148,7 +149,7 @@ class NearestPoint:
         self, point: Array, multipliers: Array, gram: Array, spread: Array, scale: Array,
         active: list[int],
     ) -> Array:
-        """The point that these multipliers lead to, on the active rows however far it came."""
+        """The point that these multipliers lead to, corrected to lie on the active rows."""
         rows, sides, within = self._rows[active], self._sides[active], np.ix_(active, active)
         current = point - spread[:, active] @ (multipliers / scale[active])
         for _ in range(_REFINEMENTS):
@@ -165,7 +166,10 @@ class NearestPoint:
     def _enter(
         gram: Array, reach: Array, row: int, missed: float, active: list[int], multipliers: Array
     ) -> Array | None:
-        """Make a violated row active, and others inactive where they have to; None if in vain."""
+        """Make a violated row active, and others inactive if need be; None if that is impossible.
+
+        Changes ``active`` in place, and returns its multipliers.
+        """
         own = 0.0
         while True:
             exchange = np.linalg.solve(gram[np.ix_(active, active)], gram[active, row])
@@ -189,10 +193,10 @@ class NearestPoint:
 
 
 class ErrorMetric:
-    r"""The metric in which an observer without a covariance is projected onto X.
+    r"""The metric in which an observer is projected onto X, unless that is its covariance.
 
-    The observer's own `Observer.metric` where it has one. Otherwise the Lyapunov matrix of the
-    linearised error :math:`E = A - K C`,
+    It is the observer's own `Observer.metric` where that exists. Otherwise it is the
+    Lyapunov matrix of the linearised error :math:`E = A - K C`,
 
     .. math::
         M = E^\top M E + \Gamma
@@ -206,7 +210,7 @@ class ErrorMetric:
     Parameters
     ----------
     observer : Observer
-        Without a covariance.
+        One with a metric, or without a covariance.
     prior_weight : (n, n) array
         :math:`\Gamma`.
     noise_deviations : (p,) array

@@ -311,7 +311,7 @@ def _switch(value: Any) -> bool:
 _CHECKS: dict[str, Callable[[Any], Any]] = {
     "models": _models,
     "backends": _backends,
-    "qps": _numbers("qps", 0, " None stands for convergence."),
+    "qps": _numbers("qps", 0, " None iterates to convergence."),
     "solver_iterations": _numbers("solver_iterations", 1, " None leaves the solver's default."),
     "horizons": _numbers("horizons", 1, " None takes the model's."),
     "starts": _starts,

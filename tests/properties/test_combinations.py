@@ -340,7 +340,7 @@ def test_rows_that_exclude_all_that_is_better_are_dropped_one_by_one(backend, ma
         if t < 3:
             estimate = mhe.update([5.0])
         else:
-            with pytest.warns(ObserverWarning, match="dropped in 3 samples running"):
+            with pytest.warns(ObserverWarning, match="dropped in 3 consecutive samples"):
                 estimate = mhe.update([5.0])
         kept = other.update([5.0])
         late = [("noises", 0, "upper", s) for s in range(max(1, t - 2), t + 1)]

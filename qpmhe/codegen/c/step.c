@@ -6,7 +6,7 @@ static void mhe_remember(mhe_estimator *e, const real *state)
     memcpy(e->history + e->newest * NX, state, sizeof(real) * NX);
 }
 
-/* Count for how many samples running the observer was far from the estimate, or rows dropped. */
+/* Count consecutive samples in which the observer was far from the estimate, or rows dropped. */
 static void mhe_watch(mhe_estimator *e, mhe_outcome *o)
 {
     real offset[NX];
