@@ -100,7 +100,7 @@ class Certificate:
 
     @property
     def horizons(self) -> tuple[int, ...]:
-        """The horizons that there are bounds for."""
+        """The horizons with bounds."""
         return tuple(self.bounds)
 
     @cached_property
@@ -110,7 +110,7 @@ class Certificate:
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
-        """The kinds of bounds that there are, the sharpest last."""
+        """The kinds of bounds at hand, the sharpest last."""
         return self.bounds[self.horizons[0]].kinds
 
     def bound(

@@ -42,7 +42,7 @@ class HorizonBounds:
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
-        """The kinds of bounds that there are, the sharpest last."""
+        """The kinds of bounds at hand, the sharpest last."""
         return ("paper",) if self.window is None else ("paper", self.window.kind, "measured")
 
     def beyond(self, kind: Kind) -> WindowBound:

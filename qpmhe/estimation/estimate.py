@@ -82,8 +82,9 @@ _TEXTS = {
     ),
     Status.OBSERVER_PROJECTED: "The observer's step left the set of states; it was projected.",
     Status.PREDICTION_OUTSIDE: (
-        "The model's prediction from the observer's state left the set of states: (eq:kappa) does "
-        "not bound the observer's correction at this sample."
+        "The model's prediction from the observer's state left the set of states, so the fitting "
+        "error does not bound the observer's correction at this sample; where this is frequent, "
+        "check that the model keeps the set."
     ),
     Status.METRIC_SINGULAR: (
         "The observer's covariance is singular and leaves no way into the set of states; the "

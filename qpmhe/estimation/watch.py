@@ -46,7 +46,7 @@ class ObserverWatch:
         return far >= self._horizon
 
     def warning(self) -> str | None:
-        """The warning, the first time that there is reason for it; None otherwise."""
+        """The warning, once, as soon as it has a reason; None otherwise."""
         far, dropped = self.counts
         if self._warned or max(far, dropped) < self._horizon:
             return None

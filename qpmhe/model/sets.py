@@ -64,7 +64,7 @@ class ConvexSet:
         points : (..., d) array
             The points.
         known : (..., d) bool array, optional
-            Components that there are; inequalities on others do not count.
+            Known components; inequalities on others do not count.
         rounding : float or (..., 1) array
             How far the points are uncertain; that much does not count.
         """

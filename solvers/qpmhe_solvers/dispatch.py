@@ -22,7 +22,7 @@ Point = NDArray[np.float64] | None
 class DispatchSolver(NativeSolver):
     """Hand the QP to one solver through ``qpsolvers.solve_problem``.
 
-    Only the arrays are kept; a solver gets the limits that there are, and no others.
+    Only the arrays are kept; a solver gets the finite limits only.
     """
 
     package = "qpsolvers"  # imports every solver that is installed

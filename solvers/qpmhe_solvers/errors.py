@@ -38,7 +38,7 @@ class OptionError(InvalidInputError):
 
 
 class UnknownOptionError(OptionError, TypeError):
-    """A keyword that there is not; also the TypeError that Python would raise."""
+    """An unknown keyword; also the TypeError that Python would raise."""
 
 
 class BackendError(InvalidInputError):

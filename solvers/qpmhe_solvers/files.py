@@ -190,7 +190,7 @@ def _shapes(stages: int, n: int, rows: int) -> dict[str, tuple[int, ...]]:
 
 
 def _in_shape(qp: QP, arrays: dict[str, Any]) -> dict[str, Array]:
-    """The arrays that there are, each as it is to be found again."""
+    """The arrays of a file, each as it will be read again."""
     shapes, shaped = _shapes(qp.stages, qp.n, qp.rows), {}
     for name, values in arrays.items():
         if values is None:

@@ -430,7 +430,7 @@ def _figures(part: Part, drawn: Mapping[str, Style], overall: Drawing | None) ->
 
 
 def _measures(part: Part, drawn: Mapping[str, Style]) -> dict[str, tuple[str, Any]]:
-    """Accuracy against time by each measure that there is: its label and its figure."""
+    """Accuracy against time by each measure of the study: its label and its figure."""
     labels = [f"RMSE of {label}" for label in part.state_labels()]
     summary = figures.with_states(part.case.summary, len(labels))
     whole = summary["failures"] == 0
