@@ -191,7 +191,7 @@ class Cost(ABC):
     def prior_deviations(self, covariance: Array | None) -> Array:
         """Standard deviations (n,) of the initial error: typical magnitudes of the states.
 
-        Where that of the disturbance w is larger, or an observer knows no initial error, they
+        Where the disturbance w has a larger one, or an observer knows no initial error, they
         are those of w.
 
         Parameters

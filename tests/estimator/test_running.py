@@ -1,4 +1,4 @@
-"""The re-initialised candidate of observers that run side by side is that of a full replay."""
+"""Observers that run side by side give the same re-initialised candidate as a full replay."""
 
 import math
 
