@@ -10,8 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["inverse", "solve", "unit_diagonal"]
-
 Array = NDArray[np.float64]
 Exponents = NDArray[np.int32]
 

@@ -26,8 +26,6 @@ from .observers import Observer
 if TYPE_CHECKING:
     from .codegen.members import CompiledMembers
 
-__all__ = ["BatchEstimate", "BatchEstimator", "BatchRun"]
-
 Array = NDArray[np.float64]
 Flags = NDArray[np.int64]
 Index = NDArray[np.intp]

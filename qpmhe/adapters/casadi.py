@@ -22,8 +22,6 @@ from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System
 
-__all__ = ["from_casadi"]
-
 Array = NDArray[np.float64]
 # Makes buffers for a number of states and the wanted results.
 Maker = Callable[[int, tuple[str, ...]], Buffers]

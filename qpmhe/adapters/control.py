@@ -14,8 +14,6 @@ from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System, probe_points
 
-__all__ = ["from_control"]
-
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
 

@@ -15,8 +15,6 @@ from ..model.sets import ConvexSet
 from ..model.system import System, checked_set, probe_points
 from .jax_programs import Programs
 
-__all__ = ["from_jax"]
-
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
 

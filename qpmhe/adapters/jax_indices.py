@@ -11,8 +11,6 @@ from typing import Any
 from ..errors import ModelError
 from ..model.functions import Probes
 
-__all__ = ["check_indices"]
-
 # What moves its window back into the array, or skips the entry, where an index is out of range.
 _INDEXING = ("gather", "scatter", "dynamic_slice", "dynamic_update_slice")
 _FOUND = re.compile(

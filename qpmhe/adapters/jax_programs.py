@@ -17,8 +17,6 @@ from ..model.discretize import discretize
 from ..model.functions import Probes, check_inputs, takes_input
 from .jax_indices import check_indices
 
-__all__ = ["Programs"]
-
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
 Program = Callable[[bytes], list[Array]]

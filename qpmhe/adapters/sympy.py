@@ -17,8 +17,6 @@ from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System
 
-__all__ = ["from_sympy"]
-
 Array = NDArray[np.float64]
 
 

@@ -23,8 +23,6 @@ from .inequalities import Matrices, eigenvalue_bounds, norm_bound
 from .observer import gain_if_constant
 from .regions import Region, bounded_region
 
-__all__ = ["Audit", "Finding", "audit", "checked_ingredients"]
-
 _SAMPLES = 2000
 _SEED = 20210829
 _SETS = ("states stay in X", "candidate in the sets")

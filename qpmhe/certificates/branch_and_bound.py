@@ -17,8 +17,6 @@ from .evidence import Evidence
 from .inequalities import Form, Matrices, definite, norm_bound
 from .regions import Region
 
-__all__ = ["Cover", "constant_output", "cover", "output_lipschitz"]
-
 _CHUNK = 256
 _MOST_CELLS = 40_000
 # Operations on one chunk, about: large systems take fewer cells at a time, so that the clock

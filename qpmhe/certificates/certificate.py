@@ -26,8 +26,6 @@ from .observer import gain_if_constant
 from .properties import Detectability, ObserverStability, json_ready
 from .regions import Region
 
-__all__ = ["ASSUMED", "Certificate"]
-
 # The constants are upper bounds, what is computed from them is not: this covers its rounding.
 _OUTWARD = 1.0 + 1e-9
 

@@ -24,10 +24,6 @@ from .properties import Detectability, ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
 
-__all__ = [
-    "certify", "composed", "cost_sizes", "estimate_weights", "horizons_of", "noise_weights"
-]
-
 # How much of the time left the audit, detectability and the observer take.
 _AUDIT, _DETECTABILITY, _OBSERVER = 0.25, 0.5, 0.9
 

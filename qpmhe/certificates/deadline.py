@@ -8,9 +8,6 @@ from typing import Any
 
 from ..errors import OptionError
 
-__all__ = ["DEFAULT_SECONDS", "PART_SECONDS", "Deadline"]
-
-
 # For a whole certificate, and for one of its ingredients asked for by itself.
 DEFAULT_SECONDS, PART_SECONDS = 60.0, 30.0
 # What a part of a time that is over still has: enough to find out that it is over.

@@ -14,8 +14,6 @@ from qpmhe_solvers.values import finite, shown
 from .._checks import Array, numbers, positive
 from ..errors import OptionError, ShapeError
 
-__all__ = ["DecayingSums", "Sizes"]
-
 
 @dataclass(frozen=True)
 class Sizes:

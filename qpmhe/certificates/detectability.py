@@ -15,8 +15,6 @@ from .regions import Region, bounded_region
 from .sdp import started
 from .search import Search, checked_weights
 
-__all__ = ["certify_detectability"]
-
 # Of an output in its own size, for a state in the region's.
 _UNSEEN = 1e-9
 _STEEP = 1e6

@@ -19,8 +19,6 @@ from .evaluation import check_values
 from .intervals import Interval, Jet, OutsideDomainError, variables
 from .regions import Region
 
-__all__ = ["MOST_ACTIVE", "Enclosure", "SmoothModel"]
-
 # Beyond, corners would be many: what the other coordinates do is covered by the error.
 MOST_ACTIVE = 6
 

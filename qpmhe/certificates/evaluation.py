@@ -13,8 +13,6 @@ from ..errors import ModelError
 from ..model.functions import BatchedFunction
 from ..model.system import System
 
-__all__ = ["check_values", "evaluated", "find_jump", "joint_jacobians"]
-
 _REMEDY = "Take a smaller region, or make the model defined on all of it."
 _PAIRS, _SEED = 400, 20210829
 # A function with derivatives changes on 2^-40 of an interval by about that share.

@@ -7,11 +7,6 @@ from enum import Enum
 
 from ..errors import InvalidInputError, QpmheError
 
-__all__ = [
-    "CertificateError", "Evidence", "JumpError", "MismatchError", "NotCertifiedError",
-    "OutOfTimeError", "weakest",
-]
-
 
 class Evidence(Enum):
     """What a constant rests on, best first."""

@@ -17,8 +17,6 @@ from .properties import Detectability, ObserverStability
 from .theorem import TheoremConstants, theorem
 from .window_bounds import SummedBound, WeightedBound, WindowBound, fit_weight, largest
 
-__all__ = ["HorizonBounds", "Kind", "bounds_for"]
-
 Kind = Literal["paper", "summed", "weighted", "measured"]
 
 # Covers the rounding of a few products and roots.

@@ -27,11 +27,6 @@ from numpy.typing import NDArray
 from .._checks import Array
 from .evidence import CertificateError
 
-__all__ = [
-    "ErrorContraction", "Form", "Matrices", "OutputInjection", "OutputWeight", "definite",
-    "eigenvalue_bounds", "euclidean_constants", "norm_bound", "rounded_up",
-]
-
 _UNIT = float(np.finfo(np.float64).eps)  # twice the unit roundoff: a margin in every bound
 _TINY = 1e-290  # covers what underflows
 

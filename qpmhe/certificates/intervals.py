@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from .._checks import Array
 
-__all__ = ["Interval", "Jet", "OutsideDomainError", "variables"]
-
 # Errors of elementary functions in units in the last place: the C library and NumPy's own
 # vector versions stay within 4.
 _LIBRARY_ULPS = 8

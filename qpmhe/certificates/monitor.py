@@ -21,10 +21,6 @@ from ..model.system import System
 from .certificate import Certificate
 from .evidence import MismatchError
 
-__all__ = [
-    "NEEDED", "UNNEEDED", "Hypotheses", "Monitor", "MonitorSummary", "monitor", "monitored_run"
-]
-
 _RELATIVE = 1e-6
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 _BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE

@@ -21,8 +21,6 @@ from .regions import Region, bounded_region
 from .sdp import started
 from .search import Found, Search, checked_weights
 
-__all__ = ["Synthesis", "certify_observer", "constant_gain", "gain_if_constant", "synthesise_gain"]
-
 _STAY = "it holds while the states of system and observer stay in the region"
 _SEARCH = 0.7  # of the time; the rest is for smaller constants of the gain that was found
 

@@ -18,8 +18,6 @@ from .evaluation import evaluated
 from .evidence import Evidence, MismatchError, weakest
 from .regions import Region, beyond, stated_region
 
-__all__ = ["Detectability", "ObserverStability", "Subject", "fitting", "json_ready", "sealed"]
-
 _POINTS, _SEED = 24, 20210829
 _ROUNDING = 1e-9  # another compiler or library may round otherwise
 

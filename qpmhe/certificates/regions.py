@@ -14,8 +14,6 @@ from ..errors import SetError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
 
-__all__ = ["Region", "beyond", "bounded_region", "stated_region"]
-
 # Of a polytope's vertices and corners, as starting points of searches; more add little.
 _MOST_CORNERS = 256
 

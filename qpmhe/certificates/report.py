@@ -31,8 +31,6 @@ from .properties import Detectability, ObserverStability
 from .regions import Region, bounded_region
 from .sdp import started
 
-__all__ = ["LABELS", "Report", "certify_model", "error_and_bounds"]
-
 Result = TypeVar("Result")
 
 #: Names of the kinds of bounds in figures and tables.

@@ -14,8 +14,6 @@ import numpy as np
 from .._checks import Array
 from .deadline import Deadline
 
-__all__ = ["Answer", "Kind", "Program", "Scales", "expected_seconds", "started"]
-
 Kind = Literal["output weight", "output injection", "observer", "synthesis"]
 
 _SOLVERS = ("CLARABEL", "SCS")

@@ -19,8 +19,6 @@ from .inequalities import ErrorContraction, Form, Matrices, OutputInjection, Out
 from .regions import Region
 from .sdp import Answer, Kind, Program, Scales, expected_seconds
 
-__all__ = ["Found", "Search", "checked_weights"]
-
 _SAMPLES = 400
 _ROUNDS = 8
 _MARGINS = (1e-6, 1e-4, 1e-3, 1e-2)

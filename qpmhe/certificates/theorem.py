@@ -14,8 +14,6 @@ from ..costs import CostConstants
 from ..errors import OptionError
 from .decay import DecayingSums, decaying_sums, lengths
 
-__all__ = ["TheoremConstants", "theorem"]
-
 Triple = tuple[float, float, float]
 
 

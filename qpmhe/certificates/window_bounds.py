@@ -17,8 +17,6 @@ from ..errors import OptionError, ShapeError
 from .decay import checked_length, decaying_sums
 from .theorem import TheoremConstants
 
-__all__ = ["Parts", "SummedBound", "WeightedBound", "WindowBound", "fit_weight", "largest"]
-
 
 @dataclass(frozen=True)
 class Parts:

@@ -21,8 +21,6 @@ from .report import export, report
 from .reproduce import reproduce
 from .solve_qp import export_qps
 
-__all__ = ["app", "main"]
-
 # Heading, and the capability that it stands for; the table fits into 80 columns.
 _FLAGS = {
     "in-\neq": "inequalities",

@@ -21,8 +21,6 @@ from ..errors import OptionError
 from ..model.sets import Box
 from ..models.loading import find, load
 
-__all__ = ["certify"]
-
 
 def certify(
     console: Console, model: str, box: str | None = None, horizon: str | None = None,

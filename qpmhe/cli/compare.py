@@ -17,8 +17,6 @@ from ..studies.grid import WORDS, Measure
 from ..studies.report import check_libraries
 from .report import show_report
 
-__all__ = ["compare", "study"]
-
 _JOBS = typer.Option(min=1, help="Cells at a time; all cores if left out. Times want 1.")
 _SCHEDULER = typer.Option(help="Address of a Dask scheduler whose workers run the cells.")
 _RETRY = typer.Option("--retry-failed", help="Run cells that failed before once more.")

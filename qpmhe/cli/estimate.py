@@ -15,8 +15,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from ..errors import OptionError
 
-__all__ = ["estimate", "run"]
-
 # Seconds until the progress bar appears, and between two refreshes.
 _BAR_AFTER, _REFRESH = 1.0, 0.1
 

@@ -22,8 +22,6 @@ from ..studies.summary import TOLERANCE
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["export", "report", "show", "show_report"]
-
 _MOST_ROWS = 40
 _BEST = "[bold green]{}*[/]"
 

@@ -13,8 +13,6 @@ from rich.table import Table
 from .. import studies
 from ..studies.paper import SETTLED, Reproduction
 
-__all__ = ["reproduce"]
-
 
 def reproduce(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,

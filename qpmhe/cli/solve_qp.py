@@ -29,8 +29,6 @@ from qpmhe_solvers.files import StoredQP, load, qp_files
 
 from ..studies.qpbenchmark_set import Matrices, export_qpbenchmark
 
-__all__ = ["Replay", "export_qps", "replay", "run"]
-
 # A backend is timed this many times, or until this many seconds are over.
 _REPEATS, _ENOUGH = 7, 0.5
 

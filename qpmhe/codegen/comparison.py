@@ -23,8 +23,6 @@ from .expressions import CasadiModel, import_casadi
 if TYPE_CHECKING:
     from .library import EstimatorLibrary
 
-__all__ = ["Batch", "Buffers", "Interpreter", "differs", "estimator_fault", "model_fault", "points"]
-
 Array = NDArray[np.float64]
 # Fixed arrays for states, inputs and results, and what computes these from those.
 Buffers = tuple[Array, Array, dict[str, Array], Callable[[], object]]

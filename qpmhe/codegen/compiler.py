@@ -19,8 +19,6 @@ from platformdirs import user_cache_path
 
 from ..errors import CompilationError
 
-__all__ = ["WrongCodeError", "cache_directory", "compiled_library", "find_compiler"]
-
 # Contraction and the like may round differently, but keep infinities and NaN.
 _FLAGS = ("-std=c99", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno",
           "-fno-trapping-math")

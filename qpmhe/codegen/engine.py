@@ -29,8 +29,6 @@ from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
 from .library import EstimatorLibrary
 
-__all__ = ["CompiledEngine"]
-
 Array = NDArray[np.float64]
 
 _ROWS_DROPPED = Status.ROWS_DROPPED.value

@@ -13,8 +13,6 @@ from ..errors import ObserverWarning
 from ..estimation.estimate import DroppedRow, Estimate, Status
 from ..estimation.watch import ObserverWatch
 
-__all__ = ["WATCHED", "CompiledEstimate", "CompiledWatch"]
-
 Array = NDArray[np.float64]
 
 _SOLVER_FAILED = Status.SOLVER_FAILED.value

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from .expressions import import_casadi
 
-__all__ = ["fixed_call", "may_fail", "separate_calls"]
-
 Array = NDArray[np.float64]
 
 

@@ -11,8 +11,6 @@ from ..errors import InvalidInputError, ModelError
 from ..model.discretize import METHODS
 from ..model.functions import check_inputs, takes_input
 
-__all__ = ["CasadiModel", "casadi_model", "import_casadi"]
-
 
 def import_casadi() -> Any:
     """The casadi package, imported late; InvalidInputError if it is not installed."""

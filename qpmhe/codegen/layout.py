@@ -19,8 +19,6 @@ from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
 
-__all__ = ["SET_NAMES", "Layout", "settings_record"]
-
 SET_NAMES = ("disturbances", "noises")
 
 _MOST = int(np.iinfo(np.int32).max)

@@ -23,8 +23,6 @@ from .compiler import compiled_library
 from .layout import SET_NAMES, Layout, settings_record
 from .source import CONTINUOUS, estimator_files
 
-__all__ = ["EstimatorLibrary", "RunLog", "generated", "uncovered"]
-
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
 _MOST_BYTES = 2**31 - 1
 

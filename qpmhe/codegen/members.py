@@ -19,8 +19,6 @@ from ..observers import Observer
 from .estimate import WATCHED, CompiledWatch
 from .library import EstimatorLibrary
 
-__all__ = ["CompiledMembers"]
-
 Array = NDArray[np.float64]
 
 # Fewer members than this are not worth waking a thread for.

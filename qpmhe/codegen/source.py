@@ -16,8 +16,6 @@ from ..errors import CompilationError
 from .expressions import CasadiModel, import_casadi
 from .layout import Layout
 
-__all__ = ["CONTINUOUS", "estimator_files", "model_files"]
-
 # Eight (n, n) arrays of them fit on any usual stack.
 _MOST_STATES = 256
 CONTINUOUS = {None: 0, "euler": 1, "rk4": 4}

@@ -17,8 +17,6 @@ from .._checks import Array
 from .._linalg import inverse
 from ..errors import OptionError
 
-__all__ = ["Cost", "CostConstants", "CostForm", "ObserverPrior", "quadratic_form"]
-
 Mask = NDArray[np.bool_]
 
 # Weights for patterns of missing components are kept up to so many bytes, and a few in any case.

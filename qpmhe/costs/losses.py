@@ -11,8 +11,6 @@ from .._checks import Array, flag, positive, positive_definite
 from ..errors import OptionError, WeightError
 from .base import quadratic_form
 
-__all__ = ["Huber", "Loss", "Power", "Quadratic"]
-
 
 class Loss(ABC):
     r"""A convex function :math:`\rho(q)` of the quadratic form :math:`q = s^\top W s`.

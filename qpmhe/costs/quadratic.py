@@ -11,8 +11,6 @@ from .._checks import Array, positive_definite
 from .._linalg import inverse
 from .base import Cost, CostConstants, CostForm, ObserverPrior, quadratic_form
 
-__all__ = ["QuadraticCost"]
-
 
 @report_unknown_options
 class QuadraticCost(Cost):

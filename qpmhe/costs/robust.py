@@ -12,8 +12,6 @@ from ..errors import InvalidInputError
 from .base import Cost, CostConstants, ObserverPrior
 from .losses import Loss, Quadratic
 
-__all__ = ["RobustCost"]
-
 
 @report_unknown_options
 class RobustCost(Cost):

@@ -15,8 +15,6 @@ from ..model.system import System
 from .estimate import DroppedRow
 from .limits import FEASIBLE
 
-__all__ = ["Constraints", "Rows"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 

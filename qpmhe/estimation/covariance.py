@@ -9,8 +9,6 @@ from .._linalg import unit_diagonal
 from ..errors import InvalidInputError
 from ..model.system import System
 
-__all__ = ["window_covariances"]
-
 Array = NDArray[np.float64]
 
 

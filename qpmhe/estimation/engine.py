@@ -31,8 +31,6 @@ from .subproblem import Subproblem
 from .watch import ObserverWatch
 from .window import Window
 
-__all__ = ["PythonEngine"]
-
 Array = NDArray[np.float64]
 
 

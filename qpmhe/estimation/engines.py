@@ -18,8 +18,6 @@ from .estimate import Estimate
 from .run import Run
 from .settings import Settings
 
-__all__ = ["Engine", "engine_for", "register_engine"]
-
 Array = NDArray[np.float64]
 
 

@@ -26,8 +26,6 @@ from .estimate import Estimate
 from .run import Run
 from .settings import Settings
 
-__all__ = ["MovingHorizonEstimator", "check_start"]
-
 Array = NDArray[np.float64]
 
 

@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = [
-    "ALONG", "BEYOND", "CORRECTIONS", "FAR", "FEASIBLE", "LARGEST", "LENGTHS", "NEAREST_POINTS",
-    "NEARLY", "ROUNDING", "STALLED",
-    "c_definitions",
-]
-
 #: Step lengths, tried in turn after the full step: the first for a step that leaves a set by
 #: the solver's tolerance, the last short enough for any useful direction of descent.
 LENGTHS = (0.9999, 0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.qp import band_index
 
-__all__ = ["Span", "Stage", "StageTerms"]
-
 Array = NDArray[np.float64]
 
 

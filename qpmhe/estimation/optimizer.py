@@ -28,8 +28,6 @@ from .problem import Problem, Trial
 from .settings import Settings
 from .subproblem import Subproblem
 
-__all__ = ["Optimizer", "Outcome"]
-
 Array = NDArray[np.float64]
 
 

@@ -22,8 +22,6 @@ from .limits import FEASIBLE
 from .stages import read_only
 from .window import Window
 
-__all__ = ["Formulation", "Problem", "Trial"]
-
 Array = NDArray[np.float64]
 
 # Rounding of a residual, as a share of the numbers that it is computed from.

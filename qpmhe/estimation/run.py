@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from .estimate import Estimate, Status
 
-__all__ = ["Run"]
-
 Array = NDArray[np.float64]
 Integers = NDArray[np.intp]
 

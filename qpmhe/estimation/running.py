@@ -11,8 +11,6 @@ from ..model.functions import BatchedFunction
 from ..observers import Sample
 from ..observers.projection import NearestPoint
 
-__all__ = ["RunningObservers"]
-
 Array = NDArray[np.float64]
 
 

@@ -10,8 +10,6 @@ from qpmhe_solvers import Solver, SolverOptions
 from .._checks import choice, count, dimension, flag, positive
 from ..errors import BackendError, OptionError
 
-__all__ = ["Candidate", "Engine", "Infeasible", "Settings"]
-
 Infeasible = Literal["drop_rows", "keep_candidate"]
 Candidate = Literal["observer", "reinitialized"]
 Engine = Literal["python", "compiled"]

@@ -15,11 +15,6 @@ from ..model.system import System, probe_points
 from ..observers import Observer
 from .settings import Settings
 
-__all__ = [
-    "SET_NAMES", "check_description", "check_size", "checked_array", "described", "mismatch",
-    "near", "reading",
-]
-
 Array = NDArray[Any]
 
 SET_NAMES = ("states", "disturbances", "noises")

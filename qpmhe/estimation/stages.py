@@ -15,8 +15,6 @@ from ..observers.projection import ErrorMetric
 from .linearization import Span, Stage, StageTerms
 from .snapshot import check_size, checked_array, mismatch
 
-__all__ = ["Mark", "StageView", "Stages", "Views", "WindowView", "read_only"]
-
 Array = NDArray[np.float64]
 
 # Views are made in advance up to this horizon: beyond it they would take more memory than the

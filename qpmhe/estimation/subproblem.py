@@ -18,8 +18,6 @@ from .limits import BEYOND
 from .linearization import Span, StageTerms
 from .problem import Problem, Trial
 
-__all__ = ["Subproblem"]
-
 Array = NDArray[np.float64]
 
 _NO_BAND: Array = np.zeros(0)

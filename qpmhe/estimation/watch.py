@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from .limits import FAR
 
-__all__ = ["ObserverWatch"]
-
 Array = NDArray[np.float64]
 
 

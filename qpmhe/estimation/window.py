@@ -21,8 +21,6 @@ from .running import RunningObservers
 from .snapshot import mismatch, near
 from .stages import Stages, StageView, WindowView, read_only
 
-__all__ = ["Window"]
-
 Array = NDArray[np.float64]
 
 # As integers: to combine flags of an enumeration takes longer than the rest of the step's logic.

@@ -15,8 +15,6 @@ from ..errors import ModelError
 from .functions import BatchedFunction, Probes, Trusted
 from .sets import ConvexSet
 
-__all__ = ["Jacobian"]
-
 Array = NDArray[Any]
 
 # Of a state's magnitude. No subtraction, hence no cancellation: any tiny step is exact.

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from .._checks import choice
 
-__all__ = ["METHODS", "Method", "discretize"]
-
 Array = NDArray[Any]
 Function = Callable[..., Any]
 Method = Literal["euler", "rk4"]

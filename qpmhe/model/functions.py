@@ -17,11 +17,6 @@ from qpmhe_solvers.values import shown
 from ..errors import ModelError, QpmheError
 from .tracing import trace
 
-__all__ = [
-    "BatchedFunction", "Trusted", "check_inputs", "contained", "raised", "raised_along",
-    "takes_input",
-]
-
 Array = NDArray[Any]
 Probes = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 

@@ -17,8 +17,6 @@ from .functions import BatchedFunction, Probes, Trusted
 from .sets import Box, ConvexSet
 from .system import System, probe_points
 
-__all__ = ["augment_parameters"]
-
 Array = NDArray[Any]
 Index = NDArray[np.intp]
 Function = Callable[..., Any]

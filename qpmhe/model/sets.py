@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import numbers
 from ..errors import SetError
 
-__all__ = ["Box", "ConvexSet", "Polytope"]
-
 Array = NDArray[np.float64]
 
 

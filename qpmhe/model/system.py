@@ -19,8 +19,6 @@ from .discretize import discretize
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .sets import ConvexSet
 
-__all__ = ["ModelKernel", "System", "checked_set", "checked_system", "probe_points"]
-
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
 

@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["trace"]
-
 Labels = NDArray[np.uint64]
 
 # A function that does more with single symbols than this is not traced any further.
@@ -108,6 +106,7 @@ class Symbol:
 
     @property
     def real(self) -> Symbol:
+        """Return the symbol itself: a state is real."""
         return self
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
@@ -142,6 +141,7 @@ class SymbolArray(np.ndarray[Any, Any]):
         _plain(self)[key] = _plain(value)
 
     def dot(self, other: Any, out: Any = None) -> Any:
+        """Return `np.dot(self, other)`, which the symbol records."""
         return np.dot(self, other) if out is None else np.dot(self, other, out)
 
     def _refuse(self, *_: Any) -> Any:

@@ -10,8 +10,6 @@ from ..model.system import System
 from ..observers import Luenberger
 from .example import Array, Example, make_example
 
-__all__ = ["batch_reactor", "casadi_output", "casadi_rate"]
-
 _K1, _K2 = 0.16, 0.64
 _DT = 0.1
 _STOICHIOMETRY = np.array([-2.0, 1.0])

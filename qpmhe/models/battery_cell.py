@@ -9,8 +9,6 @@ from ..model.system import System
 from ..observers import Luenberger
 from .example import Array, Example, make_example
 
-__all__ = ["battery_cell"]
-
 _CAPACITY = 0.85  # Ah
 _R0, _R1, _R2 = 0.07446, 0.04669, 0.04984  # Ohm
 _C1, _C2 = 703.6, 4475.0  # F

@@ -14,8 +14,6 @@ from ..model.system import System
 from ..observers import design_luenberger
 from .example import Array, Example, make_example
 
-__all__ = ["casadi_output", "casadi_rate", "chain_of_masses"]
-
 _MASS, _STIFFNESS, _LENGTH = 0.033, 1.0, 0.033  # kg, N/m, m
 _GRAVITY, _SPACING = 9.81, 0.25  # m/s^2, m
 # Above dt times the stiffness, so that an explicit Euler step is stable, too.

@@ -9,8 +9,6 @@ from ..model.system import System
 from ..observers import design_luenberger
 from .example import Array, Example, Selection, make_example
 
-__all__ = ["cstr"]
-
 _FLOW = 1.0  # 1/min, q/V = 100 L/min / 100 L
 _FEED, _FEED_TEMPERATURE = 1.0, 350.0  # mol/L, K
 _FREQUENCY, _ACTIVATION = 7.2e10, 8750.0  # 1/min, E/R in K

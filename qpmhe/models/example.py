@@ -12,8 +12,6 @@ from ..model.system import System
 from ..observers import Observer
 from .scenario import Scenario
 
-__all__ = ["Array", "Example", "Selection", "make_example"]
-
 Array = NDArray[Any]
 
 

@@ -28,11 +28,6 @@ from . import catalogue
 from .example import Example
 from .scenario import Scenario
 
-__all__ = [
-    "ModelSource", "build", "check_parts", "code_place", "find", "fingerprint", "imported", "load",
-    "module_file",
-]
-
 _FORM = re.compile(r"(?P<where>[^()]+)(?:\((?P<arguments>.*)\))?", re.DOTALL)
 _PARTS = ((System, "system"), (Observer, "observer"), (Cost, "cost"), (Scenario, "scenario"))
 _EXPECTED = (

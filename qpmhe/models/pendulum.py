@@ -8,8 +8,6 @@ from ..model.system import System
 from ..observers import HighGain
 from .example import Array, Example, Selection, make_example
 
-__all__ = ["pendulum"]
-
 _STIFFNESS, _DAMPING = 9.81 / 0.5, 0.2  # 1/s^2, 1/s
 _DT = 0.02  # s
 _COUNT = 2.0 * np.pi / 64  # rad

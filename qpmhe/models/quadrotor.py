@@ -8,8 +8,6 @@ from ..model.system import System
 from ..observers import design_luenberger
 from .example import Array, Example, Selection, make_example
 
-__all__ = ["quadrotor"]
-
 _MASS, _GRAVITY = 0.65, 9.81  # kg, m/s^2
 _INERTIA = np.array([7.5e-3, 7.5e-3, 1.3e-2])  # kg m^2
 _GYRATION = (np.roll(_INERTIA, -1) - np.roll(_INERTIA, -2)) / _INERTIA

@@ -15,8 +15,6 @@ from ..errors import InvalidInputError, ModelError, OptionError
 from ..model.sets import ConvexSet
 from ..model.system import System, checked_system
 
-__all__ = ["Record", "Scenario"]
-
 # Draws for one sample until it lies in the sets: more would mean that hardly any does.
 _DRAWS = 1000
 

@@ -8,8 +8,6 @@ from ..model.system import System
 from ..observers import HighGain
 from .example import Array, Example, Selection, make_example
 
-__all__ = ["van_der_pol"]
-
 _MU, _DT = 1.0, 0.1
 _MEASURED = Selection(2, slice(0, 1))
 

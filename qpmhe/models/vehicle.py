@@ -10,8 +10,6 @@ from ..model.system import System
 from ..observers import OutputInjection
 from .example import Array, Example, make_example
 
-__all__ = ["vehicle"]
-
 # East of all of the path, so that atan2 does not jump on it.
 _BEACONS = np.array([[9.0, -5.0], [10.0, 6.0]])  # m
 _DT = 0.2  # s

@@ -13,8 +13,6 @@ from .._linalg import inverse
 from ..errors import ShapeError
 from ..model.system import System
 
-__all__ = ["KalmanType", "Observer", "Sample"]
-
 
 @dataclass(slots=True)
 class Sample:

@@ -16,8 +16,6 @@ from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
 from ..model.system import System, checked_system
 from .luenberger import Luenberger
 
-__all__ = ["design_luenberger"]
-
 ComplexArray = NDArray[np.complex128]
 
 # So many standard deviations of the disturbance are a typical magnitude of a state.

@@ -8,8 +8,6 @@ from .._checks import Array
 from .._linalg import solve
 from .base import KalmanType, Sample
 
-__all__ = ["ExtendedKalman"]
-
 
 class ExtendedKalman(KalmanType):
     r"""The one-step predictor of the extended Kalman filter.

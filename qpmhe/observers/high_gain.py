@@ -14,8 +14,6 @@ from ..model.system import System
 from .design import ackermann, linearize, spectral_radius
 from .luenberger import Luenberger
 
-__all__ = ["HighGain"]
-
 Sampling = Literal["exact", "euler"]
 
 

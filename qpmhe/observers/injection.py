@@ -15,8 +15,6 @@ from ..errors import ModelError
 from ..model.system import System
 from .base import Observer, Sample
 
-__all__ = ["OutputInjection"]
-
 
 class OutputInjection(Observer):
     r"""Any correction :math:`L(z, v)` with :math:`L(\cdot, 0) = 0` (ass:observer_0).

@@ -10,8 +10,6 @@ from ..errors import ShapeError
 from ..model.system import System
 from .base import Observer, Sample
 
-__all__ = ["Luenberger"]
-
 
 class Luenberger(Observer):
     r"""Constant gain: :math:`L(z, v) = K v`.

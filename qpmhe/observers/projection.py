@@ -12,8 +12,6 @@ from .._linalg import inverse
 from ..model.sets import ConvexSet
 from .base import Observer, Sample
 
-__all__ = ["ErrorMetric", "NearestPoint", "Projected"]
-
 _EPS = float(np.finfo(np.float64).eps)
 
 # A variance below this share of the largest possible one counts as zero.

@@ -12,8 +12,6 @@ from ..model.system import System, checked_system
 from .base import Observer, Sample
 from .design import linearize, stationary
 
-__all__ = ["SteadyStateKalman"]
-
 
 class SteadyStateKalman(Observer):
     r"""Constant gain of the stationary Kalman predictor, with the covariance that it has.

@@ -12,8 +12,6 @@ from .._linalg import solve
 from ..model.sets import ConvexSet
 from .base import KalmanType, Sample
 
-__all__ = ["UnscentedKalman"]
-
 # A sigma point is drawn back into the state set, but not closer to z than this share.
 _CLOSEST = 1e-3
 

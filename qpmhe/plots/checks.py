@@ -13,8 +13,6 @@ from ..errors import InvalidInputError, ShapeError
 from ..estimation.estimate import Estimate
 from ..estimation.run import Run
 
-__all__ = ["check_estimate", "check_run", "curve", "label_list", "named_curves", "sample_times"]
-
 
 def check_run(run: Any) -> None:
     """Raise an InvalidInputError for anything but a Run."""

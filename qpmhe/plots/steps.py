@@ -14,8 +14,6 @@ from .style import STYLES, panels
 if TYPE_CHECKING:
     from ..estimation.run import Run
 
-__all__ = ["costs", "outcomes", "step_times"]
-
 # Below this many times the largest, a cost is drawn as this: a logarithm ends somewhere.
 _FLOOR = 1e-12
 _EVENTS = (

@@ -13,8 +13,6 @@ from ..errors import InvalidInputError, ShapeError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["LIGHT", "REAL", "STYLES", "panels", "save"]
-
 # Okabe and Ito's palette; dashes distinguish the rest.
 STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#D55E00", "linestyle": "-"},

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from ..estimation.estimate import Estimate
     from ..estimation.run import Run
 
-__all__ = ["states", "trajectories", "window"]
-
 
 def trajectories(
     times: Array, truth: Array | None, estimates: Mapping[str, Array], labels: Sequence[str],

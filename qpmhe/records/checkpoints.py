@@ -16,8 +16,6 @@ import numpy as np
 from .._version import __version__
 from ..errors import InvalidInputError, QpmheError
 
-__all__ = ["Checkpoint", "CheckpointError", "WriteError", "load", "save", "versions"]
-
 _FORMAT = 3
 
 

@@ -16,11 +16,6 @@ from .._checks import Array
 from ..errors import InvalidInputError, OptionError
 from .tables import RecordError, Row, open_table
 
-__all__ = [
-    "ColumnNames", "Columns", "FieldReader", "Measurement", "RecordReader", "Time",
-    "seconds_between",
-]
-
 _TIMES = ("time", "t", "timestamp", "datetime", "date_time")
 # "Voltage (V)", "Voltage [V]", "Voltage / V"
 _UNIT = re.compile(r"\s*(\([^()]*\)|\[[^\[\]]*\]|/\s*\S+)$")

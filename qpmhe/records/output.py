@@ -20,8 +20,6 @@ from ..estimation.estimate import Estimate
 from ..estimation.estimator import MovingHorizonEstimator
 from .checkpoints import CheckpointError, WriteError
 
-__all__ = ["Output", "RowFormat", "standard_output_for_rows"]
-
 _COVARIANCES = ("none", "std", "full")
 _PIECE = 1 << 20
 _STANDARD_OUTPUT = 1  # the number of its file descriptor

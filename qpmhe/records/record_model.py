@@ -19,8 +19,6 @@ from ..model.system import System
 from ..models import Scenario
 from ..models.loading import build, check_parts, code_place, find
 
-__all__ = ["ModelFailures", "RecordModel", "load_record_model"]
-
 _SIZES = {"states": "n", "outputs": "p", "inputs": "m"}
 _EXPECTED = (
     "expected (system, observer, cost), optionally followed by a scenario or a dict of options; "

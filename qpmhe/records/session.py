@@ -25,8 +25,6 @@ from .record_model import ModelFailures, RecordModel, load_record_model
 from .steps import OnlyGapsError, Step, Steps
 from .tables import RecordError
 
-__all__ = ["Summary", "estimate_record"]
-
 _EVERY = 100
 
 

@@ -9,8 +9,6 @@ from .._checks import count, positive
 from ..errors import InvalidInputError, OptionError
 from ..model.system import System
 
-__all__ = ["OnlyGapsError", "Step", "Steps"]
-
 # How far from a multiple of the usual step a discrete system's samples may be.
 _JITTER = 0.3
 # Steps that differ by less are equal: times are rounded.

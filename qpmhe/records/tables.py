@@ -19,8 +19,6 @@ from typing import Any, BinaryIO, NamedTuple
 from .._checks import need
 from ..errors import InvalidInputError, OptionError
 
-__all__ = ["CsvTable", "ParquetTable", "RecordError", "Row", "open_table"]
-
 # Before the comma, which occurs within names and numbers, too.
 _SEPARATORS = {"\t": "tab", ";": "semicolon", "|": "bar", ",": "comma"}
 _SEPARATOR_NAMES = {name: mark for mark, name in _SEPARATORS.items()} | {"space": " "}

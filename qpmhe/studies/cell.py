@@ -24,8 +24,6 @@ from ..models.loading import ModelSource, load
 from . import metrics
 from .environment import environment
 
-__all__ = ["OBSERVER", "Cell", "Result", "Task", "compute", "failure"]
-
 Result = dict[str, Any]
 
 #: Backend of a cell that solves no QP.

@@ -15,8 +15,6 @@ from qpmhe_solvers import backends
 
 from .._version import __version__
 
-__all__ = ["environment", "revision"]
-
 _PACKAGES = ("numpy", "scipy", "qpsolvers", "cvxpy", "casadi", "jax", "joblib")
 
 

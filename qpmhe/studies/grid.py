@@ -25,8 +25,6 @@ from ..errors import BackendError, InvalidInputError, OptionError
 from ..models.loading import ModelSource, find, load
 from .cell import OBSERVER, Cell
 
-__all__ = ["WORDS", "Measure", "Study", "StudyError"]
-
 Measure = Literal["both", "accuracy", "time"]
 #: Where the sequence of QPs begins: at the candidate, or warm-started where that is better.
 Start = Literal["candidate", "best"]

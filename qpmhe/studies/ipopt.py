@@ -18,8 +18,6 @@ from ..estimation.window import Window
 from ..model.system import System
 from ..observers import Observer
 
-__all__ = ["IpoptEstimator"]
-
 
 class IpoptEstimator:
     """The estimator of Definition def:estimator with Ipopt on the nonlinear program.

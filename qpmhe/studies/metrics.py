@@ -10,8 +10,6 @@ from .._checks import Array
 from ..estimation.estimate import Status
 from ..estimation.run import Run
 
-__all__ = ["accuracy", "consistency", "cost_ratio", "outcomes", "scales", "timing"]
-
 _FAILURES = (
     Status.SOLVER_FAILED | Status.NO_DECREASE | Status.MODEL_FAILED | Status.FAILED_STAGE
     | Status.CANDIDATE_OUTSIDE | Status.TIME_UP

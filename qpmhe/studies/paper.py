@@ -25,8 +25,6 @@ from ..plots import save, trajectories
 from .ipopt import IpoptEstimator
 from .metrics import accuracy, timing
 
-__all__ = ["SETTLED", "PaperStudy", "Reproduction", "Row", "reproduce"]
-
 # The paper's i = 0, 2, 5 and converged, and i = 1 beside them; the paper's own of Ipopt.
 _ITERATIONS: tuple[int | None, ...] = (0, 1, 2, 5, None)
 _IPOPT_ITERATIONS: tuple[int | None, ...] = (0, 2, 5, None)

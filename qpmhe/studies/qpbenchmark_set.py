@@ -20,8 +20,6 @@ from ..errors import InvalidInputError, OptionError
 if TYPE_CHECKING:
     import qpsolvers
 
-__all__ = ["ExportedSet", "export_qpbenchmark"]
-
 Matrices = Literal["sparse", "dense"]
 
 # qpbenchmark derives the name of the class from the name of the file.

@@ -29,8 +29,6 @@ from .store import Store
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["run"]
-
 # Seconds to reach a scheduler, and without any worker before giving up.
 _CONNECT, _PATIENCE = 15.0, 60.0
 # Seconds for which a worker process waits for work; those of a killed study end then.

@@ -22,8 +22,6 @@ from .cell import Cell
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["Store", "StoreError", "Writer", "export"]
-
 #: Version of the tables, and of what their columns mean.
 SCHEMA = 2
 # Distinguishes our files from other SQLite files: "qpmh".

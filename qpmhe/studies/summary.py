@@ -15,10 +15,6 @@ from ..errors import InvalidInputError, ShapeError
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
-__all__ = [
-    "CONFIGURATION", "METRICS", "PROBLEM", "TOLERANCE", "cells_of", "pareto_front", "summarise",
-]
-
 #: What distinguishes configurations.
 CONFIGURATION = (
     "model", "backend", "qps", "solver_iterations", "horizon", "start", "steps",

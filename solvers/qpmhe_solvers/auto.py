@@ -14,8 +14,6 @@ from .qp import QP, Array
 from .solution import Solution, SolveStatus
 from .solver import ContainedSolver, Solver
 
-__all__ = ["AutoSolver"]
-
 # daqp is the fastest up to about this many unknowns; sparse interior points win beyond.
 _SMALL = 60
 _SMALL_ORDER = ("daqp", "piqp", "clarabel", "proxqp", "osqp")

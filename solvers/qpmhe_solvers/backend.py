@@ -12,8 +12,6 @@ from .errors import BackendError, QpmheError, report_unknown_options
 from .options import SolverOptions
 from .solver import Solver
 
-__all__ = ["Backend", "make_solver"]
-
 _NAME = re.compile(r"\w[\w.:+-]*")
 _MATRICES = ("banded", "csc", "dense")
 

@@ -13,8 +13,6 @@ from .qp import QP, Array
 from .solution import Residuals, Solution, SolveStatus
 from .solver import Solver
 
-__all__ = ["BandedSolver"]
-
 Index = NDArray[np.intp]
 
 # How far equality rows may be missed after a solve, in scaled numbers.

@@ -8,10 +8,9 @@ from functools import partial
 from .auto import AutoSolver
 from .backend import Backend
 from .banded import BandedSolver
-from .dispatch import TRANSLATIONS, DispatchSolver
+from .dispatch import DispatchSolver
 from .native import NATIVE
-
-__all__ = ["builtin_backends"]
+from .translations import TRANSLATIONS
 
 
 def builtin_backends() -> Iterator[Backend]:

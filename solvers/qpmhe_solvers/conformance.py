@@ -17,8 +17,6 @@ from .sample_qps import Bounds, Sides, contradiction, sample
 from .solution import Solution, SolveStatus
 from .solver import Solver
 
-__all__ = ["Capabilities", "Conformance", "Finding", "check", "measure"]
-
 # Caps at which backends are tried.
 _CAPS = (1, 2, 5)
 # A cap for QPs without solution: some backends take all the time there is to give up.

@@ -14,8 +14,6 @@ from .options import SolverOptions
 from .qp import QP
 from .translations import TRANSLATIONS
 
-__all__ = ["TRANSLATIONS", "DispatchSolver", "qpsolvers_arguments"]
-
 Point = NDArray[np.float64] | None
 
 

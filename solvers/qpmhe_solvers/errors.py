@@ -7,16 +7,6 @@ import inspect
 from difflib import get_close_matches
 from typing import Any, TypeVar
 
-__all__ = [
-    "BackendError",
-    "InvalidInputError",
-    "OptionError",
-    "QpmheError",
-    "ShapeError",
-    "UnknownOptionError",
-    "report_unknown_options",
-]
-
 T = TypeVar("T")
 
 

@@ -24,8 +24,6 @@ from .qp import ARRAYS, QP, Array
 from .registry import backends
 from .solution import Residuals, Solution, SolveStatus
 
-__all__ = ["StoredQP", "dump", "load", "qp_files"]
-
 _FORMAT = "qpmhe QP"
 _VERSION = 1
 _PROBLEM = (

@@ -22,8 +22,6 @@ from .qp import QP, Array
 from .solution import Solution, SolveStatus
 from .solver import ContainedSolver, Solver
 
-__all__ = ["IsolatedSolver"]
-
 # Seconds in which a process has to import and make its solver.
 _START = 120.0
 # Share of the time limit that a backend with a clock of its own may take beyond it.

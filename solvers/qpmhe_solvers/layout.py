@@ -14,8 +14,6 @@ from .qp import QP, Array, Places, as_csc, hessian_pattern, rows_pattern
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
-__all__ = ["Layout", "Structure", "Style", "Voids"]
-
 Flags = NDArray[np.bool_]
 Index = NDArray[np.intp]
 

@@ -20,8 +20,6 @@ from .solution import RawSolution
 from .solver import Solver
 from .translations import TRANSLATIONS
 
-__all__ = ["NATIVE", "Answer", "NativeSolver"]
-
 Point = Array | None
 
 # Patterns of limits whose workspace is known without looking at their structure.

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from .errors import OptionError, report_unknown_options
 from .values import finite, integer, shown
 
-__all__ = ["SolverOptions"]
-
 # What every solver's own integer takes.
 _MOST_ITERATIONS = 2**31 - 1
 

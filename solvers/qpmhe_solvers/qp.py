@@ -14,11 +14,6 @@ from .errors import ShapeError
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
-__all__ = [
-    "ARRAYS", "QP", "Array", "Places", "as_csc", "band_index", "band_of", "hessian_pattern",
-    "rows_pattern",
-]
-
 Array = NDArray[np.float64]
 
 #: Names of the arrays that hold a QP's numbers.

@@ -25,8 +25,6 @@ from .registry import backends, register, unregister
 from .solution import Solution, SolveStatus
 from .solver import ContainedSolver, Solver
 
-__all__ = ["Recording", "RecordingWarning"]
-
 Which = Literal["suspicious", "failed", "all"]
 
 

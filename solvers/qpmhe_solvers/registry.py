@@ -12,8 +12,6 @@ from .options import SolverOptions
 from .solver import Solver
 from .values import shown
 
-__all__ = ["Backend", "available", "backend", "backends", "create", "register", "unregister"]
-
 _REGISTRY: dict[str, Backend] = {}
 _GROUP = "qpmhe.backends"
 _looked = False

@@ -8,8 +8,6 @@ import numpy as np
 
 from .qp import QP, band_index
 
-__all__ = ["contradiction", "sample"]
-
 Bounds = Literal["none", "all", "part"]
 Sides = Literal["none", "two", "equal", "mixed"]
 

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from .qp import QP, Places
 
-__all__ = ["Scale", "Scaling"]
-
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 

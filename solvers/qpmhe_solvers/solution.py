@@ -15,8 +15,6 @@ from .qp import QP, Array
 if TYPE_CHECKING:
     from .scaling import Scale
 
-__all__ = ["Errors", "RawSolution", "Residuals", "Solution", "SolveStatus"]
-
 _NOTHING = np.zeros(0)
 _largest = np.maximum.reduce  # the method of an array comes to this, by detours
 

@@ -19,8 +19,6 @@ from .sample_qps import sample
 from .scaling import Scale, Scaling
 from .solution import Errors, RawSolution, Residuals, Solution, SolveStatus
 
-__all__ = ["ContainedSolver", "Solver"]
-
 # A claim of success is believed while the recomputed residuals stay below this many times the
 # tolerance, since solvers measure in scaled norms of their own, but not beyond the loosest.
 _SLACK = 1e3

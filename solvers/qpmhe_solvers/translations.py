@@ -8,8 +8,6 @@ from typing import Any, Literal
 
 from .options import SolverOptions
 
-__all__ = ["TRANSLATIONS", "Translation"]
-
 
 @dataclass(frozen=True)
 class Translation:

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["finite", "integer", "shown"]
-
 # Longer texts are shown by their beginning and end.
 _LONGEST = 600
 

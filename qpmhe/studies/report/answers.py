@@ -14,8 +14,6 @@ from .words import configuration_words, listed, missing, number, percent, second
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["NEAR", "Answer", "Case", "cases", "chosen", "failures", "limitations"]
-
 #: "Within 1 % of the best RMSE".
 NEAR = 0.01
 _FEW_SEEDS = 10

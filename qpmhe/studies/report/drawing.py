@@ -13,8 +13,6 @@ from .words import percent, time_tick
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Axis", "Drawing", "Mark", "Panel", "Style", "interactive", "static", "styles"]
-
 _INK, _GRID, _LINE = "#333333", "#ececec", "#999999"
 
 

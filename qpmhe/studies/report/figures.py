@@ -15,9 +15,6 @@ from .words import cap_words, configuration_words, missing, number, percent, qps
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["SOLVED", "Profile", "Spread", "accuracy", "anytime", "performance", "profiles",
-           "spreads", "times", "with_states"]
-
 #: A problem counts as solved if J is on average within this part of the converged one.
 SOLVED = 0.01
 _QUANTILES = (0.01, 0.25, 0.5, 0.75, 0.99, 1.0)

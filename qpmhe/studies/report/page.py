@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-__all__ = ["check_libraries", "write_report"]
-
 _LIBRARIES = ("pandas", "plotly", "itables", "jinja2")
 
 #: States that the page draws, and a file.

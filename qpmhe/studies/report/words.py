@@ -6,11 +6,6 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
-__all__ = [
-    "cap_words", "configuration_words", "listed", "missing", "number", "percent", "qps_heading",
-    "qps_words", "ranked", "seconds", "time_tick", "usual_first",
-]
-
 USUAL_START = "candidate"
 
 
