@@ -7,7 +7,7 @@ import threading
 import warnings
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from ..codegen.source import model_files
 from ..errors import CompilationError, EngineWarning, OptionError
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
-from ..model.system import System
+from ..model.system import System, SystemOptions
 
 Array = NDArray[np.float64]
 # Makes buffers for a number of states and the wanted results.
@@ -38,10 +38,8 @@ def from_casadi(
     n: int | None = None,
     p: int | None = None,
     m: int | None = None,
-    states: ConvexSet | None = None,
-    disturbances: ConvexSet | None = None,
-    noises: ConvexSet | None = None,
     compiled: bool | None = None,
+    **options: Unpack[SystemOptions],
 ) -> System:
     """Make a system from CasADi functions, with exact Jacobians.
 
@@ -62,11 +60,11 @@ def from_casadi(
     n, p, m : int, optional
         Numbers of states, outputs and inputs; n (and m, if there are inputs) are needed
         where f is not a casadi.Function.
-    states, disturbances, noises : Box or Polytope, optional
-        The sets X, W and V; the whole space if left out.
     compiled : bool, optional
         Whether to compile the functions. The default compiles them where there is a C
         compiler.
+    **options
+        Sets and scales, as for `qpmhe.System`.
 
     Returns
     -------
@@ -85,12 +83,9 @@ def from_casadi(
     if not (compiled is None or isinstance(compiled, bool)):
         raise OptionError(f"compiled is {compiled!r}; expected True, False or None.")
     model = casadi_model(f, h, n=n, p=p, m=m, dt=dt, method=method)
-    sets: dict[str, Any] = {
-        "states": states, "disturbances": disturbances, "noises": noises
-    }
     library: ctypes.PyDLL | None = None
     if compiled or (compiled is None and find_compiler() is not None):
-        library = _library(model, states, compiled is True)
+        library = _library(model, options.get("states"), compiled is True)
 
     def made(timed: bool) -> System:
         maker = (
@@ -101,7 +96,7 @@ def from_casadi(
         one = {name: Trusted(partial(evaluator.one, name)) for name in _NAMES}
         system = System(
             one["f"], one["h"], n=model.n, p=model.p, m=model.m + timed,
-            f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"], **sets,
+            f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"], **options,
         )
         system.f_jacobian.method = system.h_jacobian.method = "casadi"
         system.kernel = evaluator
@@ -114,7 +109,7 @@ def from_casadi(
     system.recipe = (
         from_casadi,
         {
-            "f": model.f, "h": model.h, "dt": dt, "method": method, "compiled": compiled, **sets,
+            "f": model.f, "h": model.h, "dt": dt, "method": method, "compiled": compiled, **options,
         },
     )
     return system

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from .._checks import need, numbers, positive
 from ..errors import ModelError, OptionError
 from ..model.functions import Trusted
-from ..model.sets import ConvexSet
-from ..model.system import System, probe_points
+from ..model.system import System, SystemOptions, probe_points
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
@@ -25,9 +24,7 @@ def from_control(
     *,
     dt: float | None = None,
     method: str | None = None,
-    states: ConvexSet | None = None,
-    disturbances: ConvexSet | None = None,
-    noises: ConvexSet | None = None,
+    **options: Unpack[SystemOptions],
 ) -> System:
     """Make a system from one of python-control, with the same inputs.
 
@@ -41,8 +38,8 @@ def from_control(
     method : {"zoh", "rk4", "euler"}, optional
         Discretisation of a system in continuous time. The default is ``zoh``, exact for a
         held input, for linear systems and ``rk4`` for nonlinear ones.
-    states, disturbances, noises : Box or Polytope, optional
-        The sets X, W and V; the whole space if left out.
+    **options
+        Sets and scales, as for `qpmhe.System`.
 
     Returns
     -------
@@ -78,14 +75,13 @@ def from_control(
                 "leave it out."
             )
         length = None
-    sets = {"states": states, "disturbances": disturbances, "noises": noises}
     if linear:
         matrices = {name: _real(name, getattr(system, name)) for name in "ABCD"}
-        return _linear(**matrices, dt=length, method=method, sets=sets)
-    made = _nonlinear(system, length, method, sets)
+        return _linear(**matrices, dt=length, method=method, options=options)
+    made = _nonlinear(system, length, method, options)
     _check_no_time(system, made, dt)
     made.recipe = (
-        from_control, {"system": system, "dt": dt, "method": method, **sets}
+        from_control, {"system": system, "dt": dt, "method": method, **options}
     )
     return made
 
@@ -106,11 +102,11 @@ def _linear(
     D: Array,
     dt: float | None,
     method: str | None,
-    sets: dict[str, ConvexSet | None],
+    options: SystemOptions,
 ) -> System:
     (n, m), p = B.shape, C.shape[0]
     a, b = A, B
-    options: dict[str, Any] = {"n": n, "p": p, "m": m, **sets}
+    sizes = {"n": n, "p": p, "m": m}
     output, output_jacobian = _affine(C, D, m)
     if dt is None:
         if method is not None:
@@ -127,18 +123,18 @@ def _linear(
         rate, rate_jacobian = _affine(a, b, m)
         system = System.from_ode(
             rate, output, dt=dt, method=method, rate_jacobian=rate_jacobian,
-            h_jacobian=output_jacobian, **options,
+            h_jacobian=output_jacobian, **sizes, **options,
         )
-        return _with_recipe(system, A, B, C, D, dt, method, sets)
+        return _with_recipe(system, A, B, C, D, dt, method, options)
     step, step_jacobian = _affine(a, b, m)
     system = System(
-        step, output, f_jacobian=step_jacobian, h_jacobian=output_jacobian, **options
+        step, output, f_jacobian=step_jacobian, h_jacobian=output_jacobian, **sizes, **options
     )
-    return _with_recipe(system, A, B, C, D, dt, method, sets)
+    return _with_recipe(system, A, B, C, D, dt, method, options)
 
 
 def _with_recipe(system: System, *arguments: Any) -> System:
-    names = ("A", "B", "C", "D", "dt", "method", "sets")
+    names = ("A", "B", "C", "D", "dt", "method", "options")
     # A control.StateSpace does not pickle, its matrices do.
     system.recipe = (_linear, dict(zip(names, arguments, strict=True)))
     return system
@@ -164,10 +160,10 @@ def _affine(of_state: Array, of_input: Array, m: int) -> tuple[Trusted, Trusted]
 
 
 def _nonlinear(
-    system: Any, dt: float | None, method: str | None, sets: dict[str, ConvexSet | None]
+    system: Any, dt: float | None, method: str | None, options: SystemOptions
 ) -> System:
     m = system.ninputs
-    options: dict[str, Any] = {"n": system.nstates, "p": system.noutputs, "m": m, **sets}
+    sizes = {"n": system.nstates, "p": system.noutputs, "m": m}
 
     def at(function: Function) -> Function:
         # python-control's functions take one state, and a time that a System does not have.
@@ -179,8 +175,8 @@ def _nonlinear(
     if dt is None:
         if method is not None:
             raise OptionError(f"method is {method!r}, but the system is in discrete time.")
-        return System(update, output, **options)
-    return System.from_ode(update, output, dt=dt, method=method or "rk4", **options)
+        return System(update, output, **sizes, **options)
+    return System.from_ode(update, output, dt=dt, method=method or "rk4", **sizes, **options)
 
 
 def _check_no_time(system: Any, made: System, dt: float | None) -> None:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import dimension, positive
 from ..model.functions import Trusted
-from ..model.sets import ConvexSet
-from ..model.system import System, checked_set, probe_points
+from ..model.system import System, SystemOptions, checked_set, probe_points
 from .jax_programs import Programs
 
 Array = NDArray[np.float64]
@@ -33,9 +32,7 @@ def from_jax(
     m: int = 0,
     dt: float | None = None,
     method: str = "rk4",
-    states: ConvexSet | None = None,
-    disturbances: ConvexSet | None = None,
-    noises: ConvexSet | None = None,
+    **options: Unpack[SystemOptions],
 ) -> System:
     r"""Make a system from functions of one state in ``jax.numpy``, with exact Jacobians.
 
@@ -59,8 +56,8 @@ def from_jax(
         Sampling time, in the time unit of the rate; left out, f is the discrete-time map.
     method : {"rk4", "euler"}
         With dt: Runge-Kutta of order 4, or one explicit Euler step.
-    states, disturbances, noises : Box or Polytope, optional
-        The sets X, W and V; the whole space if left out.
+    **options
+        Sets and scales, as for `qpmhe.System`.
 
     Returns
     -------
@@ -115,24 +112,23 @@ def from_jax(
     """
     n, p, m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m, 0)
     length = None if dt is None else positive("dt", dt)
-    probes = probe_points(checked_set("states", states, n), n, m)
+    probes = probe_points(checked_set("states", options.get("states"), n), n, m)
     programs = Programs(f, h, n, p, m, method, length is not None, probes)
-    sets = {"states": states, "disturbances": disturbances, "noises": noises}
-    system = _assembled(_Model(programs, length), m, sets)
+    system = _assembled(_Model(programs, length), m, options)
     if length is not None:
         system.dt = length
-        system.make_timed = partial(_assembled, _Model(programs, None), m + 1, sets)
+        system.make_timed = partial(_assembled, _Model(programs, None), m + 1, options)
     system.recipe = (
         from_jax,
-        {"f": f, "h": h, "n": n, "p": p, "m": m, "dt": dt, "method": method, **sets},
+        {"f": f, "h": h, "n": n, "p": p, "m": m, "dt": dt, "method": method, **options},
     )
     return system
 
 
-def _assembled(model: _Model, m: int, sets: dict[str, Any]) -> System:
+def _assembled(model: _Model, m: int, options: SystemOptions) -> System:
     f, h, f_jacobian, h_jacobian = (Trusted(partial(model.evaluate, part)) for part in range(4))
     system = System(
-        f, h, n=model.n, p=model.p, m=m, f_jacobian=f_jacobian, h_jacobian=h_jacobian, **sets
+        f, h, n=model.n, p=model.p, m=m, f_jacobian=f_jacobian, h_jacobian=h_jacobian, **options
     )
     for name, jacobian in (("f", system.f_jacobian), ("h", system.h_jacobian)):
         jacobian.method = "jax"

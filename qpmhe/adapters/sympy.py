@@ -6,7 +6,7 @@ import builtins
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dis import get_instructions
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from .._checks import need, positive
 from ..errors import ModelError
 from ..model.functions import Trusted
-from ..model.sets import ConvexSet
-from ..model.system import System
+from ..model.system import System, SystemOptions
 
 Array = NDArray[np.float64]
 
@@ -28,9 +27,7 @@ def from_sympy(
     *,
     dt: float | None = None,
     method: str = "rk4",
-    states: ConvexSet | None = None,
-    disturbances: ConvexSet | None = None,
-    noises: ConvexSet | None = None,
+    **options: Unpack[SystemOptions],
 ) -> System:
     """Make a system from SymPy expressions, with exact Jacobians, as NumPy functions.
 
@@ -45,8 +42,8 @@ def from_sympy(
         of time, which is discretised with u held over the step.
     method : {"rk4", "euler"}
         Runge-Kutta of order 4, or one explicit Euler step.
-    states, disturbances, noises : Box or Polytope, optional
-        The sets X, W and V; the whole space if left out.
+    **options
+        Sets and scales, as for `qpmhe.System`.
 
     Returns
     -------
@@ -86,20 +83,19 @@ def from_sympy(
     step, output, step_jacobian, output_jacobian = (
         _with_inputs(function, bool(given)) for function in functions
     )
-    options: dict[str, Any] = {
-        "n": n, "p": p, "m": len(given), "h_jacobian": output_jacobian,
-        "states": states, "disturbances": disturbances, "noises": noises,
-    }
+    sizes = {"n": n, "p": p, "m": len(given)}
     if dt is None:
-        system = System(step, output, f_jacobian=step_jacobian, **options)
+        system = System(
+            step, output, f_jacobian=step_jacobian, h_jacobian=output_jacobian, **sizes, **options
+        )
     else:
         system = System.from_ode(
             step, output, dt=positive("dt", dt), method=method, rate_jacobian=step_jacobian,
-            **options,
+            h_jacobian=output_jacobian, **sizes, **options,
         )
     system.recipe = (from_sympy, {
         "f": rates, "h": outputs, "x": state, "u": given, "dt": dt, "method": method,
-        "states": states, "disturbances": disturbances, "noises": noises,
+        **options,
     })
     return system
 

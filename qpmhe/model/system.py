@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn, Protocol, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +34,15 @@ class ModelKernel(Protocol):
 
     def prepare(self, horizon: int) -> None:
         """Compile or allocate now what the first updates with this horizon would wait for."""
+
+
+class SystemOptions(TypedDict, total=False):
+    """The options of `System` that every function that makes a system hands on to it."""
+
+    states: ConvexSet | None
+    disturbances: ConvexSet | None
+    noises: ConvexSet | None
+    scales: ArrayLike | None
 
 
 class _Moved:
@@ -169,10 +178,7 @@ class System:
         method: str = "rk4",
         rate_jacobian: Function | Trusted | None = None,
         h_jacobian: Function | Trusted | None = None,
-        states: ConvexSet | None = None,
-        disturbances: ConvexSet | None = None,
-        noises: ConvexSet | None = None,
-        scales: ArrayLike | None = None,
+        **options: Unpack[SystemOptions],
     ) -> System:
         r"""Discretise :math:`\dot x = f_c(x, u)` with a fixed step; u is held over the step.
 
@@ -182,7 +188,7 @@ class System:
         ----------
         rate : callable
             f_c(x) or f_c(x, u), in units of x per unit of time.
-        h, n, p, m, h_jacobian, states, disturbances, noises, scales
+        h, n, p, m, h_jacobian, **options
             As for `System`.
         dt : float
             Sampling time, in the time unit of the rate.
@@ -199,7 +205,8 @@ class System:
             As for `System`.
         """
         n, m = dimension("n", n, 1), dimension("m", m, 0)
-        probes = probe_points(checked_set("states", states, n), n, m)
+        states = checked_set("states", options.get("states"), n)
+        probes = probe_points(states, n, m)
         batched = BatchedFunction("rate", rate, (n,), m, probes)
         given = compared = None
         if rate_jacobian is not None:
@@ -208,24 +215,23 @@ class System:
         step, step_jacobian = discretize(
             _over_leading(batched), given and _over_leading(given), method
         )
-        length = positive("dt", dt)
-        sets: dict[str, Any] = {
-            "states": states, "disturbances": disturbances, "noises": noises
-        }
+        length, scales = positive("dt", dt), options.get("scales")
+        others = options.copy()
+        others.pop("scales", None)
         system = cls(
             Trusted(partial(step, length)), h, n=n, p=p, m=m,
             f_jacobian=step_jacobian and Trusted(partial(step_jacobian, length)),
-            h_jacobian=h_jacobian, **sets,
+            h_jacobian=h_jacobian, **others,
         )
         check_inputs(m, rate=batched.takes_input, h=system.h.takes_input)
         system.dt, system.rate_jacobian = length, compared
-        if scales is not None:
+        if scales is not None:  # not before there is a rate to compare
             system._give_scales(scales)
         system.recipe = (
             cls.from_ode,
             {
                 "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": method,
-                "rate_jacobian": rate_jacobian, "h_jacobian": h_jacobian, "scales": scales, **sets,
+                "rate_jacobian": rate_jacobian, "h_jacobian": h_jacobian, **options,
             },
         )
 
@@ -235,7 +241,7 @@ class System:
                 n=n, p=p, m=m + 1,
                 f_jacobian=step_jacobian and Trusted(_timed_by_input(step_jacobian, m)),
                 h_jacobian=Trusted(_without_last(system.h_jacobian.batch, m)),
-                scales=scales, **sets,
+                **options,
             )
 
         system.make_timed = timed
