@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from ..errors import OptionError
 from ..estimation.constraints import Rows
 from ..estimation.estimate import DroppedRow, Status
 from ..estimation.limits import c_definitions
-from ..estimation.settings import Settings
+from ..estimation.settings import Infeasible, Settings
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
@@ -22,7 +22,7 @@ from ..observers import Observer
 SET_NAMES = ("disturbances", "noises")
 
 _MOST = int(np.iinfo(np.int32).max)
-_POLICIES = ("drop_rows", "keep_candidate")
+_POLICIES = get_args(Infeasible)
 
 
 @dataclass(frozen=True)
