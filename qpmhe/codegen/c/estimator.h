@@ -54,6 +54,8 @@ $status
 };
 
 /* What to do where no trajectory in the sets costs at most what the candidate does. */
+#define MHE_ROWS (MHE_HORIZON * MHE_SIZE(MHE_STAGE_ROWS))
+
 enum { MHE_DROP_ROWS = 0, MHE_KEEP_CANDIDATE = 1 };
 
 /* Sides of an inequality, as bits. */
@@ -139,7 +141,7 @@ typedef struct {
     int64_t time;                  /* of the newest sample */
     int32_t length, status, qps, iterations, corrections, nearest_points;
     /* Sides that were dropped and are violated, by stage: components of W, its rows, those of V. */
-    uint8_t dropped[MHE_HORIZON * MHE_SIZE(MHE_STAGE_ROWS)];
+    uint8_t dropped[MHE_ROWS];
 } mhe_estimate;
 
 typedef struct {
@@ -147,13 +149,20 @@ typedef struct {
     mhe_real cost, violation;
 } mhe_trial;
 
-/* Rows of a constrained QP and the interior point's variables on each of them. */
+/* The interior point's variables on one side of the rows. A side that is not there has a slack
+ * of 1 and zeros in all else, so that no loop has to ask. */
 typedef struct {
-    mhe_real low, high, scale;
-    mhe_real slack_low, slack_high, dual_low, dual_high;
-    mhe_real residual_low, residual_high, correction_low, correction_high;
-    mhe_real inverse_low, inverse_high, value, weight, load;
-} mhe_row;
+    mhe_real there[MHE_ROWS], limit[MHE_ROWS], slack[MHE_ROWS], dual[MHE_ROWS];
+    mhe_real residual[MHE_ROWS], correction[MHE_ROWS], inverse[MHE_ROWS];
+    mhe_real slack_change[MHE_ROWS], dual_change[MHE_ROWS];
+} mhe_side;
+
+/* Rows of a constrained QP: low <= value <= high. */
+typedef struct {
+    mhe_real low[MHE_ROWS], high[MHE_ROWS], scale[MHE_ROWS];
+    mhe_real value[MHE_ROWS], weight[MHE_ROWS], load[MHE_ROWS];
+    mhe_side sides[2];
+} mhe_rows;
 
 typedef struct {
     mhe_trial trials[4], bent;
@@ -165,8 +174,8 @@ typedef struct {
     mhe_real gradient[(MHE_HORIZON + 1) * MHE_NX], step[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real residual[(MHE_HORIZON + 1) * MHE_NX], direction[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real product[(MHE_HORIZON + 1) * MHE_NX];
-    mhe_row rows[MHE_HORIZON * MHE_SIZE(MHE_STAGE_ROWS)];
-    uint8_t left_out[MHE_HORIZON * MHE_SIZE(MHE_STAGE_ROWS)]; /* sides that no trial must keep */
+    mhe_rows rows;
+    uint8_t left_out[MHE_ROWS]; /* sides that no trial must keep */
 } mhe_workspace;
 
 /* Where mhe_run writes; a null pointer leaves out. One entry for each sample. */

@@ -11,6 +11,12 @@ enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED };
 /* Iterations after which rows are compared with what they were. */
 #define STALL 8
 
+/* Guesses of the active rows, and rounds of the augmented Lagrangian for each; each round makes
+ * the rows' gaps smaller by about this factor. */
+#define GUESSES 12
+#define ROUNDS 5
+#define STIFFNESS (sizeof(real) == 8 ? (real)1e6 : (real)1e3)
+
 #if CONSTRAINED
 
 /* Limits of all rows about a trajectory with residuals w and v. */
@@ -19,29 +25,29 @@ static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *w, co
     const mhe_settings *s = e->settings;
     real low[ROWS], high[ROWS];
     for (int i = 0; i < e->length; i++) {
-        mhe_row *rows = k->rows + i * ROWS;
+        real *scale = k->rows.scale + i * ROWS;
         mhe_stage_distances(e, i, w, v, low, high);
         for (int r = 0; r < ROWS; r++) {
-            const int out = k->left_out[i * ROWS + r];
-            rows[r].low = out & MHE_LOWER ? -INFINITY : low[r];
-            rows[r].high = out & MHE_UPPER ? INFINITY : high[r];
+            const int at = i * ROWS + r, out = k->left_out[at];
+            k->rows.low[at] = out & MHE_LOWER ? -INFINITY : low[r];
+            k->rows.high[at] = out & MHE_UPPER ? INFINITY : high[r];
         }
 #if MHE_W_SET
-        for (int j = 0; j < NX; j++) rows[j].scale = s->disturbances.scale[j];
-        for (int j = 0; j < MHE_W_ROWS; j++) rows[NX + j].scale = s->disturbances.row_scale[j];
-        rows += W_COUNT;
+        for (int j = 0; j < NX; j++) scale[j] = s->disturbances.scale[j];
+        for (int j = 0; j < MHE_W_ROWS; j++) scale[NX + j] = s->disturbances.row_scale[j];
+        scale += W_COUNT;
 #endif
 #if MHE_V_SET
-        for (int j = 0; j < NY; j++) rows[j].scale = s->noises.scale[j];
-        for (int j = 0; j < MHE_V_ROWS; j++) rows[NY + j].scale = s->noises.row_scale[j];
+        for (int j = 0; j < NY; j++) scale[j] = s->noises.scale[j];
+        for (int j = 0; j < MHE_V_ROWS; j++) scale[NY + j] = s->noises.row_scale[j];
 #endif
     }
 }
 
-static void mhe_values_of(int n, int count, const real *q, const real *rows, mhe_row *out)
+static void mhe_values_of(int n, int count, const real *q, const real *rows, real *out)
 {
-    for (int j = 0; j < n; j++) out[j].value = q[j];
-    for (int i = 0; i < count; i++) out[n + i].value = mhe_dot(n, rows + i * n, q);
+    for (int j = 0; j < n; j++) out[j] = q[j];
+    for (int i = 0; i < count; i++) out[n + i] = mhe_dot(n, rows + i * n, q);
 }
 
 /* rows.value = c(d). */
@@ -49,29 +55,29 @@ static void mhe_rows_times(const mhe_estimator *e, mhe_workspace *k, const real 
 {
     const mhe_settings *s = e->settings;
     for (int i = 0; i < e->length; i++) {
-        mhe_row *rows = k->rows + i * ROWS;
+        real *value = k->rows.value + i * ROWS;
         const real *own = d + i * NX;
 #if MHE_W_SET
         real q[NX];
         for (int j = 0; j < NX; j++)
             q[j] = own[NX + j] - mhe_dot(NX, k->at[i]->f_jacobian + j * NX, own);
-        mhe_values_of(NX, MHE_W_ROWS, q, s->disturbances.rows, rows);
-        rows += W_COUNT;
+        mhe_values_of(NX, MHE_W_ROWS, q, s->disturbances.rows, value);
+        value += W_COUNT;
 #endif
 #if MHE_V_SET
         real r[NY];
         for (int j = 0; j < NY; j++) r[j] = -mhe_dot(NX, k->at[i]->h_jacobian + j * NX, own);
-        mhe_values_of(NY, MHE_V_ROWS, r, s->noises.rows, rows);
+        mhe_values_of(NY, MHE_V_ROWS, r, s->noises.rows, value);
 #endif
     }
     (void)s;
 }
 
-static void mhe_loads_of(int n, int count, const real *rows, const mhe_row *in, real *out)
+static void mhe_loads_of(int n, int count, const real *rows, const real *load, real *out)
 {
-    for (int j = 0; j < n; j++) out[j] = in[j].load;
+    for (int j = 0; j < n; j++) out[j] = load[j];
     for (int i = 0; i < count; i++)
-        for (int j = 0; j < n; j++) out[j] += in[n + i].load * rows[i * n + j];
+        for (int j = 0; j < n; j++) out[j] += load[n + i] * rows[i * n + j];
 }
 
 /* out += c' load. */
@@ -79,22 +85,22 @@ static void mhe_add_loads(const mhe_estimator *e, const mhe_workspace *k, real *
 {
     const mhe_settings *s = e->settings;
     for (int i = 0; i < e->length; i++) {
-        const mhe_row *rows = k->rows + i * ROWS;
+        const real *load = k->rows.load + i * ROWS;
         real *own = out + i * NX;
 #if MHE_W_SET
         real w[NX];
         const real *A = k->at[i]->f_jacobian;
-        mhe_loads_of(NX, MHE_W_ROWS, s->disturbances.rows, rows, w);
+        mhe_loads_of(NX, MHE_W_ROWS, s->disturbances.rows, load, w);
         for (int r = 0; r < NX; r++) {
             own[NX + r] += w[r];
             for (int j = 0; j < NX; j++) own[j] -= w[r] * A[r * NX + j];
         }
-        rows += W_COUNT;
+        load += W_COUNT;
 #endif
 #if MHE_V_SET
         real v[NY];
         const real *C = k->at[i]->h_jacobian;
-        mhe_loads_of(NY, MHE_V_ROWS, s->noises.rows, rows, v);
+        mhe_loads_of(NY, MHE_V_ROWS, s->noises.rows, load, v);
         for (int r = 0; r < NY; r++)
             for (int j = 0; j < NX; j++) own[j] -= v[r] * C[r * NX + j];
 #endif
@@ -117,20 +123,20 @@ static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
 {
     const mhe_settings *s = e->settings;
     for (int i = 0; i < e->length; i++) {
-        const mhe_row *rows = k->rows + i * ROWS;
+        const real *weights = k->rows.weight + i * ROWS;
         real *panel = k->panels + i * NX * WIDTH;
 #if MHE_W_SET
         const real *A = k->at[i]->f_jacobian;
         real *next = panel + NX * WIDTH;
         for (int r = 0; r < NX; r++) {
-            const real weight = rows[r].weight;
+            const real weight = weights[r];
             if (weight == 0) continue;
             mhe_add_square(panel, weight, A + r * NX);
             next[r * WIDTH + r] += weight;
             for (int j = 0; j < NX; j++) panel[j * WIDTH + NX + r] -= weight * A[r * NX + j];
         }
         for (int r = 0; r < MHE_W_ROWS; r++) {
-            const real weight = rows[NX + r].weight, *row = s->disturbances.rows + r * NX;
+            const real weight = weights[NX + r], *row = s->disturbances.rows + r * NX;
             real a[NX];
             if (weight == 0) continue;
             for (int j = 0; j < NX; j++) {
@@ -143,21 +149,21 @@ static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
                 for (int q = 0; q < NX; q++)
                     panel[j * WIDTH + NX + q] += weight * a[j] * row[q];
         }
-        rows += W_COUNT;
+        weights += W_COUNT;
 #endif
 #if MHE_V_SET
         const real *C = k->at[i]->h_jacobian;
         for (int r = 0; r < NY; r++)
-            if (rows[r].weight != 0) mhe_add_square(panel, rows[r].weight, C + r * NX);
+            if (weights[r] != 0) mhe_add_square(panel, weights[r], C + r * NX);
         for (int r = 0; r < MHE_V_ROWS; r++) {
             const real *row = s->noises.rows + r * NY;
             real c[NX];
-            if (rows[NY + r].weight == 0) continue;
+            if (weights[NY + r] == 0) continue;
             for (int j = 0; j < NX; j++) {
                 c[j] = 0;
                 for (int q = 0; q < NY; q++) c[j] += row[q] * C[q * NX + j];
             }
-            mhe_add_square(panel, rows[NY + r].weight, c);
+            mhe_add_square(panel, weights[NY + r], c);
         }
 #endif
     }
@@ -167,11 +173,12 @@ static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
 /* The largest miss of a row in its scale; rows.value = c(d) afterwards. */
 static real mhe_row_violation(const mhe_estimator *e, mhe_workspace *k, const real *d)
 {
+    const mhe_rows *q = &k->rows;
     real worst = 0;
     mhe_rows_times(e, k, d);
     for (int i = 0; i < e->length * ROWS; i++) {
-        const mhe_row *row = k->rows + i;
-        worst = fmax(worst, fmax(row->low - row->value, row->value - row->high) / row->scale);
+        const real missed = mhe_max(q->low[i] - q->value[i], q->value[i] - q->high[i]);
+        if (missed > 0) worst = mhe_max(missed / q->scale[i], worst);
     }
     return worst;
 }
@@ -196,117 +203,213 @@ static void mhe_hessian_times(const mhe_workspace *k, int count, const real *d, 
     }
 }
 
-/* The largest ratio of a decrease to its variable, kept as a fraction: no division each. */
-typedef struct {
-    real decrease, variable;
-} mhe_ratio;
+/* Sums and maxima are taken in strands, side by side: one after the other, the latency of each
+ * operation would be most of their time. */
+#define STRANDS 8
 
-static void mhe_meet(mhe_ratio *worst, real variable, real change)
+static real mhe_product(int n, const real *a, const real *b)
 {
-    if (-change * worst->variable > worst->decrease * variable) {
-        worst->decrease = -change;
-        worst->variable = variable;
+    real sums[STRANDS] = {0};
+    int i = 0;
+    for (; i + STRANDS <= n; i += STRANDS)
+        for (int s = 0; s < STRANDS; s++) sums[s] += a[i + s] * b[i + s];
+    for (; i < n; i++) sums[0] += a[i] * b[i];
+    for (int s = 1; s < STRANDS; s++) sums[0] += sums[s];
+    return sums[0];
+}
+
+/* Guess which rows are active, solve the QP with these as equations, guess anew: the primal-dual
+ * active-set method of Hintermueller, Ito and Kunisch (SIAM Journal on Optimization 13, 2002),
+ * which mostly ends after a few factorisations, with an exact solution. The equations are those of
+ * an augmented Lagrangian, so that rows may depend on each other. `step` and rows.value
+ * are those of the minimiser without inequalities. STOPPED where the guesses do not settle. */
+static int mhe_active_set(const mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest,
+                          int limit, int *iterations)
+{
+    const int count = e->length, size = (count + 1) * NX, rows = count * ROWS;
+    const real tolerance = e->settings->solver_tolerance / 100;
+    mhe_rows *q = &k->rows;
+    real *side = q->sides[0].there, *bound = q->sides[0].limit, *dual = q->sides[0].dual;
+    for (int i = 0; i < rows; i++) side[i] = dual[i] = 0;
+    for (*iterations = 0;; ++*iterations) {
+        int changed = 0;
+        real open = INFINITY;
+        for (int i = 0; i < rows; i++) {
+            const real before = side[i], little = tolerance * q->scale[i];
+            if (before == 0) {
+                if (q->low[i] - q->value[i] > little) side[i] = -1;
+                if (q->value[i] - q->high[i] > little) side[i] = 1;
+            } else if (before * dual[i] < 0)
+                side[i] = 0;
+            changed += side[i] != before;
+            bound[i] = side[i] < 0 ? q->low[i] : side[i] > 0 ? q->high[i] : 0;
+            q->weight[i] = side[i] == 0 ? 0 : STIFFNESS / (q->scale[i] * q->scale[i]);
+            q->load[i] = q->weight[i] * bound[i];
+            dual[i] = 0;
+        }
+        if (!changed) return SOLVED;
+        if (*iterations == limit || *iterations == GUESSES) return STOPPED;
+        mhe_build(e, k, offset, nearest);
+        mhe_add_weights(e, k);
+        if (!mhe_factorise(k, count)) return STOPPED;
+        for (int j = 0; j < size; j++) k->direction[j] = -k->gradient[j];
+        memset(k->step, 0, sizeof(real) * (size_t)size);
+        for (int round = 0; open > tolerance; round++) {
+            if (round == ROUNDS) return STOPPED; /* rows that exclude each other */
+            mhe_add_loads(e, k, k->direction);
+            if (!mhe_solve(k, count, k->direction)) return STOPPED;
+            for (int j = 0; j < size; j++) k->step[j] += k->direction[j];
+            mhe_rows_times(e, k, k->step);
+            open = 0;
+            for (int i = 0; i < rows; i++) {
+                const real gap = q->value[i] - bound[i], force = q->weight[i] * gap;
+                dual[i] += force;
+                q->load[i] = -force;
+                if (side[i] != 0) open = mhe_max(fabs(gap) / q->scale[i], open);
+            }
+            memset(k->direction, 0, sizeof(real) * (size_t)size);
+        }
     }
+}
+
+/* The sign of a row's value in the slack of one of its sides. */
+static real mhe_sign(int side) { return side ? -1 : 1; }
+
+/* Slacks and duals at the start, whose products are all the same; the number of sides. */
+static int mhe_start(mhe_rows *q, int rows, real missed, real product)
+{
+    int sides = 0;
+    for (int side = 0; side < 2; side++) {
+        mhe_side *p = q->sides + side;
+        for (int i = 0; i < rows; i++) {
+            const real limit = side ? q->high[i] : -q->low[i];
+            const int there = isfinite(limit);
+            p->there[i] = there;
+            p->limit[i] = there ? limit : 0;
+            p->slack[i] = there ? mhe_max(limit, missed * q->scale[i]) : 1;
+            p->dual[i] = there ? product / p->slack[i] : 0;
+            sides += there;
+        }
+    }
+    return sides;
+}
+
+/* Residuals, weights and loads where rows.value = c(d). Returns the sum of the products, and
+ * the largest residual in its row's scale. */
+static real mhe_set_residuals(mhe_rows *q, int rows, real *infeasible)
+{
+    real products = 0, worst[STRANDS] = {0};
+    for (int i = 0; i < rows; i++) q->weight[i] = q->load[i] = 0;
+    for (int side = 0; side < 2; side++) {
+        mhe_side *p = q->sides + side;
+        const real sign = mhe_sign(side);
+        for (int i = 0; i < rows; i++) {
+            p->correction[i] = 0;
+            p->residual[i] = p->there[i] * (sign * q->value[i] + p->limit[i] - p->slack[i]);
+            p->inverse[i] = p->there[i] / p->slack[i];
+            q->weight[i] += p->dual[i] * p->inverse[i];
+            q->load[i] += sign * p->dual[i];
+        }
+        for (int i = 0; i < rows; i++) {
+            const int s = i % STRANDS;
+            worst[s] = mhe_max(fabs(p->residual[i]) / q->scale[i], worst[s]);
+        }
+        products += mhe_product(rows, p->slack, p->dual);
+    }
+    *infeasible = worst[0];
+    for (int s = 1; s < STRANDS; s++) *infeasible = mhe_max(worst[s], *infeasible);
+    return products;
 }
 
 /* Right-hand side of the Newton equations for a target of the complementarity products. */
 static void mhe_set_loads(const mhe_estimator *e, mhe_workspace *k, real target)
 {
-    for (int i = 0; i < e->length * ROWS; i++) {
-        mhe_row *q = k->rows + i;
-        q->load = 0;
-        if (q->dual_low > 0)
-            q->load += (target - q->correction_low - q->dual_low * q->residual_low) *
-                           q->inverse_low - q->dual_low;
-        if (q->dual_high > 0)
-            q->load -= (target - q->correction_high - q->dual_high * q->residual_high) *
-                           q->inverse_high - q->dual_high;
+    const int rows = e->length * ROWS;
+    mhe_rows *q = &k->rows;
+    for (int i = 0; i < rows; i++) q->load[i] = 0;
+    for (int side = 0; side < 2; side++) {
+        const mhe_side *p = q->sides + side;
+        const real sign = mhe_sign(side);
+        for (int i = 0; i < rows; i++)
+            q->load[i] += sign * ((target - p->correction[i] - p->dual[i] * p->residual[i]) *
+                                      p->inverse[i] - p->dual[i]);
     }
     memcpy(k->direction, k->residual, sizeof(real) * (size_t)(e->length + 1) * NX);
     mhe_add_loads(e, k, k->direction);
 }
 
-/* Changes of one row's variables along the direction, whose c is in `value`. */
-static void mhe_changes(const mhe_row *q, real target, real *changes)
+/* Changes of slacks and duals along the direction, whose c is in rows.value; the length of the
+ * longest step, up to the whole direction, that keeps all of them positive. */
+static real mhe_set_changes(mhe_rows *q, int rows, real target)
 {
-    for (int side = 0; side < 4; side++) changes[side] = 0;
-    if (q->dual_low > 0) {
-        changes[0] = q->value + q->residual_low;
-        changes[1] = (target - q->correction_low - q->dual_low * changes[0]) * q->inverse_low -
-                     q->dual_low;
+    real worst[STRANDS], largest = 1;
+    for (int s = 0; s < STRANDS; s++) worst[s] = 1;
+    for (int side = 0; side < 2; side++) {
+        mhe_side *p = q->sides + side;
+        const real sign = mhe_sign(side);
+        for (int i = 0; i < rows; i++) {
+            const real change = p->there[i] * sign * q->value[i] + p->residual[i];
+            p->slack_change[i] = change;
+            p->dual_change[i] =
+                (target - p->correction[i] - p->dual[i] * change) * p->inverse[i] - p->dual[i];
+        }
+        for (int i = 0; i < rows; i++) {
+            const int s = i % STRANDS;
+            const real dual = p->dual[i] + (1 - p->there[i]);
+            worst[s] = mhe_max(-p->slack_change[i] * p->inverse[i], worst[s]);
+            worst[s] = mhe_max(-p->dual_change[i] / dual, worst[s]);
+        }
     }
-    if (q->dual_high > 0) {
-        changes[2] = q->residual_high - q->value;
-        changes[3] = (target - q->correction_high - q->dual_high * changes[2]) * q->inverse_high -
-                     q->dual_high;
-    }
+    for (int s = 0; s < STRANDS; s++) largest = mhe_max(worst[s], largest);
+    return 1 / largest;
 }
 
-/* Solve the QP whose limits and terms are in place; `step` holds the minimiser without
- * inequalities and `promise` its |g'd|. A dual variable of 0 marks a side that is not there.
- * No unit matters: rows are compared with their scales, products of slacks and duals with what
- * the objective has to gain or to pay, gradients with the roots of the Hessian's diagonal. */
+/* Second-order terms of a step of this length, and the sum of the products after it. */
+static real mhe_set_corrections(mhe_rows *q, int rows, real length)
+{
+    real after = 0;
+    for (int side = 0; side < 2; side++) {
+        mhe_side *p = q->sides + side;
+        after += mhe_product(rows, p->slack, p->dual);
+        after += length * mhe_product(rows, p->slack, p->dual_change);
+        after += length * mhe_product(rows, p->slack_change, p->dual);
+        after += length * length * mhe_product(rows, p->slack_change, p->dual_change);
+        /* Of a step that was cut short, the whole second order would be misleading: with it
+         * there are QPs on which the method cycles. */
+        for (int i = 0; i < rows; i++)
+            p->correction[i] = length * length * p->slack_change[i] * p->dual_change[i];
+    }
+    return mhe_max(after, 0);
+}
+
+/* Solve the QP whose limits and terms are in place. The minimiser without inequalities misses a row
+ * by `missed` scales at most, and `promise` is its |g'd|. No unit matters: rows are compared with their scales,
+ * products of slacks and duals with what the objective has to gain or to pay, gradients with the
+ * roots of the Hessian's diagonal. */
 static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const real *offset,
-                              int nearest, real promise, int limit, int *iterations)
+                              int nearest, real missed, real promise, int limit, int *iterations)
 {
     const mhe_settings *s = e->settings;
     const int count = e->length, size = (count + 1) * NX, rows = count * ROWS;
-    const real missed = mhe_row_violation(e, k, k->step);
-    real products = 0, far = INFINITY;
-    int sides = 0;
+    mhe_rows *q = &k->rows;
+    real far = INFINITY;
     memset(k->step, 0, sizeof(real) * (size_t)size);
     const real outside = mhe_row_violation(e, k, k->step);
-    const real scale = fmax(promise, outside * outside);
+    const real scale = mhe_max(promise, outside * outside);
     /* Generous products: from smaller ones it creeps on some QPs. */
-    const real start = fmax(scale, EPSILON * EPSILON);
-    for (int i = 0; i < rows; i++) {
-        mhe_row *q = k->rows + i;
-        q->dual_low = q->dual_high = 0;
-        q->slack_low = q->slack_high = 1;
-        q->residual_low = q->residual_high = 0;
-        if (isfinite(q->low)) {
-            q->slack_low = fmax(-q->low, missed * q->scale);
-            q->dual_low = start / q->slack_low;
-            sides++;
-        }
-        if (isfinite(q->high)) {
-            q->slack_high = fmax(q->high, missed * q->scale);
-            q->dual_high = start / q->slack_high;
-            sides++;
-        }
-    }
+    const int sides = mhe_start(q, rows, missed, mhe_max(scale, EPSILON * EPSILON));
     if (!sides) return SOLVED;
     for (*iterations = 0;; ++*iterations) {
-        real infeasible = 0, unbalanced = 0, length = 1, after = 0;
+        real infeasible, unbalanced = 0, length = 1, target = 0;
         mhe_build(e, k, offset, nearest);
         mhe_hessian_times(k, count, k->step, k->product);
         mhe_rows_times(e, k, k->step);
-        products = 0;
-        for (int i = 0; i < rows; i++) {
-            mhe_row *q = k->rows + i;
-            q->correction_low = q->correction_high = 0;
-            q->weight = 0;
-            if (q->dual_low > 0) {
-                q->residual_low = q->value - q->low - q->slack_low;
-                infeasible = fmax(infeasible, fabs(q->residual_low) / q->scale);
-                products += q->slack_low * q->dual_low;
-                q->inverse_low = 1 / q->slack_low;
-                q->weight += q->dual_low * q->inverse_low;
-            }
-            if (q->dual_high > 0) {
-                q->residual_high = q->high - q->value - q->slack_high;
-                infeasible = fmax(infeasible, fabs(q->residual_high) / q->scale);
-                products += q->slack_high * q->dual_high;
-                q->inverse_high = 1 / q->slack_high;
-                q->weight += q->dual_high * q->inverse_high;
-            }
-            q->load = q->dual_low - q->dual_high;
-        }
+        const real products = mhe_set_residuals(q, rows, &infeasible);
         for (int j = 0; j < size; j++) k->residual[j] = -k->product[j] - k->gradient[j];
         mhe_add_loads(e, k, k->residual);
         for (int j = 0; j < size; j++) {
             const real curvature = k->panels[j * WIDTH + j % NX];
-            unbalanced = fmax(unbalanced, k->residual[j] * k->residual[j] / curvature);
+            unbalanced = mhe_max(k->residual[j] * k->residual[j] / curvature, unbalanced);
         }
         if (infeasible <= s->solver_tolerance / 100 &&
             unbalanced <= s->solver_tolerance * s->solver_tolerance * scale &&
@@ -320,56 +423,23 @@ static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const re
         }
         mhe_add_weights(e, k);
         if (!mhe_factorise(k, count)) return *iterations ? STOPPED : FAILED;
-        real target = 0;
         for (int corrector = 0; corrector < 2; corrector++) {
             mhe_set_loads(e, k, target);
             if (!mhe_solve(k, count, k->direction)) return *iterations ? STOPPED : FAILED;
             mhe_rows_times(e, k, k->direction);
-            mhe_ratio worst = {1, 1};
-            for (int i = 0; i < rows; i++) {
-                const mhe_row *q = k->rows + i;
-                real change[4];
-                mhe_changes(q, target, change);
-                mhe_meet(&worst, q->slack_low, change[0]);
-                mhe_meet(&worst, q->dual_low, change[1]);
-                mhe_meet(&worst, q->slack_high, change[2]);
-                mhe_meet(&worst, q->dual_high, change[3]);
-            }
-            length = worst.variable / worst.decrease;
+            length = mhe_set_changes(q, rows, target);
             if (corrector) break;
-            after = 0;
-            for (int i = 0; i < rows; i++) {
-                mhe_row *q = k->rows + i;
-                real change[4];
-                mhe_changes(q, target, change);
-                if (q->dual_low > 0)
-                    after += (q->slack_low + length * change[0]) *
-                             (q->dual_low + length * change[1]);
-                if (q->dual_high > 0)
-                    after += (q->slack_high + length * change[2]) *
-                             (q->dual_high + length * change[3]);
-                /* Of a step that was cut short, the second order would be misleading:
-                 * with the whole of it there are QPs on which it cycles. */
-                q->correction_low = length * length * change[0] * change[1];
-                q->correction_high = length * length * change[2] * change[3];
-            }
-            const real ratio = after / products;
+            const real ratio = mhe_set_corrections(q, rows, length) / products;
             target = ratio * ratio * ratio * products / sides;
         }
         length *= (real)0.995;
         if (!(length > 1e-10)) return STOPPED;
         for (int j = 0; j < size; j++) k->step[j] += length * k->direction[j];
-        for (int i = 0; i < rows; i++) {
-            mhe_row *q = k->rows + i;
-            real change[4];
-            mhe_changes(q, target, change);
-            if (q->dual_low > 0) {
-                q->slack_low += length * change[0];
-                q->dual_low += length * change[1];
-            }
-            if (q->dual_high > 0) {
-                q->slack_high += length * change[2];
-                q->dual_high += length * change[3];
+        for (int side = 0; side < 2; side++) {
+            mhe_side *p = q->sides + side;
+            for (int i = 0; i < rows; i++) {
+                p->slack[i] += length * p->slack_change[i];
+                p->dual[i] += length * p->dual_change[i];
             }
         }
     }

@@ -88,14 +88,17 @@ static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
     for (int j = 0; j < size; j++) k->step[j] = -k->gradient[j];
     if (!mhe_factorise(k, e->length) || !mhe_solve(k, e->length, k->step)) return FAILED;
 #if CONSTRAINED
-    if (mhe_row_violation(e, k, k->step) > 0) {
+    const real missed = mhe_row_violation(e, k, k->step);
+    if (missed > 0) {
         const int limit = e->settings->max_iterations;
-        int iterations = 0;
+        int guesses = 0, iterations = 0;
         if (limit == 0) return UNCONSTRAINED;
         const real promise = fabs(mhe_dot(size, k->gradient, k->step));
-        const int status =
-            mhe_interior_point(e, k, offset, nearest, promise, limit, &iterations);
-        o->iterations += iterations;
+        int status = mhe_active_set(e, k, offset, nearest, limit, &guesses);
+        if (status != SOLVED && guesses < limit)
+            status = mhe_interior_point(e, k, offset, nearest, missed, promise, limit - guesses,
+                                        &iterations);
+        o->iterations += guesses + iterations;
         return status;
     }
 #else
@@ -113,10 +116,10 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
     real *w = k->bent.w, *v = k->bent.v, *d = k->product;
     for (int j = 0; j < (count + 1) * NX; j++) d[j] = o->spare->x[j] - o->best->x[j];
     mhe_rows_times(e, k, d);
-    for (int i = 0; i < count * ROWS; i++) {
-        mhe_row *row = k->rows + i;
-        row->load = 2 * fmax(0, fmax(row->low - row->value, row->value - row->high));
-    }
+    mhe_rows *rows = &k->rows;
+    for (int i = 0; i < count * ROWS; i++)
+        rows->load[i] = 2 * mhe_max(mhe_max(rows->low[i] - rows->value[i],
+                                            rows->value[i] - rows->high[i]), 0);
     for (int i = 0; i < count; i++) {
         const mhe_terms *t = k->at[i];
         for (int j = 0; j < NX; j++) {
@@ -134,23 +137,23 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
     }
     mhe_set_limits(e, k, w, v);
     for (int i = 0; i < count; i++) {
-        mhe_row *rows = k->rows + i * ROWS;
+        real *value = rows->value + i * ROWS;
 #if MHE_W_SET
         real disturbance[NX];
         for (int j = 0; j < NX; j++) disturbance[j] = w[i * NX + j] - o->best->w[i * NX + j];
-        mhe_values_of(NX, MHE_W_ROWS, disturbance, e->settings->disturbances.rows, rows);
+        mhe_values_of(NX, MHE_W_ROWS, disturbance, e->settings->disturbances.rows, value);
 #endif
 #if MHE_V_SET
         real noise[NY];
         for (int j = 0; j < NY; j++) noise[j] = v[i * NY + j] - o->best->v[i * NY + j];
-        mhe_values_of(NY, MHE_V_ROWS, noise, e->settings->noises.rows, rows + W_COUNT);
+        mhe_values_of(NY, MHE_V_ROWS, noise, e->settings->noises.rows, value + W_COUNT);
 #endif
-        for (int r = 0; r < ROWS; r++) {
-            rows[r].load += MHE_BEYOND * fabs(rows[r].value);
-            if (rows[r].high - rows[r].low > 4 * rows[r].load) {
-                rows[r].low += rows[r].load;
-                rows[r].high -= rows[r].load;
-            }
+    }
+    for (int i = 0; i < count * ROWS; i++) {
+        rows->load[i] += MHE_BEYOND * fabs(rows->value[i]);
+        if (rows->high[i] - rows->low[i] > 4 * rows->load[i]) {
+            rows->low[i] += rows->load[i];
+            rows->high[i] -= rows->load[i];
         }
     }
 }
@@ -264,7 +267,7 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
         return 0;
     }
     real little = MHE_STALLED * negligible;
-    if (isfinite(before)) little = fmax(little, mhe_rounding_cost(e, k, o->best));
+    if (isfinite(before)) little = mhe_max(mhe_rounding_cost(e, k, o->best), little);
     o->events |= solved && promised <= little ? MHE_CONVERGED : MHE_NO_DECREASE;
     return 0;
 }
