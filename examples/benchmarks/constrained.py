@@ -129,7 +129,7 @@ def main() -> None:
     console.print(
         f"Rows active (median): {100 * statistics.median(solvers[0].active[settled]):.0f} %. "
         f"Costs agree to {gap:.0e}. QPs in an update: {statistics.median(solved):.0f}, "
-        f"interior-point iterations in each: {statistics.median(iterations):.0f}.",
+        f"iterations in each: {statistics.median(iterations):.0f}.",
         highlight=False,
     )
     arguments.out.mkdir(parents=True, exist_ok=True)

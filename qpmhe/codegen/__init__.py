@@ -36,7 +36,7 @@ def write(
     """Write the estimator as a C99 header and source that need nothing but libm.
 
     The source holds observer, growing window, candidate, Gauss-Newton QPs by a block-banded
-    factorisation (an interior-point method where inequalities are active), the verdict by the true
+    factorisation (active sets where inequalities bind), the verdict by the true
     cost, and the fallback, without allocation and with bounded loops. ``engine="compiled"``
     compiles the same text. Weights, gain, sets and options of the estimator become
     ``<name>_default_settings``; the top of the header says how to call it.

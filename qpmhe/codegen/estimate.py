@@ -106,7 +106,7 @@ class CompiledEstimate(Estimate):
 
     @property
     def solver_iterations(self) -> int:  # type: ignore[override]
-        """Iterations of the interior-point method."""
+        """Guesses of the active rows, and iterations of the interior-point method."""
         return self._numbers[3]
 
     @property

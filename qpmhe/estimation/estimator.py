@@ -76,8 +76,8 @@ class MovingHorizonEstimator:
     engine : {"python", "compiled"}
         What runs the step. ``compiled`` generates C code for the whole step from a system
         made by `qpmhe.from_casadi` without a set of states, a quadratic cost and an observer with
-        constant gain, compiles it once and keeps it in a cache on disk; an interior-point method
-        in it solves QPs with active inequalities. Without a C compiler it warns and runs the
+        constant gain, compiles it once and keeps it in a cache on disk; it also solves
+        QPs with active inequalities. Without a C compiler it warns and runs the
         Python step.
     project_observer : bool
         Whether the observer's state is projected onto X after each step, in the observer's own

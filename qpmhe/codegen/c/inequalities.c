@@ -1,5 +1,5 @@
-/* The QP with inequalities: a primal-dual interior-point method of Mehrotra's kind, whose
- * Newton matrices have the block-banded form of factor.c.
+/* The QP with inequalities: a primal-dual active-set method, and where that does not settle an
+ * interior-point method of Mehrotra's kind. The matrices of both have the form of factor.c.
  *
  *     min d'H d / 2 + g'd   s.t.   low <= c(d) <= high
  *
