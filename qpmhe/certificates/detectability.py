@@ -98,7 +98,6 @@ def _explained(search: Search, error: NotCertifiedError, eta: float | None) -> N
     if smallest is None:
         return error
     if not np.isfinite(smallest):
-        search.check_jumps()
         mode = _undetected(search)
         if mode is not None:
             return NotCertifiedError(

@@ -62,7 +62,3 @@ class NotCertifiedError(QpmheError):
 
 class OutOfTimeError(NotCertifiedError):
     """A search that was stopped before it found anything: nothing is known of the property."""
-
-
-class JumpError(NotCertifiedError):
-    """A function that seems to jump, of which no property with derivatives can be shown."""

@@ -140,7 +140,6 @@ def _check_stability(search: Search) -> None:
     radii = _radii(search)
     worst = int(radii.argmax())
     if radii[worst] >= 1.0:
-        search.check_jumps()
         raise NotCertifiedError(
             f"the observer's error does not contract: A - L C has the spectral radius "
             f"{radii[worst]:.6g} at {np.round(search.points[worst], 4).tolist()}, in the region",

@@ -15,6 +15,7 @@ from .._checks import Array, count, numbers, positive_definite
 from ..costs import Cost
 from ..errors import OptionError, ShapeError
 from .decay import checked_length, decaying_sums
+from .inequalities import norms
 from .theorem import TheoremConstants
 
 
@@ -318,17 +319,6 @@ def fit_weight(cost: Cost, gain: ArrayLike) -> Array:
     if K.shape != (cost.n, cost.p):
         raise ShapeError(f"gain has shape {K.shape}; expected {(cost.n, cost.p)}.")
     return K.T @ cost.disturbance @ K + cost.noise
-
-
-def norms(values: Array, weight: Array) -> Array:
-    """|s|_W of each row, or what it is at most for vectors of these lengths."""
-    if values.ndim == 1:
-        top = float(np.linalg.eigvalsh(weight)[-1])
-        return math.sqrt(max(0.0, top)) * values
-    if values.shape[1] != weight.shape[0]:
-        raise ShapeError(f"vectors have {values.shape[1]} components; expected {weight.shape[0]}.")
-    squares: Array = np.einsum("ti,ij,tj->t", values, weight, values)
-    return np.sqrt(np.maximum(squares, 0.0))
 
 
 def largest(matrix: Array, weight: Array) -> float:

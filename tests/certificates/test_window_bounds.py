@@ -317,8 +317,6 @@ def test_what_does_not_fit_along_a_run_is_named():
     bound = weighted()
     with pytest.raises(ShapeError, match="disturbances"):
         bound.bound(1.0, np.ones(3), np.ones(4))
-    with pytest.raises(ShapeError, match="components"):
-        bound.bound(1.0, np.ones((3, 2)), np.ones((3, 1)))
     with pytest.raises(ShapeError, match="costs"):
         bound.bound(1.0, np.ones(3), np.ones(3), costs=np.ones(4))
     with pytest.raises(OptionError, match="negative"):
