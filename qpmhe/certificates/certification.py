@@ -18,11 +18,11 @@ from .deadline import DEFAULT_SECONDS, Deadline
 from .decay import Sizes
 from .detectability import certify_detectability
 from .evidence import CertificateError
-from .horizon_bounds import bounds_for
 from .observer import certify_observer, constant_gain
 from .properties import Detectability, ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
+from .window_bounds import bounds_for
 
 # How much of the time left the audit, detectability and the observer take.
 _AUDIT, _DETECTABILITY, _OBSERVER = 0.25, 0.5, 0.9

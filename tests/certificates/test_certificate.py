@@ -263,8 +263,6 @@ def test_lengths_out_of_range_are_named(reactor, value):
                 certificate.vacuous(value, 0.1, horizon=5, kind=kind)
     with pytest.raises(OptionError, match="noise is"):
         certificate.of(5).paper.result.limit(1.0, value)
-    with pytest.raises(OptionError, match="noise is"):
-        certificate.of(5).window.limit(1.0, value)
 
 
 def test_a_funnel_needs_steps_and_nothing_measured(reactor):

@@ -141,7 +141,7 @@ def test_a_system_that_only_behaves_alike_weakens_the_label(parts):
 
 def test_what_is_stated_by_hand_is_assumed(parts):
     _, _, detected, observed = parts
-    by_hand = Detectability(0.5, 1.0, 1.0, 1.0, detected.region)
+    by_hand = Detectability(0.5, 1.0, 1.0, 1.0, region=detected.region)
     assert by_hand.evidence is Evidence.ASSUMED
     assert replace(detected, c_w=0.5 * detected.c_w).evidence is Evidence.ASSUMED
     assert replace(detected, region=bounded_region(cubic(), box(9.0))).evidence is Evidence.ASSUMED
