@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-
 from .._checks import count
 from ..costs import CostConstants
 from ..errors import OptionError

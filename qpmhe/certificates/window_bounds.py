@@ -112,7 +112,8 @@ class WindowBound:
         own = entry
         for j in range(N):  # a shorter window begins later
             own = np.where(lengths < N - j, entry, self._advanced(own, *true[:, j : j + steps + 1]))
-        return self.alphas[lengths] * roots + own
+        bound: Array = self.alphas[lengths] * roots + own
+        return bound
 
     def limit(self, disturbance: float, noise: float) -> float:
         """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows."""
