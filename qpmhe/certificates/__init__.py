@@ -8,7 +8,6 @@ from .detectability import certify_detectability
 from .evidence import (
     CertificateError,
     Evidence,
-    JumpError,
     MismatchError,
     NotCertifiedError,
     OutOfTimeError,
@@ -22,7 +21,7 @@ from .theorem import theorem
 
 __all__ = [
     "Audit", "Certificate", "CertificateError", "DecayingSums", "Detectability", "Evidence",
-    "Hypotheses", "JumpError", "MismatchError", "Monitor", "MonitorSummary", "NotCertifiedError",
+    "Hypotheses", "MismatchError", "Monitor", "MonitorSummary", "NotCertifiedError",
     "ObserverStability", "OutOfTimeError", "Region", "Report", "Sizes", "Synthesis",
     "audit", "certify", "certify_detectability", "certify_model", "certify_observer",
     "error_and_bounds", "monitor", "monitored_run", "synthesise_gain", "theorem",

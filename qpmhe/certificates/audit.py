@@ -18,7 +18,7 @@ from ..observers import Observer, Sample
 from .branch_and_bound import output_lipschitz
 from .deadline import PART_SECONDS, Deadline
 from .evaluation import evaluated
-from .evidence import Evidence
+from .evidence import Evidence, json_ready
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
 from .observer import gain_if_constant
 from .regions import Region, bounded_region
@@ -51,22 +51,11 @@ class Finding:
         return self.name not in _SETS
 
     def to_dict(self) -> dict[str, Any]:
-        """The finding in types that JSON knows; numbers that are not finite as text."""
-        return {
-            "name": self.name, "label": self.label, "holds": self.holds, "needed": self.needed,
-            "evidence": None if self.evidence is None else self.evidence.value,
-            "text": self.text, "value": _plain(self.value),
-            "counterexample": {key: _plain(value) for key, value in self.counterexample.items()},
-        }
-
-
-def _plain(value: Any) -> Any:
-    """Numbers that JSON knows, and the names of those that it does not."""
-    if isinstance(value, np.ndarray):
-        return [_plain(each) for each in value.tolist()]
-    if isinstance(value, list):
-        return [_plain(each) for each in value]
-    return str(value) if isinstance(value, float) and not np.isfinite(value) else value
+        """The finding in types that JSON knows; numbers that are not finite become None."""
+        content: dict[str, Any] = json_ready(vars(self) | {
+            "needed": self.needed, "evidence": self.evidence and self.evidence.value,
+        })
+        return content
 
 
 def _lipschitz_finding(

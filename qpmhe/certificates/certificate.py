@@ -20,11 +20,11 @@ from ..model.system import System
 from ..observers import Observer
 from .audit import Audit
 from .decay import Sizes, checked_length
-from .evidence import Evidence, MismatchError, weakest
-from .horizon_bounds import HorizonBounds, Kind
+from .evidence import Evidence, MismatchError, json_ready, weakest
 from .observer import gain_if_constant
-from .properties import Detectability, ObserverStability, json_ready
+from .properties import Detectability, ObserverStability
 from .regions import Region
+from .window_bounds import HorizonBounds, Kind
 
 # The constants are upper bounds, what is computed from them is not: this covers its rounding.
 _OUTWARD = 1.0 + 1e-9

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
 
 from .._checks import count
 from ..costs import Cost, CostConstants
-from ..errors import OptionError
+from ..errors import OptionError, QpmheError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
@@ -17,12 +17,14 @@ from .certificate import Certificate
 from .deadline import DEFAULT_SECONDS, Deadline
 from .decay import Sizes
 from .detectability import certify_detectability
-from .evidence import CertificateError
-from .horizon_bounds import bounds_for
-from .observer import certify_observer, constant_gain
+from .evidence import CertificateError, NotCertifiedError
+from .observer import certify_observer, constant_gain, gain_if_constant
 from .properties import Detectability, ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
+from .window_bounds import bounds_for
+
+Result = TypeVar("Result")
 
 # How much of the time left the audit, detectability and the observer take.
 _AUDIT, _DETECTABILITY, _OBSERVER = 0.25, 0.5, 0.9
@@ -74,52 +76,77 @@ def certify(
     checked_ingredients(system, observer, cost)
     horizons = horizons_of(horizon)
     place = bounded_region(system, region, inputs)
-    gain = None
-    try:
-        gain = constant_gain(observer, system)
-    except CertificateError:
-        if stability is None:  # without one, all else would be in vain
-            raise
+    gain = gain_if_constant(observer, system)
+    if gain is None and stability is None:  # without one, all else would be in vain
+        constant_gain(observer, system)
     if detectability is not None:
         detectability = fitting(detectability, system, place, gain)
     if stability is not None:
         stability = fitting(stability, system, place, gain)
-    deadline = started(seconds)
-    findings = audit(system, observer, cost, place, seconds=deadline.part(_AUDIT))
-    constants, _ = _needed(findings)
-    wanted = cost_sizes(constants) if sizes is None else sizes
-    if detectability is None:
-        detectability = certify_detectability(
-            system, place, weights=estimate_weights(constants),
-            seconds=deadline.part(_DETECTABILITY),
-        )
-    if stability is None:
-        stability = certify_observer(
-            system, observer, place, weights=noise_weights(wanted),
-            seconds=deadline.part(_OBSERVER),
-        )
-    return composed(
-        system, observer, cost, findings, detectability, stability, horizons, wanted
-    )
+    certificate = Ingredients(
+        system, observer, cost, place, sizes, started(seconds), detectability, stability
+    ).certificate(horizons)
+    assert certificate is not None
+    return certificate
 
 
-def composed(
-    system: System, observer: Observer, cost: Cost, findings: Audit, detectability: Detectability,
-    stability: ObserverStability, horizons: Sequence[int], sizes: Sizes,
-) -> Certificate:
-    """The certificate that follows from what was found."""
-    constants, lipschitz = _needed(findings)
-    output = constant_output(system, findings.region)
-    return Certificate(
-        system, observer, cost, findings, detectability, stability,
-        {
+class Ingredients:
+    """What a certificate is made of: audit, detectability and the observer's stability.
+
+    Errors are raised, or collected by the name of what could not be certified.
+    """
+
+    def __init__(
+        self, system: System, observer: Observer, cost: Cost, region: Region, sizes: Sizes | None,
+        deadline: Deadline, detectability: Detectability | None = None,
+        stability: ObserverStability | None = None, errors: dict[str, QpmheError] | None = None,
+    ) -> None:
+        self.errors = errors
+        self.audit = audit(system, observer, cost, region, seconds=deadline.part(_AUDIT))
+        self._constants = self._attempt("", lambda: _needed(self.audit))
+        weights = (1.0, 1.0)
+        if self.audit.constants is not None:
+            weights = estimate_weights(self.audit.constants)
+        self.sizes = Sizes(*weights) if sizes is None else sizes
+        self.detectability = detectability or self._attempt(
+            "detectability", lambda: certify_detectability(
+                system, region, weights=weights, seconds=deadline.part(_DETECTABILITY)
+            ),
+        )
+        self.stability = stability or self._attempt(
+            "the observer", lambda: certify_observer(
+                system, observer, region, weights=_noise_weights(self.sizes),
+                seconds=deadline.part(_OBSERVER),
+            ),
+        )
+        self._of = system, observer, cost
+
+    def _attempt(self, what: str, question: Callable[[], Result]) -> Result | None:
+        try:
+            return question()
+        except (NotCertifiedError, CertificateError) as error:
+            if self.errors is None:
+                raise
+            self.errors[what] = error
+            return None
+
+    def certificate(self, horizons: Sequence[int]) -> Certificate | None:
+        """The certificate that follows; None where one of the ingredients is missing."""
+        if self._constants is None or self.detectability is None or self.stability is None:
+            return None
+        (system, observer, cost), (constants, lipschitz) = self._of, self._constants
+        output = constant_output(system, self.audit.region)
+        bounds = {
             N: bounds_for(
-                N, detectability, stability, cost, constants, lipschitz=lipschitz, output=output
+                N, self.detectability, self.stability, cost, constants, lipschitz=lipschitz,
+                output=output,
             )
             for N in horizons
-        },
-        sizes,
-    ).sealed()
+        }
+        return Certificate(
+            system, observer, cost, self.audit, self.detectability, self.stability, bounds,
+            self.sizes,
+        ).sealed()
 
 
 def _needed(findings: Audit) -> tuple[CostConstants, float]:
@@ -139,18 +166,13 @@ def horizons_of(horizon: Any) -> list[int]:
     return sorted({count("horizon", each, 1) for each in given})
 
 
-def cost_sizes(constants: CostConstants) -> Sizes:
-    """The disturbances and noises of which each alone costs 1, in its cheapest direction."""
-    return Sizes(*estimate_weights(constants))
-
-
 def estimate_weights(constants: CostConstants) -> tuple[float, float]:
     """How much a cost of 1 pays for: disturbances and noises of these sizes."""
     root = -1.0 / constants.exponent
     return constants.disturbance[0] ** root, constants.noise[0] ** root
 
 
-def noise_weights(sizes: Sizes) -> tuple[float, float]:
+def _noise_weights(sizes: Sizes) -> tuple[float, float]:
     """The sizes as weights of a semidefinite program, none of them zero."""
     least = 1e-3 * max(sizes.disturbance, sizes.noise)
     return max(sizes.disturbance, least), max(sizes.noise, least)

@@ -90,14 +90,14 @@ class DecayingSums:
         """c_p, c_w and c_v."""
         return self.initial, self.disturbance, self.noise
 
-    def bound(self, initial: float, disturbances: ArrayLike, noises: ArrayLike) -> Array:
-        """The right-hand side at t = 0, ..., T, (T + 1,).
+    def bound(self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike) -> Array:
+        """The right-hand side at t = 0, ..., T, (T + 1, ...).
 
         Parameters
         ----------
-        initial : float
-            |e(0)|.
-        disturbances, noises : (T,) array_like
+        initial : float or (...) array_like
+            |e(0)|; of several runs at once, if an array.
+        disturbances, noises : (T, ...) array_like
             |w(0)|, ..., |w(T-1)| and |v(0)|, ..., |v(T-1)|.
 
         Raises
@@ -105,12 +105,22 @@ class DecayingSums:
         ShapeError, InvalidInputError
             If these are not nonnegative, finite and of one length.
         """
-        start, w, v = lengths(initial, disturbances, noises)
+        start, w, v = (
+            numbers(name, value) for name, value in
+            (("initial", initial), ("disturbances", disturbances), ("noises", noises))
+        )
+        if w.ndim != 1 + start.ndim or w.shape != v.shape:
+            raise ShapeError(
+                f"disturbances have shape {w.shape} and noises {v.shape}; expected (T,) each, "
+                "their Euclidean lengths at one sample after another."
+            )
+        if any((each < 0.0).any() for each in (start, w, v)):
+            raise OptionError("a length is negative; expected Euclidean lengths, all >= 0.")
         if not all(math.isfinite(each) for each in self.constants):
-            return np.full(w.size + 1, np.inf)
+            return np.full((len(w) + 1, *start.shape), np.inf)
         sums = decaying_sums(self.rate, self.disturbance * w + self.noise * v)
-        decay: Array = self.rate ** np.arange(w.size + 1.0)
-        return self.initial * start * decay + self.rate * sums
+        decay: Array = self.rate ** np.arange(len(w) + 1.0)
+        return np.multiply.outer(decay, self.initial * start) + self.rate * sums
 
     def limit(self, disturbance: float, noise: float) -> float:
         """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows.
@@ -127,29 +137,10 @@ class DecayingSums:
 
 def decaying_sums(rate: float, entering: Array) -> Array:
     """s(t) = sum of rate^(tau - 1) entering(t - tau) over tau = 1, ..., t; at t = 0, ..., T."""
-    sums = np.zeros(entering.size + 1)
-    for t, value in enumerate(entering.tolist()):
+    sums = np.zeros((len(entering) + 1, *entering.shape[1:]))
+    for t, value in enumerate(entering):
         sums[t + 1] = rate * sums[t] + value
     return sums
-
-
-def lengths(
-    initial: float, disturbances: ArrayLike, noises: ArrayLike
-) -> tuple[float, Array, Array]:
-    """Nonnegative lengths, checked; as many of w as of v."""
-    start = float(numbers("initial", initial))
-    w, v = (
-        np.atleast_1d(numbers(name, value))
-        for name, value in (("disturbances", disturbances), ("noises", noises))
-    )
-    if w.ndim != 1 or w.shape != v.shape:
-        raise ShapeError(
-            f"disturbances have shape {w.shape} and noises {v.shape}; expected (T,) each, "
-            "their Euclidean lengths at one sample after another."
-        )
-    if start < 0.0 or (w < 0.0).any() or (v < 0.0).any():
-        raise OptionError("a length is negative; expected Euclidean lengths, all >= 0.")
-    return start, w, v
 
 
 def checked_length(name: str, value: Any) -> float:

@@ -86,8 +86,8 @@ def certify_detectability(
         )
     return sealed(
         Detectability(
-            form.rate, c_p, c_w, c_v, search.region, notes, form.P, form.P, form.R, search.kind,
-            found.margin, found.cells,
+            form.rate, c_p, c_w, c_v, form=search.kind, region=search.region, notes=notes,
+            P=form.P, V=form.R, margin=found.margin, cells=found.cells,
         ),
         Subject.of(system, search.region), found.evidence,
     )
@@ -98,7 +98,6 @@ def _explained(search: Search, error: NotCertifiedError, eta: float | None) -> N
     if smallest is None:
         return error
     if not np.isfinite(smallest):
-        search.check_jumps()
         mode = _undetected(search)
         if mode is not None:
             return NotCertifiedError(

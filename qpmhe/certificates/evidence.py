@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from enum import Enum
+from typing import Any
+
+import numpy as np
 
 from ..errors import InvalidInputError, QpmheError
 
@@ -64,5 +68,14 @@ class OutOfTimeError(NotCertifiedError):
     """A search that was stopped before it found anything: nothing is known of the property."""
 
 
-class JumpError(NotCertifiedError):
-    """A function that seems to jump, of which no property with derivatives can be shown."""
+def json_ready(value: Any) -> Any:
+    """Lists for arrays and tuples, and None for numbers that are not finite."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): json_ready(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(each) for each in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value

@@ -29,6 +29,7 @@ from .evidence import CertificateError
 
 _UNIT = float(np.finfo(np.float64).eps)  # twice the unit roundoff: a margin in every bound
 _TINY = 1e-290  # covers what underflows
+_ROUNDING = 1e-6  # more than rounding makes of differences of f and h
 
 
 class Form(Protocol):
@@ -38,8 +39,24 @@ class Form(Protocol):
     def P(self) -> Array:  # noqa: N802 - the paper's symbol
         """The norm's matrix, (n, n)."""
 
+    @property
+    def rate(self) -> float:
+        """The contraction per step."""
+
     def matrices(self, jacobian: Matrices) -> Matrices:
         """The matrices that must be positive definite."""
+
+    def excess(self, dx: Array, df: Array, dh: Array) -> Array:
+        """By how much differences violate the conclusion; positive beyond rounding."""
+
+
+def norms(values: Array, weight: Array) -> Array:
+    """|s|_W of each row, or what it is at most for vectors of these lengths."""
+    if values.ndim == 1:
+        top = float(np.linalg.eigvalsh(weight)[-1])
+        return math.sqrt(max(0.0, top)) * values
+    squares: Array = np.einsum("ti,ij,tj->t", values, weight, values)
+    return np.sqrt(np.maximum(squares, 0.0))
 
 
 def _square(P: Array, rate: float) -> Matrices:
@@ -105,6 +122,11 @@ class OutputWeight:
         lower = _square(self.P, self.rate) + C.T @ (Matrices.exact(self.R) @ C)
         return _assemble([[P, P @ A], [lower]], [n, n], A.middle.shape[0])
 
+    def excess(self, dx: Array, df: Array, dh: Array) -> Array:
+        """The first inequality's left-hand side less its right-hand one; see `Form.excess`."""
+        left = norms(df, self.P) * (1.0 - _ROUNDING)
+        return left - np.hypot(self.rate * norms(dx, self.P), norms(dh, self.R))
+
 
 @dataclass(frozen=True, eq=False)
 class OutputInjection:
@@ -148,6 +170,8 @@ class OutputInjection:
         ]
         return _assemble(blocks, [n, n, p], A.middle.shape[0])
 
+    excess = OutputWeight.excess
+
 
 @dataclass(frozen=True, eq=False)
 class ErrorContraction:
@@ -174,6 +198,11 @@ class ErrorContraction:
         P = Matrices.exact(self.P)
         closed = P @ (A - Matrices.exact(self.gain) @ C)
         return _assemble([[P, closed], [_square(self.P, self.rate)]], [n, n], A.middle.shape[0])
+
+    def excess(self, dx: Array, df: Array, dh: Array) -> Array:
+        """What the error grows to less what it may; see `Form.excess`."""
+        left = norms(df - dh @ self.gain.T, self.P) * (1.0 - _ROUNDING)
+        return left - self.rate * norms(dx, self.P)
 
 
 @dataclass(frozen=True, eq=False)

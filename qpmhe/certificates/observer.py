@@ -111,8 +111,9 @@ def stability(search: Search, found: Found) -> ObserverStability:
     kappa = float(norm_bound(Matrices.exact(form.gain[None]))[0])
     return sealed(
         ObserverStability(
-            form.rate, c_p, c_w, c_v, kappa, search.region, (*found.notes, _STAY), form.P, form.P,
-            V + allowance * np.eye(V.shape[0]), form.gain, found.margin, found.cells,
+            form.rate, c_p, c_w, c_v, kappa, gain=form.gain, region=search.region,
+            notes=(*found.notes, _STAY), P=form.P, V=V + allowance * np.eye(V.shape[0]),
+            margin=found.margin, cells=found.cells,
         ),
         Subject.of(search.system, search.region), found.evidence,
     )
@@ -140,7 +141,6 @@ def _check_stability(search: Search) -> None:
     radii = _radii(search)
     worst = int(radii.argmax())
     if radii[worst] >= 1.0:
-        search.check_jumps()
         raise NotCertifiedError(
             f"the observer's error does not contract: A - L C has the spectral radius "
             f"{radii[worst]:.6g} at {np.round(search.points[worst], 4).tolist()}, in the region",

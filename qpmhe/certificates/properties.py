@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -15,17 +14,25 @@ from ..model.sets import ConvexSet
 from ..model.system import System
 from .decay import DecayingSums, checked_rate
 from .evaluation import evaluated
-from .evidence import Evidence, MismatchError, weakest
+from .evidence import Evidence, MismatchError, json_ready, weakest
 from .regions import Region, beyond, stated_region
 
 _POINTS, _SEED = 24, 20210829
 _ROUNDING = 1e-9  # another compiler or library may round otherwise
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Certified:
     """What detectability and the observer's stability share."""
 
-    evidence: Evidence
+    region: Region | None = None
+    notes: tuple[str, ...] = ()
+    P: Array | None = None
+    V: Array | None = None
+    margin: float = math.nan
+    cells: int = 0
+    evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
+    subject: Subject | None = field(default=None, init=False, repr=False)
 
     @property
     def sums(self) -> DecayingSums:
@@ -50,18 +57,10 @@ class _Certified:
         disturbances, noises : (T, ..., n) and (T, ..., p) array_like
             w and v, or the differences of w and of h(x), at t = 0, ..., T - 1.
         """
-        sums = self.sums
-        start, w, v = (
-            constant * np.linalg.norm(numbers(name, value), axis=-1)
-            for constant, name, value in zip(
-                sums.constants, ("initial", "disturbances", "noises"),
-                (initial, disturbances, noises), strict=True,
-            )
+        given = ("initial", initial), ("disturbances", disturbances), ("noises", noises)
+        return self.sums.bound(
+            *(np.linalg.norm(numbers(name, value), axis=-1) for name, value in given)
         )
-        bound = [start]
-        for entering in w + v:
-            bound.append(sums.rate * (bound[-1] + entering))
-        return np.array(bound)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +78,7 @@ class Detectability(_Certified):
     given, this follows from the sharper contraction, in norms :math:`|s|_M = \sqrt{s^\top M s}`,
 
     .. math::
-        |x_1^+ - x_2^+|_P \le \eta |x_1 - x_2|_P + |\delta w|_W + |\delta h|_V .
+        |x_1^+ - x_2^+|_P \le \eta |x_1 - x_2|_P + |\delta w|_P + |\delta h|_V .
 
     Parameters
     ----------
@@ -93,8 +92,8 @@ class Detectability(_Certified):
         The set in which both trajectories must stay; None for constants assumed everywhere.
     notes : tuple of str
         What else there is to say.
-    P, W, V : (n, n), (n, n) and (p, p) array or None
-        Norms of the differences of states, of disturbances (W is P) and of outputs.
+    P, V : (n, n) and (p, p) array or None
+        Norms of the differences of states and of disturbances, and of outputs.
     form : str
         Which inequality was shown: ``output weight``, ``output injection``, or ``assumed``.
     margin : float
@@ -110,16 +109,7 @@ class Detectability(_Certified):
     c_p: float
     c_w: float
     c_v: float
-    evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
-    region: Region | None
-    notes: tuple[str, ...] = ()
-    P: Array | None = None
-    W: Array | None = None
-    V: Array | None = None
-    form: str = "assumed"
-    margin: float = math.nan
-    cells: int = 0
-    subject: Subject | None = field(default=None, init=False, repr=False)
+    form: str = field(default="assumed", kw_only=True)
 
     @classmethod
     def assumed(
@@ -137,7 +127,7 @@ class Detectability(_Certified):
         """
         return cls(
             checked_rate("eta", eta), positive("c_p", c_p), positive("c_w", c_w),
-            positive("c_v", c_v), stated_region(region),
+            positive("c_v", c_v), region=stated_region(region),
         )
 
     @property
@@ -159,7 +149,7 @@ class ObserverStability(_Certified):
     Where P is given, this follows from the sharper contraction
 
     .. math::
-        |x^+ - z^+|_P \le \rho |x - z|_P + |w|_W + |v|_V .
+        |x^+ - z^+|_P \le \rho |x - z|_P + |w|_P + |v|_V .
 
     Parameters
     ----------
@@ -171,8 +161,8 @@ class ObserverStability(_Certified):
         The constant of (eq:kappa), in units of the state per unit of the output.
     gain : (n, p) array or None
         L, the observer's constant gain.
-    P, W, V : (n, n), (n, n) and (p, p) array or None
-        Norms of error, disturbance and noise: W is P and V is L^T P L.
+    P, V : (n, n) and (p, p) array or None
+        Norms of error and disturbance, and of noise: V is L^T P L.
     evidence, region, notes, margin, cells, subject
         As for `Detectability`.
     """
@@ -182,16 +172,7 @@ class ObserverStability(_Certified):
     C_w: float
     C_v: float
     kappa: float
-    evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
-    region: Region | None
-    notes: tuple[str, ...] = ()
-    P: Array | None = None
-    W: Array | None = None
-    V: Array | None = None
-    gain: Array | None = None
-    margin: float = math.nan
-    cells: int = 0
-    subject: Subject | None = field(default=None, init=False, repr=False)
+    gain: Array | None = field(default=None, kw_only=True)
 
     @classmethod
     def assumed(
@@ -201,7 +182,8 @@ class ObserverStability(_Certified):
         """Constants that the user states without proof; see `Detectability.assumed`."""
         return cls(
             checked_rate("rho", rho), positive("C_p", C_p), positive("C_w", C_w),
-            positive("C_v", C_v), positive("kappa", kappa), stated_region(region),
+            positive("C_v", C_v), positive("kappa", kappa),
+            region=stated_region(region),
         )
 
     @property
@@ -237,17 +219,12 @@ class Subject:
         sizes = system.n, system.p, system.m
         if sizes != self.sizes:
             return f"(n, p, m) is {sizes} instead of {self.sizes}"
-        mine = self.values
-        try:
-            theirs = _values(system, self.points)
-        except Exception as error:  # a user's function may raise anything
-            return f"it fails where the other one does not ({type(error).__name__}: {error})"
-        larger = np.fmax(np.abs(mine), np.abs(theirs))
-        room = _ROUNDING * (larger + np.nan_to_num(larger).max(axis=0))
-        same = (np.abs(mine - theirs) <= room) | (np.isnan(mine) & np.isnan(theirs))
+        theirs, mine = _values(system, self.points), self.values
+        size = np.nan_to_num(np.abs(mine), posinf=0.0).max(axis=0)
+        same = np.isclose(theirs, mine, _ROUNDING, _ROUNDING * size, equal_nan=True).all(axis=1)
         if same.all():
             return ""
-        k = int(np.argmin(same.all(axis=1)))
+        k = int(np.argmin(same))
         return (
             f"f, h at {np.round(self.points[k], 6).tolist()} is {theirs[k].tolist()} instead of "
             f"{mine[k].tolist()}"
@@ -306,16 +283,3 @@ def fitting(
     )
     weaker = replace(part, notes=(*part.notes, note))
     return sealed(weaker, part.subject, weakest((part.evidence, Evidence.SAMPLED)))
-
-
-def json_ready(value: Any) -> Any:
-    """Lists for arrays and tuples, and None for numbers that are not finite."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): json_ready(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [json_ready(each) for each in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    return value

@@ -16,6 +16,7 @@ from ..model.system import System, checked_system
 
 # Of a polytope's vertices and corners, as starting points of searches; more add little.
 _MOST_CORNERS = 256
+_DIRECTIONS = 32  # in which a polytope's vertices are sought, beside those of the axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,24 +93,32 @@ class Region:
     def sample(self, count: int, generator: np.random.Generator) -> Array:
         """About so many points (K, n + m) of the region, at least one: states and inputs.
 
-        The first is its middle; corners of its box that belong to it come next, then random ones.
+        The first is in the middle; corners or vertices come next, then random ones.
         """
         sides = [
             (low,) if low == high else (low, high)
             for low, high in zip(self.lower, self.upper, strict=True)
         ]
         corners = np.array(list(itertools.islice(itertools.product(*sides), _MOST_CORNERS)))
-        share = generator.random((4 * count, self.lower.size))
+        share = generator.random((count, self.lower.size))
         inner = self.lower + share * (self.upper - self.lower)
-        middle = (0.5 * (self.lower + self.upper))[None]
+        points = np.vstack((0.5 * (self.lower + self.upper), corners, inner))
         if self.is_box:
-            return np.vstack((middle, corners, inner[:count]))
-        centre = np.append(_centre(self.states, self.lower, self.upper), middle[0, self.n :])
-        points = np.vstack((middle, corners, inner))
-        # Points outside are drawn towards one inside until they reach the boundary.
-        points = centre + _shares(self.states, centre, points) * (points - centre)
-        points = points[self.contains(points[:, : self.n])]
-        return np.vstack((centre, points[: len(corners) + count]))
+            return points
+        n, directions = self.n, np.random.default_rng(0).standard_normal((_DIRECTIONS, self.n))
+        G, g = _inequalities(self.states)
+        vertices = np.array([
+            _support(G, g, e)[0] for e in (*np.eye(n), *-np.eye(n), *directions)
+        ])
+        shares = generator.dirichlet(np.full(len(vertices), (n + 1) / len(vertices)), len(points))
+        shares[: len(vertices) + 1] = np.vstack((
+            np.full(len(vertices), 1.0 / len(vertices)), np.eye(len(vertices)),
+        ))[: len(points)]
+        middle = vertices.mean(axis=0)
+        points[:, :n] = middle + (1.0 - 1e-9) * (shares @ vertices - middle)
+        inside = self.contains(points[:, :n])
+        inside[0] = True
+        return points[inside]
 
 
 def bounded_region(
@@ -180,11 +189,8 @@ def _bounds(states: ConvexSet) -> tuple[Array, Array]:
         return states.lower, states.upper
     n = states.dimension
     G, g = _inequalities(states)
-    eye = np.eye(n)
-    sides, residuals = np.full((2, n), np.inf), np.zeros((2, n))
-    for which, sign in enumerate((-1.0, 1.0)):
-        for j in range(n):
-            sides[which, j], residuals[which, j] = _dual_bound(G, g, sign * eye[j])
+    found = [_support(G, g, e)[1:] for e in (*-np.eye(n), *np.eye(n))]
+    sides, residuals = np.moveaxis(np.reshape(found, (2, n, 2)), -1, 0)
     if not np.isfinite(sides).all():
         return -sides[0], sides[1]
     # e^T x <= y^T g + |G^T y - e|_1 |x|_inf for every y >= 0: weak duality, with the
@@ -206,100 +212,50 @@ def _inequalities(states: ConvexSet) -> tuple[Array, Array]:
     return G[finite], g[finite]
 
 
-def _dual_bound(G: Array, g: Array, e: Array) -> tuple[float, float]:
-    """y^T g and a bound on |G^T y - e|_1 for multipliers of max e^T x over G x <= g."""
+def _support(G: Array, g: Array, e: Array) -> tuple[Array, float, float]:
+    """A vertex that maximises e^T x over G x <= g, y^T g, and a bound on |G^T y - e|_1.
+
+    The multipliers y >= 0 are the maximum's; y^T g is infinite where there is none.
+    """
     from scipy.optimize import linprog
 
-    answer = linprog(g, A_eq=G.T, b_eq=e, bounds=(0.0, None), method="highs")
+    answer = linprog(-e, A_ub=G, b_ub=g, bounds=(None, None), method="highs")
     if answer.x is None or answer.status != 0:
-        return np.inf, 0.0
-    y = np.maximum(np.asarray(answer.x, np.float64), 0.0)
+        return np.full(e.size, np.nan), np.inf, 0.0
+    y = np.maximum(-np.asarray(answer.ineqlin.marginals, np.float64), 0.0)
     rounding = 4.0 * (y.size + 2) * np.finfo(np.float64).eps
     side = float(y @ g) + rounding * float(y @ np.abs(g))
     residual = float(np.abs(G.T @ y - e).sum()) + rounding * float(
         (np.abs(G).T @ y + np.abs(e)).sum()
     )
-    return side, residual
-
-
-def _centre(states: ConvexSet, lower: Array, upper: Array) -> Array:
-    """A point inside, as far from the inequalities as can be (Chebyshev's)."""
-    from scipy.optimize import linprog
-
-    n = states.dimension
-    rows = np.vstack((states.matrix, -states.matrix))
-    side = np.append(states.row_upper, -states.row_lower)
-    finite = np.isfinite(side)
-    rows, side = rows[finite], side[finite]
-    away = np.linalg.norm(rows, axis=1)
-    answer = linprog(
-        np.append(np.zeros(n), -1.0), A_ub=np.column_stack((rows, away)), b_ub=side,
-        bounds=[*zip(lower[:n], upper[:n], strict=True), (0.0, None)], method="highs",
-    )
-    if answer.x is None:
-        raise SetError(f"no point of {states!r} was found; is the set empty?")
-    return np.asarray(answer.x, np.float64)[:n]
-
-
-def _shares(states: ConvexSet, centre: Array, points: Array) -> Array:
-    """How far from the centre to each point one may go, at most all the way: (K, 1)."""
-    n = states.dimension
-    rows = np.vstack((states.matrix, np.eye(n)))
-    low = np.append(states.row_lower, states.lower)
-    high = np.append(states.row_upper, states.upper)
-    start = rows @ centre[:n]
-    along = (points[:, :n] - centre[:n]) @ rows.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(
-            along > 0, (high - start) / along, np.where(along < 0, (low - start) / along, np.inf)
-        )
-    limited: Array = np.clip(share.min(axis=1, keepdims=True), 0.0, 1.0) * (1.0 - 1e-12)
-    return limited
+    return np.asarray(answer.x, np.float64), side, residual
 
 
 def beyond(inner: Region, outer: Region) -> str:
     """Where a region reaches beyond another, in words; empty if it lies within it.
 
-    Sides are compared as they are; a general inequality must be one of the inner region's own, or
-    hold on the box around it.
+    An inequality must be one of the inner region's own, or hold on the box around it.
     """
-    n = inner.n
+    n, size = inner.n, inner.lower.size
     if outer.n != n:
         return f"it has {n} states instead of {outer.n}"
-    words = _sides("x", inner.lower[:n], inner.upper[:n], outer.states.lower, outer.states.upper)
-    if outer.lower.size > n:
-        words = words or _sides("u", inner.lower[n:], inner.upper[n:], outer.lower[n:],
-                              outer.upper[n:])
-    return words or _rows(inner, outer.states)
-
-
-def _sides(letter: str, low: Array, high: Array, outer_low: Array, outer_high: Array) -> str:
-    for j in range(low.size):
-        if low[j] < outer_low[j] or high[j] > outer_high[j]:
-            return (
-                f"{letter}[{j}] in [{low[j]:.6g}, {high[j]:.6g}] is not within "
-                f"[{outer_low[j]:.6g}, {outer_high[j]:.6g}]"
-            )
-    return ""
-
-
-def _rows(inner: Region, outer: ConvexSet) -> str:
     own, sides = _inequalities(inner.states)
-    low, high = inner.lower[: inner.n], inner.upper[: inner.n]
-    size = np.maximum(np.abs(low), np.abs(high))
-    rows = np.vstack((outer.matrix, -outer.matrix))
-    limits = np.append(outer.row_upper, -outer.row_lower)
-    for row, limit in zip(rows, limits, strict=True):
-        if not np.isfinite(limit):
-            continue
-        same = (own == row).all(axis=1)
+    G, g = _inequalities(outer.states)
+    eye, inputs = np.eye(size), slice(n, outer.lower.size)
+    G = np.vstack((np.pad(G, ((0, 0), (0, size - n))), eye[inputs], -eye[inputs]))
+    g = np.concatenate((g, outer.upper[inputs], -outer.lower[inputs]))
+    largest = np.maximum(np.abs(inner.lower), np.abs(inner.upper))
+    for row, limit in zip(G, g, strict=True):
+        same = (own == row[:n]).all(axis=1) & (not row[n:].any())
         if same.any() and sides[same].min() <= limit:
             continue
-        rounding = 4.0 * (inner.n + 2) * np.finfo(np.float64).eps * float(np.abs(row) @ size)
-        most = float(np.maximum(row * low, row * high).sum()) + rounding
+        most = float(np.maximum(row * inner.lower, row * inner.upper).sum())
+        if np.count_nonzero(row) > 1:
+            most += 4.0 * (size + 2) * np.finfo(np.float64).eps * float(np.abs(row) @ largest)
         if not most <= limit:
-            return (
-                f"the inequality {np.round(row, 6).tolist()} x <= {limit:.6g} is not shown to hold "
-                f"on it: the left-hand side may be {most:.6g}"
+            terms = " + ".join(
+                f"{row[j]:.6g} {'x' if j < n else 'u'}[{j if j < n else j - n}]"
+                for j in np.flatnonzero(row)
             )
+            return f"{terms} <= {limit:.6g} is not shown to hold there: it may be {most:.6g}"
     return ""

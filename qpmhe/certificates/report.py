@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -18,20 +18,15 @@ from ..model.sets import Box, ConvexSet
 from ..models.example import Example
 from ..models.scenario import Record
 from ..plots.style import LIGHT, STYLES, panels, save
-from .audit import Audit, audit
+from .audit import Audit
 from .certificate import Certificate
-from .certification import composed, estimate_weights, horizons_of, noise_weights
+from .certification import Ingredients, horizons_of
 from .deadline import DEFAULT_SECONDS, Deadline
 from .decay import Sizes
-from .detectability import certify_detectability
-from .evidence import CertificateError, NotCertifiedError
 from .monitor import MonitorSummary, monitored_run
-from .observer import certify_observer
 from .properties import Detectability, ObserverStability
 from .regions import Region, bounded_region
 from .sdp import started
-
-Result = TypeVar("Result")
 
 #: Names of the kinds of bounds in figures and tables.
 LABELS = {
@@ -45,8 +40,6 @@ LABELS = {
 _ROOM = 0.5
 _SIGMAS = 3.0
 _QPS = 2  # a sample, in the run on the simulated record
-# How much of the time left each part takes; the run on the record is not counted.
-_AUDIT, _DETECTABILITY, _OBSERVER = 0.2, 0.5, 0.9
 
 
 @dataclass(eq=False)
@@ -202,38 +195,25 @@ def certify_model(
     system, observer, cost, scenario = example
     record = scenario.simulate(seed)
     place = _region(example, record, region, inputs)
-    name = name or scenario.title
     horizons = horizons_of(scenario.horizon if horizon is None else horizon)
-    sizes, errors = _sizes(example), dict[str, QpmheError]()
-    findings = audit(system, observer, cost, place, seconds=deadline.part(_AUDIT))
-    weights = (1.0, 1.0) if findings.constants is None else estimate_weights(findings.constants)
-
-    def attempt(what: str, question: Callable[[], Result]) -> Result | None:
-        try:
-            return question()
-        except (NotCertifiedError, CertificateError) as error:
-            errors[what] = error
-            return None
-
-    detected = attempt("detectability", lambda: certify_detectability(
-        system, place, weights=weights, seconds=deadline.part(_DETECTABILITY)))
-    observed = attempt("the observer", lambda: certify_observer(
-        system, observer, place, weights=noise_weights(sizes), seconds=deadline.part(_OBSERVER)))
-    certificate = None
-    if detected is not None and observed is not None:
-        certificate = attempt("", lambda: composed(
-            system, observer, cost, findings, detected, observed, horizons, sizes))
-    if certificate is None:
-        return Report(name, example, record, findings, None, detected, observed, errors)
-    estimator = MovingHorizonEstimator(
-        system, observer, cost, horizon=certificate.horizons[-1],
-        initial_state=scenario.initial_estimate, max_qps=_QPS,
+    errors: dict[str, QpmheError] = {}
+    found = Ingredients(
+        system, observer, cost, place, _sizes(example), deadline, errors=errors
     )
-    run, summary = monitored_run(certificate, estimator, record.measurements, record.inputs)
-    return Report(
-        name, example, record, findings, certificate, detected, observed, {}, run, summary,
-        estimator,
+    certificate = found.certificate(horizons)
+    report = Report(
+        name or scenario.title, example, record, found.audit, certificate, found.detectability,
+        found.stability, errors,
     )
+    if certificate is not None:
+        report.estimator = MovingHorizonEstimator(
+            system, observer, cost, horizon=horizons[-1],
+            initial_state=scenario.initial_estimate, max_qps=_QPS,
+        )
+        report.run, report.summary = monitored_run(
+            certificate, report.estimator, record.measurements, record.inputs
+        )
+    return report
 
 
 def _region(

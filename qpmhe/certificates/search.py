@@ -13,8 +13,8 @@ from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel
-from .evaluation import find_jump, joint_jacobians
-from .evidence import Evidence, JumpError, NotCertifiedError, OutOfTimeError
+from .evaluation import evaluated, joint_jacobians
+from .evidence import Evidence, NotCertifiedError, OutOfTimeError
 from .inequalities import ErrorContraction, Form, Matrices, OutputInjection, OutputWeight, definite
 from .regions import Region
 from .sdp import Answer, Kind, Program, Scales, expected_seconds
@@ -30,6 +30,7 @@ _ABOVE, _ATTEMPTS = 0.01, 4
 # Between the smallest rate, where constants grow without bound, and 1, where they last.
 _SHARES = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
 _SEED = 20210829
+_PAIRS = 2000
 # How much of the time the choice of a rate may take, and one verification; how many programs
 # the former solves; how far off the time that a program is expected to take may be.
 _CHOICE, _VERIFICATION = 0.5, 0.6
@@ -48,6 +49,10 @@ class Found:
     margin: float  # margin and cells are those of `Cover`
     cells: int
     notes: tuple[str, ...]
+
+
+class _BrokenPairError(NotCertifiedError):
+    """No matrix helps where f or h jumps."""
 
 
 class Search:
@@ -112,13 +117,8 @@ class Search:
         return high
 
     def explaining_rate(self, error: NotCertifiedError) -> float | None:
-        """`smallest_rate`, where an error does not say enough; None where the time is over.
-
-        A `JumpError` says more than that the time was over.
-        """
+        """`smallest_rate`, where an error does not say enough; None where the time is over."""
         if isinstance(error, OutOfTimeError):
-            self.check_jumps()
-        if isinstance(error, (OutOfTimeError, JumpError)):
             return None
         try:
             return self.smallest_rate()
@@ -180,7 +180,7 @@ class Search:
                 rate = max(rate, self.best_rate(smallest))
             try:
                 return self.find(rate)
-            except (OutOfTimeError, JumpError):
+            except (OutOfTimeError, _BrokenPairError):
                 raise
             except NotCertifiedError as error:
                 # What failed has left more states in the program, and moves the smallest rate.
@@ -262,17 +262,27 @@ class Search:
         if not shown.all():
             broken = ~shown
             return Cover(False, 0, float(least.min()), self.points[broken], self.jacobians[broken])
-        self.check_jumps()
+        self._check_pairs(form)
         note = f"{why}; the inequality holds at {self.points.shape[0]} states of the region"
         return Found(form, Evidence.SAMPLED, float(least.min()), 0, (note,))
 
-    def check_jumps(self) -> None:
-        """Raise a `JumpError` where f or h seems to jump."""
-        found = find_jump(self.system, self.points)
-        if found:
-            raise JumpError(
-                f"{found}; certificates need functions with derivatives",
-                ("a model without the jump", "a region without it"),
+    def _check_pairs(self, form: Form) -> None:
+        """Raise where the inequality does not hold between two of the samples."""
+        n, rng = self.system.n, np.random.default_rng(_SEED)
+        start, end = self.points[rng.integers(len(self.points), size=(2, _PAIRS))]
+        end[:, n:] = start[:, n:]
+        df, dh = (
+            evaluated(name, function, end[:, :n], end[:, n:])
+            - evaluated(name, function, start[:, :n], start[:, n:])
+            for name, function in (("f", self.system.f), ("h", self.system.h))
+        )
+        broken = form.excess((end - start)[:, :n], df, dh) > 0.0
+        if broken.any():
+            k = int(np.argmax(broken))
+            raise _BrokenPairError(
+                f"the inequality for the rate {form.rate:.6g} holds at {len(self.points)} states, "
+                f"but not between {start[k].tolist()} and {end[k].tolist()}: f or h may jump there",
+                ("a model without the jump", "a smaller region"),
             )
 
     def _added(self, outcome: Cover) -> bool:

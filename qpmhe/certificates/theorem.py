@@ -6,13 +6,10 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from .._checks import Array, count
+from .._checks import count
 from ..costs import CostConstants
 from ..errors import OptionError
-from .decay import DecayingSums, decaying_sums, lengths
+from .decay import DecayingSums
 
 Triple = tuple[float, float, float]
 
@@ -128,15 +125,6 @@ class TheoremConstants:
     def result(self) -> DecayingSums:
         """(eq:RGES_result): the estimator's own robust stability."""
         return DecayingSums(self.lam, *self.C)
-
-    def cost_bound(self, initial: float, disturbances: ArrayLike, noises: ArrayLike) -> Array:
-        """The lemma's bound of the estimate's cost, (eq:lem_1), at t = 0, ..., T."""
-        start, w, v = lengths(initial, disturbances, noises)
-        C_p, C_w, C_v = self.observer.constants
-        a, rho = self.cost.exponent, self.observer.rate
-        first: Array = self.rho_bar_1 * (C_p * start * rho ** np.arange(w.size + 1.0)) ** a
-        second: Array = (C_w * decaying_sums(rho, w)) ** a + (C_v * decaying_sums(rho, v)) ** a
-        return self.c_bar * (first + self.rho_bar_2 * second)
 
 
 def theorem(

@@ -1,40 +1,48 @@
-"""Bounds beyond the paper: its proof with the norms kept, or at least the sums."""
+"""Bounds for one horizon: the paper's, and its proof with the norms kept, or at least the sums."""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import ArrayLike
 
-from .._checks import Array, count, numbers, positive_definite
-from ..costs import Cost
-from ..errors import OptionError, ShapeError
-from .decay import checked_length, decaying_sums
-from .theorem import TheoremConstants
+from .._checks import Array, choice
+from ..costs import Cost, CostConstants
+from ..errors import OptionError
+from .decay import Sizes, decaying_sums
+from .inequalities import Matrices, norms
+from .properties import Detectability, ObserverStability
+from .theorem import TheoremConstants, theorem
 
+Kind = Literal["paper", "summed", "weighted", "measured"]
 
-@dataclass(frozen=True)
-class Parts:
-    """Initial error, disturbances and noises, in the norms in which they enter a bound."""
-
-    observer_start: float  # the initial error in the observer's bound
-    window_start: float  # the initial error in detectability's bound
-    entering: Array  # (T,): what enters the observer's error at each sample
-    misfit: Array  # (T,): the noises in the candidate's cost
-    disturbances: Array  # (T,): in detectability's bound
-    noises: Array  # (T,): in detectability's bound
+# Covers the rounding of a few products and roots.
+_OUTWARD = 1.0 + 1e-9
 
 
-class WindowBound(ABC):
+@dataclass(frozen=True, eq=False)
+class Norms:
+    """Weights of the norms in which initial error, disturbances and noises enter a bound."""
+
+    observer: Array  # (n, n): the initial error in the observer's bound
+    window: Array  # (n, n): the initial error in detectability's bound
+    driving: Array  # (n, n): the disturbance in the observer's step
+    corrected: Array  # (p, p): the noise in the observer's step
+    misfit: Array  # (p, p): the noise in the candidate's cost
+    disturbance: Array  # (n, n): the disturbance in detectability's step
+    noise: Array  # (p, p): the noise in detectability's step
+    gain: Array | None = None  # (n, p): K, where w - K v enters the observer's step as one
+
+
+@dataclass(frozen=True, eq=False)
+class WindowBound:
     r"""A bound of the estimator's error along the theorem's proof, with all sums kept.
 
     With k = min(t, N) the window's length, E the bound of the observer's error, and the
-    norms of `Parts`,
+    norms of `Norms`,
 
     .. math::
         \begin{aligned}
@@ -50,132 +58,78 @@ class WindowBound(ABC):
     is guaranteed, and what is not" for the derivation.
     """
 
-    kind: ClassVar[Literal["summed", "weighted"]]
+    kind: Literal["summed", "weighted"]
+    horizon: int
+    rho: float
+    eta: float
+    exponent: float  # a
+    slope: float  # l
+    entry: float  # p
+    alphas: Array = field(repr=False)  # (N + 1,): alpha_0, ..., alpha_N
+    scales: Array = field(repr=False)  # (1 + n,): s, and that of each component of the error
+    norms: Norms = field(repr=False)
 
-    def __init__(
-        self, *, horizon: int, rho: float, eta: float, exponent: float, slope: float, entry: float,
-        scales: Array,
-    ) -> None:
-        self.horizon = count("horizon", horizon, 1)
-        if not exponent >= 1.0:
-            raise OptionError(
-                f"the cost's exponent is {exponent!r}; expected at least 1: below, norms of "
-                "sums do not add up, and only the theorem's own constants are there."
-            )
-        for name, value in (("rho", rho), ("eta", eta)):
-            if not 0.0 < value < 1.0:
-                raise OptionError(f"{name} is {value!r}; expected a number in (0, 1).")
-        self.rho, self.eta, self.exponent = rho, eta, exponent
-        self.slope, self.entry, self.scales = slope, entry, scales
-        #: alpha_k for k = 0, ..., N: from the root of the cost to the norm of detectability.
-        self.alphas: Array = np.array([self._alpha(k) for k in range(horizon + 1)])
+    def bound(self, initial: Array, w: Array, v: Array, costs: Array | None = None) -> Array:
+        """The bound of |x(t) - x_hat(t)| at t = 0, ..., T, (T + 1,).
 
-    @abstractmethod
-    def _advance(self, difference: Array, disturbance: Array, noise: Array) -> Array:
-        """One step of detectability, in its norms."""
+        Arguments are vectors or lengths, (T, n) or (T,); with costs, (T,), where these are known.
+        """
+        bound: Array = self.scales[0] * self._along(initial, w, v, costs)
+        return bound
 
-    @abstractmethod
-    def _alpha(self, length: int) -> float:
-        """The largest sum of a window's estimated parts whose cost is 1."""
-
-    @abstractmethod
-    def parts(self, initial: Array, disturbances: Array, noises: Array) -> Parts:
-        """The norms of an initial error, disturbances and noises."""
-
-    def bound(
-        self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike, *,
-        costs: ArrayLike | None = None,
-    ) -> Array:
-        """The bound of |x(t) - x_hat(t)| at t = 0, ..., T."""
-        value: Array = self.scales[0] * self._evaluate(initial, disturbances, noises, costs)
-        return value
-
-    def components(
-        self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike, *,
-        costs: ArrayLike | None = None,
-    ) -> Array:
+    def components(self, initial: Array, w: Array, v: Array, costs: Array | None = None) -> Array:
         """The bound of each component's error, (T + 1, n); arguments as of `bound`."""
-        norm = self._evaluate(initial, disturbances, noises, costs)
-        return np.multiply.outer(norm, self.scales[1:])
+        return np.multiply.outer(self._along(initial, w, v, costs), self.scales[1:])
 
-    def _evaluate(
-        self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike,
-        costs: ArrayLike | None,
-    ) -> Array:
-        start = numbers("initial", initial)
-        w, v = numbers("disturbances", disturbances), numbers("noises", noises)
-        if w.shape[:1] != v.shape[:1] or not 1 <= w.ndim <= 2 or not 1 <= v.ndim <= 2:
-            raise ShapeError(
-                f"disturbances have shape {w.shape} and noises {v.shape}; expected (T, n) and "
-                "(T, p), or their lengths (T,)."
-            )
-        for lengths in (start, w, v):
-            if lengths.ndim < (1 if lengths is start else 2) and (lengths < 0.0).any():
-                raise OptionError("a length is negative; expected Euclidean lengths, all >= 0.")
-        return self.along(self.parts(start, w, v), costs)
+    def _entering(self, w: Array, v: Array) -> Array:
+        if self.norms.gain is not None and w.ndim == v.ndim == 2:
+            return norms(w - v @ self.norms.gain.T, self.norms.driving)
+        return norms(w, self.norms.driving) + norms(v, self.norms.corrected)
 
-    def along(self, parts: Parts, costs: ArrayLike | None = None) -> Array:
-        """The bound in the norm of detectability, at t = 0, ..., T, (T + 1,)."""
-        N, a, steps = self.horizon, self.exponent, parts.disturbances.size
+    def _advanced(self, difference: Array, disturbance: Array, noise: Array) -> Array:
+        """One step of detectability, in its norms."""
+        if self.kind == "weighted":
+            return np.hypot(self.eta * difference, noise) + disturbance
+        return self.eta * difference + noise + disturbance
+
+    def _along(self, initial: Array, w: Array, v: Array, costs: Array | None) -> Array:
+        """The bound in the norm of detectability."""
+        N, a, steps, weights = self.horizon, self.exponent, len(w), self.norms
         lengths = np.minimum(np.arange(steps + 1), N)
-        decay: Array = self.rho ** np.arange(steps + 1.0)
-        error = parts.observer_start * decay + decaying_sums(self.rho, parts.entering)
-        fit = (self.slope * error[:-1] + parts.misfit) ** a
-        roots: Array = _window_sums(fit, N) ** (1.0 / a)
+        first = np.asarray(initial, np.float64)[None]
+        error = float(norms(first, weights.observer)[0]) * self.rho ** np.arange(steps + 1.0)
+        error = error + decaying_sums(self.rho, self._entering(w, v))
+        fit = (self.slope * error[:-1] + norms(v, weights.misfit)) ** a
+        padded = np.concatenate((np.zeros(N), fit))
+        roots: Array = sliding_window_view(padded, N).sum(axis=1) ** (1.0 / a)
         if costs is not None:
-            known = numbers("costs", costs, finite=False)
-            if known.shape != (steps,):
-                raise ShapeError(f"costs have shape {known.shape}; expected ({steps},).")
             # NaN is no cost: fmin leaves the bound in its place.
-            roots[1:] = np.fmin(roots[1:], np.maximum(known, 0.0) ** (1.0 / a))
-        entry = np.full(steps + 1, parts.window_start)
+            roots[1:] = np.fmin(roots[1:], np.maximum(costs, 0.0) ** (1.0 / a))
+        entry = np.full(steps + 1, float(norms(first, weights.window)[0]))
         entry[N + 1 :] = self.entry * error[1 : max(1, steps + 1 - N)]
-        padded = np.zeros((2, N + steps))
-        padded[:, N:] = parts.disturbances, parts.noises
-        own = np.where(lengths == 0, entry, 0.0)
+        true = np.zeros((2, N + steps))
+        true[:, N:] = norms(w, weights.disturbance), norms(v, weights.noise)
+        own = entry
         for j in range(N):  # a shorter window begins later
-            own = np.where(lengths == N - j, entry, own)
-            own = self._advance(own, *padded[:, j : j + steps + 1])
-        own[0] = parts.window_start
-        return self.alphas[lengths] * roots + own
-
-    def funnel(self, initial: float, disturbance: float, noise: float, steps: int) -> Array:
-        """The bound at t = 0, ..., steps for all |w| <= disturbance and |v| <= noise."""
-        return self.bound(initial, np.full(steps, disturbance), np.full(steps, noise))
+            own = np.where(lengths < N - j, entry, self._advanced(own, *true[:, j : j + steps + 1]))
+        bound: Array = self.alphas[lengths] * roots + own
+        return bound
 
     def limit(self, disturbance: float, noise: float) -> float:
         """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows."""
-        checked_length("disturbance", disturbance)
-        checked_length("noise", noise)
-        parts = self.parts(np.zeros(()), np.array([disturbance]), np.array([noise]))
-        error = parts.entering / (1.0 - self.rho)
-        fit = self.slope * error + parts.misfit
+        w, v = np.array([disturbance]), np.array([noise])
+        error = self._entering(w, v) / (1.0 - self.rho)
         own = self.entry * error
         for _ in range(self.horizon):
-            own = self._advance(own, parts.disturbances, parts.noises)
+            own = self._advanced(
+                own, norms(w, self.norms.disturbance), norms(v, self.norms.noise)
+            )
+        fit = self.slope * error + norms(v, self.norms.misfit)
         root = self.horizon ** (1.0 / self.exponent) * fit
         return float(self.scales[0] * (self.alphas[-1] * root + own)[0])
 
 
-def _window_sums(values: Array, width: int) -> Array:
-    """Sums over the last values before t = 0, ..., T."""
-    padded = np.concatenate((np.zeros(width), values))
-    sums: Array = sliding_window_view(padded, width).sum(axis=1)
-    return sums
-
-
-def holder(values: Array, exponent: float) -> float:
-    """The largest sum of values[i] s[i] with the sum of s[i]^a up to 1, for a >= 1."""
-    if exponent == 1.0:
-        return float(values.max())
-    dual = exponent / (exponent - 1.0)
-    top = float(values.max())
-    if top == 0.0 or not math.isfinite(top):
-        return top
-    return float(top * np.sum((values / top) ** dual) ** (1.0 / dual))
-
-
-class SummedBound(WindowBound):
+def summed_bound(constants: TheoremConstants, n: int = 1, p: int = 1) -> WindowBound:
     r"""Sums and Hoelder's inequality in place of geometric majorants and factors 3.
 
     It needs no more than the theorem does: the Euclidean constants of detectability,
@@ -191,51 +145,40 @@ class SummedBound(WindowBound):
             (c_w \eta^\tau \underline c_w^{-1/a})^b + (c_v \eta^\tau \underline c_v^{-1/a})^b
         \big)
     """
-
-    kind = "summed"
-
-    def __init__(self, constants: TheoremConstants) -> None:
-        self.constants = constants
-        cost = constants.cost
-        a = cost.exponent
-        #: From the fitting error's length to the root of its cost.
-        self.cost_root = float(
-            (cost.disturbance[1] * constants.kappa**a + cost.noise[1]) ** (1.0 / a)
+    cost, N, a = constants.cost, constants.horizon, constants.cost.exponent
+    if not a >= 1.0:
+        raise OptionError(
+            f"the cost's exponent is {a!r}; expected at least 1: below, norms of sums do not add "
+            "up, and only the theorem's own constants are there."
         )
-        super().__init__(
-            horizon=constants.horizon, rho=constants.observer.rate,
-            eta=constants.detectability.rate, exponent=a,
-            slope=self.cost_root * constants.lipschitz, entry=constants.detectability.initial,
-            scales=np.ones(1),
-        )
-
-    def _alpha(self, length: int) -> float:
-        c_p, c_w, c_v = self.constants.detectability.constants
-        cost, a = self.constants.cost, self.exponent
-        lags: Array = self.eta ** np.arange(1.0, length + 1.0)
-        values = np.concatenate((
-            [c_p * self.eta**length * cost.prior[0] ** (-1.0 / a)],
-            c_w * cost.disturbance[0] ** (-1.0 / a) * lags,
-            c_v * cost.noise[0] ** (-1.0 / a) * lags,
+    eta, (c_p, c_w, c_v) = constants.detectability.rate, constants.detectability.constants
+    rho, (C_p, C_w, C_v) = constants.observer.rate, constants.observer.constants
+    paid = [each[0] ** (-1.0 / a) for each in (cost.prior, cost.disturbance, cost.noise)]
+    dual = math.inf if a == 1.0 else a / (a - 1.0)
+    alphas = [
+        float(np.linalg.norm(
+            np.append(c_p * paid[0] * eta**k, np.outer((c_w * paid[1], c_v * paid[2]), lags)), dual
         ))
-        return holder(values, a)
-
-    def parts(self, initial: Array, disturbances: Array, noises: Array) -> Parts:
-        """Euclidean lengths times the constants; see `WindowBound.parts`."""
-        start = float(np.linalg.norm(np.atleast_1d(initial)))
-        w, v = (x if x.ndim == 1 else np.linalg.norm(x, axis=1) for x in (disturbances, noises))
-        c_p, c_w, c_v = self.constants.detectability.constants
-        C_p, C_w, C_v = self.constants.observer.constants
-        return Parts(
-            C_p * start, c_p * start, self.rho * (C_w * w + C_v * v), self.cost_root * v,
-            self.eta * c_w * w, self.eta * c_v * v,
+        for k in range(N + 1) for lags in [eta ** np.arange(1.0, k + 1.0)]
+    ]
+    # From the fitting error's length to the root of its cost.
+    root = float((cost.disturbance[1] * constants.kappa**a + cost.noise[1]) ** (1.0 / a))
+    weights = Norms(*(
+        factor**2 * np.eye(size) for factor, size in (
+            (C_p, n), (c_p, n), (rho * C_w, n), (rho * C_v, p), (root, p), (eta * c_w, n),
+            (eta * c_v, p),
         )
+    ))
+    return WindowBound(
+        "summed", N, rho, eta, a, root * constants.lipschitz, c_p, np.array(alphas),
+        np.ones(1 + n), weights,
+    )
 
-    def _advance(self, difference: Array, disturbance: Array, noise: Array) -> Array:
-        return self.eta * difference + disturbance + noise
 
-
-class WeightedBound(WindowBound):
+def weighted_bound(
+    cost: Cost, horizon: int, detectability: Detectability, stability: ObserverStability,
+    slope: float,
+) -> WindowBound:
     r"""The quadratic cost's own weights, and the norms of the Lyapunov functions.
 
     From detectability and from an observer with constant gain K, for its error e,
@@ -254,81 +197,30 @@ class WeightedBound(WindowBound):
         \alpha_0^2 = \lambda(P \Pi^{-1}), \qquad
         \alpha_{k+1}^2 = \max\{\eta^2 \alpha_k^2, \lambda(V R^{-1})\} + \lambda(P Q^{-1})
 
-    where lambda is the largest eigenvalue.
+    where lambda is the largest eigenvalue. The slope is the largest
+    :math:`|\Delta h|_M / |\Delta x|_O`.
     """
-
-    kind = "weighted"
-
-    def __init__(
-        self, cost: Cost, *, horizon: int, P: ArrayLike, eta: float,
-        noise_weight: ArrayLike, observer_norm: ArrayLike, rho: float, gain: ArrayLike,
-        slope: float,
-    ) -> None:
-        n, p = cost.n, cost.p
-        self.P = positive_definite("P", P, n)
-        self.observer_norm = positive_definite("observer_norm", observer_norm, n)
-        self._V = np.atleast_2d(numbers("noise_weight", noise_weight))
-        if self._V.shape != (p, p):
-            raise ShapeError(f"noise_weight has shape {self._V.shape}; expected {(p, p)}.")
-        self._fit = fit_weight(cost, gain)
-        self.gain = numbers("gain", gain)
-        self._shares = (
-            largest(self.P, cost.least_prior), largest(self.P, cost.disturbance),
-            largest(self._V, cost.noise),
-        )
-        inverse = np.linalg.inv(self.P)
-        super().__init__(
-            horizon=horizon, rho=rho, eta=eta, exponent=2.0, slope=float(numbers("slope", slope)),
-            entry=math.sqrt(largest(self.P, self.observer_norm)),
-            scales=_rounding(self.P) * np.sqrt(
-                np.append(np.linalg.eigvalsh(inverse)[-1], np.diag(inverse))
-            ),
-        )
-
-    def _alpha(self, length: int) -> float:
-        square, disturbance, noise = self._shares
-        for _ in range(length):
-            square = max(self.eta**2 * square, noise) + disturbance
-        return math.sqrt(square)
-
-    def _advance(self, difference: Array, disturbance: Array, noise: Array) -> Array:
-        return np.hypot(self.eta * difference, noise) + disturbance
-
-    def parts(self, initial: Array, disturbances: Array, noises: Array) -> Parts:
-        """Norms of vectors, or the largest ones of vectors of these lengths."""
-        w, v, O = disturbances, noises, self.observer_norm  # noqa: E741 - the symbol
-        if w.ndim == v.ndim == 2:
-            entering = norms(w - v @ self.gain.T, O)
-        else:
-            entering = norms(w, O) + norms(v, self.gain.T @ O @ self.gain)
-        return Parts(
-            float(norms(initial[None], O)[0]), float(norms(initial[None], self.P)[0]), entering,
-            norms(v, self._fit), norms(w, self.P), norms(v, self._V),
-        )
+    P, V, O, K = detectability.P, detectability.V, stability.P, stability.gain  # noqa: E741
+    assert P is not None
+    assert V is not None
+    assert O is not None
+    assert K is not None
+    squares, bought = [largest(P, cost.least_prior)], largest(P, cost.disturbance)
+    noise = largest(V, cost.noise)
+    for _ in range(horizon):
+        squares.append(max(detectability.eta**2 * squares[-1], noise) + bought)
+    inverse = np.linalg.inv(P)
+    scales = np.append(np.linalg.eigvalsh(inverse)[-1], np.diag(inverse))
+    return WindowBound(
+        "weighted", horizon, stability.rho, detectability.eta, 2.0, slope,
+        math.sqrt(largest(P, O)), np.sqrt(squares), _rounding(P) * np.sqrt(scales),
+        Norms(O, P, O, K.T @ O @ K, fit_weight(cost, K), P, V, K),
+    )
 
 
-def fit_weight(cost: Cost, gain: ArrayLike) -> Array:
+def fit_weight(cost: Cost, gain: Array) -> Array:
     """The weight M = K^T Q K + R that the candidate's cost puts on fitting errors."""
-    if not isinstance(cost, Cost) or not cost.quadratic or cost.discount < 1.0:
-        raise OptionError(
-            "the weighted bound needs a QuadraticCost without discount; the theorem's own "
-            "constants and the summed bound do with any cost that has constants."
-        )
-    K = numbers("gain", gain)
-    if K.shape != (cost.n, cost.p):
-        raise ShapeError(f"gain has shape {K.shape}; expected {(cost.n, cost.p)}.")
-    return K.T @ cost.disturbance @ K + cost.noise
-
-
-def norms(values: Array, weight: Array) -> Array:
-    """|s|_W of each row, or what it is at most for vectors of these lengths."""
-    if values.ndim == 1:
-        top = float(np.linalg.eigvalsh(weight)[-1])
-        return math.sqrt(max(0.0, top)) * values
-    if values.shape[1] != weight.shape[0]:
-        raise ShapeError(f"vectors have {values.shape[1]} components; expected {weight.shape[0]}.")
-    squares: Array = np.einsum("ti,ij,tj->t", values, weight, values)
-    return np.sqrt(np.maximum(squares, 0.0))
+    return gain.T @ cost.disturbance @ gain + cost.noise
 
 
 def largest(matrix: Array, weight: Array) -> float:
@@ -342,3 +234,95 @@ def _rounding(weight: Array) -> float:
     """A factor that covers what rounding does to numbers that a matrix is inverted for."""
     eps = float(np.finfo(np.float64).eps)
     return float(1.0 + 32.0 * weight.shape[0] ** 2 * eps * np.linalg.cond(weight))
+
+
+@dataclass(frozen=True, eq=False)
+class HorizonBounds:
+    """What bounds the error for one horizon.
+
+    Parameters
+    ----------
+    paper : TheoremConstants
+    window : WindowBound or None
+        The sharper bound: with norms for a quadratic cost and certified constants, with sums
+        for other costs and assumed constants, none for costs whose exponent is below 1.
+    """
+
+    paper: TheoremConstants
+    window: WindowBound | None
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kinds of bounds at hand, the sharpest last."""
+        return ("paper",) if self.window is None else ("paper", self.window.kind, "measured")
+
+    def beyond(self, kind: Kind) -> WindowBound:
+        """The bound beyond the paper that a kind asks for."""
+        choice("kind", kind, get_args(Kind))
+        if self.window is None or kind not in self.kinds:
+            raise OptionError(
+                f"kind is {kind!r}, for which there is no bound here; expected one of "
+                f"{list(self.kinds)}. The weighted one is there for a quadratic cost and constants "
+                "that were certified, the summed one where the weighted one is not."
+            )
+        return self.window
+
+    def to_dict(self, sizes: Sizes) -> dict[str, Any]:
+        """All constants in types that JSON knows."""
+        c = self.paper
+        content: dict[str, Any] = {
+            "horizon": c.horizon,
+            "paper": {
+                "L_bar": c.L_bar, "c_bar": c.c_bar, "eta_bar": c.eta_bar,
+                "rho_bar_1": c.rho_bar_1, "rho_bar_2": c.rho_bar_2, "C_bar": list(c.C_bar),
+                "C_prime": list(c.C_prime), "C_double_prime": list(c.C_double_prime),
+                "C": list(c.C), "lambda": c.lam,
+                "limit": c.result.limit(sizes.disturbance, sizes.noise),
+            },
+        }
+        if self.window is not None:
+            content[self.window.kind] = {
+                "beyond_the_paper": True, "alpha": self.window.alphas.tolist(),
+                "limit": self.window.limit(sizes.disturbance, sizes.noise),
+            }
+        return content
+
+
+def bounds_for(
+    horizon: int, detectability: Detectability, stability: ObserverStability, cost: Cost,
+    constants: CostConstants, *, lipschitz: float, output: Matrices | None = None,
+) -> HorizonBounds:
+    """The bounds that follow from what was certified."""
+    plain = theorem(
+        detectability.sums, stability.sums, constants, kappa=stability.kappa,
+        lipschitz=lipschitz, horizon=horizon,
+    )
+    paper = plain
+    if lipschitz > 0.0:  # a larger C_v holds as well, and from 1 / L_h on L_bar is L_h
+        larger = max(plain.observer.noise, 1.0 / lipschitz)
+        paper = replace(plain, observer=replace(plain.observer, noise=larger))
+    certified = (detectability.P, detectability.V, stability.P, stability.gain)
+    if all(each is not None for each in certified) and cost.quadratic and cost.discount == 1.0:
+        slope = _slope(cost, stability, lipschitz, output)
+        return HorizonBounds(
+            paper, weighted_bound(cost, horizon, detectability, stability, slope)
+        )
+    summed = constants.exponent >= 1.0
+    return HorizonBounds(paper, summed_bound(plain, cost.n, cost.p) if summed else None)
+
+
+def _slope(
+    cost: Cost, stability: ObserverStability, lipschitz: float, output: Matrices | None
+) -> float:
+    """The largest |h(x) - h(z)|_M / |x - z|_O, from L_h or from a constant Jacobian of h."""
+    assert stability.P is not None
+    assert stability.gain is not None
+    fit = fit_weight(cost, stability.gain)
+    plain = math.sqrt(
+        float(np.linalg.eigvalsh(fit)[-1]) * largest(np.eye(cost.n), stability.P)
+    )
+    slope = plain * lipschitz
+    if output is not None:
+        C, radius = output.middle[0], float(np.linalg.norm(output.radius[0]))
+        slope = min(slope, math.sqrt(largest(C.T @ fit @ C, stability.P)) + plain * radius)
+    return slope * _OUTWARD

@@ -9,8 +9,7 @@ import pytest
 from rich.console import Console
 
 import qpmhe
-from qpmhe.certificates import certify_model
-from qpmhe.certificates import report as report_module
+from qpmhe.certificates import certification, certify_model
 from qpmhe.certificates.evidence import NotCertifiedError
 from qpmhe.cli.certify import certify
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError, SetError
@@ -195,7 +194,7 @@ def test_smallest_feasible_rate_is_told_to_machines(shown, monkeypatch, tmp_path
     def refused(*_, **__):
         raise NotCertifiedError("no", ("a larger eta",), 0.73)
 
-    monkeypatch.setattr(report_module, "certify_detectability", refused)
+    monkeypatch.setattr(certification, "certify_detectability", refused)
     report = tmp_path / "failed.json"
     assert not shown(report=report, box="-2:2,-2:2")[0]
     told = json.loads(report.read_text())

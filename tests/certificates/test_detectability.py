@@ -112,7 +112,7 @@ def test_pairs_of_trajectories_keep_to_the_bound(name):
 
     # The contraction behind it, in one step.
     following, now = norm(dx[1:], found.P), norm(dx[:-1], found.P)
-    right = found.eta * now + norm(dw, found.W) + norm(dh, found.V)
+    right = found.eta * now + norm(dw, found.P) + norm(dh, found.V)
     assert np.all(following <= right * (1 + 1e-9))
 
 

@@ -123,7 +123,7 @@ def test_a_wrong_certificate_is_caught_by_closed_runs():
     attacks, _ = attack_estimator(certificate, trials=20, backends=["auto"], seed=2)
     weighted = certificate.of().window
     # Below what was reached, no factor may pass.
-    weighted.scales = weighted.scales * 0.8 * attacks["weighted"].ratio
+    weighted.scales[:] *= 0.8 * attacks["weighted"].ratio
     again, _ = attack_estimator(certificate, trials=20, backends=["auto"], seed=2)
     assert again["weighted"].refuted
     assert not again["paper"].refuted
@@ -160,6 +160,6 @@ def test_models_of_the_zoo_are_certified_and_not_refuted(name):
     pairs = attack_detectability(system, certificate.region, claim, trials=PAIRS)
     assert not pairs.refuted
     assert pairs.ratio > 0.1
-    attacks, lost = attack_estimator(certificate, trials=20, backends=["auto"])
+    attacks, lost = attack_estimator(certificate, trials=20, backends=["auto"], seed=1)
     assert not any(attack.refuted for attack in attacks.values())
-    assert lost < 20
+    assert lost < 40  # of 60, with those that were made worse

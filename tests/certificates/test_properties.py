@@ -60,7 +60,7 @@ def test_parts_of_the_same_serve_on_the_region_and_on_a_smaller_one(parts):
 def test_a_larger_region_is_refused(parts, which):
     system, observer, detected, observed = parts
     given = {"detectability": detected} if which == "detectability" else {"stability": observed}
-    with pytest.raises(MismatchError, match=rf"{which}.*x\[0\] in \[-0.99, 0.99\].*Certify it"):
+    with pytest.raises(MismatchError, match=rf"{which}.*x\[0\] <= 0.3 .*0.99.*Certify it"):
         certify(system, observer, COST, horizon=2, region=box(0.99), **given)
 
 
@@ -110,7 +110,7 @@ def test_a_larger_set_of_inputs_is_refused():
         "detectability": certify_detectability(system, box(1.0), inputs=box(0.1), eta=0.5),
         "stability": certify_observer(system, observer, box(1.0), inputs=box(0.1), rho=0.6),
     }
-    with pytest.raises(MismatchError, match=r"u\[0\] in \[-5, 5\]"):
+    with pytest.raises(MismatchError, match=r"u\[0\] <= 0.1 .* may be 5"):
         certify(system, observer, COST, horizon=2, region=box(1.0), inputs=box(5.0), **given)
     certificate = certify(
         system, observer, COST, horizon=2, region=box(1.0), inputs=box(0.05), **given
@@ -141,7 +141,7 @@ def test_a_system_that_only_behaves_alike_weakens_the_label(parts):
 
 def test_what_is_stated_by_hand_is_assumed(parts):
     _, _, detected, observed = parts
-    by_hand = Detectability(0.5, 1.0, 1.0, 1.0, detected.region)
+    by_hand = Detectability(0.5, 1.0, 1.0, 1.0, region=detected.region)
     assert by_hand.evidence is Evidence.ASSUMED
     assert replace(detected, c_w=0.5 * detected.c_w).evidence is Evidence.ASSUMED
     assert replace(detected, region=bounded_region(cubic(), box(9.0))).evidence is Evidence.ASSUMED
@@ -229,7 +229,7 @@ def test_containment_of_boxes_and_polytopes():
         told = beyond(region(inner), region(outer))
         # The diamond touches the square's sides, which rounding does not let be shown.
         assert told, (inner, outer)
-    assert "inequality" in beyond(region(square), region(diamond))
+    assert "1 x[0] + 1 x[1] <= 1 " in beyond(region(square), region(diamond))
 
 
 def test_containment_is_right_at_random():

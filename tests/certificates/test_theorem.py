@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from qpmhe.certificates.decay import DecayingSums, Sizes
+from qpmhe.certificates.decay import DecayingSums, Sizes, decaying_sums
 from qpmhe.certificates.theorem import theorem
 from qpmhe.costs import CostConstants
 from qpmhe.errors import OptionError, ShapeError
@@ -243,6 +243,15 @@ def admissible(rng, problem, ys, zs):
     return zs + move, allowed, *cost(zs + move)
 
 
+def lemma_bound(constants, start, w, v):
+    """The lemma's bound of the estimate's cost, (eq:lem_1), at t = 0, ..., T."""
+    C_p, C_w, C_v = constants.observer.constants
+    a, rho = constants.cost.exponent, constants.observer.rate
+    first = constants.rho_bar_1 * (C_p * start * rho ** np.arange(w.size + 1.0)) ** a
+    second = (C_w * decaying_sums(rho, w)) ** a + (C_v * decaying_sums(rho, v)) ** a
+    return constants.c_bar * (first + constants.rho_bar_2 * second)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_the_chain_of_the_proof_holds_link_by_link(seed):
     rng = np.random.default_rng(seed)
@@ -260,7 +269,7 @@ def test_the_chain_of_the_proof_holds_link_by_link(seed):
     start, lengths = abs(x[0] - z[0]), (np.abs(w), np.abs(v))
     slack = 1 + 1e-9
     assert (np.abs(x - z) <= slack * constants.observer.bound(start, *lengths)).all()
-    lemma = constants.cost_bound(start, *lengths)
+    lemma = lemma_bound(constants, start, *lengths)
     final = constants.result.bound(start, *lengths)
     # The bracket of (eq:bound_hat_x), and the misfit's bound (eq:proof_2).
     bracket = DecayingSums(rho, *(max(1.0, C) for C in constants.C_bar))
