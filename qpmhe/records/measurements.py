@@ -45,7 +45,7 @@ class Measurement:
 class RecordReader:
     """A CSV or Parquet file, or standard input; counts what it holds and skips.
 
-    `cut` is the last line, if it has no end; `blank` counts rows at the end that hold nothing.
+    `cut` is the last line, if it has no end; `blank` counts rows that hold nothing.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class RecordReader:
             self._columns = names.find(table.header, table.name, table.header_line)
         except InvalidInputError as error:
             if isinstance(error, RecordError):
-                error.args = (f"{error}{table.explain(names.find)}",)
+                error.args = (f"{error}{table.hint}",)
             table.close()
             raise
 
@@ -95,15 +95,10 @@ class RecordReader:
     def samples(self, held: Array | None = None) -> Iterator[Measurement]:
         """The samples in order of time; `held` are the inputs before the first one."""
         before: Measurement | None = None
-        blank: Row | None = None
         for row in self._table:
             if not "".join(row.fields).strip():
-                blank, self.blank = blank or row, self.blank + 1
+                self.blank += 1
                 continue
-            if blank is not None:
-                raise self.error(
-                    "the line is blank, and others follow it; delete it.", blank.line
-                )
             self.cut = None if row.ended else row.line
             time = self._value(row, self._columns.time, self._reader.time)
             if before is not None:
@@ -189,10 +184,8 @@ class ColumnNames:
     def find(self, header: Sequence[str], file: str, line: int | None = None) -> Columns:
         """The columns in a header; RecordError where one is missing or ambiguous."""
         table = _Header([name.strip() for name in header], file, line)
-        if self.time is not None:
-            time = table.exactly(self.time, "the time", "name it by --time.")
-        else:
-            time = table.guess(_TIMES, "the time", "name it by --time COLUMN.")
+        times = _TIMES if self.time is None else (self.time,)
+        time = table.find(times, "the time", "name it by --time COLUMN.")
         outputs = _find(table, "outputs", self.outputs, self.output_columns)
         inputs = _find(table, "inputs", self.inputs, self.input_columns)
         if all(position < 0 for position in outputs):
@@ -212,19 +205,16 @@ def _find(
     chosen = _chosen(option, given, letter, names)
     found = []
     for i, name in enumerate(names):
-        what = f"{option[:-1]} {name!r}"
-        remedy = f"name it by --{option} {letter}{i + 1}=COLUMN."
-        if i in chosen:
-            if not chosen[i] and option == "inputs":
-                raise OptionError(f"--inputs gives no column for {name!r}; inputs are needed.")
-            found.append(table.exactly(chosen[i], what, remedy) if chosen[i] else -1)
-            continue
-        guesses = [name, f"{letter}{i + 1}", f"{letter}_{i + 1}"]
-        if len(names) == 1:
-            guesses.append(letter)
+        guesses = [name, f"{letter}{i + 1}", f"{letter}_{i + 1}", *[letter] * (len(names) == 1)]
+        remedy = f"name it by --{option} {letter}{i + 1}=COLUMN"
         if option == "outputs":
-            remedy = f"{remedy[:-1]}, or leave it out by --outputs {letter}{i + 1}= (no column)."
-        found.append(table.guess(guesses, what, remedy))
+            remedy += f", or leave it out by --outputs {letter}{i + 1}= (no column)"
+        elif chosen.get(i) == "":
+            raise OptionError(f"--inputs gives no column for {name!r}; inputs are needed.")
+        wanted = [chosen[i]] if i in chosen else guesses
+        found.append(
+            -1 if wanted == [""] else table.find(wanted, f"{option[:-1]} {name!r}", f"{remedy}.")
+        )
     return tuple(found)
 
 
@@ -234,45 +224,31 @@ class _Header:
     file: str
     line: int | None
 
-    def exactly(self, name: str, what: str, remedy: str) -> int:
-        """The column of this very name, or of this name but for case."""
-        lower = [one.lower() for one in self.names]
-        for names, wanted in ((self.names, name), (lower, name.lower())):
-            if names.count(wanted) > 1:
-                raise RecordError(
-                    f"there are {names.count(wanted)} columns {name!r}; rename all but one.",
-                    self.file, self.line,
-                )
-            if wanted in names:
-                return names.index(wanted)
-        raise self._missing(f"column {name!r} for {what}", remedy)
-
-    def guess(self, names: Sequence[str], what: str, remedy: str) -> int:
-        """The column of the first of these names; units behind a column's name do not count."""
-        lower = [one.lower() for one in self.names]
-        bare = [_UNIT.sub("", one) for one in lower]
-        for name in names:
-            if name.lower() in lower:
-                return self.exactly(name, what, remedy)
-            found = [i for i, one in enumerate(bare) if one == name.lower()]
-            if len(found) == 1:
-                return found[0]
-            if found:
-                same = ", ".join(repr(self.names[i]) for i in found)
-                raise RecordError(f"{same} could all be {what}; {remedy}", self.file, self.line)
-        tried = ", ".join(map(repr, dict.fromkeys(names)))
-        raise self._missing(f"column for {what} (looked for {tried})", remedy)
-
-    def _missing(self, what: str, remedy: str) -> RecordError:
+    def find(self, wanted: Sequence[str], what: str, remedy: str) -> int:
+        """The column of the first of these names; case does not matter, nor a unit behind it."""
+        lower = [name.lower() for name in self.names]
+        bare = [_UNIT.sub("", name) for name in lower]
+        for name in wanted:
+            for names, one in ((self.names, name), (lower, name.lower()), (bare, name.lower())):
+                found = [i for i, each in enumerate(names) if each == one]
+                if len(found) == 1:
+                    return found[0]
+                if found:
+                    same = ", ".join(repr(self.names[i]) for i in found)
+                    raise RecordError(
+                        f"{len(found)} columns could all be {what}: {same}; rename all but one, "
+                        f"or {remedy}", self.file, self.line,
+                    )
+        tried = ", ".join(map(repr, dict.fromkeys(wanted)))
         shown = ", ".join(
             repr(name if len(name) <= _LETTERS_SHOWN else f"{name[:_LETTERS_SHOWN]}...")
             for name in self.names[:_NAMES_SHOWN]
         )
         if len(self.names) > _NAMES_SHOWN:
             shown += f" and {len(self.names) - _NAMES_SHOWN} more"
-        return RecordError(
-            f"there is no {what}; the columns are {shown}. If it is one of them, {remedy}",
-            self.file, self.line,
+        raise RecordError(
+            f"there is no column for {what} (looked for {tried}); the columns are {shown}. If it "
+            f"is one of them, {remedy}", self.file, self.line,
         )
 
 

@@ -139,13 +139,6 @@ class Output:
         except OSError as error:
             raise self._failed(error, " Name another place by --out.") from error
 
-    def discard(self) -> None:
-        """Remove a file that could not be begun, and its checkpoint."""
-        self.close()
-        for path in filter(None, (self.path, self.checkpoint)):
-            with contextlib.suppress(OSError):
-                path.unlink()
-
     def resume(self, offset: int, digest: str) -> None:
         """Open a file to continue after `offset` bytes, of which `digest` is known."""
         assert self.path is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,15 +18,20 @@ import numpy as np
 
 from .._checks import count
 from ..errors import InvalidInputError, OptionError
-from ..estimation.estimate import Status
+from ..estimation.estimate import Estimate, Status
 from .checkpoints import Checkpoint, CheckpointError, WriteError, load, save, versions
 from .measurements import ColumnNames, FieldReader, Measurement, RecordReader, seconds_between
 from .output import Output, RowFormat, standard_output_for_rows
-from .record_model import ModelFailures, RecordModel, load_record_model
-from .steps import OnlyGapsError, Step, Steps
+from .record_model import RecordModel, load_record_model
+from .steps import Step, Steps
 from .tables import RecordError
 
 _EVERY = 100
+# A mistake in the model's code, rather than a state at which it has no value.
+_MISTAKE = re.compile(
+    r" raised (TypeError|NameError|UnboundLocalError|AttributeError|ImportError|"
+    r"ModuleNotFoundError)\b| returned (?!not)"
+)
 
 
 @dataclass
@@ -120,8 +126,7 @@ def estimate_record(
         Whether steps must be equal also where the model takes any; whether to skip lines whose
         time repeats the line before.
     max_gap : int, optional
-        Most samples without measurement in a row. By default 1000, and a record that consists of
-        gaps of one size is refused: its unit of time is not the model's.
+        Most samples without measurement in a row, 500 by default.
     covariances, step_time : {"none", "std", "full"}, bool
         What to write of the covariances; whether to write the seconds of each step.
     resume, overwrite : bool
@@ -150,20 +155,12 @@ def estimate_record(
     CheckpointError
         If the checkpoint does not fit.
     InvalidInputError
-        If model, options or files do not fit, or a file exists already; nothing has been
-        written then.
+        If model, options or files do not fit, or a file exists already.
     """
     output = Output(out)
     _check_files(str(record), output)
     found = _found(output, resume, overwrite)
-    every = _EVERY if checkpoint_every is None else count("--checkpoint-every", checkpoint_every, 1)
-    if found is not None:
-        if checkpoint_every not in (None, found.every):
-            raise CheckpointError(
-                f"the checkpoint was made with --checkpoint-every {found.every}, not {every}; "
-                "leave the option out."
-            )
-        every = found.every
+    every = _samples_between(checkpoint_every, found)
     with contextlib.ExitStack() as stack:
         stack.callback(output.close)
         if output.path is None:  # neither a model nor a solver may print among the rows
@@ -182,8 +179,7 @@ def estimate_record(
         stack.callback(reader.close)
         identity = loaded.identity | {
             "dt": dt, "time_scale": time_scale, "equal_steps": equal_steps,
-            "max_gap": steps.max_gap, "states": list(loaded.states),
-            "covariances": covariances, "step_time": step_time,
+            "states": list(loaded.states), "covariances": covariances, "step_time": step_time,
         }
         session = _Session(
             loaded, rows, steps, reader, output, Checkpoint(identity, every),
@@ -207,11 +203,9 @@ def _check_files(record: str, output: Output) -> None:
 
 def _found(output: Output, resume: bool, overwrite: bool) -> Checkpoint | None:
     """The checkpoint to resume at, if that is wanted; no results are lost without asking."""
-    if output.checkpoint is None:
-        if resume:
-            raise OptionError("--resume needs a file: give --out a name in .csv or .parquet.")
-        return None
-    if overwrite:
+    if output.checkpoint is None and resume:
+        raise OptionError("--resume needs a file: give --out a name in .csv or .parquet.")
+    if output.checkpoint is None or overwrite:
         return None
     found = load(output.checkpoint)
     if found is None:
@@ -226,15 +220,26 @@ def _found(output: Output, resume: bool, overwrite: bool) -> Checkpoint | None:
         return None
     if resume:
         return found
-    if found.finished:
-        raise CheckpointError(
-            f"{output.name} holds a finished estimation; replace it by --overwrite, continue by "
-            "--resume if the record has grown, or give another --out."
-        )
+    state = "a finished estimation" if found.finished else "an estimation that was interrupted"
     raise CheckpointError(
-        f"{output.name} holds an estimation that was interrupted (its checkpoint was taken after "
-        f"{found.samples} samples); continue by --resume, or start again by --overwrite."
+        f"{output.name} holds {state} (its checkpoint was taken after {found.samples} samples); "
+        "continue by --resume (a finished one, if the record has grown), start again by "
+        "--overwrite, or give another --out."
     )
+
+
+def _samples_between(wanted: int | None, found: Checkpoint | None) -> int:
+    """How many samples lie between checkpoints: as before, if an estimation is resumed."""
+    if wanted is not None:
+        count("--checkpoint-every", wanted, 1)
+    if found is None:
+        return wanted or _EVERY
+    if wanted not in (None, found.every):
+        raise CheckpointError(
+            f"the checkpoint was made with --checkpoint-every {found.every}, not {wanted}; leave "
+            "the option out."
+        )
+    return found.every
 
 
 class _Session:
@@ -251,7 +256,6 @@ class _Session:
     ) -> None:
         self._mhe, self._rows, self._steps = model.estimator, rows, steps
         self._reader, self._output = reader, output
-        self._failures = ModelFailures(self._mhe.system, self._mhe.horizon, model.file)
         self._report, self._progress = report, progress
         self._summary = Summary()
         self._inserted = 0  # since the last row
@@ -289,7 +293,6 @@ class _Session:
             self._save()  # no row is in the file without a checkpoint beside it
             self._output.write(self._rows.header)
         except WriteError as error:
-            self._output.discard()
             raise WriteError(f"{error} Make room, or name another place by --out.") from error
         return self._reader.samples(), None
 
@@ -307,13 +310,8 @@ class _Session:
             )
         last = self._last_sample(found)
         samples = reader.samples(last.u if last is not None and reader.is_stream else None)
-        if not reader.is_stream:
-            self._skip_known(samples, found)
-        elif last is not None:
-            samples = self._after(samples, last)
-        if reader.is_stream or last is None:
-            # The only row of a file that was cut off may have a time that was cut off, too.
-            samples = self._check_rows(samples, found, 1 if reader.is_stream else 2)
+        first = self._skip_known(samples, found, last)
+        self._check_rows(first, found)
         self._digest = found.samples_digest
         self._summary.before = found.samples
         if found.versions != versions():
@@ -325,9 +323,9 @@ class _Session:
             self._begin()
         else:
             output.resume(found.offset, found.results_digest)
-            self._steps.resume(found.usual_step)
+            self._steps.usual = found.usual_step
             self._newest, self._is_saved = found, True
-        return samples, last
+        return samples if first is None else chain((first,), samples), last
 
     def _last_sample(self, found: Checkpoint) -> Measurement | None:
         """Restore the estimator; the last sample that it knows."""
@@ -343,51 +341,45 @@ class _Session:
             ) from error
         return Measurement(0, time, np.empty(0), inputs)
 
-    def _skip_known(self, samples: Iterator[Measurement], found: Checkpoint) -> None:
-        """Skip the samples that the checkpoint knows, and compare them with it."""
+    def _skip_known(
+        self, samples: Iterator[Measurement], found: Checkpoint, last: Measurement | None
+    ) -> Measurement | None:
+        """The first sample after the checkpoint; those before must be the same in a file."""
         name, digest = self._reader.name, ""
-        for number in range(found.samples):
-            sample = next(samples, None)
-            if sample is None:
-                raise CheckpointError(
-                    f"{name} has {number} samples, and the checkpoint was taken after "
-                    f"{found.samples}; give the same record."
-                )
+        first = None
+        for sample in samples:
+            if last is None or (
+                sample.time.kind == last.time.kind and sample.time.value > last.time.value
+            ):
+                first = sample
+                break
             digest = _digest(digest, sample)
-        if digest != found.samples_digest:
+        if not self._reader.is_stream and digest != found.samples_digest:
             raise CheckpointError(
                 f"the first {found.samples} samples of {name} are not those of the checkpoint (or "
                 "other columns are read); give the same record and columns, or start again by "
                 "--overwrite."
             )
-        self._reader.held = self._reader.repeated = 0
+        return first
 
-    def _after(self, samples: Iterator[Measurement], last: Measurement) -> Iterator[Measurement]:
-        for sample in samples:
-            if sample.time.kind != last.time.kind:
-                raise CheckpointError(
-                    f"the times of {self._reader.name} are of another kind than {last.time.text} "
-                    "in the results; give the same record, or start again by --overwrite."
-                )
-            if sample.time.value > last.time.value:
-                yield sample
-
-    def _check_rows(
-        self, samples: Iterator[Measurement], found: Checkpoint, least: int
-    ) -> Iterator[Measurement]:
-        """The same samples, if they give the rows again that the checkpoint does not know."""
-        first, times = next(samples, None), self._output.times_after(found.offset)
-        if len(times) >= least:
-            due = FieldReader(".").time(times[0])
-            if first is None or first.time.kind != due.kind or first.time.value > due.value:
-                known = f"those up to {found.time}" if found.samples else "no sample"
-                raise CheckpointError(
-                    f"{self._reader.name} does not contain the sample of time {times[0]}; its row "
-                    f"and those after it would be lost, since the checkpoint knows {known}. Give "
-                    "the record from there, or from its beginning; or another --out; or start "
-                    "again by --overwrite."
-                )
-        return samples if first is None else chain((first,), samples)
+    def _check_rows(self, first: Measurement | None, found: Checkpoint) -> None:
+        """Raise where a record lacks samples whose rows the checkpoint does not know."""
+        is_stream = self._reader.is_stream
+        if found.samples and not is_stream:
+            return
+        times = self._output.times_after(found.offset)
+        # The only row of a file that was cut off may have a time that was cut off, too.
+        if len(times) < (1 if is_stream else 2):
+            return
+        due = FieldReader(".").time(times[0])
+        if first is None or first.time.kind != due.kind or first.time.value > due.value:
+            known = f"those up to {found.time}" if found.samples else "no sample"
+            raise CheckpointError(
+                f"{self._reader.name} does not contain the sample of time {times[0]}; its row "
+                f"and those after it would be lost, since the checkpoint knows {known}. Give "
+                "the record from there, or from its beginning; or another --out; or start "
+                "again by --overwrite."
+            )
 
     def _estimate(self, samples: Iterator[Measurement], last: Measurement | None) -> None:
         waits = self._steps.any_length
@@ -423,14 +415,28 @@ class _Session:
 
     def _update(self, y: Any, sample: Measurement, length: float | None) -> Any:
         estimate = self._mhe.update(y, sample.u if sample.u.size else None, dt=length)
-        if self._failures.note(estimate, sample.u, length):
-            self._failures.place = self._reader.place(sample)
-            if self._report is not None:
-                self._report(
-                    f"the model failed at {self._failures.reason} The run continues; the status "
-                    "marks such rows."
-                )
+        if Status.MODEL_FAILED in estimate.status:
+            self._count_failure(estimate, sample)
+        else:
+            self._summary.stale += Status.FAILED_STAGE in estimate.status
         return estimate
+
+    def _count_failure(self, estimate: Estimate, sample: Measurement) -> None:
+        summary, is_mistake = self._summary, bool(_MISTAKE.search(estimate.message))
+        summary.model_is_wrong |= is_mistake
+        summary.failed += 1
+        if summary.failed > 1:
+            return
+        remedy = (
+            "Correct the model." if is_mistake
+            else "Bound the states, or make the model defined on all of them."
+        )
+        summary.failure = f"{self._reader.place(sample)}: {estimate.message} {remedy}"
+        if self._report is not None:
+            self._report(
+                f"the model failed at {summary.failure} The run continues; the status marks such "
+                "rows."
+            )
 
     def _advance(self, sample: Measurement, length: float | None) -> None:
         """Estimate a sample, and write its row."""
@@ -445,7 +451,7 @@ class _Session:
         self._digest = _digest(self._digest, sample)
         if self._taken % self._newest.every == 0:
             state = self._mhe.state_dict()  # in any case: the solver forgets its warm start
-            if sample.complete and self._steps.settled:
+            if sample.complete:
                 self._newest = replace(
                     self._newest, samples=self._taken, offset=self._output.offset,
                     time=sample.time.text, inputs=sample.u.tolist(), state=state,
@@ -470,16 +476,25 @@ class _Session:
         there = f" The {self._taken} samples before are in {self._output.name}; "
         if isinstance(error, WriteError):
             return f"{there}make room, and continue by --resume."
-        if isinstance(error.__cause__, OnlyGapsError):
-            return f"{there}start again by --overwrite."
         return f"{there}correct the record, and continue by --resume."
 
     def _finished(self) -> Summary:
-        reader, summary, failures = self._reader, self._summary, self._failures
+        reader, summary = self._reader, self._summary
         summary.held, summary.repeated = reader.held, reader.repeated
-        summary.failed, summary.stale = failures.failed, failures.stale
-        summary.failure = failures.report(summary.samples + summary.inserted)
-        summary.model_is_wrong = failures.is_mistake
+        if summary.failed:
+            stale = (
+                f", which affects the windows of {summary.stale} more (FAILED_STAGE)"
+                if summary.stale else ""
+            )
+            summary.failure = (
+                f"the model failed at {summary.failed} of {summary.samples + summary.inserted} "
+                f"samples (MODEL_FAILED){stale}, first at {summary.failure}"
+            )
+        if summary.inserted > summary.samples:
+            summary.notes.append(
+                f"{summary.inserted} samples were inserted into gaps, more than were measured; "
+                "give --time-scale if the record's unit of time is not the model's."
+            )
         if reader.cut is not None:
             summary.notes.append(
                 f"the last line of {reader.name}, {reader.cut}, has no end of line and may be cut "
@@ -487,7 +502,7 @@ class _Session:
             )
         if reader.blank:
             summary.notes.append(
-                f"{reader.blank} rows without any value at the end of {reader.name} were skipped."
+                f"{reader.blank} rows without any value of {reader.name} were skipped."
             )
         return summary
 

@@ -13,13 +13,8 @@ from ..model.system import System
 _JITTER = 0.3
 # Steps that differ by less are equal: times are rounded.
 _ROUNDING = 1e-6
-_MAX_GAP = 1000
-# So many steps at the beginning must not be gaps of one size; sizes that differ by less are one.
-_TRIAL, _SIZE_TOLERANCE = 3, 0.1
-
-
-class OnlyGapsError(ValueError):
-    """A record whose unit of time is probably not the model's."""
+# Milliseconds taken for seconds are gaps of 999.
+_MAX_GAP = 500
 
 
 class Step(NamedTuple):
@@ -38,8 +33,6 @@ class Steps:
     ) -> None:
         self._scale = positive("--time-scale", scale)
         self.max_gap = _MAX_GAP if max_gap is None else count("--max-gap", max_gap, 0)
-        # Numbers of steps between samples, until it is clear that the unit of time fits.
-        self._trial: list[int] | None = [] if max_gap is None else None
         self.any_length = not equal and _takes_lengths(system)
         self.usual = system.dt if usual is None else positive("--dt", usual)
         if system.dt is not None and not math.isclose(
@@ -49,15 +42,6 @@ class Steps:
                 f"--dt is {usual!r}, and the model's own step {system.dt}; leave --dt out, or "
                 "make the model with that step."
             )
-
-    @property
-    def settled(self) -> bool:
-        """Whether it is clear that the record's unit of time is the model's."""
-        return self._trial is None
-
-    def resume(self, usual: float | None) -> None:
-        """Continue within a record, of which the usual step is known."""
-        self.usual, self._trial = usual, None
 
     def between(self, spacing: float, magnitude: float) -> Step:
         """The step from one sample to the next, whose times differ by `spacing`.
@@ -75,7 +59,6 @@ class Steps:
                 f"{self.max_gap} samples in a row may be missing. Split the record there, raise "
                 "--max-gap, or give --time-scale if the record's unit of time is not the model's"
             )
-        self._try(number)
         each = length / number
         rounding = _ROUNDING * self.usual + 4e-16 * magnitude * self._scale
         if self.any_length:
@@ -87,24 +70,6 @@ class Steps:
                 "the model by System.from_ode, which takes steps of any length"
             )
         return Step(None, number - 1)
-
-    def _try(self, number: int) -> None:
-        if self._trial is None:
-            return
-        self._trial.append(number)
-        if len(self._trial) < _TRIAL:
-            return
-        trial, self._trial = self._trial, None
-        size = sorted(trial)[_TRIAL // 2]
-        if size < 2 or any(abs(one - size) > _SIZE_TOLERANCE * size for one in trial):
-            return
-        assert self.usual is not None
-        raise OnlyGapsError(
-            f"the record begins with nothing but gaps of about {size} usual steps, "
-            f"{self.usual:.6g} each; give --time-scale {self._scale / size:.4g} or so if its unit "
-            "of time is not the model's, or a model (or --dt) with another usual step; if the "
-            f"samples really are that rare, give --max-gap {max(trial)} or more"
-        )
 
 
 def _takes_lengths(system: System) -> bool:

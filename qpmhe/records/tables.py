@@ -6,8 +6,6 @@ import contextlib
 import csv
 import gzip
 import io
-import itertools
-import math
 import os
 import re
 import stat
@@ -22,10 +20,6 @@ from ..errors import InvalidInputError, OptionError
 # Before the comma, which occurs within names and numbers, too.
 _SEPARATORS = {"\t": "tab", ";": "semicolon", "|": "bar", ",": "comma"}
 _SEPARATOR_NAMES = {name: mark for mark, name in _SEPARATORS.items()} | {"space": " "}
-# A quotation mark that is never closed must not swallow the record, nor keep a pipe waiting.
-_LINES_PER_ROW = 20
-# A header is looked for below so many lines.
-_PREAMBLE = 50
 _BATCH = 4096
 
 _GZIP, _PARQUET = b"\x1f\x8b", b"PAR1"
@@ -120,60 +114,37 @@ class CsvTable:
             )
         self.position = self.line = 0
         self.close: Callable[[], None] = stream.close
-        self._row_begins: float = math.inf
-        self._ended = True
-        self._lines = self._read_lines()
-        text = next(filter(str.strip, self._lines), None)
+        self._lines = filter(str.strip, self._read_lines())
+        text = next(self._lines, None)
         note = re.fullmatch(r"\s*sep=(.)\s*", text or "", re.IGNORECASE)
         if note:  # a spreadsheet writes its separator above the header
             self._separator = self._separator or note[1]
-            text = next(filter(str.strip, self._lines), None)
+            text = next(self._lines, None)
         if text is None:
             raise RecordError("it is empty; expected a header with the columns' names.", name)
-        if "\r" in text.rstrip("\r\n"):
-            raise RecordError(
-                "its lines end in CR alone; convert them to LF, as by tr '\\r' '\\n'.", name
-            )
-        self._separator, self.header = self._split_header(text)
+        if self._separator is None:  # the first that separates anything
+            self._separator = next((mark for mark in _SEPARATORS if mark in text), ",")
+        self.header = self._split(text)
         self.header_line = self.line
         if all(map(_is_number, self.header)):
             raise RecordError(
                 "it begins with numbers; expected a header with the columns' names above them.",
                 name, self.line,
             )
+        word = _SEPARATORS.get(self._separator, repr(self._separator))
+        #: What an error of the columns adds.
+        self.hint = (
+            f" The separator is taken to be {word}; choose another one by --separator. Delete "
+            "lines above the header, and comments."
+        )
 
     def __iter__(self) -> Iterator[Row]:
-        assert self._separator is not None
-        reader = csv.reader(self._lines, delimiter=self._separator, strict=True)
         width = len(self.header)
-        while True:
-            self._row_begins = line = self.line + 1
-            try:
-                fields = next(reader)
-            except StopIteration:
-                return
-            except csv.Error as error:
-                raise self._unbalanced(error, line) from error
+        for text in self._lines:
+            fields, ended = self._split(text), text.endswith(("\n", "\r"))
             if len(fields) != width:
-                if len(fields) < 2 and not "".join(fields).strip():
-                    continue
-                fields = self._fitted(fields, line)
-            yield Row(line, fields, self._ended)
-
-    def explain(self, find: Callable[..., Any]) -> str:
-        """What to add to an error of `find(header, file, line)`, which finds the columns."""
-        word = _SEPARATORS.get(self._separator or "", repr(self._separator))
-        hint = f" The separator is taken to be {word}; choose another one by --separator."
-        if self.name != "standard input":  # a pipe would keep waiting
-            for text in itertools.islice(self._lines, _PREAMBLE):
-                try:
-                    find(self._split_header(text)[1], self.name, self.line)
-                except RecordError:
-                    continue
-                return f"{hint} Line {self.line} looks like the header; delete the lines above it."
-        if _is_comment(self.header):
-            return f"{hint} Comments above the header are not supported; delete them."
-        return hint
+                fields = self._fitted(fields, ended)
+            yield Row(self.line, fields, ended)
 
     def _read_lines(self) -> Iterator[str]:
         while True:
@@ -192,59 +163,45 @@ class CsvTable:
                 if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
                     raise RecordError("it is in UTF-16; save it as UTF-8.", self.name)
                 raw = raw.removeprefix(b"\xef\xbb\xbf")
-            if self.line - self._row_begins > _LINES_PER_ROW:
-                raise self._unbalanced(
-                    f"a field has more than {_LINES_PER_ROW} lines", int(self._row_begins)
-                )
             try:
-                text = raw.decode(self._encoding)
+                yield raw.decode(self._encoding)
             except UnicodeDecodeError as error:
                 raise RecordError(
                     f"byte {error.start + 1} of the line is not {self._encoding}; save the "
                     "record as UTF-8, or give --encoding (cp1252 is usual in Western Europe).",
                     self.name, self.line,
                 ) from None
-            self._ended = text.endswith(("\n", "\r"))
-            yield text
 
-    def _split_header(self, text: str) -> tuple[str, list[str]]:
-        """The separator and the names; the separator is the first that separates anything."""
-        marks = list(_SEPARATORS) if self._separator is None else [self._separator]
-        mark = next((mark for mark in marks if mark in text), self._separator or ",")
-        return mark, self._split(text.rstrip("\r\n"), mark)
-
-    def _split(self, text: str, separator: str) -> list[str]:
+    def _split(self, text: str) -> list[str]:
+        assert self._separator is not None
         try:
-            return next(csv.reader([text], delimiter=separator, strict=True), [""])
+            return next(csv.reader([text], delimiter=self._separator, strict=True), [""])
         except csv.Error as error:
-            raise self._unbalanced(error, self.line) from error
+            raise RecordError(
+                f"it cannot be split into fields ({error}); close quotation marks on the line "
+                "where they open, and end lines in LF or CR LF.", self.name, self.line,
+            ) from error
 
-    def _unbalanced(self, reason: Any, line: int) -> RecordError:
-        return RecordError(
-            f"its quotation marks are not balanced ({reason}); close each one that is open.",
-            self.name, line,
-        )
-
-    def _fitted(self, fields: list[str], line: int) -> list[str]:
+    def _fitted(self, fields: list[str], ended: bool) -> list[str]:
         """The fields of a line that has more or fewer than the header."""
         width, found = len(self.header), len(fields)
         if found > width and not "".join(fields[width:]).strip():
             return fields[:width]
-        if not self._ended and found < width:
+        if not ended and found < width:
             raise RecordError(
                 f"the last line is cut off: it has {found} of {width} fields and no end of line. "
-                "Complete or delete it.", self.name, line,
+                "Complete or delete it.", self.name, self.line,
             )
-        what = f"it has {found} field{'s' if found > 1 else ''}, and the header {width}; "
-        remedy = "correct the line."
-        if _is_comment(fields):
-            remedy = "comments are not supported; delete such lines."
-        elif self._separator == "," and found > width:
+        remedy = "correct the line, or delete it if it is a comment."
+        if self._separator == "," and found > width:
             remedy = (
                 "correct the line; numbers with decimal commas need quotation marks or another "
                 "separator."
             )
-        raise RecordError(what + remedy, self.name, line)
+        raise RecordError(
+            f"it has {found} field{'s' if found > 1 else ''}, and the header {width}; {remedy}",
+            self.name, self.line,
+        )
 
 
 class ParquetTable:
@@ -252,6 +209,7 @@ class ParquetTable:
 
     unit = "row"
     header_line = None
+    hint = ""
 
     def __init__(self, name: str) -> None:
         self._arrow = need("pyarrow", "a Parquet file")
@@ -284,10 +242,6 @@ class ParquetTable:
                 self.position += 1
                 yield Row(self.position, list(values), True)
 
-    def explain(self, find: Callable[..., Any]) -> str:
-        """Nothing to add: a Parquet file has its columns in one place."""
-        return ""
-
     def _texts(self, column: Any) -> list[str]:
         """Values as a CSV file would have them; all digits of floats, nanoseconds of dates."""
         if self._arrow.types.is_timestamp(column.type):
@@ -295,10 +249,6 @@ class ParquetTable:
         elif self._arrow.types.is_boolean(column.type):
             column = column.cast(self._arrow.int8())
         return ["" if value is None else str(value) for value in column.to_pylist()]
-
-
-def _is_comment(fields: list[str]) -> bool:
-    return fields[0].lstrip().startswith(("#", "//", "%"))
 
 
 def _is_number(field: str) -> bool:

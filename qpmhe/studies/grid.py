@@ -7,7 +7,6 @@ are relative to the file.
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +19,7 @@ from qpmhe_solvers import available, backend
 from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import integer, shown
 
-from .._checks import count, dimension, positive
+from .._checks import choice, count, dimension, flag, positive
 from ..errors import BackendError, InvalidInputError, OptionError
 from ..models.loading import ModelSource, find, load
 from .cell import OBSERVER, Cell
@@ -119,22 +118,23 @@ class Study:
     def from_toml(cls, path: str | Path) -> Study:
         """Read a study from the TOML file ``path``, and check it before anything runs.
 
-        Its keys are the parameters of this class, without ``folder``. A `StudyError` names the file
-        and the line of what does not fit.
+        Its keys are the parameters of this class, without ``folder``. A `StudyError` names the
+        file, the key and the value that does not fit.
         """
         path = Path(path)
-        text = _read(path)
-        lines = text.splitlines()
         try:
-            found = tomllib.loads(text)
+            found = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise StudyError(f"cannot read the study file {path}: {error.strerror}.") from error
+        except UnicodeDecodeError as error:
+            raise StudyError(f"the study file {path} is no text in UTF-8 ({error}).") from error
         except tomllib.TOMLDecodeError as error:
-            words = str(error).replace("end of document", f"line {len(lines)}, the end")
-            raise StudyError(f"the study file {path} is no valid TOML: {words}.") from error
+            raise StudyError(f"the study file {path} is no valid TOML: {error}.") from error
         for key in found:
             if key not in _CHECKS:
                 near = get_close_matches(key, _CHECKS, 1)
                 raise StudyError(
-                    f"{_place(path, lines, key)}: unknown key {key!r}; expected some of "
+                    f"{path}: unknown key {key!r}; expected some of "
                     f"{', '.join(_CHECKS)}.{f' Did you mean {near[0]}?' if near else ''}"
                 )
         if not found:
@@ -143,12 +143,14 @@ class Study:
                 "what is left out has its default."
             )
         options = {key: _translated(key, value) for key, value in found.items()}
-        for key, value in options.items():
-            _check_items(path, lines, key, value)
         try:
             return cls(**options, folder=path.parent)
         except InvalidInputError as error:
-            raise StudyError(f"{path}: {error}") from error
+            words = str(error)
+            for key, word in WORDS.items():
+                if words.startswith(f"{key} is "):
+                    words = words.replace(" None ", f' "{word}" ')
+            raise StudyError(f"{path}: {words}") from error
 
     def settings(self) -> dict[str, Any]:
         """The grid as plain lists and numbers; what the store keeps of it."""
@@ -180,15 +182,6 @@ class Study:
         return tuple(made)
 
 
-def _read(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise StudyError(f"cannot read the study file {path}: {error.strerror}.") from error
-    except UnicodeDecodeError as error:
-        raise StudyError(f"the study file {path} is no text in UTF-8 ({error}).") from error
-
-
 def _translated(key: str, value: Any) -> Any:
     """A value of a file with None in place of the words."""
     word = WORDS.get(key)
@@ -197,38 +190,6 @@ def _translated(key: str, value: Any) -> Any:
     return [None if item == word else item for item in (
         value if isinstance(value, list) else [value]
     )]
-
-
-def _check_items(path: Path, lines: list[str], key: str, value: Any) -> None:
-    """Check the items of an option one by one, so that the error names the line."""
-    several = isinstance(value, list) and len(value) > 0
-    for item in value if several else [value]:
-        try:
-            _CHECKS[key]([item] if several else item)
-            if key == "models":
-                load(find(item, path.parent))
-        except InvalidInputError as error:
-            words = str(error)
-            if key in WORDS:
-                words = words.replace(" None ", f' "{WORDS[key]}" ')
-            raise StudyError(f"{_place(path, lines, key, item)}: {words}") from error
-
-
-def _place(path: Path, lines: list[str], key: str, item: Any = None) -> str:
-    """File and line of a key, or of an item of its value, which tomllib does not keep."""
-    begins = re.compile(rf"""\s*(\[+\s*)?["']?{re.escape(key)}["']?\s*(=|\]|\.)""")
-    other = re.compile(r"""\s*["']?[A-Za-z0-9_-]+["']?\s*=""")
-    first = next((i for i, line in enumerate(lines) if begins.match(line)), None)
-    if first is None:
-        return str(path)
-    value = item if isinstance(item, str) else repr(item).lower()
-    for i in range(first, len(lines)):
-        if i > first and other.match(lines[i]):
-            break
-        text = lines[i].partition("=")[2] if i == first else lines[i]
-        if item is not None and re.search(rf"(?<![\w.]){re.escape(value)}(?![\w.])", text):
-            return f"{path}, line {i + 1}"
-    return f"{path}, line {first + 1}"
 
 
 def _distinct(values: Iterable[Any]) -> tuple[Any, ...]:
@@ -279,9 +240,7 @@ def _numbers(name: str, least: int, nothing: str) -> Callable[[Any], tuple[int |
 
 def _starts(value: Any) -> tuple[str, ...]:
     items = _several("starts", value, "expected 'candidate' or 'best'")
-    for item in items:
-        _one_of("starts", item, get_args(Start))
-    return _distinct(items)
+    return _distinct(choice("starts", item, get_args(Start)) for item in items)
 
 
 def _seeds(value: Any) -> tuple[int, ...]:
@@ -289,20 +248,6 @@ def _seeds(value: Any) -> tuple[int, ...]:
         return tuple(range(dimension("seeds", value, 1)))
     items = _several("seeds", value, "give a number of seeds, or some of them")
     return _distinct(count("seeds", item, 0) for item in items)
-
-
-def _one_of(name: str, value: Any, known: Sequence[str]) -> str:
-    if not (isinstance(value, str) and value in known):
-        raise StudyError(
-            f"{name} is {shown(value)}; expected one of {', '.join(repr(item) for item in known)}."
-        )
-    return str(value)
-
-
-def _switch(value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise StudyError(f"covariances is {shown(value)}; expected True or False.")
-    return value
 
 
 # The check of each option, in order; each returns the value in its standard form.
@@ -315,8 +260,8 @@ _CHECKS: dict[str, Callable[[Any], Any]] = {
     "starts": _starts,
     "seeds": _seeds,
     "steps": lambda value: None if value is None else dimension("steps", value, 1),
-    "measure": lambda value: _one_of("measure", value, get_args(Measure)),
+    "measure": lambda value: choice("measure", value, get_args(Measure)),
     "deadline": lambda value: None if value is None else positive("deadline", value),
-    "covariances": _switch,
+    "covariances": lambda value: flag("covariances", value),
     "cell_timeout": lambda value: positive("cell_timeout", value),
 }

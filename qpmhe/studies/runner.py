@@ -308,14 +308,14 @@ def _tasks(
     for cell in study.cells():
         first = cell.configuration not in seen
         seen.add(cell.configuration)
-        missing = wanted - present.get(cell.key, frozenset())
-        if not missing:
+        known = present.get(cell.key, frozenset())
+        if wanted <= known:
             found += 1
             continue
         registered = None if cell.backend == OBSERVER else backend(cell.backend)
         tasks.append(
             Task(
-                cell, sources[cell.model], missing, study.cell_timeout,
+                cell, sources[cell.model], wanted | known, study.cell_timeout,
                 keep=first, shared=shared, registered=registered,
             )
         )

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
-from dataclasses import fields
+from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,13 +15,12 @@ import numpy as np
 
 from .._checks import checked_path, need
 from ..errors import InvalidInputError, OptionError, QpmheError
-from .cell import Cell
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 #: Version of the tables, and of what their columns mean.
-SCHEMA = 2
+SCHEMA = 3
 # Distinguishes our files from other SQLite files: "qpmh".
 _APPLICATION = 0x71706D68
 # Seconds to wait for another program's lock.
@@ -41,29 +38,26 @@ COLUMNS = {
     "times": "BLOB", "shared": "INTEGER", "environment": "INTEGER", "finished": "TEXT",
     "parts": "TEXT",
 }
-# Columns that only one part of a measurement fills; the others come with each.
-_PARTS = {
-    "accuracy": ("cost_ratio",),
-    "time": ("time_median", "time_p95", "time_p99", "time_max", "times", "shared"),
-    "covariance": ("nees",),
-}
 _JSON = ("rmse_states", "rmse_settled_states", "reasons")
-_REAL = tuple(name for name, kind in COLUMNS.items() if kind == "REAL")
-_SHARES = ("improved", "kept", "fallback", "cap_hits")
+_ARRAYS = ("times", "states", "estimates")
 _TYPES = {
-    **dict.fromkeys((*_REAL, "late"), "float64"),
+    **{name: "float64" for name, kind in COLUMNS.items() if kind == "REAL"},
     **dict.fromkeys(("qps", "solver_iterations"), "Int64"),
     **dict.fromkeys(("horizon", "seed", "steps", "environment"), "int64"),
-    **dict.fromkeys(
-        ("key", "model", "backend", "start", "outcome", "reason", "finished"), "object"
-    ),
+    "shared": "bool",
 }
 _TABLES = (
     f"CREATE TABLE cells ({', '.join(f'{name} {kind}' for name, kind in COLUMNS.items())})",
     "CREATE TABLE environments (id INTEGER PRIMARY KEY, settings TEXT UNIQUE)",
     "CREATE TABLE studies (id INTEGER PRIMARY KEY, settings TEXT, started TEXT)",
     "CREATE TABLE models (name TEXT PRIMARY KEY, fingerprint TEXT)",
-    "CREATE TABLE trajectories (key TEXT PRIMARY KEY, header TEXT, numbers BLOB)",
+    "CREATE TABLE trajectories (key TEXT PRIMARY KEY, content TEXT)",
+)
+# What failed takes nothing away from what is there.
+_PUT = (
+    f"INSERT INTO cells ({', '.join(COLUMNS)}) VALUES ({', '.join('?' * len(COLUMNS))}) "
+    f"ON CONFLICT (key) DO UPDATE SET {', '.join(f'{name} = excluded.{name}' for name in COLUMNS)} "
+    "WHERE excluded.outcome = 'done' OR cells.outcome = 'failed'"
 )
 _LOCKED = "another program has locked it; close that, then give the same command again"
 _DAMAGED = (
@@ -79,9 +73,6 @@ _REMEDIES = {
     ),
     "SQLITE_IOERR": "the disk does not read or write; give the same command again when it works",
     "SQLITE_CANTOPEN": "it cannot be opened; check that the folder exists and can be written",
-    "SQLITE_CORRUPT": _DAMAGED,
-    "SQLITE_ERROR": _DAMAGED,  # a table or column that we made is not there
-    "": _DAMAGED,  # text that cannot be decoded
     "SQLITE_NOTADB": "it is no SQLite file and was left as it is; name another",
 }
 
@@ -120,21 +111,25 @@ class Store:
         - environment (index into ``meta()["environments"]``) and finished (UTC).
         """
         pandas = need("pandas", "a data frame of results")
-        names = [name for name in COLUMNS if name != "parts"]
         with _reading(self.path) as connection:
-            found = connection.execute(f"SELECT {', '.join(names)} FROM cells ORDER BY rowid")
-            rows = [_checked(dict(zip(names, row, strict=True))) for row in found]
+            found = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM cells ORDER BY rowid")
             last = connection.execute(
                 "SELECT settings FROM studies ORDER BY id DESC LIMIT 1"
             ).fetchone()
             deadline = json.loads(last[0])["deadline"] if last else None
-            for row in rows:
-                measured = row["times"] is not None and deadline is not None
-                row["late"] = float((row["times"] > deadline).mean()) if measured else float("nan")
-            names.insert(names.index("times"), "late")
-            columns = {name: [row[name] for row in rows] for name in names}
-            frame = pandas.DataFrame(columns, columns=names).astype(_TYPES)
-            whole: DataFrame = frame.assign(shared=frame["shared"].astype("bool"))
+            frame = pandas.DataFrame(found.fetchall(), columns=[*COLUMNS], dtype=object)
+            frame["shared"] = frame["shared"].eq(1)
+            frame = frame.astype(_TYPES).drop(columns="parts")
+            for name in _JSON:
+                frame[name] = [None if text is None else json.loads(text) for text in frame[name]]
+            times = [None if one is None else np.frombuffer(one, "f4") for one in frame["times"]]
+            late = [
+                float("nan") if one is None or deadline is None else float((one > deadline).mean())
+                for one in times
+            ]
+            frame["times"] = pandas.Series(times, dtype=object)
+            frame.insert(frame.columns.get_loc("times"), "late", pandas.Series(late, dtype=float))
+        whole: DataFrame = frame
         return whole
 
     def meta(self) -> dict[str, Any]:
@@ -163,27 +158,29 @@ class Store:
         """
         with _reading(self.path) as connection:
             found = connection.execute(
-                "SELECT header, numbers FROM trajectories WHERE key = ?", (key,)
+                "SELECT content FROM trajectories WHERE key = ?", (key,)
             ).fetchone()
-            return None if found is None else _unpacked(*found)
+            if found is None:
+                return None
+            content: dict[str, Any] = json.loads(found[0])
+            return content | {name: np.array(content[name], float) for name in _ARRAYS}
 
     @contextmanager
     def writing(self) -> Iterator[Writer]:
-        """Open for writing, one process at a time; the file is made if it does not exist.
+        """Open for writing; the file is made if it does not exist.
 
-        Raises `StoreError` if it is no store of this version, damaged, read-only, or another study
-        writes.
+        Raises `StoreError` if it is no store of this version, damaged or read-only.
         """
         _check_file(self.path)
-        with (
-            _alone(self.path), _explained(self.path),
-            closing(_connect(self.path, "rwc")) as connection,
-        ):
-            _check(connection, self.path, empty=True)
-            (answer,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-            if answer != "ok":
-                raise StoreError(f"the store {self.path}: {_DAMAGED} ({answer}).")
-            _create(connection)
+        with _explained(self.path):
+            opened = _connect(self.path, "rwc")
+        with closing(opened) as connection:
+            with _explained(self.path):
+                _check(connection, self.path, empty=True)
+                (answer,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+                if answer != "ok":
+                    raise ValueError(answer)
+                _create(connection)
             yield Writer(self.path, connection)
 
 
@@ -216,22 +213,27 @@ class Writer:
     def present(self, retry_failed: bool) -> dict[str, frozenset[str]]:
         """The parts that each cell has; if failed cells are to be retried, without those."""
         where = "WHERE outcome = 'done'" if retry_failed else ""
-        with _explained(self._path), _undamaged(self._path):
+        with _explained(self._path):
             rows = self._connection.execute(f"SELECT key, parts FROM cells {where}").fetchall()
             return {key: frozenset(parts.split(",")) for key, parts in rows}
 
     def put(self, result: dict[str, Any]) -> None:
-        """Store what `qpmhe.studies.cell.compute` gives."""
+        """Store what `qpmhe.studies.cell.compute` gives, in place of an earlier result."""
         connection = self._connection
+        row = {name: result.get(name) for name in COLUMNS}
+        row |= {name: json.dumps(row[name]) for name in _JSON if row[name] is not None}
+        row["parts"], row["finished"] = ",".join(sorted(result["parts"])), _now()
+        if row["times"] is not None:
+            row["times"] = np.asarray(row["times"], "f4").tobytes()
         with _explained(self._path), _transaction(connection):
-            row = {name: result.get(name) for name in COLUMNS}
             row["environment"] = _environment(connection, result["environment"])
-            row["finished"] = _now()
-            _merge(connection, row)
+            connection.execute(_PUT, [*row.values()])
             if "trajectory" in result:
+                content = result["trajectory"]
+                content = content | {name: content[name].tolist() for name in _ARRAYS}
                 connection.execute(
-                    "INSERT OR REPLACE INTO trajectories VALUES (?, ?, ?)",
-                    (row["key"], *_packed(result["trajectory"])),
+                    "INSERT OR REPLACE INTO trajectories VALUES (?, ?)",
+                    (row["key"], json.dumps(content)),
                 )
 
 
@@ -266,69 +268,6 @@ def _text(value: Any) -> str | None:
     return json.dumps(value if isinstance(value, (list, dict)) else value.tolist())
 
 
-def _encoded(name: str, value: Any) -> Any:
-    if value is None:
-        return None
-    if name in _JSON:
-        return json.dumps(value)
-    if name == "times":
-        return np.asarray(value, np.float32).tobytes()
-    return ",".join(sorted(value)) if name == "parts" else value
-
-
-def _checked(row: dict[str, Any]) -> dict[str, Any]:
-    """A row of cells, decoded; raises any exception where it cannot be what was stored."""
-    found = {name: _decoded(name, value) for name, value in row.items()}
-    cell = Cell(**{one.name: found[one.name] for one in fields(Cell)})
-    done = found["outcome"] == "done"
-    lists, reasons = [found["rmse_states"], found["rmse_settled_states"]], found["reasons"]
-    if (
-        cell.key != found["key"]
-        or found["outcome"] not in ("done", "failed")
-        or (done and not all(isinstance(one, list) and np.ndim(one) == 1 for one in lists))
-        or (done and not all(number >= 0 for number in reasons.values()))
-        or not all(found[name] >= 0 for name in ("horizon", "seed", "steps", "environment"))
-        or any(found[name] < 0.0 for name in _REAL)
-        or any(found[name] > 1.0 for name in _SHARES)
-    ):
-        raise ValueError(f"a value of the cell {found['key']}")
-    return found
-
-
-def _decoded(name: str, value: Any) -> Any:
-    if name in _REAL:
-        return float("nan") if value is None else float(value)
-    if value is None:
-        return None
-    if name in _JSON:
-        return json.loads(value)
-    return np.frombuffer(value, np.float32) if name == "times" else value
-
-
-def _merge(connection: sqlite3.Connection, row: dict[str, Any]) -> None:
-    """Insert a row, or add to the one that is there what was measured now."""
-    found = connection.execute(
-        "SELECT outcome, parts FROM cells WHERE key = ?", (row["key"],)
-    ).fetchone()
-    written = set(COLUMNS)
-    if found is not None and found[0] == "done":
-        for part, columns in _PARTS.items():
-            if row["outcome"] == "failed" or part not in row["parts"]:
-                written -= set(columns)
-        if row["outcome"] == "failed":
-            what = "; ".join(sorted(set(row["parts"]) - set(found[1].split(","))))
-            row["reason"] = f"{what}: {row['reason']}"
-            written = {"key", "parts", "reason"}
-        row["parts"] = set(row["parts"]) | set(found[1].split(","))
-    names = [name for name in COLUMNS if name in written]
-    connection.execute(
-        f"INSERT INTO cells ({', '.join(names)}) VALUES ({', '.join('?' * len(names))}) "
-        f"ON CONFLICT (key) DO UPDATE SET "
-        + ", ".join(f"{name} = excluded.{name}" for name in names if name != "key"),
-        [_encoded(name, row[name]) for name in names],
-    )
-
-
 def _environment(connection: sqlite3.Connection, settings: dict[str, Any]) -> int:
     """Number of an environment, from 0 in the order in which they came."""
     text = json.dumps(settings, sort_keys=True)
@@ -337,29 +276,6 @@ def _environment(connection: sqlite3.Connection, settings: dict[str, Any]) -> in
     )
     found = connection.execute("SELECT id FROM environments WHERE settings = ?", (text,))
     return int(found.fetchone()[0])
-
-
-def _packed(trajectory: dict[str, Any]) -> tuple[str, bytes]:
-    names = ("times", "states", "estimates")
-    header = {name: value for name, value in trajectory.items() if name not in names}
-    header["shape"] = list(trajectory["states"].shape)
-    numbers = np.concatenate([np.ravel(trajectory[name]) for name in names])
-    return json.dumps(header), numbers.astype(np.float64).tobytes()
-
-
-def _unpacked(packed: str, numbers: bytes) -> dict[str, Any]:
-    header = json.loads(packed)
-    rows, n = header.pop("shape")
-    values = np.frombuffer(numbers)
-    found = {
-        "times": values[:rows],
-        "states": values[rows : rows * (n + 1)].reshape(rows, n),
-        "estimates": values[rows * (n + 1) :].reshape(rows, n),
-        **header,
-    }
-    if len(found["labels"]) != n or not isinstance(found["time_unit"], str):
-        raise ValueError("the labels of a run")
-    return found
 
 
 def _now() -> str:
@@ -386,9 +302,6 @@ def _transaction(connection: sqlite3.Connection) -> Iterator[None]:
 
 def _create(connection: sqlite3.Connection) -> None:
     """Make the tables of an empty file, all or none."""
-    connection.execute("PRAGMA journal_mode = WAL")
-    # A process that ends loses nothing; a power failure loses the last rows, never the file.
-    connection.execute("PRAGMA synchronous = NORMAL")
     with _transaction(connection):
         if not _tables(connection):
             for statement in _TABLES:
@@ -420,8 +333,8 @@ def _check(connection: sqlite3.Connection, path: Path, empty: bool) -> None:
             "Use the qpmhe that wrote it, or name another file for a new store."
         )
     (page,) = connection.execute("PRAGMA page_size").fetchone()
-    if not _unwritten(path) and path.stat().st_size % page:  # SQLite would read zeros there
-        raise StoreError(f"the store {path}: {_DAMAGED}.")
+    if path.stat().st_size % page:  # SQLite would read zeros there
+        raise ValueError("its last page is cut off")
 
 
 def _check_file(path: Path) -> None:
@@ -431,83 +344,26 @@ def _check_file(path: Path) -> None:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[sqlite3.Connection]:
-    """A connection that changes nothing and sees one moment, also while another process writes."""
+    """A connection that sees one moment, also while another process writes."""
     if not path.exists():
         raise StoreError(f"there is no store {path}; run a study first, or check the name.")
     _check_file(path)
-    with _undamaged(path), _explained(path), closing(_reader(path)) as connection:
+    with _explained(path), closing(_connect(path, "rw")) as connection:
         connection.execute("BEGIN")
         _check(connection, path, empty=False)
         yield connection
 
 
-def _reader(path: Path) -> sqlite3.Connection:
-    connection = _connect(path, "rw")
-    try:
-        connection.execute("PRAGMA query_only = ON")
-        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
-    except sqlite3.OperationalError as error:
-        connection.close()
-        if _code(error) not in ("SQLITE_CANTOPEN", "SQLITE_READONLY") or _unwritten(path):
-            raise
-        # A folder where nothing can be written: nobody else writes to the file, either.
-        return _connect(path, "ro&immutable=1")
-    return connection
-
-
-def _unwritten(path: Path) -> bool:
-    """Whether the log holds something that the file does not yet."""
-    log = path.with_name(path.name + "-wal")
-    return log.exists() and log.stat().st_size > 0
-
-
-def _code(error: sqlite3.Error) -> str:
-    """The primary code: SQLITE_READONLY for SQLITE_READONLY_DIRECTORY."""
-    return "_".join(getattr(error, "sqlite_errorname", "").split("_")[:2])
-
-
 @contextmanager
-def _undamaged(path: Path) -> Iterator[None]:
-    """Report content that cannot be decoded as damage."""
+def _explained(path: Path) -> Iterator[None]:
+    """Give errors of SQLite, and of content that cannot be decoded, with name and remedy."""
     try:
         yield
     except QpmheError:
         raise
-    except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError) as error:
-        raise StoreError(f"the store {path}: {_DAMAGED} ({error}).") from error
-
-
-@contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """Give SQLite's errors with the store's name and a remedy."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        remedy = _REMEDIES.get(_code(error), "SQLite cannot go on")
-        raise StoreError(f"the store {path}: {remedy} ({error}).") from error
-
-
-@contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Hold a lock, which ends with the process, however that ends."""
-    beside = path.with_name(path.name + "-lock")
-    with _explained(path):
-        lock = _connect(beside, "rwc")
-    with closing(lock):
-        try:
-            lock.execute("PRAGMA busy_timeout = 0")
-            lock.execute("PRAGMA journal_mode = MEMORY")
-            lock.execute("BEGIN EXCLUSIVE")
-        except sqlite3.OperationalError as error:
-            if _code(error) == "SQLITE_BUSY":
-                raise StoreError(
-                    f"another study is writing to the store {path}; wait for its end, or name "
-                    "another file."
-                ) from error
-            with _explained(path):
-                raise
-        try:
-            yield
-        finally:
-            with suppress(OSError):
-                os.remove(beside)
+    except (sqlite3.Error, ValueError, TypeError, LookupError, AttributeError) as error:
+        # The primary code: SQLITE_READONLY for SQLITE_READONLY_DIRECTORY.
+        code = "_".join(getattr(error, "sqlite_errorname", "").split("_")[:2])
+        raise StoreError(
+            f"the store {path}: {_REMEDIES.get(code, _DAMAGED)} ({error})."
+        ) from error

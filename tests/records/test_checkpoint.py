@@ -48,9 +48,9 @@ def test_other_options_are_refused(cut, options, words):
 def test_another_record_is_refused(cut):
     stamp, _, u = cut[12].split(",")
     changed = [*cut[:12], f"{stamp},0.123,{u}", *cut[13:]]
-    for text, words in ((changed, "first 40 samples"), (cut[:20], "has 19 samples")):
+    for text in (changed, cut[:20]):
         put("record.csv", text)
-        with pytest.raises(CheckpointError, match=words):
+        with pytest.raises(CheckpointError, match="first 40 samples"):
             estimate_record(CONTINUOUS, "record.csv", "out.csv", resume=True, **OPTIONS)
 
 
@@ -105,27 +105,27 @@ def test_damaged_checkpoints(cut):
         wrong[generator.integers(len(sound) // 2)] ^= 0xFF
         damaged.append(bytes(wrong))
     before = Path("out.csv").read_bytes()
-    told = 0
     for content in damaged:
         path.write_bytes(content)
-        try:
-            found = load(path)
-        except CheckpointError as error:
-            told += "--overwrite" in str(error)
-        else:  # a byte that nobody reads
-            assert found.samples == 40
-    assert told > 10
+        with pytest.raises(CheckpointError, match="--overwrite"):
+            load(path)
     assert Path("out.csv").read_bytes() == before
 
 
 def test_a_checkpoint_keeps_every_bit(cut):
     path = Path("out.csv.checkpoint")
     found = load(path)
-    state = {"a": np.array([np.nan, -0.0, 5e-324]), 3: (1, None, [True, "x"]), "b": np.float64(0.1)}
+    state = {
+        "a": np.array([[np.nan, -0.0, 5e-324]]), "c": [1, None, [True, "x"]], "b": np.float64(0.1),
+        "d": {"e": np.bool_(True), "f": np.empty((0, 3))},
+    }
     save(path, replace(found, state=state, inputs=[0.1 + 0.2], usual_step=None))
     again = load(path)
     assert again.state["a"].tobytes() == state["a"].tobytes()
-    assert again.state[3] == state[3]
+    assert again.state["a"].shape == (1, 3)
+    assert again.state["c"] == state["c"]
+    assert again.state["d"]["e"]
+    assert again.state["d"]["f"].shape == (0, 3)
     assert again.state["b"] == 0.1
     assert again.inputs == [0.1 + 0.2]
     assert again.identity == found.identity

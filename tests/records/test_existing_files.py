@@ -94,7 +94,7 @@ def test_files_of_others(text, name, resume):
 def test_finished_results_of_ours(text):
     estimate_record(DISCRETE, "record.csv", "out.csv", checkpoint_every=7, **OPTIONS)
     written = Path("out.csv").read_bytes()
-    with pytest.raises(CheckpointError, match=r"finished.*--overwrite.*--resume"):
+    with pytest.raises(CheckpointError, match=r"finished.*--resume.*--overwrite"):
         estimate_record(DISCRETE, "record.csv", "out.csv", horizon=2, **OPTIONS)
     assert Path("out.csv").read_bytes() == written
     estimate_record(DISCRETE, "record.csv", "out.csv", horizon=2, overwrite=True, **OPTIONS)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import qpmhe
 from qpmhe.records import estimate_record
 
 from . import process
@@ -53,8 +52,7 @@ def record(here):
 def model(body, system=DISCRETE):
     path = Path("model.py")
     path.write_text(MODEL.format(body=body, system=system))
-    number = path.read_text().splitlines().index(body.splitlines()[-1]) + 1
-    return "model.py:make", number
+    return "model.py:make"
 
 
 @pytest.mark.parametrize("system", [DISCRETE, TIMED])
@@ -64,12 +62,12 @@ def model(body, system=DISCRETE):
         (BEYOND, "h raised ValueError: beyond the table at x = [", False),
         (MISTAKE, "h raised NameError: name 'ofset' is not defined at x = [", True),
         (WRONG_SHAPE, "h returned shape (2,); expected (1,) at x = [", True),
-        (INFINITE, "h is [inf] at x = [", False),
-        (LATE_SHAPE, "h returned shape (2,); expected (1,) at x = [", True),
+        (INFINITE, "is not finite at x = [", False),
+        (LATE_SHAPE, "returned other than real numbers of the right shape at x = [", True),
     ],
 )
 def test_it_is_told(record, body, words, is_mistake, system):
-    name, number = model(body, system)
+    name = model(body, system)
     told = []
     summary = estimate_record(name, "record.csv", "out.csv", report=told.append)
     text = Path("out.csv").read_text().splitlines()[1:]
@@ -80,17 +78,17 @@ def test_it_is_told(record, body, words, is_mistake, system):
     assert summary.stale == len(set(stale) - set(failed))
     assert summary.model_is_wrong == is_mistake
     assert f"failed at {len(failed)} of 50 samples" in summary.failure
-    place = f"first at record.csv, line {failed[0] + 2} (time {failed[0]}): "
-    if "raised" in words:
-        place += f"{record / 'model.py'}, line {number}: "
-    assert f"{place}{words}" in summary.failure
+    place, _, why = summary.failure.partition(f"first at record.csv, line {failed[0] + 2}")
+    assert place
+    assert f"(time {failed[0]}): " in why
+    assert words in why
     # Once, when it happens.
     assert len(told) == 1
     assert words in told[0]
 
 
 def test_nothing_is_told_of_a_model_that_works(record):
-    name, _ = model("    pass")
+    name = model("    pass")
     summary = estimate_record(name, "record.csv", "out.csv")
     assert (summary.failed, summary.stale, summary.failure) == (0, 0, "")
 
@@ -105,7 +103,7 @@ def test_nothing_is_told_of_a_model_that_works(record):
     ],
 )
 def test_exit_codes(record, body, expected, quiet):
-    name, _ = model(body)
+    name = model(body)
     code, out, error = process.shell(f"qpmhe estimate {name} record.csv")
     assert code == expected
     assert out.count("\n") == 51  # bad luck stops nothing
@@ -114,28 +112,3 @@ def test_exit_codes(record, body, expected, quiet):
     assert (code, out.count("\n")) == (expected, 51)
     assert error.startswith(quiet)
     assert bool(error) == bool(quiet)
-
-
-def test_a_model_that_is_not_asked_in_vain(here):
-    """What cannot be found out is said, too."""
-    from qpmhe.records.record_model import ModelFailures as Failures
-
-    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1)
-    failures = Failures(system, 5)
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([0.3]),
-        qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0), horizon=5,
-        initial_state=[0.0],
-    )
-    estimate = mhe.update([1.0])
-    assert not failures.note(estimate, np.empty(0), None)
-    assert failures.report(1) == ""
-    estimate.status |= qpmhe.Status.MODEL_FAILED
-    estimate.message = "h raised OSError: the table is away at x = [1.0]."
-    assert failures.note(estimate, np.empty(0), None)
-    assert not failures.note(estimate, np.empty(0), None)
-    assert failures.failed == 2
-    assert (
-        "h raised OSError: the table is away at x = [1.0]; evaluated again, it has values there; "
-        "is it random?" in failures.report(3)
-    )

@@ -182,13 +182,6 @@ def test_a_full_disk_in_the_middle_is_told_and_the_same_call_goes_on(path, monke
     assert list(after["finished"][: len(before)]) == list(before["finished"])
 
 
-def test_a_store_in_use_is_refused_before_anything_runs(path, monkeypatch):
-    handed = counted(monkeypatch)
-    with Store(path).writing(), pytest.raises(StoreError, match="another study is writing"):
-        run(Study(**SMALL), path, progress=False)
-    assert handed == []
-
-
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [

@@ -65,37 +65,36 @@ def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "line", "words"),
+    ("old", "new", "words"),
     [
-        ("seeds = 3", "sedes = 3", 12, "unknown key 'sedes'; expected some of models, backends"),
-        ("# every option", "[study]", 1, "unknown key 'study'"),
-        ('"batch_reactor"', '"batch_reactr"', 3, "expected one of batch_reactor"),
-        ("masses=1", "mases=1", 4, "mases"),
-        ('"batch_reactor"', '"missing.py:make"', 3, "missing.py"),
-        ('"osqp"', '"osq"', 6, "backend 'osq' is not known; expected one of auto"),
-        ('["daqp", "osqp"]', "[]", 6, "backends is empty"),
-        ('"converged"', '"convergd"', 8, '\'convergd\'; expected an integer >= 0. "converged"'),
-        ("[0, 2,", "[0, -2,", 7, "qps is -2"),
-        ('[5, "none"]', "[]", 9, "solver_iterations is empty"),
-        ("[5, ", "[5, 0, ", 9, "solver_iterations is 0"),
-        ('"default"', '"converged"', 10, "horizons is 'converged'"),
-        ('"best"', '"bets"', 11, "starts is 'bets'"),
-        ("seeds = 3", "seeds = 0", 12, "seeds is 0"),
-        ("steps = 20", "steps = 2.5", 13, "steps is 2.5"),
-        ('"time"', '"speed"', 14, "measure is 'speed'"),
-        ("deadline = 0.01", "deadline = -1", 15, "deadline is -1"),
-        ("true", '"yes"', 16, "covariances is 'yes'"),
-        ("cell_timeout = 5", "cell_timeout = 0", 17, "cell_timeout is 0"),
-        ("seeds = 3", "seeds 3", 12, "no valid TOML"),
-        ("cell_timeout = 5", "cell_timeout =", 17, "no valid TOML"),
+        ("seeds = 3", "sedes = 3", "unknown key 'sedes'; expected some of models, backends"),
+        ("# every option", "[study]", "unknown key 'study'"),
+        ('"batch_reactor"', '"batch_reactr"', "expected one of batch_reactor"),
+        ("masses=1", "mases=1", "mases"),
+        ('"batch_reactor"', '"missing.py:make"', "missing.py"),
+        ('"osqp"', '"osq"', "backend 'osq' is not known; expected one of auto"),
+        ('["daqp", "osqp"]', "[]", "backends is empty"),
+        ('"converged"', '"convergd"', '\'convergd\'; expected an integer >= 0. "converged"'),
+        ("[0, 2,", "[0, -2,", "qps is -2"),
+        ('[5, "none"]', "[]", "solver_iterations is empty"),
+        ("[5, ", "[5, 0, ", "solver_iterations is 0"),
+        ('"default"', '"converged"', "horizons is 'converged'"),
+        ('"best"', '"bets"', "starts is 'bets'"),
+        ("seeds = 3", "seeds = 0", "seeds is 0"),
+        ("steps = 20", "steps = 2.5", "steps is 2.5"),
+        ('"time"', '"speed"', "measure is 'speed'"),
+        ("deadline = 0.01", "deadline = -1", "deadline is -1"),
+        ("true", '"yes"', "covariances is 'yes'"),
+        ("cell_timeout = 5", "cell_timeout = 0", "cell_timeout is 0"),
+        ("seeds = 3", "seeds 3", "no valid TOML"),
+        ("cell_timeout = 5", "cell_timeout =", "no valid TOML"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_file_and_line(tmp_path, old, new, line, words):
+def test_what_does_not_fit_is_refused_with_file_and_key(tmp_path, old, new, words):
     path = written(tmp_path, GOOD.replace(old, new))
     with pytest.raises(StudyError, match=re.escape(words)) as caught:
         Study.from_toml(path)
     assert str(path) in str(caught.value)
-    assert re.search(rf"\bline {line}\b", str(caught.value)), caught.value
 
 
 def test_a_file_that_cannot_be_read_is_told(tmp_path):
