@@ -141,7 +141,10 @@ def test_points_are_drawn_into_a_polytope():
     np.testing.assert_array_equal(drawn[stays], points[stays])
 
 
-@pytest.mark.parametrize("name", ["pendulum", "van_der_pol"])
+@pytest.mark.parametrize(
+    # The gain of the second one is synthesised first, which takes long.
+    "name", ["pendulum", pytest.param("van_der_pol", marks=pytest.mark.slow)]
+)
 def test_models_of_the_zoo_are_certified_and_not_refuted(name):
     system, observer, cost, _ = qpmhe.models.catalogue()[name]()
     if name == "pendulum":
