@@ -19,10 +19,10 @@ reproduce: $(VENV)/.solvers
 
 # A sample of three minutes on two cores: every test, but not all of its cases.
 test: $(VENV)/.test
-	$(BIN)/python -m pytest --numprocesses auto $(ARGS)
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal $(ARGS)
 
 test-all: $(VENV)/.test
-	$(BIN)/python -m pytest --numprocesses auto --all $(ARGS)
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal --all $(ARGS)
 
 # Style, and which room may import which.
 lint: $(VENV)/.dev

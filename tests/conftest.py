@@ -9,11 +9,16 @@ processes of pytest-xdist agree on it.
 import hashlib
 from collections import defaultdict
 
+import hypothesis
 import pytest
 
 SEED = 1
 # Cases that every test keeps, and the share of its further cases.
-HANDFUL, SHARE = 4, 0.04
+HANDFUL, SHARE = 2, 0.04
+# Examples of each property whose test names no number: in the sample, and in all.
+FEW, MANY = 8, 25
+# Begun first, so that no long test is the last one: most of these tests start processes.
+FIRST = {"studies", "tests", "examples", "records"}
 WHOLE = {"oracles", "properties"}  # folders that keep every value of every parameter
 LEFT_OUT = pytest.StashKey[int]()
 COLLECTED = pytest.StashKey[int]()
@@ -27,6 +32,12 @@ def pytest_addoption(parser):
         help="random steps to compare with the second implementation (default: some hundreds)",
     )
     group.addoption("--fuzz-seed", type=int, default=1, metavar="N", help="seed of these steps")
+
+
+def pytest_configure(config):
+    examples = MANY if config.option.all else FEW
+    hypothesis.settings.register_profile("here", max_examples=examples)
+    hypothesis.settings.load_profile("here")
 
 
 def named(config, item):
@@ -60,7 +71,8 @@ def pytest_collection_modifyitems(config, items):
     for cases in tests.values():
         kept.update(sample(cases) if len(cases) > HANDFUL else cases)
     config.hook.pytest_deselected(items=[item for item in items if item not in kept])
-    items[:] = [item for item in items if item in kept]
+    kept = [item for item in items if item in kept]
+    items[:] = sorted(kept, key=lambda item: item.path.parent.name not in FIRST)
     config.stash[LEFT_OUT] -= len(items)
 
 

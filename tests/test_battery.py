@@ -208,6 +208,7 @@ def test_the_parameter_file_follows_from_the_data(cell):
 
 
 @needs_data
+@pytest.mark.slow  # two measured cycles of an hour each
 @pytest.mark.parametrize("name", ["udds_25degC.mat", "hwfet_25degC.mat"])
 def test_targets_on_the_measured_cycles(cell, name):
     bench, cycle = study.Bench(cell, 0.6), study.read(cell, DATA / name, None)
@@ -218,6 +219,7 @@ def test_targets_on_the_measured_cycles(cell, name):
 
 
 @needs_data
+@pytest.mark.slow  # all estimators of the study, the converged one too
 def test_the_study_writes_table_and_picture(tmp_path, monkeypatch, capsys):
     arguments = ["--data", str(DATA), "--out", str(tmp_path), "--quick", "--cycles", "udds"]
     monkeypatch.setattr(sys, "argv", ["study.py", *arguments])

@@ -696,24 +696,23 @@ def test_matrix_expressions(case, tmp_path):
 
 
 def test_what_does_not_fit_into_c_is_refused(tmp_path):
-    def made(n, horizon, compiled=False):
-        system = qpmhe.from_casadi(
-            lambda x: 0.9 * x, lambda x: x[0], n=n, compiled=compiled
-        )
+    def made(n, horizon):
+        system = qpmhe.from_casadi(lambda x: 0.9 * x, lambda x: x[0], n=n)
         cost = qpmhe.QuadraticCost(prior=np.eye(n), disturbance=np.eye(n), noise=[[1.0]])
         return qpmhe.MovingHorizonEstimator(
             system, qpmhe.Luenberger(np.zeros(n)), cost, horizon=horizon,
             initial_state=np.ones(n), max_qps=0,
         )
 
+    large = made(257, 1)
     with pytest.raises(QpmheError, match=r"257 states; .* at most 256"):
-        codegen.write(made(257, 1), tmp_path)
-    assert made(257, 1, None).system.symbolic is not None  # CasADi evaluates it instead
-    settings = made(200, 2).settings
-    with pytest.raises(OptionError, match=r"a horizon of 50000 with 200 states .* shorter one"):
+        codegen.write(large, tmp_path)
+    assert large.system.symbolic is not None  # CasADi evaluates it instead
+    large = made(50, 2)
+    with pytest.raises(OptionError, match=r"a horizon of 800000 with 50 states .* shorter one"):
         generated(
-            made(200, 2).system, qpmhe.Luenberger(np.zeros(200)), made(200, 2).cost,
-            dataclasses.replace(settings, horizon=50000),
+            large.system, large.observer, large.cost,
+            dataclasses.replace(large.settings, horizon=800000),
         )
     assert not list(tmp_path.iterdir())
 

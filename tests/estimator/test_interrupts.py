@@ -72,7 +72,13 @@ def leaves(value):
     return [value]
 
 
-def interrupted(mhe, do, generator, stride=60):
+@pytest.fixture
+def stride(pytestconfig):
+    """Lines from one interrupt to the next, at most."""
+    return 60 if pytestconfig.option.all else 200
+
+
+def interrupted(mhe, do, generator, stride):
     """Interrupt something again and again, each time at a later line, until it is done."""
     before, after = leaves(state_of(mhe)), 1
     while True:
@@ -97,7 +103,7 @@ def state_of(mhe):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_an_interrupted_step_was_not_taken(name):
+def test_an_interrupted_step_was_not_taken(name, stride):
     engine, options = CASES[name]
     if engine == "compiled" and find_compiler() is None:
         pytest.skip("there is no C compiler")
@@ -106,7 +112,7 @@ def test_an_interrupted_step_was_not_taken(name):
 
     def both(do):
         state_of(twin)  # in which solvers forget, as they do after an interrupt
-        expected, found = do(twin), interrupted(mhe, do, generator)
+        expected, found = do(twin), interrupted(mhe, do, generator, stride)
         assert (found is None) == (expected is None)
         if expected is not None:
             assert_same(numbers(found), numbers(expected))
@@ -217,7 +223,7 @@ def test_an_interrupt_out_of_what_the_user_wrote(where, candidate, monkeypatch):
 
 
 @pytest.mark.parametrize("name", BATCHES)
-def test_an_interrupted_step_of_a_batch_was_not_taken(name):
+def test_an_interrupted_step_of_a_batch_was_not_taken(name, stride):
     mhe, twin, generator = batch_of(name), batch_of(name), np.random.default_rng(0)
     for t in range(20):
         Y, U = generator.normal(0.0, 0.5, (3, 1)), generator.normal(0.0, 1.0, (3, 1))
@@ -237,7 +243,7 @@ def test_an_interrupted_step_of_a_batch_was_not_taken(name):
                     return None
                 np.testing.assert_array_equal(mhe.states, twin.states)
                 np.testing.assert_array_equal(mhe.initial_states, twin.initial_states)
-                after += int(generator.integers(1, 60))
+                after += int(generator.integers(1, stride))
 
         if t % 3 == 0:
             both(lambda one, Y=Y, U=U: one.update(Y, U))

@@ -438,8 +438,10 @@ class Case:
                     raise WrongStepError(f"{point} is not in X: {outside}; {status}")
 
 
-def fuzz(steps, seed=0, *, source=None, writing=None, engine=None, estimators=3, report=None):
-    """So many steps; counts by category and the failures found, as text."""
+def fuzz(
+    steps, seed=0, *, source=None, writing=None, engine=None, estimators=3, report=None, until=None
+):
+    """So many steps, or until a failure has some words; counts by category, and the failures."""
     counts, failures, began = Counter(), [], time.perf_counter()
     number = 0
     told = time.perf_counter()
@@ -469,7 +471,7 @@ def fuzz(steps, seed=0, *, source=None, writing=None, engine=None, estimators=3,
             report(failures[-1])
         counts["systems"] += 1
         counts["failures"] = len(failures)
-        if len(failures) > 200:
+        if len(failures) > 200 or (until and any(until in failure for failure in failures)):
             break
         if report is not None and time.perf_counter() - told > 30.0:
             told = time.perf_counter()

@@ -8,12 +8,13 @@ from tests.properties import fuzz_promise
 
 @pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
 @pytest.mark.parametrize("seed", [7, 8])
-def test_no_step_breaks_the_promise(seed):
-    counts, faults = fuzz_promise.run(1000, seed)
+def test_no_step_breaks_the_promise(pytestconfig, seed):
+    steps = 1000 if pytestconfig.option.all else 300
+    counts, faults = fuzz_promise.run(steps, seed)
     assert faults == []
-    assert counts["steps"] >= 1000
-    assert counts["IMPROVED"] > 100
-    assert counts["CANDIDATE_OUTSIDE"] > 100
+    assert counts["steps"] >= steps
+    assert counts["IMPROVED"] > 0.1 * steps
+    assert counts["CANDIDATE_OUTSIDE"] > 0.1 * steps
 
 
 @pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")

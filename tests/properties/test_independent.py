@@ -16,8 +16,8 @@ from qpmhe.observers.projection import NearestPoint
 from .fuzz_independent import WRITINGS, Case, WrongStepError, fuzz, table
 
 SEED = 1
-# Steps of each by default: whatever is compiled takes its time to be made.
-FEW = {"numpy": 120, "casadi": 180, "jax": 90}
+# Steps of each by default, and in the sample: whatever is compiled takes its time to be made.
+FEW = {"numpy": (120, 60), "casadi": (180, 90), "jax": (90, 45)}
 WAYS = [(source, writing) for source, writings in WRITINGS.items() for writing in writings]
 
 
@@ -26,7 +26,8 @@ def test_every_step_is_what_it_says(pytestconfig, source, writing):
     if source != "numpy":
         pytest.importorskip(source)
     share = {"numpy": 0.6, "casadi": 0.3, "jax": 0.1}[source] / len(WRITINGS[source])
-    steps = max(FEW[source], round(share * pytestconfig.option.fuzz_steps))
+    least = FEW[source][not pytestconfig.option.all]
+    steps = max(least, round(share * pytestconfig.option.fuzz_steps))
     seed = pytestconfig.option.fuzz_seed
     counts, failures = fuzz(steps, seed, source=source, writing=writing, estimators=2)
     print(table(counts))
@@ -88,7 +89,7 @@ def test_a_cost_that_is_too_low_is_noticed(monkeypatch):
         return estimate
 
     monkeypatch.setattr(qpmhe.MovingHorizonEstimator, "update", flattering)
-    _, failures = fuzz(30, SEED, source="numpy", writing="batched")
+    _, failures = fuzz(30, SEED, source="numpy", writing="batched", until="cost is")
     assert "cost is" in failures[0]
 
 
@@ -103,7 +104,7 @@ def test_memory_of_the_estimator_that_is_handed_out_is_noticed(monkeypatch):
         return estimate
 
     monkeypatch.setattr(qpmhe.MovingHorizonEstimator, "update", careless)
-    _, failures = fuzz(400, SEED, source="numpy", writing="batched")
+    _, failures = fuzz(400, SEED, source="numpy", writing="batched", until="handed out")
     assert any("handed out" in failure for failure in failures)
 
 
@@ -114,11 +115,13 @@ def test_a_projection_in_another_metric_is_noticed(monkeypatch):
         return nearest(self, point, np.eye(point.size))
 
     monkeypatch.setattr(NearestPoint, "__call__", clipping)
-    _, failures = fuzz(500, SEED, source="numpy", writing="batched", estimators=1)
-    assert any("the candidate goes to" in failure for failure in failures)
+    words = "the candidate goes to"
+    _, failures = fuzz(500, SEED, source="numpy", writing="batched", estimators=1, until=words)
+    assert any(words in failure for failure in failures)
 
 
 def test_a_row_that_is_dropped_in_secret_is_noticed(monkeypatch):
     monkeypatch.setattr(Problem, "missed_rows", lambda self, trial: ())
-    _, failures = fuzz(800, SEED, source="numpy", writing="batched", estimators=1)
-    assert any("dropped set()" in failure for failure in failures)
+    words = "dropped set()"
+    _, failures = fuzz(800, SEED, source="numpy", writing="batched", estimators=1, until=words)
+    assert any(words in failure for failure in failures)

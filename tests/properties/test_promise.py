@@ -175,10 +175,7 @@ def cases(draw):
 
 
 @pytest.mark.parametrize("backend", qpmhe.solvers.available())
-@settings(
-    max_examples=25, derandomize=True, deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
-)
+@settings(derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     case=cases(),
     horizon=st.integers(1, 6),

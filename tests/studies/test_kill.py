@@ -6,7 +6,7 @@ from qpmhe.studies import Study
 from .killing import kill_and_finish, start
 
 _READ = """
-import sys
+import sys, time
 from qpmhe.studies import Store, StoreError
 
 rows, reads = 0, 0
@@ -20,6 +20,7 @@ while rows < int(sys.argv[2]):
     rows, reads = found, reads + 1
     if reads == 1:
         print("reading", flush=True)
+    time.sleep(0.01)
 print(reads)
 """
 

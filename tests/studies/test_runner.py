@@ -149,7 +149,7 @@ def test_a_backend_that_was_registered_here_runs_there(path):
 
 def test_a_cell_whose_backend_crashes_is_run_again_with_the_backend_apart(path):
     with registered(entry(CrashingOnce)):
-        study = Study(**{**SMALL, "backends": ["crashingonce", "banded"], "qps": [1], "seeds": 2})
+        study = Study(**{**SMALL, "backends": ["crashingonce", "banded"], "qps": [1], "seeds": 1})
         frame = run(study, path, progress=False).frame()
     assert set(frame["outcome"]) == {"done"}
     for row in frame.itertuples():
