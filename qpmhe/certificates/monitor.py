@@ -183,7 +183,7 @@ class Monitor:
         InvalidInputError
             If the estimator has taken measurements already.
         OptionError
-            If it has no bounds for its horizon, or the estimator takes another candidate.
+            If it has no bounds for its horizon, or the estimator takes another candidate or prior.
         """
         certificate.check_estimator(estimator)
         if estimator.time:
@@ -195,6 +195,11 @@ class Monitor:
             raise OptionError(
                 "the estimator's candidate comes from a reinitialized observer, which the "
                 "theorem does not cover; make it with candidate='observer'."
+            )
+        if estimator.settings.arrival != "observer":
+            raise OptionError(
+                "the estimator's prior is a smoothed estimate, which the theorem does not cover; "
+                "make it with arrival='observer'."
             )
         return cls(certificate, estimator.horizon)
 

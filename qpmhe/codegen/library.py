@@ -59,6 +59,10 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             f"a horizon of {settings.horizon} with {system.n} states needs {size:.3g} bytes for "
             f"its window, more than the {_MOST_BYTES:.3g} of one structure; take a shorter one."
         )
+    if settings.arrival != "observer":
+        return (
+            f"arrival={settings.arrival!r} has no C form; take engine='python', or leave arrival out."
+        )
     if settings.backend not in ("auto", "banded"):
         return (
             f"the compiled step solves its QPs itself, not by {settings.backend!r}; take "

@@ -66,6 +66,7 @@ class PythonEngine:
         self._optimizer = Optimizer(self._subproblem, solver, settings)
         self._with_terms = settings.qp_limit > 0
         self._reinitialized = settings.candidate == "reinitialized"
+        self._smoothed = settings.arrival == "smoothed"
         self._window = self._fresh_window(initial_state)
         self._watch = ObserverWatch(settings.horizon)
         self._known_modes = system.call_modes()  # as found at construction
@@ -111,6 +112,8 @@ class PythonEngine:
             with np.errstate(all="ignore"):
                 if window.length == self._settings.horizon:
                     self._solver.shift()
+                    if self._smoothed and self._trajectory is not None:
+                        window.smoothed_prior = self._trajectory[1].copy()
                 window.push(y, u, dt, noise_weight)
                 if reinitialized:
                     window.reinitialize(self._history)
@@ -325,6 +328,8 @@ class PythonEngine:
         loaded, recomputed = (self._fresh_window(np.zeros(n)) for _ in range(2))
         for one in (loaded, recomputed):
             one.load_state_dict(state["window"], self._system.make_timed is not None)
+        if (loaded.smoothed_prior is None) == (self._smoothed and loaded.time > loaded.horizon):
+            raise ValueError("there must be a smoothed prior once the window has moved on")
         history = [checked_array("history", one, (n,)) for one in state["history"]]
         count = min(loaded.length + 1, self._history.maxlen or 1)
         if len(history) != count:

@@ -104,6 +104,12 @@ class MovingHorizonEstimator:
         Whether the backend solves in a process of its own, so that a crash of compiled code is
         a failed QP and nothing more, and the time budget stops any backend. It adds some tenths
         of a millisecond to each QP. Not for ``engine="compiled"``, which needs no backend.
+    arrival : {"observer", "smoothed"}
+        The mean of the prior: the observer's z(t-N), or ``smoothed``, the estimate of the same
+        state in the window before, once the window moves on. That is a convenience outside of the
+        theorem: this estimate has used N - 1 of the window's measurements already, so they count
+        twice. The candidate stays the observer's trajectory, and its J then has a prior term.
+        Where a loss has no finite value there, z(t-N) serves in this step.
 
     Raises
     ------
@@ -143,11 +149,12 @@ class MovingHorizonEstimator:
         time_budget: float | None = None,
         delay: int = 0,
         isolated: bool = False,
+        arrival: str = "observer",
     ) -> None:
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
             engine, project_observer, infeasible, warm_start, candidate, time_budget, delay,
-            isolated,
+            isolated, arrival,
         )
         self.system, self.observer, self.cost = system, observer, cost
         _require(system, System, "system", "qpmhe.System")

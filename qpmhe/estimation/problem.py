@@ -100,7 +100,9 @@ class Problem:
     constraints : Constraints
         The rows that a trial must satisfy.
     prior, inputs, measurements : array
-        z(t-N) (n,), u (K, m) and y (K, p).
+        z(t-N) or, with ``arrival="smoothed"``, another prior mean (n,), u (K, m) and y (K, p).
+    prior_moved : bool
+        Whether the prior is other than the candidate's first state.
     observed : (K, p) bool array or None
         Which components of y are not missing; None if none is missing.
     prior_weight : (n, n) array
@@ -120,7 +122,7 @@ class Problem:
     __slots__ = (
         "_clip", "_formulation", "_has_noise_free", "_prior_band", "candidate", "constrained",
         "constraints", "discounts", "inputs", "measurements", "model", "observed", "prior",
-        "prior_weight", "span", "stage_weights", "time",
+        "prior_moved", "prior_weight", "span", "stage_weights", "time",
     )
 
     _clip: tuple[Array, Array] | None
@@ -150,6 +152,9 @@ class Problem:
         self.candidate = Trial(
             view.candidate, view.residuals, weights, window.candidate_cost_of(view)
         )
+        self.prior_moved = False
+        if window.smoothed_prior is not None:
+            self._move_prior(window.smoothed_prior)
         self.constraints, self.constrained = formulation.constraints, formulation.constrained
         self._has_noise_free, self._clip = False, None
         if self.constrained:
@@ -158,6 +163,26 @@ class Problem:
                 constraints = constraints.observed(self.observed)
             self._constrain(constraints)
             self.candidate.violation = self._violation(self.candidate)
+
+    def _move_prior(self, prior: Array) -> None:
+        """Take another prior mean, unless the candidate has no finite prior cost there."""
+        offset = self.candidate.trajectory[0] - prior
+        try:
+            cost = self._prior_cost(offset)
+            self.prior_weight_at(offset)
+        except Exception:  # a user's loss
+            return
+        if math.isfinite(cost):
+            self.prior, self.prior_moved = prior, True
+            self.candidate.cost += cost
+
+    def _prior_cost(self, offset: Array) -> float:
+        formulation, weight = self._formulation, self.prior_weight
+        if formulation.quadratic:
+            cost = float(offset.dot(weight).dot(offset))
+        else:
+            cost = formulation.prior_cost(offset, weight)
+        return cost if self.discounts is None else float(self.discounts[0]) * cost
 
     def _constrain(self, constraints: Constraints) -> None:
         self.constraints = constraints
@@ -196,18 +221,12 @@ class Problem:
 
     def evaluate(self, trajectory: Array) -> Trial:
         """Evaluate a trajectory (K + 1, n); never raises, whatever the model does."""
-        formulation, prior_weight = self._formulation, self.prior_weight
         try:
             if self._has_noise_free:
                 trajectory = self._rolled_out(trajectory)
             residuals = self._residuals(trajectory)
             weights, cost = self._weights_and_cost(residuals)
-            offset = trajectory[0] - self.prior
-            if formulation.quadratic:
-                prior_cost = float(offset.dot(prior_weight).dot(offset))
-            else:
-                prior_cost = formulation.prior_cost(offset, prior_weight)
-            cost += prior_cost if self.discounts is None else float(self.discounts[0]) * prior_cost
+            cost += self._prior_cost(trajectory[0] - self.prior)
         except Exception as error:  # a model function outside its domain, or a user's loss
             residuals = np.full_like(self.candidate.residuals, np.nan)
             return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf, error)

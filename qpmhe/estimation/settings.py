@@ -12,6 +12,7 @@ from ..errors import BackendError, OptionError
 
 Infeasible = Literal["drop_rows", "keep_candidate"]
 Candidate = Literal["observer", "reinitialized"]
+Arrival = Literal["observer", "smoothed"]
 Engine = Literal["python", "compiled"]
 
 # Bounds the sequence of QPs with max_qps=None where it does not converge.
@@ -37,6 +38,7 @@ class Settings:
     time_budget: float | None = None
     delay: int = 0
     isolated: bool = False
+    arrival: str = "observer"
 
     def __post_init__(self) -> None:
         # Stored as Python's int: not all code that reads them accepts NumPy's integers.
@@ -64,6 +66,7 @@ class Settings:
             ("engine", get_args(Engine)),
             ("infeasible", get_args(Infeasible)),
             ("candidate", get_args(Candidate)),
+            ("arrival", get_args(Arrival)),
         ):
             choice(name, getattr(self, name), choices)
         if self.isolated and self.engine == "compiled":

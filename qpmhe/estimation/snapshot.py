@@ -33,7 +33,9 @@ def described(
     stored stages are computed again. Options that may change between saving and loading are left
     out: caps, backend and tolerances of the QPs, ``infeasible`` and ``warm_start``.
     """
-    found: dict[str, Any] = {"candidate": settings.candidate, "sampling time": system.dt}
+    found: dict[str, Any] = {
+        "candidate": settings.candidate, "arrival": settings.arrival, "sampling time": system.dt,
+    }
     for name in SET_NAMES:
         _describe(f"set of {name}", getattr(system, name), found)
     _describe("observer", observer, found)

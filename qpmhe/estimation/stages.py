@@ -33,6 +33,7 @@ class Mark(NamedTuple):
     last_irregular: int
     unusual: bool
     own_noise: dict[int, Array] | None
+    smoothed_prior: Array | None
     metric: tuple[Array, bool] | None
     arrays: list[Array] | None
 
@@ -104,6 +105,8 @@ class Stages:
             self._window_views = list(self._window_views)
         #: Metric of the projection onto X, where the observer has no covariance.
         self.metric: ErrorMetric | None = None
+        #: Prior mean in place of z(t-N), with ``arrival="smoothed"``; replaced, never changed.
+        self.smoothed_prior: Array | None = None
         self.time = 0  # number of samples pushed: the window ends at x(time)
         self.start = self.end = 0
         # Times of the last stages of each kind; at first, long ago.
@@ -223,6 +226,7 @@ class Stages:
         return Mark(
             self.start, self.end, self.time, self._last_special, self._last_irregular,
             self.unusual, self._own_noise.copy() if self._own_noise else None,
+            self.smoothed_prior,
             None if self.metric is None else self.metric.state,
             self._copies() if whole else None,
         )
@@ -233,6 +237,7 @@ class Stages:
         self.start, self.end, self.time = mark.start, mark.end, mark.time
         self._last_special, self._last_irregular = mark.last_special, mark.last_irregular
         self._own_noise = mark.own_noise or {}
+        self.smoothed_prior = mark.smoothed_prior
         if self.metric is not None and mark.metric is not None:
             self.metric.state = mark.metric
         if mark.arrays is not None:
@@ -251,6 +256,7 @@ class Stages:
             "earlier": earlier.copy(),
             "earlier_covariance": None if covariance is None else covariance.copy(),
             "time": self.time,
+            "smoothed_prior": None if self.smoothed_prior is None else self.smoothed_prior.copy(),
             "z": self._z[points].copy(),
             "covariance": None if self._covariances is None else self._covariances[points].copy(),
             "stages": [array[stages].copy() for array in self._stage_arrays()],
@@ -277,6 +283,8 @@ class Stages:
             if mine is not None:
                 mine[: length + 1] = checked_array(name, saved, (length + 1, *mine.shape[1:]))
         self._earlier_state = checked_array("earlier", state["earlier"], self._earlier_state.shape)
+        if (prior := state["smoothed_prior"]) is not None:
+            self.smoothed_prior = checked_array("smoothed_prior", prior, self._earlier_state.shape)
         if self._covariances is not None:
             saved, shape = state["earlier_covariance"], self._covariances.shape[1:]
             self._earlier_covariance = checked_array("earlier_covariance", saved, shape)

@@ -72,7 +72,7 @@ class Subproblem:
                 count = len(span.panel)
                 self._scaled.copy_scaled(span, problem.discounts[1:])
                 span = Span(self._scaled, 0, count)
-            return self._assemble(problem, trial, span, True)
+            return self._assemble(problem, trial, span, not problem.prior_moved)
         states, terms, n = trial.trajectory[:-1], self._terms, self._n
         count = states.shape[0]
         model, linear = problem.model, terms.linear[:count]
@@ -129,7 +129,7 @@ class Subproblem:
         """Build the QP anew at its next use: an interrupt may have left it half written."""
         self._qp = None
 
-    def _assemble(self, problem: Problem, trial: Trial, span: Span, at_candidate: bool) -> QP:
+    def _assemble(self, problem: Problem, trial: Trial, span: Span, at_prior: bool) -> QP:
         count = len(span.panel)
         qp = self._qp
         if qp is None or qp.stages != count + 1:
@@ -143,8 +143,8 @@ class Subproblem:
                 else [band_of(weight[:n, :n]) for weight in weights]
             )
             self._uniform = uniform
-        # The candidate starts at the prior: no offset, and no gradient from it.
-        offset = self._no_offset if at_candidate else trial.trajectory[0] - problem.prior
+        # The candidate starts at the prior as a rule: no offset, and no gradient from it.
+        offset = self._no_offset if at_prior else trial.trajectory[0] - problem.prior
         prior_band = problem.prior_band_at(offset)
         if prior_band is not self._prior_band:
             self._added_bands[0] = self._prior_band = prior_band
@@ -153,7 +153,7 @@ class Subproblem:
         band_last[...] = self._added_bands[-1]
         np.add(span.gradient_rest, span.next_gradient_rest, gradient_rest)
         gradient_first[...] = span.gradient_first
-        if not at_candidate:
+        if not at_prior:
             gradient_first += problem.prior_weight_at(offset).dot(offset)
         gradient_last[...] = span.next_gradient_last
         self._minus_jacobian = span.minus_jacobian
