@@ -217,6 +217,8 @@ def test_a_monitor_is_for_one_estimator():
         Monitor.of(certificate, estimator(certificate, horizon=4))
     with pytest.raises(OptionError, match="reinitialized"):
         Monitor.of(certificate, estimator(certificate, candidate="reinitialized"))
+    with pytest.raises(OptionError, match="smoothed"):
+        Monitor.of(certificate, estimator(certificate, arrival="smoothed"))
     used = estimator(certificate)
     used.update(0.0)
     with pytest.raises(InvalidInputError, match="reset"):

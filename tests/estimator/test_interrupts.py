@@ -31,6 +31,7 @@ CASES = {
     "projected": ("numpy", {"sets": BOX, "max_qps": 2}),
     "dropped": ("numpy", {"sets": NARROW, "max_qps": 2}),
     "discount": ("numpy", {"discount": 0.8, "warm_start": True}),
+    "smoothed": ("numpy", {"arrival": "smoothed"}),
     "casadi": ("casadi", {}),
     "compiled": ("compiled", {"candidate": "reinitialized"}),
 }

@@ -22,6 +22,7 @@ OPTIONS = {
 }
 PYTHON_ONLY = {
     "robust": {"robust": True},
+    "smoothed": {"arrival": "smoothed", "discount": 0.8},
     "kalman": {"kalman": True, "candidate": "reinitialized"},
 }
 HORIZON = 4

@@ -89,6 +89,7 @@ def test_available_backends_are_accepted(backend):
             ("candidate", value, ["observer", "reinitialized"])
             for value in ("reinitialised", "best", None, 0)
         ),
+        *(("arrival", value, ["observer", "smoothed"]) for value in ("smooth", None, True)),
     ],
 )
 def test_unknown_choices_list_the_known_ones(name, value, known):
@@ -137,6 +138,7 @@ def test_settings_are_kept_and_frozen():
         "solver_tolerance": 1e-5, "tolerance": 1e-6, "engine": "python",
         "infeasible": "keep_candidate", "project_observer": False,
         "warm_start": True, "candidate": "reinitialized", "time_budget": 3.5, "delay": 1,
+        "arrival": "smoothed",
     }
     settings = estimator(**given).settings
     assert given.items() <= dataclasses.asdict(settings).items()

@@ -14,6 +14,8 @@ OPTIONS = {
     "converged": {"max_qps": None},
     "best": {"warm_start": True, "max_qps": 2},
     "reinitialized": {"candidate": "reinitialized"},
+    "smoothed": {"arrival": "smoothed"},
+    "smoothed anew": {"arrival": "smoothed", "candidate": "reinitialized"},
     "observer alone": {"max_qps": 0},
     "delayed": {"delay": 3},
 }
