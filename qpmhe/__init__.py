@@ -25,6 +25,7 @@ from .estimation.engines import Engine, register_engine
 from .estimation.estimate import DroppedRow, Estimate, Status
 from .estimation.estimator import MovingHorizonEstimator
 from .estimation.run import Run
+from .model.noisy_inputs import noisy_inputs
 from .model.parameters import augment_parameters
 from .model.sets import Box, ConvexSet, Polytope
 from .model.system import System
@@ -91,5 +92,6 @@ __all__ = [
     "from_jax",
     "from_sympy",
     "models",
+    "noisy_inputs",
     "solvers",
 ]

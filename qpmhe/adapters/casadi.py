@@ -18,6 +18,7 @@ from ..codegen.evaluation import fixed_call, may_fail, separate_calls
 from ..codegen.expressions import CasadiModel, casadi_model, import_casadi
 from ..codegen.source import model_files
 from ..errors import CompilationError, EngineWarning, OptionError
+from ..model.augmentation import Augmentation
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System, SystemOptions
@@ -106,6 +107,16 @@ def from_casadi(
     system.symbolic, system.dt = model, model.dt
     if model.dt is not None:
         system.make_timed = lambda: made(True)
+
+    def augmented(change: Augmentation, others: SystemOptions) -> System:
+        join = import_casadi().vertcat
+        return from_casadi(
+            change.of_one_state(model.f, join, 1.0 if dt is None else 0.0),
+            change.of_one_state(model.h, join),
+            n=change.n, p=model.p, m=change.m, dt=dt, method=method, compiled=compiled, **others,
+        )
+
+    system.make_augmented = augmented
     system.recipe = (
         from_casadi,
         {

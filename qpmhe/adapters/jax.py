@@ -9,8 +9,9 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import dimension, positive
-from ..model.functions import Trusted
+from .._checks import dimension, need, positive
+from ..model.augmentation import Augmentation
+from ..model.functions import Trusted, takes_input
 from ..model.system import System, SystemOptions, checked_set, probe_points
 from .jax_programs import Programs
 
@@ -118,6 +119,24 @@ def from_jax(
     if length is not None:
         system.dt = length
         system.make_timed = partial(_assembled, _Model(programs, None), m + 1, options)
+
+    def augmented(change: Augmentation, others: SystemOptions) -> System:
+        jnp: Any = need("jax.numpy", "from_jax", "jax")
+
+        def join(*parts: Any) -> Any:
+            return jnp.hstack(parts)
+
+        def of_both(name: str, function: Function) -> Function:
+            both = takes_input(name, function, m)
+            return lambda x, v: jnp.asarray(function(x, v) if both else function(x))
+
+        return from_jax(
+            change.of_one_state(of_both("f", f), join, 1.0 if dt is None else 0.0),
+            change.of_one_state(of_both("h", h), join),
+            n=change.n, p=p, m=change.m, dt=dt, method=method, **others,
+        )
+
+    system.make_augmented = augmented
     system.recipe = (
         from_jax,
         {"f": f, "h": h, "n": n, "p": p, "m": m, "dt": dt, "method": method, **options},

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from .._checks import need, positive
 from ..errors import ModelError
+from ..model.augmentation import Augmentation
 from ..model.functions import Trusted
 from ..model.system import System, SystemOptions
 
@@ -93,6 +94,17 @@ def from_sympy(
             step, output, dt=positive("dt", dt), method=method, rate_jacobian=step_jacobian,
             h_jacobian=output_jacobian, **sizes, **options,
         )
+    def augmented(change: Augmentation, others: SystemOptions) -> System:
+        moved = [sympy.Dummy(f"m{i}", real=True) for i in range(change.n - n)]
+        entries = change.inputs(given, moved)
+        replaced = dict(zip(given, map(sympy.sympify, entries), strict=True))
+        return from_sympy(
+            [*rates.xreplace(replaced), *(moved if dt is None else [0] * len(moved))],
+            outputs.xreplace(replaced), [*state, *moved], given[: change.m], dt=dt, method=method,
+            **others,
+        )
+
+    system.make_augmented = augmented
     system.recipe = (from_sympy, {
         "f": rates, "h": outputs, "x": state, "u": given, "dt": dt, "method": method,
         **options,

@@ -61,7 +61,8 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         )
     if settings.arrival != "observer":
         return (
-            f"arrival={settings.arrival!r} has no C form; take engine='python', or leave arrival out."
+            f"arrival={settings.arrival!r} has no C form; take engine='python', or leave "
+            "arrival out."
         )
     if settings.backend not in ("auto", "banded"):
         return (

@@ -34,6 +34,24 @@ class Trusted(NamedTuple):
     function: Callable[..., Any]
 
 
+class Parametric(NamedTuple):
+    """A user's f(x, u, theta), or f(x, theta) without inputs, as one of x and (u, theta)."""
+
+    function: Callable[..., Any]
+    inputs: int
+
+    def by_rows(self, x: Array, known: Array) -> Any:
+        """The value where the last axis counts components."""
+        return self._called(x, known[..., : self.inputs], known[..., self.inputs :])
+
+    def by_columns(self, x: Array, known: Array) -> Any:
+        """The value where the first axis does."""
+        return self._called(x, known[: self.inputs], known[self.inputs :])
+
+    def _called(self, x: Array, u: Array, theta: Array) -> Any:
+        return self.function(x, u, theta) if self.inputs else self.function(x, theta)
+
+
 def contained(function: Callable[..., Any]) -> Callable[..., Any]:
     """Foreign code that may raise an Exception or be interrupted, and nothing else."""
 
@@ -97,14 +115,17 @@ class BatchedFunction:
     def __init__(
         self,
         name: str,
-        function: Callable[..., Any] | Trusted,
+        function: Callable[..., Any] | Trusted | Parametric,
         shape: tuple[int, ...],
         inputs: int,
         probes: Probes,
     ) -> None:
         self._trusted = isinstance(function, Trusted)
+        by_columns = None
         if isinstance(function, Trusted):
             function = function.function
+        elif isinstance(function, Parametric):
+            by_columns, function = contained(function.by_columns), function.by_rows
         if not callable(function):
             raise ModelError(f"{name} is {shown(function)}; expected a function of the state.")
         self.name, self.shape = name, shape
@@ -112,6 +133,7 @@ class BatchedFunction:
         self.takes_input = takes_input(name, function, inputs)
         #: What is called: the user's function, contained.
         self.function = contained(function)
+        self._by_columns = by_columns or self.function
         # A scalar at one state is a value of shape (1,): p = 1 is written without brackets.
         self._short = False
         self.reads_only = self._trusted
@@ -157,7 +179,7 @@ class BatchedFunction:
             if len(lead) == 1 and not self._short:
                 return value
         elif self.mode == "columns":
-            value = self.function(x.T, u.T) if self.takes_input else self.function(x.T)
+            value = self._by_columns(x.T, u.T) if self.takes_input else self._by_columns(x.T)
             value = np.moveaxis(np.asarray(value), -1, 0)
         else:
             # Copied row by row: a function may return one and the same array every time.
@@ -224,9 +246,10 @@ class BatchedFunction:
         arguments = self._labelled(
             *(np.repeat(bits[:, None], size, axis=1) for size in (states, self._inputs))
         )
+        function = self.function
         if mode == "columns":
-            arguments = [labels.T for labels in arguments]
-        found = trace(self.function, arguments)
+            arguments, function = [labels.T for labels in arguments], self._by_columns
+        found = trace(function, arguments)
         if found is None or found.size != count * math.prod(self.shape):
             return False
         own = bits if mode == "columns" else bits.reshape(-1, *[1] * (found.ndim - 1))

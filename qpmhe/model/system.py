@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any, NoReturn, Protocol, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,9 @@ from .derivatives import Jacobian
 from .discretize import discretize
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .sets import ConvexSet
+
+if TYPE_CHECKING:
+    from .augmentation import Augmentation
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
@@ -154,6 +157,9 @@ class System:
         self.symbolic: Any = None
         #: Makes the system `timed`; None where there is no model in continuous time.
         self.make_timed: Callable[[], System] | None = None
+        #: Makes the system again with inputs among its states, in the language of its functions;
+        #: None where f and h themselves will do.
+        self.make_augmented: Callable[[Augmentation, SystemOptions], System] | None = None
         #: Function and keyword arguments that make this system again, when it is unpickled.
         self.recipe: tuple[Function, dict[str, Any]] = (
             type(self),
@@ -244,7 +250,13 @@ class System:
                 **options,
             )
 
-        system.make_timed = timed
+        def augmented(change: Augmentation, options: SystemOptions) -> System:
+            return cls.from_ode(
+                change.over_leading(batched, 0.0), change.over_leading(system.h),
+                dt=dt, method=method, n=change.n, p=p, m=change.m, **options,
+            )
+
+        system.make_timed, system.make_augmented = timed, augmented
         return system
 
     from_casadi = _Moved()
@@ -400,8 +412,10 @@ def _made(maker: Function, arguments: dict[str, Any]) -> Any:
     return maker(**arguments)
 
 
-def checked_set(name: str, value: ConvexSet | None, dimension: int) -> ConvexSet | None:
-    """The set, or None, after a check of its type and dimension."""
+def checked_set(
+    name: str, value: ConvexSet | None, dimension: int, meaning: str = ""
+) -> ConvexSet | None:
+    """The set, or None, after a check of its type and dimension, which may have a meaning."""
     if value is None:
         return None
     if not isinstance(value, ConvexSet):
@@ -409,7 +423,7 @@ def checked_set(name: str, value: ConvexSet | None, dimension: int) -> ConvexSet
             f"{name} is {shown(value)}; expected a qpmhe.Box, a qpmhe.Polytope or None."
         )
     if value.dimension != dimension:
-        raise SetError(f"{name} has dimension {value.dimension}; expected {dimension}.")
+        raise SetError(f"{name} has dimension {value.dimension}; expected {dimension}{meaning}.")
     return value
 
 

@@ -58,6 +58,7 @@ def test_one_qp_from_the_smoothed_prior(horizon, missing, discount):
 def test_the_candidate_is_the_observers_and_pays_for_the_other_prior():
     ys = record(20)
     mhes = [estimator(arrival=arrival, max_qps=3) for arrival in ("observer", "smoothed")]
+    before = None
     for t, y in enumerate(ys):
         plain, smoothed = (mhe.update(y) for mhe in mhes)
         np.testing.assert_array_equal(plain.candidate, smoothed.candidate)
@@ -67,8 +68,8 @@ def test_the_candidate_is_the_observers_and_pays_for_the_other_prior():
             assert plain.candidate_cost == smoothed.candidate_cost
         else:
             offset = smoothed.candidate[0] - before[1]
-            extra = offset @ P @ offset
-            assert smoothed.candidate_cost == pytest.approx(plain.candidate_cost + extra, rel=1e-12)
+            expected = plain.candidate_cost + offset @ P @ offset
+            assert smoothed.candidate_cost == pytest.approx(expected, rel=1e-12)
         before = smoothed.trajectory
 
 
@@ -100,7 +101,7 @@ def test_robust_losses_are_taken_at_the_smoothed_prior():
 def test_convergence_is_the_dense_minimum_of_every_window():
     horizon, ys = 5, record(25)
     roots = [np.linalg.cholesky(weight).T for weight in (P, Q, R)]
-    prior, window = np.array(START), []
+    prior, window, estimate = np.array(START), [], None
     mhe = estimator(horizon=horizon, max_qps=None, tolerance=1e-14, arrival="smoothed")
 
     def residuals(flat):

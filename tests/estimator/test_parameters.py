@@ -5,8 +5,15 @@ import pytest
 from scipy.optimize import least_squares
 
 import qpmhe
-from qpmhe import Box, Luenberger, MovingHorizonEstimator, Polytope, QuadraticCost, Status
-from qpmhe.model.parameters import augment_parameters
+from qpmhe import (
+    Box,
+    Luenberger,
+    MovingHorizonEstimator,
+    Polytope,
+    QuadraticCost,
+    Status,
+    augment_parameters,
+)
 from qpmhe_solvers import backend
 
 DT = 0.1
@@ -425,7 +432,7 @@ def build(**changes):
         ({"nominal": [2.0]}, "ModelError", r"IndexError.*theta = \[2.0\].*Check nominal"),
         ({"estimated": [2]}, "InvalidInputError", "names parameter 2; expected .* 0 to 1"),
         ({"estimated": [-1]}, "InvalidInputError", "names parameter -1"),
-        ({"estimated": [1, 1]}, "InvalidInputError", r"\[1, 1\], which names a parameter twice"),
+        ({"estimated": [1, 1]}, "InvalidInputError", r"\[1, 1\], which names one parameter twice"),
         ({"estimated": [0.0]}, "InvalidInputError", r"\[0.0\]; expected indices"),
         ({"estimated": [[0, 1]]}, "InvalidInputError", r"\[\[0, 1\]\]; expected indices"),
         ({"estimated": "damping"}, "InvalidInputError", "'damping'; expected indices"),

@@ -1,0 +1,160 @@
+"""Inputs of a model that become states: what unknown parameters and noisy inputs have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Unpack
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qpmhe_solvers.values import shown
+
+from ..errors import InvalidInputError, ShapeError
+from .functions import BatchedFunction, Trusted
+from .sets import Box, ConvexSet
+from .system import System, SystemOptions
+
+Array = NDArray[Any]
+Index = NDArray[np.intp]
+Function = Callable[..., Any]
+
+
+class Augmentation:
+    r"""A change of a model of state x and inputs v into one of state z = (x, s) and inputs u.
+
+    .. math::
+        v = \begin{pmatrix} u \\ c \end{pmatrix} + S s
+
+    where each column of S picks the input to which an entry of s is added. Every adapter applies
+    it to functions in its own language before they are differentiated and compiled.
+
+    Parameters
+    ----------
+    n, m : int
+        Numbers of states x and of inputs u.
+    constants : (l,) array
+        c.
+    moved : (k,) array of int
+        The place in v of each entry of s.
+    """
+
+    def __init__(self, n: int, m: int, constants: Array, moved: Index) -> None:
+        self._n, self.m, self._constants, self._moved = n, m, constants, moved
+        #: Number of states z.
+        self.n = n + moved.size
+
+    def inputs(self, u: Any, s: Any) -> list[Any]:
+        """The entries of v, of anything that has entries and can be added."""
+        entries = [*(u[j] for j in range(self.m)), *self._constants.tolist()]
+        for j, place in enumerate(self._moved.tolist()):
+            entries[place] = entries[place] + s[j]
+        return entries
+
+    def of_one_state(
+        self, function: Function, join: Function, factor: float | None = None
+    ) -> Function:
+        """A function of (x, v) as one of (z, u), in a language of columns of one state.
+
+        ``join`` makes one column of several and of single entries. With a ``factor``, this
+        multiple of s stands behind the value.
+        """
+        n = self._n
+
+        def evaluate(z: Any, u: Any = ()) -> Any:
+            value = function(z[:n], join(*self.inputs(u, z[n:])))
+            return value if factor is None else join(value, factor * z[n:])
+
+        return evaluate
+
+    def over_leading(self, function: BatchedFunction, factor: float | None = None) -> Trusted:
+        """The same of a NumPy function, over leading dimensions."""
+        n, m, constants, moved = self._n, self.m, self._constants, self._moved
+        size, inputs = function.shape[0], self.m + self._constants.size
+        nothing: Array = np.zeros(0)
+
+        def evaluate(z: Array, u: Array = nothing) -> Array:
+            v = np.empty((*z.shape[:-1], inputs), np.result_type(z, u))
+            v[..., :m], v[..., m:] = u, constants
+            v[..., moved] += z[..., n:]
+            x = z[..., :n]
+            if z.ndim == 1:
+                value = np.asarray(function(x, v)).reshape(size)
+            else:
+                value = function.batch(x, v)
+            return value if factor is None else np.concatenate((value, factor * z[..., n:]), -1)
+
+        return Trusted(evaluate)
+
+
+def augmented(system: System, change: Augmentation, **options: Unpack[SystemOptions]) -> System:
+    """The augmented system, made by the adapter that made the system, with exact derivatives."""
+    if system.make_augmented is not None:
+        return system.make_augmented(change, options)
+    return System(
+        change.over_leading(system.f, 1.0), change.over_leading(system.h),
+        n=change.n, p=system.p, m=change.m, **options,
+    )
+
+
+def chosen(name: str, given: ArrayLike | None, size: int, kind: str) -> Index:
+    """Indices from indices or a boolean mask; all of them for None."""
+    if given is None:
+        return np.arange(size)
+    refused = InvalidInputError(
+        f"{name} is {shown(given)}; expected indices of {kind}s or a boolean mask."
+    )
+    try:
+        found = np.atleast_1d(np.asarray(given))
+    except ValueError as error:  # rows of different lengths
+        raise refused from error
+    if found.dtype == np.bool_:
+        if found.shape != (size,):
+            raise ShapeError(
+                f"{name} is a mask of shape {found.shape}; expected ({size},), one entry for each "
+                f"{kind}."
+            )
+        return np.flatnonzero(found)
+    if found.size == 0:
+        return np.empty(0, np.intp)
+    if found.ndim != 1 or found.dtype.kind not in "iu":
+        raise refused
+    outside = (found < 0) | (found >= size)
+    if outside.any():
+        raise InvalidInputError(
+            f"{name} names {kind} {int(found[outside][0])}; expected indices from 0 to {size - 1}."
+        )
+    if np.unique(found).size < found.size:
+        raise InvalidInputError(
+            f"{name} is {found.tolist()}, which names one {kind} twice; expected different indices."
+        )
+    return found.astype(np.intp)
+
+
+def product(
+    first: ConvexSet | None, n: int, second: ConvexSet | None, k: int
+) -> ConvexSet | None:
+    """All (x, s) with x (n,) in the first set and s (k,) in the second; None is everything."""
+    if first is None and second is None:
+        return None
+    if k == 0:
+        return first
+    one, two = _or_everything(first, n), _or_everything(second, k)
+    lower, upper = np.append(one.lower, two.lower), np.append(one.upper, two.upper)
+    rows = one.matrix.shape[0] + two.matrix.shape[0]
+    if rows == 0:
+        return Box(lower, upper)
+    matrix = np.zeros((rows, n + k))
+    matrix[: one.matrix.shape[0], :n] = one.matrix
+    matrix[one.matrix.shape[0] :, n:] = two.matrix
+    return ConvexSet(
+        lower, upper, matrix,
+        np.append(one.row_lower, two.row_lower), np.append(one.row_upper, two.row_upper),
+    )
+
+
+def _or_everything(one: ConvexSet | None, dimension: int) -> ConvexSet:
+    if one is not None:
+        return one
+    free = np.full(dimension, np.inf)
+    return Box(-free, free)

@@ -1,0 +1,112 @@
+"""Inputs that are measured with noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InvalidInputError
+from .augmentation import Augmentation, augmented, chosen, product
+from .functions import Trusted
+from .system import System, SystemOptions, checked_system
+
+Array = NDArray[Any]
+
+
+def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
+    r"""The system whose state is the model's state together with the errors of its inputs.
+
+    The inputs u are measured, and what acts is :math:`u + e` with an error e that is white: its
+    values at different times have nothing to do with each other.
+
+    .. math::
+        x(t+1) = f(x(t), u(t) + e(t)) + w(t), \qquad e(t+1) = w_e(t), \qquad
+        y(t) = h(x(t), u(t) + e(t)) + v(t)
+
+    The state is (x, e), the disturbance (w, w_e), and nothing is approximated: with the
+    covariance :math:`Q_u` of the errors, extend the covariances of the prior and of the disturbance
+    by it, ``scipy.linalg.block_diag(P, Qu)`` and ``block_diag(Q, Qu)``, the gain of an observer by
+    rows of zeros, and the initial state by zeros. On a linear system
+    :math:`x^+ = A x + B u + w` this is the process noise covariance :math:`Q + B Q_u B^\top`.
+
+    This is a convenience outside of the paper. Its theorem speaks of the system that is returned
+    only where that meets its assumptions, and its bounds count e among the errors; none of the
+    constants of the original system carry over.
+
+    Parameters
+    ----------
+    system : System
+        The model, with inputs.
+    inputs : array_like, optional
+        Indices of the inputs that have errors, or a boolean mask (m,). All if left out.
+
+    Returns
+    -------
+    System
+        With a state behind x for each of these inputs, in their order, and the same inputs. It
+        takes steps of other lengths and pickles where the given one does. There is no C form
+        of it.
+
+    Raises
+    ------
+    ModelError
+        If it is not a `System`.
+    InvalidInputError, ShapeError
+        If the system has no inputs, or ``inputs`` does not name any.
+
+    Examples
+    --------
+    >>> import qpmhe
+    >>> plant = qpmhe.System(lambda x, u: 0.9 * x + u, lambda x: x, n=1, p=1, m=1)
+    >>> qpmhe.noisy_inputs(plant).f([2.0, 0.5], [1.0])
+    array([3.3, 0. ])
+    """
+    n, m = checked_system(system).n, system.m
+    if m == 0:
+        raise InvalidInputError("system has no inputs, so none of them is measured.")
+    noisy = chosen("inputs", inputs, m, "input")
+    if noisy.size == 0:
+        raise InvalidInputError("inputs is empty; expected at least one input, or leave it out.")
+    options: SystemOptions = {
+        "states": product(system.states, n, None, noisy.size),
+        "disturbances": product(system.disturbances, n, None, noisy.size),
+        "noises": system.noises,
+    }
+    held = augmented(system, Augmentation(n, m, np.zeros(0), noisy), **options)
+    made = _without_memory(held, n, options)
+    made.recipe = noisy_inputs, {"system": system, "inputs": inputs}
+    return made
+
+
+def _without_memory(held: System, n: int, options: SystemOptions) -> System:
+    """The system with e+ = 0, from the one with e+ = e."""
+
+    def zeroed(function: Any) -> Callable[[Array, Array], Array]:
+        def evaluate(z: Array, u: Array) -> Array:
+            many = z.ndim > 1
+            value = np.array(function.batch(z, u) if many else function(z, u))
+            value[(slice(None), slice(n, None)) if many else slice(n, None)] = 0.0
+            return value
+
+        return evaluate
+
+    def output(function: Any) -> Callable[[Array, Array], Array]:
+        return lambda z, u: function.batch(z, u) if z.ndim > 1 else np.asarray(function(z, u))
+
+    # What is computed by small steps is better computed of the new functions, in their scales.
+    exact = [
+        one.method not in ("complex step", "finite differences")
+        for one in (held.f_jacobian, held.h_jacobian)
+    ]
+    made = System(
+        Trusted(zeroed(held.f)), Trusted(output(held.h)), n=held.n, p=held.p, m=held.m,
+        f_jacobian=Trusted(zeroed(held.f_jacobian)) if exact[0] else None,
+        h_jacobian=Trusted(output(held.h_jacobian)) if exact[1] else None, **options,
+    )
+    made.dt = held.dt
+    if held.make_timed is not None:
+        made.make_timed = lambda: _without_memory(held.timed, n, options)
+    return made
