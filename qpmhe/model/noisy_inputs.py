@@ -59,9 +59,9 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
 
     Examples
     --------
-    >>> import qpmhe
+    >>> import numpy as np, qpmhe
     >>> plant = qpmhe.System(lambda x, u: 0.9 * x + u, lambda x: x, n=1, p=1, m=1)
-    >>> qpmhe.noisy_inputs(plant).f([2.0, 0.5], [1.0])
+    >>> qpmhe.noisy_inputs(plant).f(np.array([2.0, 0.5]), np.ones(1))
     array([3.3, 0. ])
     """
     n, m = checked_system(system).n, system.m
@@ -77,7 +77,7 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
     }
     held = augmented(system, Augmentation(n, m, np.zeros(0), noisy), **options)
     made = _without_memory(held, n, options)
-    made.recipe = noisy_inputs, {"system": system, "inputs": inputs}
+    made.recipe = noisy_inputs, {"system": system, "inputs": noisy}
     return made
 
 

@@ -124,13 +124,13 @@ def augment_parameters(
     ...     system, qpmhe.Luenberger([0.4, 0.0]), cost, horizon=10,
     ...     initial_state=[0.0, 0.5], max_qps=None)
     """
-    arguments = {
-        "f": f, "h": h, "nominal": nominal, "n": n, "p": p, "m": m, "estimated": estimated,
-        "drifting": drifting, "dt": dt, "method": method, "states": states, "disturbances": disturbances,
-        "noises": noises, "parameter_bounds": parameter_bounds,
-    }
     values = _nominal(nominal)
     moved = chosen("estimated", estimated, values.size, "parameter")
+    arguments = {
+        "f": f, "h": h, "nominal": values, "n": n, "p": p, "m": m, "estimated": moved,
+        "drifting": drifting, "dt": dt, "method": method, "states": states,
+        "disturbances": disturbances, "noises": noises, "parameter_bounds": parameter_bounds,
+    }
     if isinstance(f, System):
         n, p, m = f.n, f.p, _other_inputs(arguments, values.size)
         states, disturbances, noises = f.states, f.disturbances, f.noises
@@ -153,20 +153,25 @@ def augment_parameters(
         system = augmented(f, change, **options)
     else:
         probes = _probes(probe_points(states, n, m), values, moved, parameter_bounds)
-        of_state = _function("f", f, n, m, probes)
-        output = change.over_leading(_function("h", h, p, m, probes))
-        sizes = {"n": change.n, "p": p, "m": m}
-        if dt is None:
-            if method is not None:
-                raise OptionError(f"method is {shown(method)}, but there is no dt; give both.")
-            system = System(change.over_leading(of_state, 1.0), output, **sizes, **options)
-        else:
-            system = System.from_ode(
-                change.over_leading(of_state, 0.0), output, dt=dt, method=method or "rk4",
-                **sizes, **options,
-            )
+        functions = _function("f", f, n, m, probes), _function("h", h, p, m, probes)
+        system = _of_functions(change, *functions, dt, method, options)
     system.recipe = augment_parameters, arguments
     return system
+
+
+def _of_functions(
+    change: Augmentation, f: BatchedFunction, h: BatchedFunction, dt: float | None,
+    method: str | None, options: Any,
+) -> System:
+    sizes: Any = {"n": change.n, "p": h.shape[0], "m": change.m}
+    output = change.over_leading(h)
+    if dt is None and method is not None:
+        raise OptionError(f"method is {shown(method)}, but dt is missing; give both or neither.")
+    if dt is None:
+        return System(change.over_leading(f, 1.0), output, **sizes, **options)
+    return System.from_ode(
+        change.over_leading(f, 0.0), output, dt=dt, method=method or "rk4", **sizes, **options
+    )
 
 
 def _other_inputs(arguments: dict[str, Any], parameters: int) -> int:
@@ -187,7 +192,7 @@ def _other_inputs(arguments: dict[str, Any], parameters: int) -> int:
 
 
 def _nominal(given: ArrayLike) -> Array:
-    values = np.atleast_1d(numbers("nominal", given, finite=False))
+    values = np.array(numbers("nominal", given, finite=False), ndmin=1)  # ours: pickles hold it
     if values.ndim != 1 or values.size == 0:
         raise ShapeError(
             f"nominal has shape {values.shape}; expected (k,), a value for each parameter."

@@ -1,0 +1,193 @@
+"""Inputs with white errors: the Kalman filter with B Qu B', and Ipopt on a nonlinear plant."""
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+import qpmhe
+
+from .plain import spd
+
+
+class Plant:
+    """A random linear system whose inputs, some of them measured with noise, act on y as well."""
+
+    def __init__(self, seed, n=3, p=2, m=2, noisy=(0, 1), steps=60):
+        rng = np.random.default_rng(seed)
+        a = rng.standard_normal((n, n))
+        self.A = a * (0.95 / np.abs(np.linalg.eigvals(a)).max())
+        self.B, self.C = rng.standard_normal((n, m)), rng.standard_normal((p, n))
+        self.P, self.Q, self.R = spd(rng, n), 0.1 * spd(rng, n), spd(rng, p)
+        self.noisy, self.Qu = list(noisy), spd(rng, len(noisy))
+        self.start, self.U = rng.standard_normal(n), rng.standard_normal((steps, m))
+        x, self.Y, self.X = self.start + rng.standard_normal(n), [], []
+        for u in self.U:
+            acting = u.copy()
+            acting[self.noisy] += np.linalg.cholesky(self.Qu) @ rng.standard_normal(len(noisy))
+            self.Y.append(self.C @ x + np.linalg.cholesky(self.R) @ rng.standard_normal(p))
+            x = self.A @ x + self.B @ acting + np.linalg.cholesky(self.Q) @ rng.standard_normal(n)
+            self.X.append(x)
+        self.Y = np.array(self.Y)
+
+    def kalman(self):
+        """Predicted and filtered states with the process noise Q + B Qu B'."""
+        A, C, b = self.A, self.C, self.B[:, self.noisy]
+        z, S, predicted, filtered = self.start, self.P, [], []
+        for y, u in zip(self.Y, self.U, strict=True):
+            gain = S @ C.T @ np.linalg.inv(C @ S @ C.T + self.R)
+            z, S = z + gain @ (y - C @ z), S - gain @ C @ S
+            filtered.append(z)
+            z, S = A @ z + self.B @ u, A @ S @ A.T + self.Q + b @ self.Qu @ b.T
+            predicted.append((z, S))
+        return predicted, np.array(filtered)
+
+    def estimator(self, horizon, **options):
+        A, B, C, k = self.A, self.B, self.C, len(self.noisy)
+        plant = qpmhe.System(
+            lambda x, u: x @ A.T + u @ B.T, lambda x: x @ C.T, n=len(A), p=len(C), m=B.shape[1]
+        )
+        prior, disturbance = block_diag(self.P, self.Qu), block_diag(self.Q, self.Qu)
+        return qpmhe.MovingHorizonEstimator(
+            qpmhe.noisy_inputs(plant, self.noisy),
+            qpmhe.ExtendedKalman(prior=prior, disturbance=disturbance, noise=self.R),
+            qpmhe.QuadraticCost.from_covariances(
+                prior=qpmhe.ObserverPrior(), disturbance=disturbance, noise=self.R
+            ),
+            horizon=horizon, initial_state=[*self.start, *np.zeros(k)], **options,
+        )
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 5, 20])
+@pytest.mark.parametrize("noisy", [(0, 1), (1,)])
+def test_it_is_the_kalman_filter_with_the_inputs_covariance(noisy, horizon):
+    for seed in range(3):
+        plant = Plant(seed, noisy=noisy)
+        predicted, filtered = plant.kalman()
+        mhe = plant.estimator(horizon)
+        for t, (y, u) in enumerate(zip(plant.Y, plant.U, strict=True)):
+            estimate = mhe.update(y, u)
+            mean, covariance = predicted[t]
+            np.testing.assert_allclose(estimate.state[:3], mean, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(estimate.filtered[:3], filtered[t], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(
+                mhe.covariances()[-1], block_diag(covariance, plant.Qu), rtol=1e-8, atol=1e-9
+            )
+
+
+def test_errors_of_inputs_are_estimated_within_the_window():
+    """What the estimate calls e is what it needs besides w to explain the record."""
+    plant = Plant(7, noisy=(1,))
+    mhe = plant.estimator(10)
+    for t, (y, u) in enumerate(zip(plant.Y, plant.U, strict=True)):
+        estimate = mhe.update(y, u)
+        x, e = estimate.trajectory[:, :3], estimate.trajectory[:, 3:]
+        inputs = plant.U[t + 1 - len(estimate.noises) : t + 1].copy()
+        inputs[:, 1:] += e[:-1]
+        w = x[1:] - x[:-1] @ plant.A.T - inputs @ plant.B.T
+        np.testing.assert_allclose(estimate.disturbances[:, :3], w, atol=1e-12)
+        np.testing.assert_allclose(estimate.disturbances[:, 3:], e[1:], atol=1e-12)
+        assert np.abs(e[-1]).max() < 1e-9  # no measurement has seen it yet
+    assert np.abs(e[:-1]).max() > 0.05
+
+
+def tank(x, u):
+    """A level with a pump and a valve, both nonlinear; y sees the valve, too."""
+    return x + 0.1 * (np.tanh(u[..., :1]) - u[..., 1:] * np.sqrt(1.0 + x**2))
+
+
+def gauge(x, u):
+    return x + 0.2 * u[..., 1:] ** 2
+
+
+def test_ipopt_finds_the_same_minimum_on_a_nonlinear_plant():
+    """The oracle has the errors themselves as variables, not states: x, e and nothing else."""
+    ca = pytest.importorskip("casadi")
+    horizon, rng = 6, np.random.default_rng(4)
+    P, Q, R, Qu = 0.5, 0.001, 0.002, np.array([[0.05, 0.01], [0.01, 0.04]])
+    options = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "ipopt.tol": 1e-11}
+
+    def program(count):
+        x, e = ca.SX.sym("x", count + 1), ca.SX.sym("e", 2, count)
+        y, u, before = ca.SX.sym("y", count), ca.SX.sym("u", 2, count), ca.SX.sym("before")
+        first = ca.SX.sym("first", 2)
+        cost = (x[0] - before) ** 2 / P
+        for i in range(count):
+            pump, valve = u[0, i] + e[0, i], u[1, i] + e[1, i]
+            step = x[i] + 0.1 * (ca.tanh(pump) - valve * ca.sqrt(1.0 + x[i] ** 2))
+            cost += (x[i + 1] - step) ** 2 / Q + (y[i] - x[i] - 0.2 * valve**2) ** 2 / R
+            error = e[:, i] - (first if i == 0 else 0.0)
+            cost += error.T @ ca.DM(np.linalg.inv(Qu)) @ error
+        unknown = ca.vertcat(x, ca.vec(e))
+        given = ca.vertcat(y, ca.vec(u), before, first)
+        return ca.nlpsol("mhe", "ipopt", {"x": unknown, "p": given, "f": cost}, options)
+
+    programs = [program(count) for count in range(1, horizon + 1)]
+    system = qpmhe.noisy_inputs(qpmhe.System(tank, gauge, n=1, p=1, m=2))
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=block_diag(P, Qu), disturbance=block_diag(Q, Qu), noise=R
+    )
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.2, 0.0, 0.0]), cost, horizon=horizon,
+        initial_state=[1.0, 0.0, 0.0], max_qps=None, tolerance=1e-14,
+    )
+    x, ys, us = np.array([1.5]), [], []
+    for t in range(20):
+        u = np.array([np.sin(0.3 * t), 0.5])
+        acting = u + np.linalg.cholesky(Qu) @ rng.standard_normal(2)
+        ys.append(gauge(x, acting) + np.sqrt(R) * rng.standard_normal(1))
+        us.append(u)
+        x = tank(x, acting) + np.sqrt(Q) * rng.standard_normal(1)
+        estimate = mhe.update(ys[-1], u)
+        candidate, count = estimate.candidate, len(estimate.noises)
+        found = programs[count - 1](
+            x0=np.concatenate((candidate[:, 0], candidate[:-1, 1:].ravel())),
+            p=np.concatenate((np.ravel(ys[-count:]), np.ravel(us[-count:]), candidate[0])),
+        )
+        assert estimate.cost <= estimate.candidate_cost
+        assert estimate.cost == pytest.approx(float(found["f"]), rel=1e-6)
+        solution = np.array(found["x"]).ravel()
+        np.testing.assert_allclose(estimate.trajectory[:, 0], solution[: count + 1], atol=1e-6)
+        np.testing.assert_allclose(
+            estimate.trajectory[:-1, 1:].ravel(), solution[count + 1 :], atol=1e-6
+        )
+
+
+def test_a_plant_of_which_only_one_function_takes_inputs():
+    for f, h in (
+        (lambda x, u: 0.5 * x + u, lambda x: x), (lambda x: 0.5 * x, lambda x, u: x + u),
+    ):
+        system = qpmhe.noisy_inputs(qpmhe.System(f, h, n=1, p=1, m=1))
+        z, u = np.array([2.0, 0.25]), np.ones(1)
+        expected = [0.5 * 2.0 + (1.25 if f.__code__.co_argcount == 2 else 0.0), 0.0]
+        np.testing.assert_array_equal(system.f(z, u), expected)
+        np.testing.assert_array_equal(
+            system.h(z, u), [2.0 + (1.25 if h.__code__.co_argcount == 2 else 0.0)]
+        )
+
+
+def test_finite_differences_have_the_scales_of_the_augmented_state():
+    """A model that refuses complex numbers, in tiny units."""
+
+    def rigid(x, u):
+        return np.array([0.9 * float(x[0]) + 1e-3 * float(u[0])])
+
+    system = qpmhe.noisy_inputs(qpmhe.System(rigid, lambda x: x[:1], n=1, p=1, m=1))
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=np.diag([1e-18, 1e-12]), disturbance=np.diag([1e-20, 1e-12]), noise=1e-19
+    )
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.2, 0.0]), cost, horizon=5, initial_state=[1e-9, 0.0]
+    )
+    assert system.derivatives["f"] == "finite differences"
+    y = 1e-9 * np.sin(np.arange(10.0))
+    run = mhe.run(y, np.full((10, 1), 1e-6))
+    large = qpmhe.MovingHorizonEstimator(
+        qpmhe.noisy_inputs(qpmhe.System(
+            lambda x, u: 0.9 * x + u, lambda x: x, n=1, p=1, m=1
+        )),
+        qpmhe.Luenberger([0.2, 0.0]),
+        qpmhe.QuadraticCost.from_covariances(
+            prior=np.eye(2), disturbance=np.diag([1e-2, 1.0]), noise=1e-1
+        ), horizon=5, initial_state=[1.0, 0.0],
+    ).run(1e9 * y, np.ones((10, 1)))
+    np.testing.assert_allclose(1e9 * run.states[:, 0], large.states[:, 0], rtol=1e-7)
