@@ -5,10 +5,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from estimator.plain import euler, rk4
 
 import qpmhe
-
-from estimator.plain import euler, rk4
 
 THETA = [0.7, 1.3, 0.2]
 ESTIMATED = [2, 0]
