@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array, count, numbers, vector
+from qpmhe_solvers.values import shown
+
+from .._checks import Array, count, numbers
 from ..costs import Cost
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.estimate import Status
@@ -34,8 +36,8 @@ ASSUMED = (
     "the true state stays in the region, and follows the model",
     "the bounds on disturbances and noises that are passed are true",
 )
-# A window without all its measurements has another cost.
-_BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
+#: A window without all its measurements has another cost.
+BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,31 +149,75 @@ class Certificate:
             If the source is of another system, observer, cost or horizon, or did not make
             the run.
         """
-        w, v = _signals(self.system, run, disturbances, noises)
-        start = numbers("initial_error", initial_error)
-        if start.ndim:
-            start = vector("initial_error", start, self.system.n)
-        else:
-            checked_length("initial_error", start)
         if source is not None and horizon is None:
             horizon = getattr(source, "horizon", None)
         chosen = self.of(horizon)
+        start, w, v = self._signals(run, initial_error, disturbances, noises)
         costs = None
         if source is not None:
-            costs = _checked_costs(self, source, run, chosen.paper.horizon)
+            costs = self._costs(source, run, chosen.paper.horizon)
         elif kind == "measured":
             raise InvalidInputError(
                 "the measured bound has no source, and a run does not say its horizon and "
                 "cost; pass the estimator that made it (source=estimator)."
             )
-        if kind == "paper":
-            lengths = [x if x.ndim == 1 else np.linalg.norm(x, axis=1) for x in (w, v)]
-            return _OUTWARD * chosen.paper.result.bound(
-                float(np.linalg.norm(np.atleast_1d(start))), *lengths
+        if kind != "paper":
+            measured = costs if kind == "measured" else None
+            return _OUTWARD * chosen.beyond(kind).bound(start, w, v, measured)
+        lengths = [x if x.ndim == 1 else np.linalg.norm(x, axis=1) for x in (w, v)]
+        return _OUTWARD * chosen.paper.result.bound(np.linalg.norm(start), *lengths)
+
+    def _signals(
+        self, run: Run | None, initial_error: ArrayLike, disturbances: ArrayLike, noises: ArrayLike
+    ) -> tuple[Array, Array, Array]:
+        """Initial error, disturbances and noises: vectors or lengths, at each sample."""
+        n, p = self.system.n, self.system.p
+        start = numbers("initial_error", initial_error)
+        w, v = numbers("disturbances", disturbances), numbers("noises", noises)
+        steps = len(run) if run is not None else next((len(x) for x in (w, v) if x.ndim), None)
+        if steps is None:
+            raise ShapeError(
+                "disturbances and noises are numbers and there is no run; expected a sequence "
+                "for one of them, to say how many steps there are."
             )
-        if kind != "measured":
-            costs = None
-        return _OUTWARD * chosen.beyond(kind).bound(start, w, v, costs=costs)
+        known = ("initial_error", start, (), (n,)), ("disturbances", w, (steps,), (steps, n)), (
+            "noises", v, (steps,), (steps, p)
+        )
+        found = []
+        for name, x, lengths, vectors in known:
+            if x.ndim and x.shape not in (lengths, vectors):
+                raise ShapeError(
+                    f"{name} has shape {x.shape}; expected {vectors}, lengths {lengths}, or a "
+                    "number."
+                )
+            if x.shape != vectors and (x < 0.0).any():
+                raise OptionError(f"{name} is {shown(x)}; expected Euclidean lengths, all >= 0.")
+            found.append(x if x.ndim else np.full(lengths, x))
+        return found[0], found[1], found[2]
+
+    def _costs(self, source: MovingHorizonEstimator, run: Run | None, horizon: int) -> Array:
+        """The costs of a run's estimates; NaN where a window is not what the bound is of."""
+        if run is None or not isinstance(source, MovingHorizonEstimator):
+            raise InvalidInputError(
+                f"source is {source!r} and run {run!r}; expected an estimator and its run."
+            )
+        self.check_estimator(source)
+        if source.horizon != horizon:
+            raise MismatchError(
+                f"horizon is {horizon}, but the run's estimator has {source.horizon}; take the "
+                "bound for its horizon, and certify again if there is none."
+            )
+        if source.time != len(run) or not np.array_equal(
+            source.state, run.states[-1], equal_nan=True
+        ):
+            raise MismatchError(
+                "the source is not at the end of this run: it has seen another one, or more or "
+                "less of it. Pass the estimator right after its run from the start."
+            )
+        costs = np.array(run.costs, np.float64)
+        for t in np.flatnonzero(run.flags & BROKEN.value):
+            costs[t : t + horizon] = np.nan
+        return costs
 
     def funnel(
         self, w_max: float, v_max: float, *, initial_error: float, steps: int,
@@ -194,8 +240,6 @@ class Certificate:
             If a length is negative or not finite, the steps are no integer, or there is no
             such bound.
         """
-        w, v = checked_length("w_max", w_max), checked_length("v_max", v_max)
-        start = checked_length("initial_error", initial_error)
         if kind == "measured":
             raise OptionError(
                 "kind is 'measured', but nothing is measured yet; expected one of "
@@ -203,7 +247,9 @@ class Certificate:
             )
         length = count("steps", steps, 1)
         return self.bound(
-            None, np.full(length, w), np.full(length, v), initial_error=start, horizon=horizon,
+            None, np.full(length, checked_length("w_max", w_max)),
+            np.full(length, checked_length("v_max", v_max)),
+            initial_error=checked_length("initial_error", initial_error), horizon=horizon,
             kind=kind,
         )
 
@@ -213,9 +259,8 @@ class Certificate:
         """What the funnel tends to as t grows; arguments and errors as for `funnel`."""
         w, v = checked_length("w_max", w_max), checked_length("v_max", v_max)
         chosen = self.of(horizon)
-        if kind == "paper":
-            return _OUTWARD * chosen.paper.result.limit(w, v)
-        return _OUTWARD * chosen.beyond(kind).limit(w, v)
+        bound = chosen.paper.result if kind == "paper" else chosen.beyond(kind)
+        return _OUTWARD * bound.limit(w, v)
 
     def vacuous(
         self, w_max: float | None = None, v_max: float | None = None, *, horizon: int | None = None,
@@ -273,82 +318,3 @@ class Certificate:
             },
         })
         return content
-
-    def summary(self) -> str:
-        """The certificate in some lines of text."""
-        sizes = self.sizes
-        lines = [
-            f"On {self.region.states!r}: {self.evidence}.",
-            *(f"Assumed: {each}." for each in ASSUMED),
-            *(
-                f"Violated{'' if each.needed else ', but the bounds need no sets'}: {each.text} "
-                f"({each.label})." for each in self.audit.violated
-            ),
-            f"Bounds of the error for |w| <= {sizes.disturbance:.3g} and |v| <= "
-            f"{sizes.noise:.3g} for all times:",
-        ]
-        for N, bounds in self.bounds.items():
-            C, lam = bounds.paper.C, bounds.paper.lam
-            lines.append(
-                f"N = {N}: C_1 = {C[0]:.4g}, C_2 = {C[1]:.4g}, C_3 = {C[2]:.4g}, "
-                f"lambda = {lam:.4g}"
-            )
-            for kind in self.kinds:
-                if kind == "measured":
-                    continue
-                limit = self.limit(sizes.disturbance, sizes.noise, horizon=N, kind=kind)
-                verdict = ""
-                if self.vacuous(horizon=N, kind=kind):
-                    verdict = f", vacuous: the region's diameter is {self.diameter:.4g}"
-                lines.append(f"  {kind}: {limit:.4g}{verdict}")
-        return "\n".join(lines)
-
-
-def _signals(
-    system: System, run: Run | None, disturbances: ArrayLike, noises: ArrayLike
-) -> tuple[Array, Array]:
-    """Vectors or lengths at each sample."""
-    w, v = numbers("disturbances", disturbances), numbers("noises", noises)
-    steps = len(run) if run is not None else next((len(x) for x in (w, v) if x.ndim), None)
-    if steps is None:
-        raise ShapeError(
-            "disturbances and noises are numbers and there is no run; expected a sequence "
-            "for one of them, to say how many steps there are."
-        )
-    for name, x, width in (("disturbances", w, system.n), ("noises", v, system.p)):
-        if x.ndim and x.shape not in ((steps,), (steps, width)):
-            raise ShapeError(
-                f"{name} has shape {x.shape}; expected ({steps}, {width}), their lengths "
-                f"({steps},), or a number."
-            )
-    return (w if w.ndim else np.full(steps, float(w)), v if v.ndim else np.full(steps, float(v)))
-
-
-def _checked_costs(
-    certificate: Certificate, source: MovingHorizonEstimator, run: Run | None, horizon: int
-) -> Array:
-    """The costs of a run's estimates; NaN where a window is not what the bound is of."""
-    if run is None:
-        raise InvalidInputError("a source is given, but no run; pass the run that it made.")
-    if not isinstance(source, MovingHorizonEstimator):
-        raise InvalidInputError(
-            f"source is {source!r}; expected the estimator that made the run."
-        )
-    certificate.check_estimator(source)
-    if source.horizon != horizon:
-        raise MismatchError(
-            f"horizon is {horizon}, but the run's estimator has {source.horizon}; take the "
-            "bound for its horizon, and certify again if there is none."
-        )
-    if source.time != len(run) or not np.array_equal(
-        source.state, run.states[-1], equal_nan=True
-    ):
-        raise MismatchError(
-            "the source is not at the end of this run: it has seen another one, or more or less "
-            "of it. Pass the estimator right after its run from the start."
-        )
-    costs = np.array(run.costs, np.float64)
-    broken = (run.flags & _BROKEN.value) != 0
-    for t in np.flatnonzero(broken):
-        costs[t : t + horizon] = np.nan
-    return costs
