@@ -1,11 +1,11 @@
-"""What is certified of an estimator: constants, their evidence, and bounds of its error."""
+"""From system, observer, cost and horizon to a certificate, and to bounds of the error."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,20 +13,31 @@ from numpy.typing import ArrayLike
 from qpmhe_solvers.values import shown
 
 from .._checks import Array, count, numbers
-from ..costs import Cost
-from ..errors import InvalidInputError, OptionError, ShapeError
+from ..costs import Cost, CostConstants
+from ..errors import InvalidInputError, OptionError, QpmheError, ShapeError
 from ..estimation.estimate import Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
+from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
-from .audit import Audit
-from .decay import Sizes, checked_length
-from .evidence import Evidence, MismatchError, json_ready, weakest
-from .observer import gain_if_constant
-from .properties import Detectability, ObserverStability
-from .regions import Region
-from .window_bounds import HorizonBounds, Kind
+from .audit import Audit, audit, checked_ingredients
+from .branch_and_bound import constant_output
+from .contraction import certify_detectability, certify_observer, constant_gain, gain_if_constant
+from .deadline import DEFAULT_SECONDS, Deadline
+from .evidence import (
+    CertificateError,
+    Evidence,
+    MismatchError,
+    NotCertifiedError,
+    json_ready,
+    weakest,
+)
+from .properties import Detectability, ObserverStability, fitting
+from .regions import Region, bounded_region
+from .sdp import started
+from .theorem import Sizes, checked_length
+from .window_bounds import HorizonBounds, Kind, bounds_for
 
 # The constants are upper bounds, what is computed from them is not: this covers its rounding.
 _OUTWARD = 1.0 + 1e-9
@@ -58,6 +69,8 @@ class Certificate:
         For each horizon.
     sizes : Sizes
         For which disturbances and noises the bounds are called vacuous or not.
+    evidence : Evidence
+        What the bounds rest on: the weakest evidence among their ingredients'.
     """
 
     system: System
@@ -68,12 +81,7 @@ class Certificate:
     stability: ObserverStability
     bounds: Mapping[int, HorizonBounds]
     sizes: Sizes
-    _certified: bool = field(default=False, init=False, repr=False)
-
-    def sealed(self) -> Certificate:
-        """The certificate itself, whose evidence is from now on its parts'."""
-        object.__setattr__(self, "_certified", True)
-        return self
+    evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
 
     @cached_property
     def gain(self) -> Array | None:
@@ -84,19 +92,6 @@ class Certificate:
     def region(self) -> Region:
         """Where it holds."""
         return self.audit.region
-
-    @cached_property
-    def evidence(self) -> Evidence:
-        """What the bounds rest on: the weakest evidence among their ingredients'."""
-        if not self._certified:
-            return Evidence.ASSUMED
-        used = [self.audit[name].evidence for name in (
-            "output Lipschitz", "no correction without error", "correction bound", "cost bounds"
-        )]
-        return weakest([
-            *(each for each in used if each is not None),
-            self.detectability.evidence, self.stability.evidence,
-        ])
 
     @property
     def horizons(self) -> tuple[int, ...]:
@@ -318,3 +313,142 @@ class Certificate:
             },
         })
         return content
+
+
+Result = TypeVar("Result")
+
+# How much of the time left the audit, detectability and the observer take.
+_AUDIT, _DETECTABILITY, _OBSERVER = 0.25, 0.5, 0.9
+
+
+def certify(
+    system: System, observer: Observer, cost: Cost, *, horizon: int | Sequence[int],
+    region: ConvexSet | Region | None = None, inputs: Box | None = None, sizes: Sizes | None = None,
+    detectability: Detectability | None = None, stability: ObserverStability | None = None,
+    seconds: float | Deadline = DEFAULT_SECONDS,
+) -> Certificate:
+    """Check the theorem's assumptions on a set of states, and bound the estimator's error.
+
+    Parameters
+    ----------
+    system, observer, cost
+        What the estimator is made of.
+    horizon : int or sequence of int
+        N, or several of them.
+    region : Box, Polytope or Region, optional
+        A bounded set of states; the system's own if left out.
+    inputs : Box, optional
+        Bounds on the inputs, for a system with inputs.
+    sizes : Sizes, optional
+        For which disturbances and noises the observer's constants are to be small, and the
+        bounds are called vacuous or not; left out, those of which each alone costs 1 in its
+        cheapest direction.
+    detectability, stability : optional
+        Constants to take instead of looking for them, such as assumed ones, or those that
+        were certified of this system and gain on a set that contains the region.
+    seconds : float or Deadline
+        How long the audit and the search for constants may take, about, from when the solvers
+        are loaded. What is not proved when its share is over rests on samples, and says so.
+
+    Raises
+    ------
+    SetError, ShapeError, OptionError, InvalidInputError, ModelError
+        If an argument does not fit.
+    MismatchError
+        If constants that are passed are of another system or gain, or of a set that does not
+        contain the region and the inputs.
+    CertificateError
+        If the cost has no constants, h no Lipschitz constant, or the observer no constant
+        gain and no assumed constants.
+    NotCertifiedError
+        If detectability or the observer's stability cannot be shown; the text says what
+        may help.
+    """
+    checked_ingredients(system, observer, cost)
+    horizons = horizons_of(horizon)
+    place = bounded_region(system, region, inputs)
+    gain = gain_if_constant(observer, system)
+    if gain is None and stability is None:  # without one, all else would be in vain
+        constant_gain(observer, system)
+    if detectability is not None:
+        detectability = fitting(detectability, system, place, gain)
+    if stability is not None:
+        stability = fitting(stability, system, place, gain)
+    *_, certificate = certified(
+        system, observer, cost, place, horizons, sizes, started(seconds), detectability, stability
+    )
+    assert certificate is not None
+    return certificate
+
+
+def certified(
+    system: System, observer: Observer, cost: Cost, region: Region, horizons: Sequence[int],
+    sizes: Sizes | None, deadline: Deadline, detectability: Detectability | None = None,
+    stability: ObserverStability | None = None, errors: dict[str, QpmheError] | None = None,
+) -> tuple[Audit, Detectability | None, ObserverStability | None, Certificate | None]:
+    """Each ingredient, and the certificate that follows; None for what could not be certified.
+
+    Errors are collected by the name of what could not be, or raised where nothing collects them.
+    """
+
+    def attempt(what: str, question: Callable[[], Result]) -> Result | None:
+        try:
+            return question()
+        except (NotCertifiedError, CertificateError) as error:
+            if errors is None:
+                raise
+            errors[what] = error
+            return None
+
+    findings = audit(system, observer, cost, region, seconds=deadline.part(_AUDIT))
+    constants = attempt("", lambda: _needed(findings))
+    weights = (1.0, 1.0) if constants is None else _cheapest(constants)
+    sizes = Sizes(*weights) if sizes is None else sizes
+    w, v = sizes.disturbance, sizes.noise
+    least = 1e-3 * max(w, v)
+    detectability = detectability or attempt("detectability", lambda: certify_detectability(
+        system, region, weights=weights, seconds=deadline.part(_DETECTABILITY)
+    ))
+    stability = stability or attempt("the observer", lambda: certify_observer(
+        system, observer, region, weights=(max(w, least), max(v, least)),
+        seconds=deadline.part(_OBSERVER),
+    ))
+    if constants is None or detectability is None or stability is None:
+        return findings, detectability, stability, None
+    output = constant_output(system, region)
+    bounds = {
+        N: bounds_for(
+            N, detectability, stability, cost, constants, lipschitz=findings.lipschitz,
+            output=output,
+        )
+        for N in horizons
+    }
+    certificate = Certificate(
+        system, observer, cost, findings, detectability, stability, bounds, sizes
+    )
+    used = [detectability.evidence, stability.evidence] + [
+        each.evidence for each in findings.findings if each.needed and each.evidence is not None
+    ]
+    object.__setattr__(certificate, "evidence", weakest(used))
+    return findings, detectability, stability, certificate
+
+
+def _needed(findings: Audit) -> CostConstants:
+    """The cost's constants; a `CertificateError` where there are none."""
+    if findings.constants is None:
+        raise CertificateError(f"{findings['cost bounds'].text}; the theorem needs them.")
+    return findings.constants
+
+
+def _cheapest(constants: CostConstants) -> tuple[float, float]:
+    """Sizes of disturbance and noise of which each alone costs 1, in its cheapest direction."""
+    root = -1.0 / constants.exponent
+    return constants.disturbance[0] ** root, constants.noise[0] ** root
+
+
+def horizons_of(horizon: Any) -> list[int]:
+    """One horizon or several, checked; sorted, each once."""
+    given = list(horizon) if isinstance(horizon, Iterable) else [horizon]
+    if isinstance(horizon, str) or not given:
+        raise OptionError(f"horizon is {horizon!r}; expected an integer >= 1, or several of them.")
+    return sorted({count("horizon", each, 1) for each in given})

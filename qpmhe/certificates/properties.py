@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from .._checks import Array, numbers, positive
 from ..model.sets import ConvexSet
 from ..model.system import System
-from .decay import DecayingSums, checked_rate
 from .evidence import Evidence, MismatchError, json_ready
 from .regions import Region, beyond, stated_region
+from .theorem import DecayingSums, checked_rate
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

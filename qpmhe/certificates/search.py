@@ -13,13 +13,12 @@ from ..errors import ModelError, OptionError
 from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
-from .decay import checked_rate
-from .enclosures import SmoothModel
-from .evaluation import evaluated, joint_jacobians
+from .enclosures import SmoothModel, evaluated, joint_jacobians
 from .evidence import Evidence, NotCertifiedError, OutOfTimeError
 from .inequalities import ErrorContraction, Form, Matrices, OutputInjection, OutputWeight, definite
 from .regions import Region
 from .sdp import Answer, Kind, Program, Scales, expected_seconds
+from .theorem import checked_rate
 
 _SAMPLES = 400
 _ROUNDS = 8

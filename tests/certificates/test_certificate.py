@@ -8,14 +8,12 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates.audit import audit
-from qpmhe.certificates.certification import certify
-from qpmhe.certificates.decay import DecayingSums
-from qpmhe.certificates.detectability import certify_detectability
+from qpmhe.certificates.certificate import certify
+from qpmhe.certificates.contraction import certify_detectability, certify_observer, synthesise_gain
 from qpmhe.certificates.evidence import CertificateError, Evidence, NotCertifiedError
-from qpmhe.certificates.observer import certify_observer, synthesise_gain
 from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.certificates.report import LABELS, error_and_bounds
-from qpmhe.certificates.theorem import theorem
+from qpmhe.certificates.theorem import DecayingSums, theorem
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
 
 SLACK = 1 + 1e-9

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates.certification import certify
+from qpmhe.certificates.certificate import certify
 from qpmhe.certificates.monitor import Hypotheses, Monitor, monitor, monitored_run
 from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.certificates.contraction import certify_observer, synthesise_gain
 from qpmhe.certificates.evidence import CertificateError, Evidence, NotCertifiedError
-from qpmhe.certificates.observer import certify_observer, synthesise_gain
 from qpmhe.certificates.properties import ObserverStability
 from qpmhe.errors import OptionError
 

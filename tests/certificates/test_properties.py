@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates.certification import certify
-from qpmhe.certificates.detectability import certify_detectability
+from qpmhe.certificates.certificate import certify
+from qpmhe.certificates.contraction import certify_detectability, certify_observer
 from qpmhe.certificates.evidence import Evidence, MismatchError
 from qpmhe.certificates.monitor import monitored_run
-from qpmhe.certificates.observer import certify_observer
 from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.certificates.regions import beyond, bounded_region
 from qpmhe.errors import SetError
