@@ -1,10 +1,8 @@
 """Which parts of the theorem hold for a given system, and with which constants."""
 
 from .audit import Audit, audit
-from .certificate import Certificate
-from .certification import certify
-from .decay import DecayingSums, Sizes
-from .detectability import certify_detectability
+from .certificate import Certificate, certify
+from .contraction import Synthesis, certify_detectability, certify_observer, synthesise_gain
 from .evidence import (
     CertificateError,
     Evidence,
@@ -13,11 +11,10 @@ from .evidence import (
     OutOfTimeError,
 )
 from .monitor import Hypotheses, Monitor, MonitorSummary, monitor, monitored_run
-from .observer import Synthesis, certify_observer, synthesise_gain
 from .properties import Detectability, ObserverStability
 from .regions import Region
 from .report import Report, certify_model, error_and_bounds
-from .theorem import theorem
+from .theorem import DecayingSums, Sizes, theorem
 
 __all__ = [
     "Audit", "Certificate", "CertificateError", "DecayingSums", "Detectability", "Evidence",

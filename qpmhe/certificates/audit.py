@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -16,11 +16,11 @@ from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
 from ..observers import Observer, Sample
 from .branch_and_bound import output_lipschitz
+from .contraction import gain_if_constant
 from .deadline import PART_SECONDS, Deadline
-from .evaluation import evaluated
+from .enclosures import evaluated
 from .evidence import Evidence, json_ready
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
-from .observer import gain_if_constant
 from .regions import Region, bounded_region
 
 _SAMPLES = 2000
@@ -58,86 +58,52 @@ class Finding:
         return content
 
 
-def _lipschitz_finding(
-    system: System, region: Region, seconds: float | Deadline = PART_SECONDS
-) -> Finding:
-    """The output's Lipschitz constant."""
-    found = output_lipschitz(system, region, seconds=seconds)
-    return Finding(
-        "output Lipschitz", "ass:lipschitz", True, found.evidence,
-        f"L_h = {found.value:.6g} ({found.note}); the gradient has the norm {found.attained:.6g} "
-        f"at {np.round(found.at, 4).tolist()}",
-        found.value,
-    )
-
-
-def _correction(system: System, observer: Observer) -> Callable[[Array, Array], Array] | None:
-    """A correction that is a function of z and v alone; None where there is more to it."""
-    if observer.initial_covariance() is not None or observer.needs_jacobians:
-        return None
-    sample = Sample(system, np.zeros(system.m))
-    return lambda z, v: np.asarray(observer.correct(z, v, sample)[0], np.float64)
-
-
-def _no_correction_finding(system: System, observer: Observer, region: Region) -> Finding:
-    """Whether the observer corrects where the output fits."""
-    found = partial(Finding, "no correction without error", "ass:observer_0")
-    if gain_if_constant(observer, system) is not None:
-        return found(True, Evidence.PROVED, "L(z, v) = L v vanishes with v")
-    correction = _correction(system, observer)
-    if correction is None:
-        return found(
-            True, Evidence.ASSUMED,
-            f"{type(observer).__name__} multiplies v by its gain of the moment",
-        )
-    points = region.sample(_SAMPLES, np.random.default_rng(_SEED))[:, : system.n]
-    for z in points:
-        value = correction(z, np.zeros(system.p))
-        if value.any():
-            return found(
-                False, Evidence.PROVED,
-                f"L(z, 0) = {value.tolist()} at z = {z.tolist()}", None, {"z": z, "L": value},
-            )
-    return found(True, Evidence.SAMPLED, f"L(z, 0) = 0 at {points.shape[0]} states")
-
-
-def _kappa_finding(system: System, observer: Observer, region: Region) -> Finding:
-    """The bound on the correction."""
-    found = partial(Finding, "correction bound", "eq:kappa")
-    gain = gain_if_constant(observer, system)
+def _correction_findings(
+    system: System, observer: Observer, region: Region
+) -> tuple[Finding, Finding]:
+    """Whether the observer corrects where the output fits, and how much elsewhere."""
+    none = partial(Finding, "no correction without error", "ass:observer_0")
+    bound = partial(Finding, "correction bound", "eq:kappa")
+    gain, kind = gain_if_constant(observer, system), type(observer).__name__
     if gain is not None:
         kappa = float(norm_bound(Matrices.exact(gain[None]))[0])
-        return found(True, Evidence.PROVED, f"kappa = |L| = {kappa:.6g}, of a constant gain", kappa)
-    correction = _correction(system, observer)
-    if correction is None:
-        return found(
-            None, None,
-            f"{type(observer).__name__} has a gain that follows from what was measured: state its "
-            "bound, ObserverStability.assumed(kappa=...)",
+        return none(True, Evidence.PROVED, "L(z, v) = L v vanishes with v"), bound(
+            True, Evidence.PROVED, f"kappa = |L| = {kappa:.6g}, of a constant gain", kappa
         )
-    worst, z, v = _steepest(correction, system, region)
-    how = f"the largest |L(z, v)| / |v| tried, at z = {z.tolist()}, v = {v.tolist()}"
-    if not np.isfinite(worst):
-        return found(False, Evidence.SAMPLED, f"kappa is infinite: {how}")
-    return found(True, Evidence.SAMPLED, f"kappa = {worst:.6g}, {how}", worst)
+    if observer.initial_covariance() is not None or observer.needs_jacobians:
+        return none(True, Evidence.ASSUMED, f"{kind} multiplies v by its gain of the moment"), bound(
+            None, None,
+            f"{kind} has a gain that follows from what was measured: state its bound, "
+            "ObserverStability.assumed(kappa=...)",
+        )
+    generator, sample = np.random.default_rng(_SEED), Sample(system, np.zeros(system.m))
 
+    def correct(z: Array, v: Array) -> Array:
+        return np.asarray(observer.correct(z, v, sample)[0], np.float64)
 
-def _steepest(
-    correction: Callable[[Array, Array], Array], system: System, region: Region
-) -> tuple[float, Array, Array]:
-    generator = np.random.default_rng(_SEED)
     points = region.sample(_SAMPLES, generator)
-    states, u = points[:, : system.n], points[:, system.n :]
-    size = np.ptp(evaluated("h", system.h, states, u), axis=0)
+    states = points[:, : system.n]
+    size = np.ptp(evaluated("h", system.h, states, points[:, system.n :]), axis=0)
     size = np.where(size > 0.0, size, 1.0)
+    unmoved = none(True, Evidence.SAMPLED, f"L(z, 0) = 0 at {len(states)} states")
     worst = 0.0, states[0], size
     for z in states:
+        still = correct(z, np.zeros(system.p))
+        if still.any() and unmoved.holds:
+            unmoved = none(
+                False, Evidence.PROVED, f"L(z, 0) = {still.tolist()} at z = {z.tolist()}", None,
+                {"z": z, "L": still},
+            )
         v = generator.choice(_SCALES) * size * generator.uniform(-1.0, 1.0, system.p)
         with np.errstate(all="ignore"):
-            ratio = float(np.linalg.norm(correction(z, v)) / np.linalg.norm(v))
+            ratio = float(np.linalg.norm(correct(z, v)) / np.linalg.norm(v))
         if not ratio <= worst[0]:
             worst = (ratio if np.isfinite(ratio) else np.inf), z, v
-    return worst
+    kappa, z, v = worst
+    how = f"the largest |L(z, v)| / |v| tried, at z = {z.tolist()}, v = {v.tolist()}"
+    if not np.isfinite(kappa):
+        return unmoved, bound(False, Evidence.SAMPLED, f"kappa is infinite: {how}")
+    return unmoved, bound(True, Evidence.SAMPLED, f"kappa = {kappa:.6g}, {how}", kappa)
 
 
 def _cost_finding(cost: Cost) -> tuple[CostConstants | None, Finding]:
@@ -187,6 +153,10 @@ def _invariance_finding(system: System, region: Region) -> Finding:
     if not x.shape[0]:
         return found(None, None, "the region and X have no sample in common")
     following = evaluated("f", system.f, x, u)
+
+    def where(k: int) -> dict[str, Any]:
+        return {"x": x[k], "f(x)": following[k]} | ({"u": u[k]} if system.m else {})
+
     lost = ~np.isfinite(following).all(axis=1)
     if lost.any():
         k = int(np.argmax(lost))
@@ -194,36 +164,23 @@ def _invariance_finding(system: System, region: Region) -> Finding:
             False, Evidence.PROVED,
             f"f is not finite: {following[k].tolist()} at x = {x[k].tolist()}"
             + (f", u = {u[k].tolist()}" if system.m else ""),
-            None, {"x": x[k], "f(x)": following[k]} | ({"u": u[k]} if system.m else {}),
+            None, where(k),
         )
     if system.states is None:
         return found(True, Evidence.PROVED, "X is the whole space")
     missed = np.array([system.states.violation(one) for one in following])
-    worst = int(missed.argmax())
-    if missed[worst] == 0.0:
+    k = int(missed.argmax())
+    if missed[k] == 0.0:
         return found(
             True, Evidence.SAMPLED,
             f"f(x) is in X for {x.shape[0]} states x of X in the region",
         )
-    counterexample: dict[str, Any] = {
-        "x": x[worst], "f(x)": following[worst], "missed by": float(missed[worst])
-    }
-    if system.m:
-        counterexample["u"] = u[worst]
     return found(
         False, Evidence.PROVED,
-        f"f leaves X from {x[worst].tolist()}, which is in it, to {following[worst].tolist()}: by "
-        f"{missed[worst]:.6g}; the disturbance must then lead back",
-        None, counterexample,
+        f"f leaves X from {x[k].tolist()}, which is in it, to {following[k].tolist()}: by "
+        f"{missed[k]:.6g}; the disturbance must then lead back",
+        None, where(k) | {"missed by": float(missed[k])},
     )
-
-
-def _candidate_finding(system: System) -> Finding:
-    """Whether the candidate lies in X, W and V."""
-    found = partial(Finding, "candidate in the sets", "ass:observer")
-    if all(one is None for one in (system.states, system.disturbances, system.noises)):
-        return found(True, Evidence.PROVED, "X, W and V are the whole space")
-    return found(None, None, "the monitor checks it at each step of a run")
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,9 +209,11 @@ class Audit:
         raise InvalidInputError(f"there is no finding {name!r}; expected one of {known}.")
 
     @property
-    def lipschitz(self) -> float | None:
+    def lipschitz(self) -> float:
         """L_h."""
-        return self["output Lipschitz"].value
+        value = self["output Lipschitz"].value
+        assert value is not None
+        return value
 
     @property
     def kappa(self) -> float | None:
@@ -291,16 +250,25 @@ def audit(
         assumption that does not hold raises nothing.
     """
     checked_ingredients(system, observer, cost)
-    deadline = Deadline.of(seconds)
     place = bounded_region(system, region, inputs)
+    slope = output_lipschitz(system, place, seconds=Deadline.of(seconds))
     constants, about_cost = _cost_finding(cost)
+    candidate: tuple[bool | None, Evidence | None, str] = (
+        True, Evidence.PROVED, "X, W and V are the whole space"
+    )
+    if any(one is not None for one in (system.states, system.disturbances, system.noises)):
+        candidate = None, None, "the monitor checks it at each step of a run"
     findings = (
-        _lipschitz_finding(system, place, deadline),
-        _no_correction_finding(system, observer, place),
-        _kappa_finding(system, observer, place),
+        Finding(
+            "output Lipschitz", "ass:lipschitz", True, slope.evidence,
+            f"L_h = {slope.value:.6g} ({slope.note}); the gradient has the norm "
+            f"{slope.attained:.6g} at {np.round(slope.at, 4).tolist()}",
+            slope.value,
+        ),
+        *_correction_findings(system, observer, place),
         about_cost,
         _invariance_finding(system, place),
-        _candidate_finding(system),
+        Finding("candidate in the sets", "ass:observer", *candidate),
     )
     return Audit(findings, constants, place)
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from .._checks import Array
 from ..model.system import System
 from .deadline import PART_SECONDS, Deadline
-from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel
-from .evaluation import check_values, evaluated
+from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel, check_values, evaluated
 from .evidence import Evidence
 from .inequalities import Form, Matrices, definite, norm_bound
 from .regions import Region

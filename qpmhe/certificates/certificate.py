@@ -1,30 +1,43 @@
-"""What is certified of an estimator: constants, their evidence, and bounds of its error."""
+"""From system, observer, cost and horizon to a certificate, and to bounds of the error."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array, count, numbers, vector
-from ..costs import Cost
-from ..errors import InvalidInputError, OptionError, ShapeError
+from qpmhe_solvers.values import shown
+
+from .._checks import Array, count, numbers
+from ..costs import Cost, CostConstants
+from ..errors import InvalidInputError, OptionError, QpmheError, ShapeError
 from ..estimation.estimate import Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
+from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
-from .audit import Audit
-from .decay import Sizes, checked_length
-from .evidence import Evidence, MismatchError, json_ready, weakest
-from .observer import gain_if_constant
-from .properties import Detectability, ObserverStability
-from .regions import Region
-from .window_bounds import HorizonBounds, Kind
+from .audit import Audit, audit, checked_ingredients
+from .branch_and_bound import constant_output
+from .contraction import certify_detectability, certify_observer, constant_gain, gain_if_constant
+from .deadline import DEFAULT_SECONDS, Deadline
+from .evidence import (
+    CertificateError,
+    Evidence,
+    MismatchError,
+    NotCertifiedError,
+    json_ready,
+    weakest,
+)
+from .properties import Detectability, ObserverStability, fitting
+from .regions import Region, bounded_region
+from .sdp import started
+from .theorem import Sizes, checked_length
+from .window_bounds import HorizonBounds, Kind, bounds_for
 
 # The constants are upper bounds, what is computed from them is not: this covers its rounding.
 _OUTWARD = 1.0 + 1e-9
@@ -34,8 +47,8 @@ ASSUMED = (
     "the true state stays in the region, and follows the model",
     "the bounds on disturbances and noises that are passed are true",
 )
-# A window without all its measurements has another cost.
-_BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
+#: A window without all its measurements has another cost.
+BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +69,8 @@ class Certificate:
         For each horizon.
     sizes : Sizes
         For which disturbances and noises the bounds are called vacuous or not.
+    evidence : Evidence
+        What the bounds rest on: the weakest evidence among their ingredients'.
     """
 
     system: System
@@ -66,12 +81,7 @@ class Certificate:
     stability: ObserverStability
     bounds: Mapping[int, HorizonBounds]
     sizes: Sizes
-    _certified: bool = field(default=False, init=False, repr=False)
-
-    def sealed(self) -> Certificate:
-        """The certificate itself, whose evidence is from now on its parts'."""
-        object.__setattr__(self, "_certified", True)
-        return self
+    evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
 
     @cached_property
     def gain(self) -> Array | None:
@@ -82,19 +92,6 @@ class Certificate:
     def region(self) -> Region:
         """Where it holds."""
         return self.audit.region
-
-    @cached_property
-    def evidence(self) -> Evidence:
-        """What the bounds rest on: the weakest evidence among their ingredients'."""
-        if not self._certified:
-            return Evidence.ASSUMED
-        used = [self.audit[name].evidence for name in (
-            "output Lipschitz", "no correction without error", "correction bound", "cost bounds"
-        )]
-        return weakest([
-            *(each for each in used if each is not None),
-            self.detectability.evidence, self.stability.evidence,
-        ])
 
     @property
     def horizons(self) -> tuple[int, ...]:
@@ -147,31 +144,75 @@ class Certificate:
             If the source is of another system, observer, cost or horizon, or did not make
             the run.
         """
-        w, v = _signals(self.system, run, disturbances, noises)
-        start = numbers("initial_error", initial_error)
-        if start.ndim:
-            start = vector("initial_error", start, self.system.n)
-        else:
-            checked_length("initial_error", start)
         if source is not None and horizon is None:
             horizon = getattr(source, "horizon", None)
         chosen = self.of(horizon)
+        start, w, v = self._signals(run, initial_error, disturbances, noises)
         costs = None
         if source is not None:
-            costs = _checked_costs(self, source, run, chosen.paper.horizon)
+            costs = self._costs(source, run, chosen.paper.horizon)
         elif kind == "measured":
             raise InvalidInputError(
                 "the measured bound has no source, and a run does not say its horizon and "
                 "cost; pass the estimator that made it (source=estimator)."
             )
-        if kind == "paper":
-            lengths = [x if x.ndim == 1 else np.linalg.norm(x, axis=1) for x in (w, v)]
-            return _OUTWARD * chosen.paper.result.bound(
-                float(np.linalg.norm(np.atleast_1d(start))), *lengths
+        if kind != "paper":
+            measured = costs if kind == "measured" else None
+            return _OUTWARD * chosen.beyond(kind).bound(start, w, v, measured)
+        lengths = [x if x.ndim == 1 else np.linalg.norm(x, axis=1) for x in (w, v)]
+        return _OUTWARD * chosen.paper.result.bound(np.linalg.norm(start), *lengths)
+
+    def _signals(
+        self, run: Run | None, initial_error: ArrayLike, disturbances: ArrayLike, noises: ArrayLike
+    ) -> tuple[Array, Array, Array]:
+        """Initial error, disturbances and noises: vectors or lengths, at each sample."""
+        n, p = self.system.n, self.system.p
+        start = numbers("initial_error", initial_error)
+        w, v = numbers("disturbances", disturbances), numbers("noises", noises)
+        steps = len(run) if run is not None else next((len(x) for x in (w, v) if x.ndim), None)
+        if steps is None:
+            raise ShapeError(
+                "disturbances and noises are numbers and there is no run; expected a sequence "
+                "for one of them, to say how many steps there are."
             )
-        if kind != "measured":
-            costs = None
-        return _OUTWARD * chosen.beyond(kind).bound(start, w, v, costs=costs)
+        known = ("initial_error", start, (), (n,)), ("disturbances", w, (steps,), (steps, n)), (
+            "noises", v, (steps,), (steps, p)
+        )
+        found = []
+        for name, x, lengths, vectors in known:
+            if x.ndim and x.shape not in (lengths, vectors):
+                raise ShapeError(
+                    f"{name} has shape {x.shape}; expected {vectors}, lengths {lengths}, or a "
+                    "number."
+                )
+            if x.shape != vectors and (x < 0.0).any():
+                raise OptionError(f"{name} is {shown(x)}; expected Euclidean lengths, all >= 0.")
+            found.append(x if x.ndim else np.full(lengths, x))
+        return found[0], found[1], found[2]
+
+    def _costs(self, source: MovingHorizonEstimator, run: Run | None, horizon: int) -> Array:
+        """The costs of a run's estimates; NaN where a window is not what the bound is of."""
+        if run is None or not isinstance(source, MovingHorizonEstimator):
+            raise InvalidInputError(
+                f"source is {source!r} and run {run!r}; expected an estimator and its run."
+            )
+        self.check_estimator(source)
+        if source.horizon != horizon:
+            raise MismatchError(
+                f"horizon is {horizon}, but the run's estimator has {source.horizon}; take the "
+                "bound for its horizon, and certify again if there is none."
+            )
+        if source.time != len(run) or not np.array_equal(
+            source.state, run.states[-1], equal_nan=True
+        ):
+            raise MismatchError(
+                "the source is not at the end of this run: it has seen another one, or more or "
+                "less of it. Pass the estimator right after its run from the start."
+            )
+        costs = np.array(run.costs, np.float64)
+        for t in np.flatnonzero(run.flags & BROKEN.value):
+            costs[t : t + horizon] = np.nan
+        return costs
 
     def funnel(
         self, w_max: float, v_max: float, *, initial_error: float, steps: int,
@@ -194,8 +235,6 @@ class Certificate:
             If a length is negative or not finite, the steps are no integer, or there is no
             such bound.
         """
-        w, v = checked_length("w_max", w_max), checked_length("v_max", v_max)
-        start = checked_length("initial_error", initial_error)
         if kind == "measured":
             raise OptionError(
                 "kind is 'measured', but nothing is measured yet; expected one of "
@@ -203,7 +242,9 @@ class Certificate:
             )
         length = count("steps", steps, 1)
         return self.bound(
-            None, np.full(length, w), np.full(length, v), initial_error=start, horizon=horizon,
+            None, np.full(length, checked_length("w_max", w_max)),
+            np.full(length, checked_length("v_max", v_max)),
+            initial_error=checked_length("initial_error", initial_error), horizon=horizon,
             kind=kind,
         )
 
@@ -213,9 +254,8 @@ class Certificate:
         """What the funnel tends to as t grows; arguments and errors as for `funnel`."""
         w, v = checked_length("w_max", w_max), checked_length("v_max", v_max)
         chosen = self.of(horizon)
-        if kind == "paper":
-            return _OUTWARD * chosen.paper.result.limit(w, v)
-        return _OUTWARD * chosen.beyond(kind).limit(w, v)
+        bound = chosen.paper.result if kind == "paper" else chosen.beyond(kind)
+        return _OUTWARD * bound.limit(w, v)
 
     def vacuous(
         self, w_max: float | None = None, v_max: float | None = None, *, horizon: int | None = None,
@@ -274,81 +314,141 @@ class Certificate:
         })
         return content
 
-    def summary(self) -> str:
-        """The certificate in some lines of text."""
-        sizes = self.sizes
-        lines = [
-            f"On {self.region.states!r}: {self.evidence}.",
-            *(f"Assumed: {each}." for each in ASSUMED),
-            *(
-                f"Violated{'' if each.needed else ', but the bounds need no sets'}: {each.text} "
-                f"({each.label})." for each in self.audit.violated
-            ),
-            f"Bounds of the error for |w| <= {sizes.disturbance:.3g} and |v| <= "
-            f"{sizes.noise:.3g} for all times:",
-        ]
-        for N, bounds in self.bounds.items():
-            C, lam = bounds.paper.C, bounds.paper.lam
-            lines.append(
-                f"N = {N}: C_1 = {C[0]:.4g}, C_2 = {C[1]:.4g}, C_3 = {C[2]:.4g}, "
-                f"lambda = {lam:.4g}"
-            )
-            for kind in self.kinds:
-                if kind == "measured":
-                    continue
-                limit = self.limit(sizes.disturbance, sizes.noise, horizon=N, kind=kind)
-                verdict = ""
-                if self.vacuous(horizon=N, kind=kind):
-                    verdict = f", vacuous: the region's diameter is {self.diameter:.4g}"
-                lines.append(f"  {kind}: {limit:.4g}{verdict}")
-        return "\n".join(lines)
+
+Result = TypeVar("Result")
+
+# How much of the time left the audit, detectability and the observer take.
+_AUDIT, _DETECTABILITY, _OBSERVER = 0.25, 0.5, 0.9
 
 
-def _signals(
-    system: System, run: Run | None, disturbances: ArrayLike, noises: ArrayLike
-) -> tuple[Array, Array]:
-    """Vectors or lengths at each sample."""
-    w, v = numbers("disturbances", disturbances), numbers("noises", noises)
-    steps = len(run) if run is not None else next((len(x) for x in (w, v) if x.ndim), None)
-    if steps is None:
-        raise ShapeError(
-            "disturbances and noises are numbers and there is no run; expected a sequence "
-            "for one of them, to say how many steps there are."
-        )
-    for name, x, width in (("disturbances", w, system.n), ("noises", v, system.p)):
-        if x.ndim and x.shape not in ((steps,), (steps, width)):
-            raise ShapeError(
-                f"{name} has shape {x.shape}; expected ({steps}, {width}), their lengths "
-                f"({steps},), or a number."
-            )
-    return (w if w.ndim else np.full(steps, float(w)), v if v.ndim else np.full(steps, float(v)))
+def certify(
+    system: System, observer: Observer, cost: Cost, *, horizon: int | Sequence[int],
+    region: ConvexSet | Region | None = None, inputs: Box | None = None, sizes: Sizes | None = None,
+    detectability: Detectability | None = None, stability: ObserverStability | None = None,
+    seconds: float | Deadline = DEFAULT_SECONDS,
+) -> Certificate:
+    """Check the theorem's assumptions on a set of states, and bound the estimator's error.
+
+    Parameters
+    ----------
+    system, observer, cost
+        What the estimator is made of.
+    horizon : int or sequence of int
+        N, or several of them.
+    region : Box, Polytope or Region, optional
+        A bounded set of states; the system's own if left out.
+    inputs : Box, optional
+        Bounds on the inputs, for a system with inputs.
+    sizes : Sizes, optional
+        For which disturbances and noises the observer's constants are to be small, and the
+        bounds are called vacuous or not; left out, those of which each alone costs 1 in its
+        cheapest direction.
+    detectability, stability : optional
+        Constants to take instead of looking for them, such as assumed ones, or those that
+        were certified of this system and gain on a set that contains the region.
+    seconds : float or Deadline
+        How long the audit and the search for constants may take, about, from when the solvers
+        are loaded. What is not proved when its share is over rests on samples, and says so.
+
+    Raises
+    ------
+    SetError, ShapeError, OptionError, InvalidInputError, ModelError
+        If an argument does not fit.
+    MismatchError
+        If constants that are passed are of another system or gain, or of a set that does not
+        contain the region and the inputs.
+    CertificateError
+        If the cost has no constants, h no Lipschitz constant, or the observer no constant
+        gain and no assumed constants.
+    NotCertifiedError
+        If detectability or the observer's stability cannot be shown; the text says what
+        may help.
+    """
+    checked_ingredients(system, observer, cost)
+    horizons = horizons_of(horizon)
+    place = bounded_region(system, region, inputs)
+    gain = gain_if_constant(observer, system)
+    if gain is None and stability is None:  # without one, all else would be in vain
+        constant_gain(observer, system)
+    if detectability is not None:
+        detectability = fitting(detectability, system, place, gain)
+    if stability is not None:
+        stability = fitting(stability, system, place, gain)
+    *_, certificate = certified(
+        system, observer, cost, place, horizons, sizes, started(seconds), detectability, stability
+    )
+    assert certificate is not None
+    return certificate
 
 
-def _checked_costs(
-    certificate: Certificate, source: MovingHorizonEstimator, run: Run | None, horizon: int
-) -> Array:
-    """The costs of a run's estimates; NaN where a window is not what the bound is of."""
-    if run is None:
-        raise InvalidInputError("a source is given, but no run; pass the run that it made.")
-    if not isinstance(source, MovingHorizonEstimator):
-        raise InvalidInputError(
-            f"source is {source!r}; expected the estimator that made the run."
+def certified(
+    system: System, observer: Observer, cost: Cost, region: Region, horizons: Sequence[int],
+    sizes: Sizes | None, deadline: Deadline, detectability: Detectability | None = None,
+    stability: ObserverStability | None = None, errors: dict[str, QpmheError] | None = None,
+) -> tuple[Audit, Detectability | None, ObserverStability | None, Certificate | None]:
+    """Each ingredient, and the certificate that follows; None for what could not be certified.
+
+    Errors are collected by the name of what could not be, or raised where nothing collects them.
+    """
+
+    def attempt(what: str, question: Callable[[], Result]) -> Result | None:
+        try:
+            return question()
+        except (NotCertifiedError, CertificateError) as error:
+            if errors is None:
+                raise
+            errors[what] = error
+            return None
+
+    findings = audit(system, observer, cost, region, seconds=deadline.part(_AUDIT))
+    constants = attempt("", lambda: _needed(findings))
+    weights = (1.0, 1.0) if constants is None else _cheapest(constants)
+    sizes = Sizes(*weights) if sizes is None else sizes
+    w, v = sizes.disturbance, sizes.noise
+    least = 1e-3 * max(w, v)
+    detectability = detectability or attempt("detectability", lambda: certify_detectability(
+        system, region, weights=weights, seconds=deadline.part(_DETECTABILITY)
+    ))
+    stability = stability or attempt("the observer", lambda: certify_observer(
+        system, observer, region, weights=(max(w, least), max(v, least)),
+        seconds=deadline.part(_OBSERVER),
+    ))
+    if constants is None or detectability is None or stability is None:
+        return findings, detectability, stability, None
+    output = constant_output(system, region)
+    bounds = {
+        N: bounds_for(
+            N, detectability, stability, cost, constants, lipschitz=findings.lipschitz,
+            output=output,
         )
-    certificate.check_estimator(source)
-    if source.horizon != horizon:
-        raise MismatchError(
-            f"horizon is {horizon}, but the run's estimator has {source.horizon}; take the "
-            "bound for its horizon, and certify again if there is none."
-        )
-    if source.time != len(run) or not np.array_equal(
-        source.state, run.states[-1], equal_nan=True
-    ):
-        raise MismatchError(
-            "the source is not at the end of this run: it has seen another one, or more or less "
-            "of it. Pass the estimator right after its run from the start."
-        )
-    costs = np.array(run.costs, np.float64)
-    broken = (run.flags & _BROKEN.value) != 0
-    for t in np.flatnonzero(broken):
-        costs[t : t + horizon] = np.nan
-    return costs
+        for N in horizons
+    }
+    certificate = Certificate(
+        system, observer, cost, findings, detectability, stability, bounds, sizes
+    )
+    used = [detectability.evidence, stability.evidence] + [
+        each.evidence for each in findings.findings if each.needed and each.evidence is not None
+    ]
+    object.__setattr__(certificate, "evidence", weakest(used))
+    return findings, detectability, stability, certificate
+
+
+def _needed(findings: Audit) -> CostConstants:
+    """The cost's constants; a `CertificateError` where there are none."""
+    if findings.constants is None:
+        raise CertificateError(f"{findings['cost bounds'].text}; the theorem needs them.")
+    return findings.constants
+
+
+def _cheapest(constants: CostConstants) -> tuple[float, float]:
+    """Sizes of disturbance and noise of which each alone costs 1, in its cheapest direction."""
+    root = -1.0 / constants.exponent
+    return constants.disturbance[0] ** root, constants.noise[0] ** root
+
+
+def horizons_of(horizon: Any) -> list[int]:
+    """One horizon or several, checked; sorted, each once."""
+    given = list(horizon) if isinstance(horizon, Iterable) else [horizon]
+    if isinstance(horizon, str) or not given:
+        raise OptionError(f"horizon is {horizon!r}; expected an integer >= 1, or several of them.")
+    return sorted({count("horizon", each, 1) for each in given})

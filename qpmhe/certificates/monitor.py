@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any
@@ -13,17 +13,17 @@ from numpy.typing import ArrayLike
 from .._checks import Array, count, record
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.constraints import Constraints
-from ..estimation.estimate import Estimate, Status
+from ..estimation.estimate import Estimate
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.limits import FEASIBLE
 from ..estimation.run import Run
 from ..model.system import System
-from .certificate import Certificate
+from .certificate import BROKEN, Certificate
 from .evidence import MismatchError
 
 _RELATIVE = 1e-6
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
-_BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
+
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,8 @@ class MonitorSummary:
         the observer's bound goes back to the start, and is lost with it.
     held : int
         Steps at which all needed hypotheses held, whatever had happened before.
-    counts : dict of str to int
-        At how many steps each hypothesis held.
+    missed : dict of str to int
+        At how many steps each hypothesis did not hold.
     first_failure, failed : int or None, and tuple of str
         The first step at which hypotheses failed, and which.
     """
@@ -104,14 +104,9 @@ class MonitorSummary:
     steps: int
     applied: int
     held: int
-    counts: dict[str, int]
+    missed: dict[str, int]
     first_failure: int | None
     failed: tuple[str, ...]
-
-    @property
-    def missed(self) -> dict[str, int]:
-        """At how many steps each hypothesis did not hold."""
-        return {name: self.steps - self.counts.get(name, 0) for name in (*NEEDED, *UNNEEDED)}
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows."""
@@ -126,33 +121,26 @@ class MonitorSummary:
 
     def __str__(self) -> str:
         text = f"The certificate applied at {self.applied} of {self.steps} steps"
-        if self.first_failure is None:
-            text += "."
-        else:
-            reasons = ", ".join(_words(name) for name in self.failed)
+        either = ""
+        if self.first_failure is not None:
+            reasons = ", ".join(self.failed).replace("_", " ")
             text += (
                 f": at step {self.first_failure} it was lost ({reasons} did not hold). All "
-                f"hypotheses that the bound needs held at {self.held} steps."
+                f"hypotheses that the bound needs held at {self.held} steps"
             )
-            text += _counted("Not held", {name: self.missed[name] for name in NEEDED})
-        return text + _counted(
-            "Not held either, but the bound needs no sets" if self.failed
-            else "Not held, but the bound needs no sets",
-            {name: self.missed[name] for name in UNNEEDED},
+            either = " either"
+        return (
+            f"{text}.{self._missed('Not held', NEEDED)}"
+            f"{self._missed(f'Not held{either}, but the bound needs no sets', UNNEEDED)}"
         )
 
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
-
-
-def _counted(what: str, missed: dict[str, int]) -> str:
-    """A sentence about the hypotheses that did not hold at all steps; empty without any."""
-    text = ", ".join(
-        f"{_words(name)} at {count} step{'s' if count > 1 else ''}"
-        for name, count in missed.items() if count
-    )
-    return f" {what}: {text}." if text else ""
+    def _missed(self, what: str, names: tuple[str, ...]) -> str:
+        """A sentence about the hypotheses that did not hold at all steps; empty without any."""
+        text = ", ".join(
+            f"{name.replace('_', ' ')} at {count} step{'s' if count > 1 else ''}"
+            for name in names if (count := self.missed[name])
+        )
+        return f" {what}: {text}." if text else ""
 
 
 class Monitor:
@@ -213,18 +201,10 @@ class Monitor:
         ShapeError
             If the input does not fit.
         """
-        m = self.certificate.system.m
+        t, m = len(self._checks), self.certificate.system.m
         given = np.zeros(0) if u is None else np.atleast_1d(np.asarray(u, np.float64))
         if given.shape != (m,):
             raise ShapeError(f"u has shape {given.shape}; expected ({m},).")
-        self._check_next(estimate)
-        self._inputs.append(given)
-        found = monitor(self.certificate, estimate, np.array(self._inputs))
-        self._checks.append(found)
-        return found
-
-    def _check_next(self, estimate: Estimate) -> None:
-        t = len(self._checks)
         if estimate.time != t:
             raise MismatchError(
                 f"the estimate is of the time {estimate.time}; expected {t}: a monitor sees all "
@@ -236,6 +216,9 @@ class Monitor:
                 f"the estimate's window has {stages} stages at time {t}; expected {expected}, for "
                 f"the horizon {self.horizon}. Make the monitor for the estimator's horizon."
             )
+        self._inputs.append(given)
+        self._checks.append(monitor(self.certificate, estimate, np.array(self._inputs)))
+        return self._checks[-1]
 
     @property
     def applies(self) -> bool:
@@ -244,14 +227,16 @@ class Monitor:
 
     def summary(self) -> MonitorSummary:
         """For how many of the steps so far the certificate applied."""
-        held = [check.held for check in self._checks]
+        checks = self._checks
+        held = [check.held for check in checks]
         first = held.index(False) if False in held else None
-        counts = Counter({each.name: 0 for each in fields(Hypotheses)})
-        for check in self._checks:
-            counts.update(each.name for each in fields(check) if getattr(check, each.name))
         return MonitorSummary(
-            len(held), len(held) if first is None else first, sum(held), dict(counts), first,
-            () if first is None else self._checks[first].failed,
+            len(held), len(held) if first is None else first, sum(held),
+            {
+                name: sum(not getattr(check, name) for check in checks)
+                for name in (*NEEDED, *UNNEEDED)
+            },
+            first, () if first is None else checks[first].failed,
         )
 
 
@@ -282,7 +267,7 @@ def monitor(
         y = outputs + estimate.noises
         corrections, candidate_outputs = _along(system, estimate.candidate, u)
         fit = y - candidate_outputs
-        complete = not estimate.status & _BROKEN and bool(
+        complete = not estimate.status & BROKEN and bool(
             np.isfinite(w).all() and np.isfinite(y).all() and np.isfinite(fit).all()
         )
         # What is missing is reported as that alone: the observer takes it for a fit.

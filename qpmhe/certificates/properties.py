@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,13 +12,9 @@ from numpy.typing import ArrayLike
 from .._checks import Array, numbers, positive
 from ..model.sets import ConvexSet
 from ..model.system import System
-from .decay import DecayingSums, checked_rate
-from .evaluation import evaluated
-from .evidence import Evidence, MismatchError, json_ready, weakest
+from .evidence import Evidence, MismatchError, json_ready
 from .regions import Region, beyond, stated_region
-
-_POINTS, _SEED = 24, 20210829
-_ROUNDING = 1e-9  # another compiler or library may round otherwise
+from .theorem import DecayingSums, checked_rate
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,7 +28,11 @@ class _Certified:
     margin: float = math.nan
     cells: int = 0
     evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
-    subject: Subject | None = field(default=None, init=False, repr=False)
+    system: System | None = field(default=None, init=False, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the system, whose functions often cannot be pickled."""
+        return vars(self) | {"system": None}
 
     @property
     def sums(self) -> DecayingSums:
@@ -43,7 +43,7 @@ class _Certified:
         """All but the region, in types that JSON knows; infinite numbers become None."""
         values = vars(self) | {"evidence": str(self.evidence)}
         content: dict[str, Any] = json_ready({
-            name: value for name, value in values.items() if name not in ("region", "subject")
+            name: value for name, value in values.items() if name not in ("region", "system")
         })
         return content
 
@@ -101,8 +101,8 @@ class Detectability(_Certified):
         rounded: what the solver's tolerance and rounding have left.
     cells : int
         In how many pieces of the region the inequality was verified; 0 if in none.
-    subject : Subject or None
-        What it was certified of; None for constants made or changed by hand.
+    system : System or None
+        What it was certified of; None for constants made or changed by hand, or copied.
     """
 
     eta: float
@@ -163,7 +163,7 @@ class ObserverStability(_Certified):
         L, the observer's constant gain.
     P, V : (n, n) and (p, p) array or None
         Norms of error and disturbance, and of noise: V is L^T P L.
-    evidence, region, notes, margin, cells, subject
+    evidence, region, notes, margin, cells, system
         As for `Detectability`.
     """
 
@@ -195,51 +195,9 @@ class ObserverStability(_Certified):
 Result = TypeVar("Result", "Detectability", "ObserverStability")
 
 
-@dataclass(frozen=True, eq=False)
-class Subject:
-    """What a result is about: a system, and what it does at some points of a region."""
-
-    system: System | None  # None once it was copied or pickled
-    sizes: tuple[int, int, int]  # n, p and m
-    points: Array  # (K, n + m): states and inputs
-    values: Array  # (K, n + p): f and h there
-
-    @classmethod
-    def of(cls, system: System, region: Region) -> Subject:
-        """A system, seen on a region."""
-        points = region.sample(_POINTS, np.random.default_rng(_SEED))
-        return cls(system, (system.n, system.p, system.m), points, _values(system, points))
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the system, whose functions often cannot be pickled."""
-        return vars(self) | {"system": None}
-
-    def difference(self, system: System) -> str:
-        """What a system does otherwise, in words; empty if nothing."""
-        sizes = system.n, system.p, system.m
-        if sizes != self.sizes:
-            return f"(n, p, m) is {sizes} instead of {self.sizes}"
-        theirs, mine = _values(system, self.points), self.values
-        size = np.nan_to_num(np.abs(mine), posinf=0.0).max(axis=0)
-        same = np.isclose(theirs, mine, _ROUNDING, _ROUNDING * size, equal_nan=True).all(axis=1)
-        if same.all():
-            return ""
-        k = int(np.argmin(same))
-        return (
-            f"f, h at {np.round(self.points[k], 6).tolist()} is {theirs[k].tolist()} instead of "
-            f"{mine[k].tolist()}"
-        )
-
-
-def _values(system: System, points: Array) -> Array:
-    x, u = points[:, : system.n], points[:, system.n :]
-    values = [evaluated(name, one, x, u) for name, one in (("f", system.f), ("h", system.h))]
-    return np.concatenate(values, axis=1)
-
-
-def sealed(result: Result, subject: Subject, evidence: Evidence) -> Result:
-    """The result itself, with what it is about and what it rests on; its arrays are fixed."""
-    object.__setattr__(result, "subject", subject)
+def sealed(result: Result, system: System, evidence: Evidence) -> Result:
+    """The result itself, with its system and what it rests on; its arrays are fixed."""
+    object.__setattr__(result, "system", system)
     object.__setattr__(result, "evidence", evidence)
     for name, value in list(vars(result).items()):
         if isinstance(value, np.ndarray):
@@ -249,9 +207,7 @@ def sealed(result: Result, subject: Subject, evidence: Evidence) -> Result:
     return result
 
 
-def fitting(
-    part: Result, system: System, region: Region, gain: Array | None
-) -> Result:
+def fitting(part: Result, system: System, region: Region, gain: Array | None) -> Result:
     """A part of a certificate, if it is about this system, region and gain."""
     what = "detectability" if hasattr(part, "eta") else "stability"
     if part.region is not None:
@@ -268,18 +224,9 @@ def fitting(
             f"the {what} that was passed is of the gain {own.tolist()}; the observer's is "
             f"{theirs}. Certify this observer."
         )
-    if part.subject is None:
-        return part
-    difference = part.subject.difference(system)
-    if difference:
+    if part.evidence is not Evidence.ASSUMED and part.system is not system:
         raise MismatchError(
-            f"the {what} that was passed is of another system: {difference}. Certify this system."
+            f"the {what} that was passed is of another System object. Certify this system, or "
+            f"state the constants: {type(part).__name__}.assumed(...)."
         )
-    if part.subject.system is system:
-        return part
-    note = (
-        "certified of another System object; this one does the same at "
-        f"{len(part.subject.points)} states"
-    )
-    weaker = replace(part, notes=(*part.notes, note))
-    return sealed(weaker, part.subject, weakest((part.evidence, Evidence.SAMPLED)))
+    return part

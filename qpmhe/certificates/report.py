@@ -19,14 +19,13 @@ from ..models.example import Example
 from ..models.scenario import Record
 from ..plots.style import LIGHT, STYLES, panels, save
 from .audit import Audit
-from .certificate import Certificate
-from .certification import Ingredients, horizons_of
+from .certificate import Certificate, certified, horizons_of
 from .deadline import DEFAULT_SECONDS, Deadline
-from .decay import Sizes
 from .monitor import MonitorSummary, monitored_run
 from .properties import Detectability, ObserverStability
 from .regions import Region, bounded_region
 from .sdp import started
+from .theorem import Sizes
 
 #: Names of the kinds of bounds in figures and tables.
 LABELS = {
@@ -197,13 +196,11 @@ def certify_model(
     place = _region(example, record, region, inputs)
     horizons = horizons_of(scenario.horizon if horizon is None else horizon)
     errors: dict[str, QpmheError] = {}
-    found = Ingredients(
-        system, observer, cost, place, _sizes(example), deadline, errors=errors
+    findings, detected, observed, certificate = certified(
+        system, observer, cost, place, horizons, _sizes(example), deadline, errors=errors
     )
-    certificate = found.certificate(horizons)
     report = Report(
-        name or scenario.title, example, record, found.audit, certificate, found.detectability,
-        found.stability, errors,
+        name or scenario.title, example, record, findings, certificate, detected, observed, errors
     )
     if certificate is not None:
         report.estimator = MovingHorizonEstimator(

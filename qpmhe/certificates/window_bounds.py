@@ -12,10 +12,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from .._checks import Array, choice
 from ..costs import Cost, CostConstants
 from ..errors import OptionError
-from .decay import Sizes, decaying_sums
 from .inequalities import Matrices, norms
 from .properties import Detectability, ObserverStability
-from .theorem import TheoremConstants, theorem
+from .theorem import Sizes, TheoremConstants, decaying_sums, theorem
 
 Kind = Literal["paper", "summed", "weighted", "measured"]
 

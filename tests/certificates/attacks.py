@@ -6,8 +6,8 @@ from itertools import cycle, product
 import numpy as np
 
 import qpmhe
-from qpmhe.certificates.decay import decaying_sums
 from qpmhe.certificates.monitor import Monitor
+from qpmhe.certificates.theorem import decaying_sums
 from qpmhe.estimation.run import Run
 
 # Of two numbers computed in floating point, one exceeds the other by more than this, or not.

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates.certification import certify
-from qpmhe.certificates.decay import Sizes
-from qpmhe.certificates.detectability import certify_detectability
-from qpmhe.certificates.observer import certify_observer
+from qpmhe.certificates.certificate import certify
+from qpmhe.certificates.contraction import certify_detectability, certify_observer
+from qpmhe.certificates.theorem import Sizes
 
 REACTOR_BOX = ([0.1, -1.0], [9.0, 9.0])
 

@@ -6,12 +6,11 @@ import pytest
 import qpmhe
 from qpmhe.certificates.audit import audit
 from qpmhe.certificates.branch_and_bound import constant_output, output_lipschitz
-from qpmhe.certificates.certification import certify
-from qpmhe.certificates.detectability import certify_detectability
+from qpmhe.certificates.certificate import certify
+from qpmhe.certificates.contraction import certify_detectability, certify_observer, synthesise_gain
 from qpmhe.certificates.enclosures import SmoothModel
 from qpmhe.certificates.evidence import Evidence, NotCertifiedError
 from qpmhe.certificates.inequalities import euclidean_constants
-from qpmhe.certificates.observer import certify_observer, synthesise_gain
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.errors import ModelError
 

@@ -9,7 +9,8 @@ import pytest
 from rich.console import Console
 
 import qpmhe
-from qpmhe.certificates import certification, certify_model
+from qpmhe.certificates import certificate as certification
+from qpmhe.certificates import certify_model
 from qpmhe.certificates.evidence import NotCertifiedError
 from qpmhe.cli.certify import certify
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError, SetError

@@ -14,9 +14,9 @@ from qpmhe.certificates import deadline as deadline_module
 from qpmhe.certificates import sdp
 from qpmhe.certificates.audit import Finding
 from qpmhe.certificates.branch_and_bound import cover, output_lipschitz
-from qpmhe.certificates.certification import certify
+from qpmhe.certificates.certificate import certify
+from qpmhe.certificates.contraction import certify_detectability, certify_observer, synthesise_gain
 from qpmhe.certificates.deadline import Deadline
-from qpmhe.certificates.detectability import certify_detectability
 from qpmhe.certificates.enclosures import Enclosure, SmoothModel
 from qpmhe.certificates.evidence import (
     CertificateError,
@@ -25,7 +25,6 @@ from qpmhe.certificates.evidence import (
     OutOfTimeError,
 )
 from qpmhe.certificates.inequalities import OutputWeight
-from qpmhe.certificates.observer import certify_observer, synthesise_gain
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.certificates.sdp import Program, Scales
 from qpmhe.certificates.search import Search
@@ -231,7 +230,7 @@ def test_parts_of_a_deadline_leave_the_rest(ticking):
 
 def test_measured_mode_is_not_called_unseen_however_fast_it_is():
     region = bounded_region(linear(np.eye(2), np.eye(2)), qpmhe.Box([-1.0, -1.0], [1.0, 1.0]))
-    from qpmhe.certificates.detectability import _undetected
+    from qpmhe.certificates.contraction import _undetected
 
     fast = np.diag([1e15, 0.5])
     assert _undetected(Search(linear(fast, [[1.0, 1.0]]), region, None, (1.0, 1.0))) is None

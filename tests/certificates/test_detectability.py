@@ -9,7 +9,7 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates import search as search_module
-from qpmhe.certificates.detectability import certify_detectability
+from qpmhe.certificates.contraction import certify_detectability
 from qpmhe.certificates.evidence import Evidence, NotCertifiedError, weakest
 from qpmhe.certificates.inequalities import Matrices, OutputWeight, definite
 from qpmhe.certificates.properties import Detectability

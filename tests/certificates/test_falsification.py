@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates.certification import certify
-from qpmhe.certificates.decay import DecayingSums
-from qpmhe.certificates.detectability import certify_detectability
+from qpmhe.certificates.certificate import certify
+from qpmhe.certificates.contraction import certify_detectability, certify_observer, synthesise_gain
 from qpmhe.certificates.evidence import Evidence
-from qpmhe.certificates.observer import certify_observer, synthesise_gain
 from qpmhe.certificates.regions import bounded_region
+from qpmhe.certificates.theorem import DecayingSums
 
 from .attacks import attack_detectability, attack_estimator, attack_observer, inside
 

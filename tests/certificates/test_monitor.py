@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates.certification import certify
+from qpmhe.certificates.certificate import certify
 from qpmhe.certificates.monitor import Hypotheses, Monitor, monitor, monitored_run
 from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError
@@ -44,7 +44,7 @@ def test_on_an_ordinary_run_everything_holds():
     run, summary = monitored_run(certificate, estimator(certificate), rng.standard_normal(20))
     assert len(run) == summary.steps == summary.applied == summary.held == 20
     assert summary.first_failure is None
-    assert summary.counts == dict.fromkeys(ALL, 20)
+    assert summary.missed == dict.fromkeys(ALL, 0)
     assert str(summary) == "The certificate applied at 20 of 20 steps."
     again = estimator(certificate).run(np.random.default_rng(0).standard_normal(20))
     np.testing.assert_array_equal(run.states, again.states)
@@ -57,7 +57,7 @@ def test_a_missing_measurement_ends_the_certificate_and_leaves_the_window_again(
     _, summary = monitored_run(certificate, estimator(certificate), y)
     assert (summary.applied, summary.first_failure) == (4, 4)
     assert summary.failed == ("complete",)
-    assert summary.counts["complete"] == 12 - 3  # the window holds it for three steps
+    assert summary.missed["complete"] == 3  # the window holds it for three steps
     assert "lost (" in str(summary)
 
 

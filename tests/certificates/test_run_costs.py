@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates.certification import certify
+from qpmhe.certificates.certificate import certify
 from qpmhe.certificates.evidence import MismatchError
 from qpmhe.certificates.monitor import Monitor, monitor
 from qpmhe.certificates.properties import Detectability, ObserverStability

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from qpmhe.certificates.decay import DecayingSums, Sizes, decaying_sums
-from qpmhe.certificates.theorem import theorem
+from qpmhe.certificates.theorem import DecayingSums, Sizes, decaying_sums, theorem
 from qpmhe.costs import CostConstants
 from qpmhe.errors import OptionError, ShapeError
 

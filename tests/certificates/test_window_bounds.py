@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates.decay import DecayingSums
 from qpmhe.certificates.properties import Detectability, ObserverStability
-from qpmhe.certificates.theorem import theorem
+from qpmhe.certificates.theorem import DecayingSums, theorem
 from qpmhe.certificates.window_bounds import largest, summed_bound, weighted_bound
 from qpmhe.costs import CostConstants
 from qpmhe.errors import OptionError
