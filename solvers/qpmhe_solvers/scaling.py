@@ -42,18 +42,9 @@ class Scale:
     that does so for the gradient or the step, as `Peaks` puts them together. The cost's unit is
     :math:`t^2 / c`, with c = 1 or 1/2, as its square root need not be a power of two.
 
-    Attributes
-    ----------
-    sizes, key
-        As given.
-    step : (K, n) array
-        t S: the unit of d.
-    units : (K n + K rows,) array
-        Units of the constraints: t S of the bounds, and t / R of the rows.
-    duals : (K n + K rows,) array
-        Units of the multipliers: t / (c S), also the unit of the gradient, and t R / c.
-    cost : float
-        t squared over c, the unit of the objective.
+    ``step``, (K, n), is the unit of d, t S; ``units`` and ``duals``, (K n + K rows,), are those of
+    the constraints, t S and t / R, and of their multipliers, t / (c S) and t R / c, bounds first;
+    ``cost`` is that of the objective, t squared over c.
     """
 
     __slots__ = (
@@ -172,13 +163,7 @@ class Peaks:
 
 
 class Scaling:
-    """The scales of one solver.
-
-    Attributes
-    ----------
-    qp : QP
-        The last scaled QP.
-    """
+    """The scales of one solver, and ``qp``, the last scaled QP."""
 
     def __init__(self, held: bool) -> None:
         self._held = held
