@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend import Backend
-from .layout import Layout, Structure, Style
+from .layout import Layout, Structure
 from .native import NATIVE, Answer, NativeSolver
 from .options import SolverOptions
 from .qp import QP
@@ -33,10 +33,7 @@ class DispatchSolver(NativeSolver):
         super().__init__(options)
         self.name = name
         self._translation = how = TRANSLATIONS[name]
-        self.style = Style(
-            how.matrices, bounds=how.bounds, sides=1, needs_row=how.needs_row,
-            objective=how.objective,
-        )
+        self.style = how.style
         self._keywords = how.keywords(options)
         self._solve_problem: Callable[..., Any] = self._package.solve_problem
 
@@ -116,7 +113,7 @@ def _report(extras: Mapping[str, Any]) -> tuple[int | None, str]:
 DISPATCHED = tuple(
     Backend(
         f"qpsolvers:{name}" if name in NATIVE else name, partial(DispatchSolver, name),
-        how.method, how.package, how.package, how.matrices,
+        how.method, how.package, how.package, how.style.matrices,
         iteration_cap=how.cap is not None,
         iterate_at_cap=how.cap is not None and name != "daqp",
         warm_start=how.start,

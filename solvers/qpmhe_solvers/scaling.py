@@ -8,7 +8,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from .qp import QP, Array, Places
+from .qp import QP, Places
 
 # Scales kept at a time: for QPs of other sizes, and for projections between estimations.
 _KEPT = 4
