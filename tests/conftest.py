@@ -1,6 +1,6 @@
 """Which tests run: a sample of about three minutes, or everything with ``--all``.
 
-The sample holds every test but those marked ``slow``. Of a test with many cases it holds a handful
+The sample holds every test but those marked ``slow``. Of a test with several cases it holds one
 and a share of the others: first those that bring new values of the parameters, and in `oracles`
 and `properties` all of these. The choice depends on the names of the cases only, so that the
 processes of pytest-xdist agree on it.
@@ -13,8 +13,8 @@ import hypothesis
 import pytest
 
 SEED = 1
-# Cases that every test keeps, and the share of its further cases.
-HANDFUL, SHARE = 2, 0.04
+# The share of the cases beyond the first that a test keeps.
+SHARE = 0.1
 # Examples of each property whose test names no number: in the sample, and in all.
 FEW, MANY = 8, 25
 # Begun first, so that no long test is the last one: most of these tests start processes.
@@ -46,14 +46,14 @@ def named(config, item):
 
 
 def sample(cases):
-    """A handful of the cases and a share of the others, new values of the parameters first."""
+    """One of the cases and a share of the others, new values of the parameters first."""
     cases = sorted(cases, key=lambda item: hashlib.sha256(f"{SEED}{item.nodeid}".encode()).digest())
     seen, kept, others = set(), [], []
     for item in cases:
         values = {(name, id(value)) for name, value in item.callspec.params.items()}
         (others if values <= seen else kept).append(item)
         seen |= values
-    wanted = HANDFUL + round(SHARE * (len(cases) - HANDFUL))
+    wanted = 1 + round(SHARE * (len(cases) - 1))
     if cases[0].path.parent.name in WHOLE:
         wanted = max(wanted, len(kept))
     return (kept + others)[:wanted]
@@ -69,7 +69,7 @@ def pytest_collection_modifyitems(config, items):
         elif item.get_closest_marker("slow") is None:
             tests[item.nodeid.partition("[")[0]].append(item)
     for cases in tests.values():
-        kept.update(sample(cases) if len(cases) > HANDFUL else cases)
+        kept.update(sample(cases) if len(cases) > 1 else cases)
     config.hook.pytest_deselected(items=[item for item in items if item not in kept])
     kept = [item for item in items if item in kept]
     items[:] = sorted(kept, key=lambda item: item.path.parent.name not in FIRST)

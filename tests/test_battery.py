@@ -150,7 +150,7 @@ def test_a_warming_cell_is_followed_in_spite_of_outliers(cell, seed):
 
 
 def test_a_prior_that_is_too_sure_is_overcome(cell):
-    bench, cycle = study.Bench(cell, 0.6), drive(cell, 3)
+    bench, cycle = study.Bench(cell, 0.6), drive(cell, 3, seconds=700)
     wrong = study.PRIORS["prior too small"]
     robust = bench.mhe("MHE", 1, cycle, prior=wrong)
     plain = bench.alone("EKF", study.kalman(cell, wrong), cycle)

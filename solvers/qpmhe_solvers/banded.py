@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .options import SolverOptions
-from .qp import QP, Array
+from .qp import QP, Array, Places, hessian_pattern, rows_pattern
 from .solution import Residuals, Solution, SolveStatus
 from .solver import Solver
 
@@ -64,7 +64,7 @@ class BandedSolver(Solver):
         rounding = _ROUNDING * (1.0 + float(np.abs(step).max()))
         feasible = scaled.violation(step) <= rounding
         return _judged(
-            qp, step * scale.step, multipliers.ravel() * scale.duals[qp.size :], feasible
+            qp, step * scale.step, multipliers * scale.duals[qp.size :], feasible
         )
 
     def _cholesky(self, qp: QP) -> Array | None:
@@ -88,41 +88,20 @@ class BandedSolver(Solver):
         return step if info == 0 and finite else None
 
     def _with_equalities(self, qp: QP) -> tuple[Array | None, Array]:
-        """Minimiser and multipliers (K, rows) subject to the equality rows alone."""
-        stages, n = qp.stages, qp.n
-        equal = qp.row_lower == qp.row_upper
-        slots = np.flatnonzero(equal.any(axis=0))
-        m, s = slots.size, n + slots.size
-        present = equal[:, slots]
-        own = np.where(present[:, :, None], qp.row_own[:, slots], 0.0)
-        following = np.where(present[:, :, None], qp.row_next[:, slots], 0.0)
-        lower, below = _unpacked(qp.band)
-        diagonal = np.zeros((stages, s, s))
-        diagonal[:, :n, :n] = lower
-        diagonal[:, n:, :n] = own
-        diagonal[:, :n, n:] = own.transpose(0, 2, 1)
-        # A slot without an equality at this stage gets the multiplier 0.
-        diagonal[:, n:, n:] = np.where(present, 0.0, 1.0)[:, :, None] * np.eye(m)
-        coupling = np.zeros((stages, s, s))  # rows of stage k+1, columns of stage k
-        coupling[:, :n, :n] = below
-        coupling[:, :n, n:] = following.transpose(0, 2, 1)
-        bandwidth = 2 * s - 1
-        band = np.zeros((3 * bandwidth + 1, stages * s))
-        for blocks, (rows, columns) in zip(
-            (diagonal, coupling[:-1], coupling[:-1].transpose(0, 2, 1)),
-            _places(stages, s), strict=True,
-        ):
-            band[2 * bandwidth + rows - columns, columns] = blocks.ravel()
-        side = np.zeros((stages, s))
-        side[:, :n] = -qp.gradient
-        side[:, n:] = np.where(present, qp.row_upper[:, slots], 0.0)
-        _, _, solution, info = self._dgbsv(bandwidth, bandwidth, band, side.ravel())
-        multipliers = np.zeros((stages, qp.rows))
-        if info != 0 or not np.isfinite(solution).all():
+        """Minimiser (K, n) and multipliers (K rows,) subject to the equality rows alone."""
+        width, level, order, source, target = _optimality_conditions(
+            qp.sizes, (qp.row_lower == qp.row_upper).tobytes()
+        )
+        band = np.zeros((3 * width + 1, order.size))
+        band.reshape(-1)[target] = qp.numbers[source]
+        side = np.append(-qp.gradient, qp.row_upper.ravel()[level])[order]
+        _, _, solution, info = self._dgbsv(width, width, band, side)
+        found, multipliers = np.empty(order.size), np.zeros(qp.stages * qp.rows)
+        found[order] = solution
+        multipliers[level] = found[qp.size :]
+        if info != 0 or not np.isfinite(found).all():
             return None, multipliers
-        solution = solution.reshape(stages, s)
-        multipliers[:, slots] = solution[:, n:]
-        return np.ascontiguousarray(solution[:, :n]), multipliers
+        return found[: qp.size].reshape(qp.stages, qp.n), multipliers
 
 
 def _judged(qp: QP, step: Array, row_duals: Array, feasible: bool) -> Solution:
@@ -134,22 +113,23 @@ def _judged(qp: QP, step: Array, row_duals: Array, feasible: bool) -> Solution:
     return Solution(step, SolveStatus.UNCONSTRAINED, 0, residuals, no_bound, row_duals)
 
 
-def _unpacked(band: Array) -> tuple[Array, Array]:
-    """Diagonal blocks (K, n, n), full, and the blocks below them, from the band panels."""
-    n = band.shape[1]
-    row, column = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
-    low, high = np.minimum(row, column), np.maximum(row, column)
-    return band[:, low, high - low], band[:, column, n + row - column]
-
-
 @lru_cache(maxsize=64)
-def _places(stages: int, s: int) -> tuple[tuple[Index, Index], ...]:
-    """Rows and columns of the entries of diagonal blocks, blocks below, and blocks above."""
-    k, i, j = np.ix_(np.arange(stages), np.arange(s), np.arange(s))
-    row, column = np.broadcast_arrays(k * s + i, k * s + j)
-    inner = slice(0, stages - 1)
-    return (
-        (row.ravel(), column.ravel()),
-        ((row[inner] + s).ravel(), column[inner].ravel()),
-        (row[inner].ravel(), (column[inner] + s).ravel()),
-    )
+def _optimality_conditions(
+    sizes: tuple[int, int, int], equal: bytes
+) -> tuple[int, Index, Index, Index, Index]:
+    """How [H, A'; A, 0] is written as a band, A being the rows that are equalities.
+
+    Returns the bandwidth, those rows, the order of unknowns and multipliers by stages, and for
+    each entry its place in `QP.numbers` and in the flat band of LAPACK's ``gbsv``.
+    """
+    stages, n, rows = sizes
+    size, level = stages * n, np.flatnonzero(np.frombuffer(equal, np.bool_))
+    order = np.argsort(np.append(np.arange(size) // n, level // rows), kind="stable")
+    at = np.argsort(order)
+    H, A = hessian_pattern(stages, n).tocoo(), rows_pattern(*sizes).tocsr()[level].tocoo()
+    own = Places.of(*sizes).own + A.data
+    row = at[np.concatenate((H.row, size + A.row, A.col))]
+    column = at[np.concatenate((H.col, A.col, size + A.row))]
+    width = int(np.abs(row - column).max())
+    target = (2 * width + row - column) * order.size + column
+    return width, level, order, np.concatenate((H.data, own, own)), target

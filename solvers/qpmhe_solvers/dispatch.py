@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .layout import Layout, Structure, Style
-from .native import Answer, NativeSolver
+from .backend import Backend
+from .layout import Layout, Structure
+from .native import NATIVE, Answer, NativeSolver
 from .options import SolverOptions
 from .qp import QP
 from .translations import TRANSLATIONS
@@ -31,10 +33,7 @@ class DispatchSolver(NativeSolver):
         super().__init__(options)
         self.name = name
         self._translation = how = TRANSLATIONS[name]
-        self.style = Style(
-            how.matrices, bounds=how.bounds, sides=1, needs_row=how.needs_row,
-            objective=how.objective,
-        )
+        self.style = how.style
         self._keywords = how.keywords(options)
         self._solve_problem: Callable[..., Any] = self._package.solve_problem
 
@@ -108,3 +107,18 @@ def _report(extras: Mapping[str, Any]) -> tuple[int | None, str]:
         count = int(np.ravel(count)[0])  # quadprog counts two: added, then dropped
     status = getattr(info, "status", extras.get("status", extras.get("exitFlag", "")))
     return count, str(status)
+
+
+#: The backends of this module, with "qpsolvers:" in front where there is a native one.
+DISPATCHED = tuple(
+    Backend(
+        f"qpsolvers:{name}" if name in NATIVE else name, partial(DispatchSolver, name),
+        how.method, how.package, how.package, how.style.matrices,
+        iteration_cap=how.cap is not None,
+        iterate_at_cap=how.cap is not None and name != "daqp",
+        warm_start=how.start,
+        time_limit=how.time_limit is not None,
+        reports_infeasibility=how.reports_infeasibility,
+    )
+    for name, how in TRANSLATIONS.items()
+)

@@ -60,7 +60,7 @@ class IsolatedSolver(Solver):
         # Where a process is starting, the solve has half of the time at least.
         fault = child.wait(_START if limit is None else 0.5 * limit)
         if fault:
-            if child.ended:
+            if child.fault:
                 self._replace()
             return Solution(None, SolveStatus.FAILED, message=fault)
         if limit is not None:
@@ -101,7 +101,7 @@ class IsolatedSolver(Solver):
     def _send(self, what: str) -> None:
         child = self._child
         # A process that is starting has nothing to forget or to shift.
-        if child is not None and child.mine and child.ready:
+        if child is not None and child.mine and child.fault == "":
             with suppress(_DeadError):
                 child.send((what,))
 
@@ -146,14 +146,9 @@ class _Child:
         return self._owner == os.getpid()
 
     @property
-    def ready(self) -> bool:
-        """Whether the solver is made."""
-        return self._started.done() and not self._started.result()
-
-    @property
-    def ended(self) -> bool:
-        """Whether it could not make the solver."""
-        return self._started.done() and bool(self._started.result())
+    def fault(self) -> str | None:
+        """Why it could not make the solver, empty once it has; None while it starts."""
+        return self._started.result() if self._started.done() else None
 
     def wait(self, seconds: float) -> str:
         """Wait until the solver is made; what hinders it, if anything does."""

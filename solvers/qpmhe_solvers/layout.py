@@ -81,22 +81,10 @@ class Layout:
         l \le C x \le u, \quad A x = b, \quad l_x \le x \le u_x
 
     in two-sided styles; with one side, C x <= u alone, its rows being the equality rows, those
-    with an upper limit, and those with a lower limit, negated.
-
-    Attributes
-    ----------
-    hessian, matrix, equality_matrix
-        P, C and A: CSC matrices, or arrays.
-    gradient, lower, upper, level, box_lower, box_upper : array
-        q, l, u, b, l_x and u_x; the box is empty where there is none.
-    all_lower, all_upper : array
-        Views of the box's limits, followed by those of C.
-    constraints, equalities : array of int
-        The constraint that each row of C and of A stands for.
-    signs : array
-        -1 for negated rows of C.
-    size, count : int
-        Numbers of unknowns and of constraints.
+    with an upper limit, and those with a lower limit, negated (their ``signs`` are -1). P, q, l,
+    u, b, l_x and u_x are ``hessian``, ``gradient``, ``lower``, ``upper``, ``level``, ``box_lower``
+    and ``box_upper``; ``all_lower`` and ``all_upper`` the box's limits, followed by those of C;
+    ``constraints`` and ``equalities`` the constraint that each row of C and of A stands for.
     """
 
     def __init__(

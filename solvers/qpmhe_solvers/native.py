@@ -79,6 +79,7 @@ class NativeSolver(Solver):
 
     def forget(self) -> None:
         """Drop the workspaces; see `Solver.forget`."""
+        super().forget()
         self._workspaces.clear()
 
     def prepare(self, size: int) -> None:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import warnings
 from importlib import metadata
 
+from .auto import AutoSolver
 from .backend import Backend, make_solver
-from .builtin import builtin_backends
+from .banded import BandedSolver
+from .dispatch import DISPATCHED
 from .errors import BackendError, OptionError
+from .native import NATIVE
 from .options import SolverOptions
 from .solver import Solver
 from .values import shown
@@ -153,5 +156,13 @@ def _look_for_plugins() -> None:
             )
 
 
-for _one in builtin_backends():
+register(Backend(  # the default one
+    "auto", AutoSolver, "banded, then a QP", matrices="banded", iteration_cap=True,
+    iterate_at_cap=True, time_limit=True, reports_infeasibility=True, keeps_workspace=True,
+))
+register(Backend(
+    "banded", BandedSolver, "banded Cholesky", matrices="banded", inequalities=False,
+    keeps_workspace=True,
+))
+for _one in sorted((*NATIVE.values(), *DISPATCHED), key=lambda backend: backend.name):
     register(_one)

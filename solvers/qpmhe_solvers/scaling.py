@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .qp import QP, Places
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
-_NOTHING = np.zeros(1, np.int64)
 
 # Scales kept at a time: for QPs of other sizes, and for projections between estimations.
 _KEPT = 4
@@ -42,44 +36,35 @@ class Scale:
     that does so for the gradient or the step, as `Peaks` puts them together. The cost's unit is
     :math:`t^2 / c`, with c = 1 or 1/2, as its square root need not be a power of two.
 
-    Attributes
-    ----------
-    sizes, key
-        As given.
-    step : (K, n) array
-        t S: the unit of d.
-    units : (K n + K rows,) array
-        Units of the constraints: t S of the bounds, and t / R of the rows.
-    duals : (K n + K rows,) array
-        Units of the multipliers: t / (c S), also the unit of the gradient, and t R / c.
-    cost : float
-        t squared over c, the unit of the objective.
+    ``step``, (K, n), is the unit of d, t S; ``units`` and ``duals``, (K n + K rows,), are those of
+    the constraints, t S and t / R, and of their multipliers, t / (c S) and t R / c, bounds first;
+    ``cost`` is that of the objective, t squared over c.
     """
 
-    __slots__ = (
-        "_factor", "_unknown", "cost", "duals", "key", "sizes", "step", "units",
-    )
+    __slots__ = ("_factors", "_unknown", "cost", "duals", "key", "sizes", "step", "units")
 
     def __init__(
-        self, exponents: Index, odd: int, places: Index, sizes: tuple[int, int, int], key: int
+        self, exponents: NDArray[np.int64], odd: int, sizes: tuple[int, int, int], key: int
     ) -> None:
         stages, n, rows = self.sizes = sizes
         self.key = key
         self._unknown: list[int] = []
-        s, r = exponents[:n] - odd, exponents[n:-1] + odd  # of c S and of R / c
-        signed = np.concatenate((exponents, -exponents, _NOTHING, s, -s, r))
-        factors = np.ldexp(1.0, signed[places[0]] + signed[places[1]])
-        count = stages * (n + rows)
-        self._factor: Array = factors[: -2 * count]
-        units = factors[-2 * count :].reshape(2, count)
-        self.units: Array = units[0]
-        self.duals: Array = units[1]
-        self.step: Array = self.units[: stages * n].reshape(stages, n)
-        self.cost = math.ldexp(1.0, 2 * int(exponents[-1]) + odd)
+        S, R, (t,) = np.split(np.ldexp(1.0, exponents), (n, n + rows))
+        c = 0.5**odd
+        factors = QP(*sizes)
+        factors.band = c * S[:, None] * S[(np.arange(n)[:, None] + np.arange(2 * n)) % n]
+        factors.gradient = c * S / t
+        factors.row_own = factors.row_next = R[:, None] * S
+        factors.lower = factors.upper = 1.0 / (S * t)
+        factors.row_lower = factors.row_upper = R / t
+        self._factors = factors.numbers
+        self.cost = float(t * t / c)
+        self.units, self.duals = 1.0 / factors.all_lower, factors.all_lower * self.cost
+        self.step = self.units[: stages * n].reshape(stages, n)
 
     def apply(self, qp: QP, scaled: QP) -> None:
         """Write the scaled numbers of a QP."""
-        np.multiply(qp.numbers, self._factor, out=scaled.numbers)
+        np.multiply(qp.numbers, self._factors, out=scaled.numbers)
         scaled.key = self.key
 
     def leave_out(self, peaks: list[float]) -> None:
@@ -88,40 +73,14 @@ class Scale:
 
     def fits(self, peaks: list[float]) -> bool:
         """Whether scaled numbers with these peaks are of order one."""
-        if self._unknown and any(peaks[at] > 0.0 for at in self._unknown):
+        if any(peaks[at] > 0.0 for at in self._unknown):
             return False
-        last = peaks.pop()
+        *others, last = peaks
         least, most = _STEP_PEAKS
         if last > 0.0 and not least <= last <= most:
             return False
         least, most = _PEAKS
-        return all(peak == 0.0 or least <= peak <= most for peak in peaks)
-
-
-@lru_cache(maxsize=64)
-def _places(sizes: tuple[int, int, int]) -> Index:
-    """Which two of the exponents make up each factor.
-
-    They are those of S, R, t, 1/S, 1/R, 1/t, 1, c S, 1/(c S) and R/c.
-    """
-    stages, n, rows = sizes
-    s, r, t = np.arange(n), n + np.arange(rows), np.array(n + rows)
-    one = 2 * (n + rows + 1)
-    cs = one + 1 + s
-    cs_less, cr_less = cs + n, one + 1 + 2 * n + np.arange(rows)
-    s_less, r_less, t_less = (place + n + rows + 1 for place in (s, r, t))
-    panel = (s[:, None] + np.arange(2 * n)) % n  # the row of each of its entries
-    row, next_row = (np.broadcast_arrays(r[:, None], s) for _ in range(2))
-    parts = [
-        (s[:, None] + 0 * panel, cs[panel]), (cs, t_less), row, next_row,
-        (s_less, t_less), (r, t_less), (s_less, t_less), (r, t_less),
-        (s, t), (r_less, t), (cs_less, t), (cr_less, t),
-    ]
-    made = [
-        np.tile(np.array(np.broadcast_arrays(*part)).reshape(2, -1), stages) for part in parts
-    ]
-    made.insert(4, np.full((2, 1), one))
-    return np.concatenate(made, axis=1)
+        return all(peak == 0.0 or least <= peak <= most for peak in others)
 
 
 class Peaks:
@@ -172,13 +131,7 @@ class Peaks:
 
 
 class Scaling:
-    """The scales of one solver.
-
-    Attributes
-    ----------
-    qp : QP
-        The last scaled QP.
-    """
+    """The scales of one solver, and ``qp``, the last scaled QP."""
 
     def __init__(self, held: bool) -> None:
         self._held = held
@@ -222,23 +175,21 @@ class Scaling:
 
     def _ideal(self, qp: QP, scaled: QP) -> Scale:
         """The best scale for one QP."""
-        _, n, rows = qp.sizes
-        places, key = _places(qp.sizes), next(self._keys)
-        exponents = np.zeros(n + rows + 1, np.int64)
-        peaks = self._peaks.of(qp)
+        n, key = qp.n, next(self._keys)
+        exponents = np.zeros(n + qp.rows + 1, np.int64)
+        peaks = self._peaks.of(qp)[:n]
         # A unit of the cost changes all the diagonal's exponents, units of unknowns the even part.
-        odd = next((math.frexp(peak)[1] % 2 for peak in peaks[:n] if peak > 0.0), 0)
-        # The peaks of rows depend on S, and that of the step on both.
-        for part in (slice(n), slice(n, n + rows), slice(n + rows, None)):
-            found = np.frexp(peaks[part])[1]
-            if part.start is None:
-                exponents[part] = -((found - odd) // 2)
-            else:
-                exponents[part] = found if part.stop is None else -found
-            np.clip(exponents, -_MOST, _MOST, out=exponents)
-            scale = Scale(exponents, odd, places, qp.sizes, key)
-            if part.stop is not None:
-                scale.apply(qp, scaled)
-                peaks = self._peaks.of(scaled)
+        odd = next((math.frexp(peak)[1] % 2 for peak in peaks if peak > 0.0), 0)
+        exponents[:n] = np.clip(-((np.frexp(peaks)[1] - odd) // 2), -_MOST, _MOST)
+        Scale(exponents, odd, qp.sizes, key).apply(qp, scaled)
+        if qp.rows:
+            found = np.frexp(self._peaks.of(scaled)[n:-1])[1]
+            exponents[n:-1] = np.clip(-found, -_MOST, _MOST)
+            R = np.ldexp(1.0, exponents[n:-1])
+            scaled.row_lower *= R
+            scaled.row_upper *= R
+        peaks = self._peaks.of(scaled)
+        exponents[-1] = np.clip(math.frexp(peaks[-1])[1], -_MOST, _MOST)
+        scale = Scale(exponents, odd, qp.sizes, key)
         scale.leave_out(peaks)
         return scale

@@ -1,4 +1,4 @@
-"""What a QP solver brought back, judged from the data and never from its word."""
+"""The solution of a QP, judged by the QP's data and never by the solver's word."""
 
 from __future__ import annotations
 
@@ -100,15 +100,10 @@ class Residuals:
 class Errors:
     """What an iterate misses optimality by, entry by entry; bounds and rows in one array each.
 
-    Attributes
-    ----------
-    missed : (K n + K rows,) array
-        Amount by which each constraint is missed, negative where it is met; empty where there
-        is no constraint at all.
-    force : (K n,) array or None
-        Gradient of the Lagrangian; None without multipliers.
-    gap : float
-        Distance between primal and dual objective; NaN without multipliers.
+    ``missed``, (K n + K rows,), is the amount by which each constraint is missed, negative where
+    it is met, and empty where there is none; ``force``, (K n,), the size of the gradient of the
+    Lagrangian; ``gap`` the distance between primal and dual objective. Without multipliers
+    ``force`` is None and ``gap`` NaN.
     """
 
     __slots__ = ("force", "gap", "missed")

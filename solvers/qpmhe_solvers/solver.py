@@ -6,7 +6,7 @@ import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from functools import partial, wraps
+from functools import partial
 from itertools import count
 from typing import Any, ClassVar, cast
 
@@ -64,8 +64,6 @@ class Solver(ABC):
         cls._builtin = cls.__module__.startswith(f"{__package__}.")
         if "_solve" in cls.__dict__:
             cls._judges = cls._judges and cls._builtin
-        if "forget" in cls.__dict__:  # which need not call this class's
-            cls.forget = _forgetting(cls.forget)  # type: ignore[assignment,method-assign]
 
     def __init__(self, options: SolverOptions) -> None:
         self.options = options
@@ -89,7 +87,8 @@ class Solver(ABC):
         """Drop what is kept from solve to solve: the next one is as the first.
 
         What a solver keeps may change the last digits of what it finds. So whoever wants the
-        same numbers twice asks for this in between.
+        same numbers twice asks for this in between. A subclass that keeps something drops it
+        here, and calls ``super().forget()``.
         """
         if self._scaling is not None:
             self._scaling.forget()
@@ -243,17 +242,6 @@ class Solver(ABC):
         )
 
 
-def _forgetting(forget: Callable[[Any], None]) -> Callable[[Any], None]:
-    """A subclass's `Solver.forget` that drops the scales, too."""
-
-    @wraps(forget)
-    def both(self: Solver) -> None:
-        Solver.forget(self)
-        forget(self)
-
-    return both
-
-
 class ContainedSolver:
     """A solver whose methods raise nothing but KeyboardInterrupt, whatever class it is of.
 
@@ -292,7 +280,7 @@ class ContainedSolver:
 
     def _take_over(self, solver: Solver) -> None:
         if solver._user:
-            _quietly(solver.forget)
+            self._start_afresh()
             solver.time_limit = solver.options.time_limit
         solver._user = self._number
 
@@ -304,7 +292,11 @@ class ContainedSolver:
     def forget(self) -> None:
         """Drop what is kept from solve to solve; see `Solver.forget`."""
         if self.solver._user in (0, self._number):
-            _quietly(self.solver.forget)
+            self._start_afresh()
+
+    def _start_afresh(self) -> None:
+        _quietly(self.solver.forget)
+        Solver.forget(self.solver)  # which a user's class need not call
 
     def prepare(self, size: int) -> None:
         """Do beforehand what the first QPs would wait for; see `Solver.prepare`."""

@@ -4,31 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
+from .layout import Style
 from .options import SolverOptions
 
 
 @dataclass(frozen=True)
 class Translation:
-    """How our vocabulary reads in one solver's own."""
+    """How our vocabulary reads in one solver's own; the style is what qpsolvers is to be given."""
 
     method: str
     package: str
-    matrices: Literal["csc", "dense"]
-    bounds: Literal["box", "rows"]
+    style: Style
     cap: str | None
     absolute: tuple[str, ...]
     relative: tuple[str, ...] = ()
     time_limit: str | None = None
     start: bool = False
-    needs_row: bool = False
     keep_empty: bool = False
     reports_infeasibility: bool = False
     default_cap: int | None = None
     beyond_cap: int = 0
     others: tuple[tuple[str, float], ...] = ()
-    objective: float = 1.0
 
     def keywords(self, options: SolverOptions) -> dict[str, Any]:
         """The options in the solver's own words, but for the time limit."""
@@ -51,46 +49,51 @@ class Translation:
 # change that of proxqp, which without a cap goes on for minutes.
 TRANSLATIONS: Mapping[str, Translation] = {
     "clarabel": Translation(
-        "interior point", "clarabel", "csc", "rows", "max_iter", ("tol_gap_abs", "tol_feas"),
-        ("tol_gap_rel",), "time_limit", needs_row=True, reports_infeasibility=True,
+        "interior point", "clarabel", Style("csc", bounds="rows", sides=1, needs_row=True),
+        "max_iter", ("tol_gap_abs", "tol_feas"), ("tol_gap_rel",), "time_limit",
+        reports_infeasibility=True,
     ),
     "cvxopt": Translation(
-        "interior point", "cvxopt", "csc", "rows", "maxiters", ("abstol", "feastol"), ("reltol",),
+        "interior point", "cvxopt", Style("csc", bounds="rows", sides=1),
+        "maxiters", ("abstol", "feastol"), ("reltol",),
     ),
     "daqp": Translation(
-        "dual active set", "daqp", "dense", "box", "iter_limit", ("primal_tol", "dual_tol"),
-        time_limit="time_limit", start=True, beyond_cap=1,
+        "dual active set", "daqp", Style("dense", sides=1),
+        "iter_limit", ("primal_tol", "dual_tol"), time_limit="time_limit", start=True,
+        beyond_cap=1,
     ),
     "ecos": Translation(
-        "interior point", "ecos", "dense", "rows", "max_iters", ("abstol", "feastol", "reltol"),
-        needs_row=True,
+        "interior point", "ecos", Style("dense", bounds="rows", sides=1, needs_row=True),
+        "max_iters", ("abstol", "feastol", "reltol"),
     ),
     "highs": Translation(
-        "active set", "highspy", "csc", "box", "qp_iteration_limit",
-        ("primal_feasibility_tolerance", "dual_feasibility_tolerance"), time_limit="time_limit",
-        needs_row=True, default_cap=10000, others=(("qp_regularization_value", 1e-9),),
+        "active set", "highspy", Style("csc", sides=1, needs_row=True),
+        "qp_iteration_limit", ("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
+        time_limit="time_limit", default_cap=10000, others=(("qp_regularization_value", 1e-9),),
     ),
     "osqp": Translation(
-        "ADMM", "osqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",), "time_limit",
-        start=True, reports_infeasibility=True, others=(("eps_dual_inf", 1e-12),),
+        "ADMM", "osqp", Style("csc", sides=1),
+        "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", start=True,
+        reports_infeasibility=True, others=(("eps_dual_inf", 1e-12),),
     ),
     "piqp": Translation(
-        "interior point", "piqp", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),
-        keep_empty=True, reports_infeasibility=True, others=(("eps_dual_inf", 1e-12),),
+        "interior point", "piqp", Style("csc", sides=1),
+        "max_iter", ("eps_abs",), ("eps_rel",), keep_empty=True, reports_infeasibility=True,
+        others=(("eps_dual_inf", 1e-12),),
     ),
     "proxqp": Translation(
-        "augmented Lagrangian", "proxsuite", "dense", "box", "max_iter", ("eps_abs",),
-        ("eps_rel",), default_cap=200, reports_infeasibility=True, objective=2.0**9,
+        "augmented Lagrangian", "proxsuite", Style("dense", sides=1, objective=2.0**9),
+        "max_iter", ("eps_abs",), ("eps_rel",), default_cap=200, reports_infeasibility=True,
     ),
     "qpalm": Translation(
-        "augmented Lagrangian", "qpalm", "csc", "box", "max_iter", ("eps_abs",), ("eps_rel",),
-        "time_limit", reports_infeasibility=True,
+        "augmented Lagrangian", "qpalm", Style("csc", sides=1),
+        "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", reports_infeasibility=True,
     ),
     "quadprog": Translation(
-        "dual active set", "quadprog", "dense", "rows", None, (),
+        "dual active set", "quadprog", Style("dense", bounds="rows", sides=1), None, (),
     ),
     "scs": Translation(
-        "ADMM", "scs", "csc", "rows", "max_iters", ("eps_abs",), ("eps_rel",), "time_limit_secs",
-        start=True, needs_row=True,
+        "ADMM", "scs", Style("csc", bounds="rows", sides=1, needs_row=True),
+        "max_iters", ("eps_abs",), ("eps_rel",), "time_limit_secs", start=True,
     ),
 }

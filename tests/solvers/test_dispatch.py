@@ -137,7 +137,7 @@ def test_sparse_matrices_are_made_once_for_a_pattern(name, case, monkeypatch):
     qp, _ = make(**CASES[case])
     solver.solve(qp)
     (workspace,) = solver._workspaces.values()
-    assert scipy.sparse.issparse(workspace.handle.P) == (solver._translation.matrices == "csc")
+    assert scipy.sparse.issparse(workspace.handle.P) == (solver.style.matrices == "csc")
     count.made = 0
     for _ in range(3):
         qp.gradient[...] += 0.1

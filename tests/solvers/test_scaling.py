@@ -11,6 +11,7 @@ import pytest
 
 from qpmhe_solvers import QP, RawSolution, Solver, SolverOptions, SolveStatus, backends, create
 from qpmhe_solvers.scaling import Scaling
+from qpmhe_solvers.solver import ContainedSolver
 
 from .problems import CASES, EVERY, WITH_INEQUALITIES, make, of_order_one
 
@@ -259,7 +260,8 @@ def test_a_stage_that_is_known_least_is_solved_for_beside_others():
 
 
 def test_who_writes_a_forget_need_not_call_ours():
-    solver, (qp, _) = Looking(), make(**CASES["all kinds"])
+    looking, (qp, _) = Looking(), make(**CASES["all kinds"])
+    solver = ContainedSolver(looking)
     solver.solve(qp)
     other = qp.copy()
     other.gradient *= 5.0
@@ -269,8 +271,8 @@ def test_who_writes_a_forget_need_not_call_ours():
     solver.solve(other)
     fresh = Looking()
     fresh.solve(other)
-    assert solver.forgotten == 1
-    held, ideal = solver.seen[1:]
+    assert looking.forgotten == 1
+    held, ideal = looking.seen[1:]
     assert np.abs(held.band).max() != np.abs(ideal.band).max()
     np.testing.assert_array_equal(ideal.band, fresh.seen[0].band)
 
