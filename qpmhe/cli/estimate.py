@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from time import monotonic
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -14,9 +13,6 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ..errors import OptionError
-
-# Seconds until the progress bar appears, and between two refreshes.
-_BAR_AFTER, _REFRESH = 1.0, 0.1
 
 
 def estimate(
@@ -118,21 +114,24 @@ def run(
 
     # A bar would stand among the rows.
     mixed = out == "-" and sys.stdout is not None and sys.stdout.isatty()
-    bar = _Bar(console) if console.is_terminal and not (quiet or mixed) else None
     try:
-        summary = estimate_record(
-            model, record, out, progress=None if bar is None else bar.show,
-            report=None if quiet else lambda text: _warn(console, text), **options,
-        )
+        with Progress(
+            TextColumn("estimating"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+            console=console, transient=True, redirect_stdout=False,  # it holds the rows
+            disable=quiet or mixed or not console.is_terminal,
+        ) as bar:
+            task = bar.add_task("", total=None)
+            summary = estimate_record(
+                model, record, out, **options,
+                progress=lambda done, total: bar.update(task, completed=done, total=total),
+                report=None if quiet else lambda text: _warn(console, text),
+            )
     except BrokenPipeError:
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         if out != "-":
             console.print("interrupted; continue by --resume.", highlight=False)
         raise
-    finally:
-        if bar is not None:
-            bar.close()
     most_failed = 2 * summary.failed > summary.samples + summary.inserted
     is_broken = summary.model_is_wrong or most_failed
     if not quiet:
@@ -164,32 +163,6 @@ def _print(console: Console, summary: Any, out: str) -> None:
     console.print(", ".join(words) + where, highlight=False, soft_wrap=True)
     for note in summary.notes:
         console.print(f"[yellow]note:[/] {escape(note)}", highlight=False, soft_wrap=True)
-
-
-class _Bar:
-    """A progress bar that appears in long runs only."""
-
-    def __init__(self, console: Console) -> None:
-        self._bar = Progress(
-            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
-            TimeRemainingColumn(), console=console, transient=True, auto_refresh=False,
-        )
-        self._task = self._bar.add_task("", total=None)
-        self._due, self._samples = monotonic() + _BAR_AFTER, 0
-
-    def show(self, position: int, total: int | None) -> None:
-        self._samples += 1
-        if monotonic() < self._due:
-            return
-        self._bar.start()
-        self._bar.update(
-            self._task, completed=position, total=total, description=f"{self._samples} samples"
-        )
-        self._bar.refresh()
-        self._due = monotonic() + _REFRESH
-
-    def close(self) -> None:
-        self._bar.stop()
 
 
 def _number(option: str, text: str, word: str) -> int | None:

@@ -44,6 +44,12 @@ class MheQpbenchmark(qpbenchmark.TestSet):
 '''
 
 
+_DESCRIPTION = (
+    "{} QPs from the steps of qpmhe's moving horizon estimators: increments of a state trajectory, "
+    "with a block-tridiagonal Hessian. Every solver starts cold here."
+)
+
+
 class ExportedSet(NamedTuple):
     """The script that qpbenchmark takes, the ``.npz`` problems, and why files were left out."""
 
@@ -107,8 +113,8 @@ def export_qpbenchmark(
         problems = _write(chosen, folder / "problems")
         script = folder / _SCRIPT
         code = _CODE.format(
-            script=_SCRIPT, title=title, description=_description(chosen), matrices=matrices,
-            sparse=matrices == "sparse",
+            script=_SCRIPT, title=title, description=_DESCRIPTION.format(len(chosen)),
+            matrices=matrices, sparse=matrices == "sparse",
         )
         script.write_text(code, encoding="utf-8")
     except OSError as error:
@@ -161,22 +167,3 @@ def _problem(qp: QP) -> qpsolvers.Problem:
         lower if lower is not None and sides[0].all() else None,
         upper if upper is not None and sides[1].all() else None,
     )
-
-
-def _description(chosen: list[StoredQP]) -> str:
-    unknowns = sorted({one.qp.size for one in chosen})
-    span = f"{unknowns[0]} to {unknowns[-1]}" if len(unknowns) > 1 else str(unknowns[0])
-    backends = Counter(one.backend or "unknown" for one in chosen)
-    answers = Counter(
-        one.solution.status.name if one.solution is not None else "not recorded" for one in chosen
-    )
-    return (
-        f"{len(chosen)} QPs from the steps of qpmhe's moving horizon estimators, with {span} "
-        "unknowns: increments of a state trajectory, with a block-tridiagonal Hessian. "
-        f"Recorded with the backend {_counted(backends)}; its verdicts: {_counted(answers)}. Every "
-        "solver starts cold here."
-    )
-
-
-def _counted(counts: Counter[str]) -> str:
-    return ", ".join(f"{name} ({count})" for name, count in counts.most_common())
