@@ -7,6 +7,7 @@ are relative to the file.
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -119,11 +120,12 @@ class Study:
         """Read a study from the TOML file ``path``, and check it before anything runs.
 
         Its keys are the parameters of this class, without ``folder``. A `StudyError` names the
-        file, the key and the value that does not fit.
+        file, the key with its line, and the value that does not fit.
         """
         path = Path(path)
         try:
-            found = tomllib.loads(path.read_text(encoding="utf-8"))
+            text = path.read_text(encoding="utf-8")
+            found = tomllib.loads(text)
         except OSError as error:
             raise StudyError(f"cannot read the study file {path}: {error.strerror}.") from error
         except UnicodeDecodeError as error:
@@ -134,7 +136,7 @@ class Study:
             if key not in _CHECKS:
                 near = get_close_matches(key, _CHECKS, 1)
                 raise StudyError(
-                    f"{path}: unknown key {key!r}; expected some of "
+                    f"{_place(path, text, key)}: unknown key {key!r}; expected some of "
                     f"{', '.join(_CHECKS)}.{f' Did you mean {near[0]}?' if near else ''}"
                 )
         if not found:
@@ -143,14 +145,15 @@ class Study:
                 "what is left out has its default."
             )
         options = {key: _translated(key, value) for key, value in found.items()}
-        try:
-            return cls(**options, folder=path.parent)
-        except InvalidInputError as error:
-            words = str(error)
-            for key, word in WORDS.items():
-                if words.startswith(f"{key} is "):
-                    words = words.replace(" None ", f' "{word}" ')
-            raise StudyError(f"{path}: {words}") from error
+        for key, value in options.items():  # one by one, so that the error names the line
+            try:
+                cls(**{key: value}, folder=path.parent)
+            except InvalidInputError as error:
+                words = str(error)
+                if key in WORDS:
+                    words = words.replace(" None ", f' "{WORDS[key]}" ')
+                raise StudyError(f"{_place(path, text, key)}: {words}") from error
+        return cls(**options, folder=path.parent)
 
     def settings(self) -> dict[str, Any]:
         """The grid as plain lists and numbers; what the store keeps of it."""
@@ -180,6 +183,14 @@ class Study:
                     cell = Cell(source.name, name, qps, own, *place)
                 made[cell] = None
         return tuple(made)
+
+
+def _place(path: Path, text: str, key: str) -> str:
+    """File and line of a key, which tomllib does not keep."""
+    for number, line in enumerate(text.splitlines(), 1):
+        if re.match(rf"""\s*\[*\s*["']?{re.escape(key)}\b""", line):
+            return f"{path}, line {number}"
+    return str(path)
 
 
 def _translated(key: str, value: Any) -> Any:

@@ -90,11 +90,19 @@ def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
         ("cell_timeout = 5", "cell_timeout =", "no valid TOML"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_file_and_key(tmp_path, old, new, words):
-    path = written(tmp_path, GOOD.replace(old, new))
+def test_what_does_not_fit_is_refused_with_file_and_line(tmp_path, old, new, words):
+    text = GOOD.replace(old, new)
+    path = written(tmp_path, text)
     with pytest.raises(StudyError, match=re.escape(words)) as caught:
         Study.from_toml(path)
     assert str(path) in str(caught.value)
+    if "TOML" not in words:
+        # Of a list over several lines, the line of its key.
+        lines = text.splitlines()
+        wrong = next(i for i, line in enumerate(lines) if new in line)
+        while not re.match(r"\w+ =|\[", lines[wrong]):
+            wrong -= 1
+        assert f", line {wrong + 1}:" in str(caught.value)
 
 
 def test_a_file_that_cannot_be_read_is_told(tmp_path):
