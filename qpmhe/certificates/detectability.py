@@ -7,13 +7,12 @@ import numpy as np
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from .deadline import PART_SECONDS, Deadline
-from .decay import checked_rate
 from .evidence import NotCertifiedError
-from .inequalities import OutputInjection, OutputWeight, euclidean_constants
+from .inequalities import OutputInjection, OutputWeight
 from .properties import Detectability, Subject, sealed
 from .regions import Region, bounded_region
 from .sdp import started
-from .search import Search, checked_weights
+from .search import Search
 
 # Of an output in its own size, for a state in the region's.
 _UNSEEN = 1e-9
@@ -63,20 +62,12 @@ def certify_detectability(
         If there are no such constants, or none were found; the text gives the smallest feasible
         rate and what is not detected. An `OutOfTimeError` says that it is not known which.
     """
-    if eta is not None:
-        checked_rate("eta", eta)
-    deadline = started(seconds)
     search = Search(
-        system, bounded_region(system, region, inputs), None, checked_weights(weights),
-        seconds=deadline,
+        system, bounded_region(system, region, inputs), None, weights, seconds=started(seconds)
     )
-    try:
-        found = search.find_best() if eta is None else search.find(eta)
-    except NotCertifiedError as error:
-        raise _explained(search, error, eta) from error
+    found = search.answer("eta", eta, (), _undetectable)
     form = found.form
     assert isinstance(form, (OutputWeight, OutputInjection))
-    c_p, c_w, c_v = euclidean_constants(form.P, form.R, form.rate)
     notes = (*found.notes, _STAY)
     if isinstance(form, OutputInjection):
         notes = (
@@ -93,31 +84,21 @@ def certify_detectability(
     )
 
 
-def _explained(search: Search, error: NotCertifiedError, eta: float | None) -> NotCertifiedError:
-    smallest = search.explaining_rate(error)
-    if smallest is None:
-        return error
-    if not np.isfinite(smallest):
-        search.check_jumps()
-        mode = _undetected(search)
-        if mode is not None:
-            return NotCertifiedError(
-                f"the system is not exponentially detectable by any constant P: {mode}",
-                (
-                    "measure something that this mode acts on",
-                    "leave the mode out of the model if it is not to be estimated",
-                ),
-            )
+def _undetectable(search: Search, text: str) -> NotCertifiedError:
+    """Why no rate is feasible."""
+    mode = _undetected(search)
+    if mode is not None:
         return NotCertifiedError(
-            f"{error.args[0]}: no constant P shows detectability on the whole region, although "
-            f"every single linearisation may be detectable{_steepest(search)}",
-            ("a smaller region", "other coordinates of the state"),
+            f"the system is not exponentially detectable by any constant P: {mode}",
+            (
+                "measure something that this mode acts on",
+                "leave the mode out of the model if it is not to be estimated",
+            ),
         )
-    asked = "" if eta is None else f"eta = {eta:.6g}; "
     return NotCertifiedError(
-        f"{error.args[0]}. Asked for: {asked}feasible at the states tried: eta from "
-        f"{smallest:.4g} on",
-        ("a larger eta", "a smaller region"), smallest,
+        f"{text}: no constant P shows detectability on the whole region, although "
+        f"every single linearisation may be detectable{_steepest(search)}",
+        ("a smaller region", "other coordinates of the state"),
     )
 
 

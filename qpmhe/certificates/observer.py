@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 
-from .._checks import Array, choice
+from .._checks import Array
 from ..errors import InvalidInputError, ShapeError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
 from ..observers import Luenberger, Observer
 from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
-from .decay import checked_rate
 from .evidence import CertificateError, NotCertifiedError
 from .inequalities import ErrorContraction, Matrices, euclidean_constants, norm_bound
-from .properties import ObserverStability, Subject, sealed
+from .properties import ObserverStability, sealed
 from .regions import Region, bounded_region
 from .sdp import started
-from .search import Found, Search, checked_weights
+from .search import Search
 
 _STAY = "it holds while the states of system and observer stay in the region"
-_SEARCH = 0.7  # of the time; the rest is for smaller constants of the gain that was found
 
 
 def constant_gain(observer: Observer, system: System) -> Array:
@@ -87,34 +84,30 @@ def certify_observer(
         If there are no such constants, or none were found; the text gives the smallest feasible
         rate, and what to try. An `OutOfTimeError` says that it is not known which.
     """
-    if rho is not None:
-        checked_rate("rho", rho)
     gain = constant_gain(observer, checked_system(system))
-    deadline = started(seconds)
     search = Search(
-        system, bounded_region(system, region, inputs), "observer", checked_weights(weights), gain,
-        deadline,
+        system, bounded_region(system, region, inputs), "observer", weights, gain, started(seconds)
     )
     _check_stability(search)
-    try:
-        return stability(search, search.find_best() if rho is None else search.find(rho))
-    except NotCertifiedError as error:
-        raise _explained(search, error) from error
+    return _stability(search, rho)
 
 
-def stability(search: Search, found: Found) -> ObserverStability:
+def _stability(search: Search, rho: float | None) -> ObserverStability:
     """The constants that follow from a verified contraction of the error."""
+    others = () if search.gain is None else ("another gain, such as synthesise_gain finds",)
+    found = search.answer("rho", rho, others, _unstable)
     form = found.form
     assert isinstance(form, ErrorContraction)
     V, allowance = _noise_weight(form.P, form.gain)
-    c_p, c_w, c_v = euclidean_constants(form.P, V + allowance * np.eye(V.shape[0]), form.rate)
+    V = V + allowance * np.eye(V.shape[0])
     kappa = float(norm_bound(Matrices.exact(form.gain[None]))[0])
     return sealed(
         ObserverStability(
-            form.rate, c_p, c_w, c_v, kappa, search.region, (*found.notes, _STAY), form.P, form.P,
-            V + allowance * np.eye(V.shape[0]), form.gain, found.margin, found.cells,
+            form.rate, *euclidean_constants(form.P, V, form.rate), kappa, gain=form.gain,
+            region=search.region, notes=(*found.notes, _STAY), P=form.P, V=V, margin=found.margin,
+            cells=found.cells,
         ),
-        Subject.of(search.system, search.region), found.evidence,
+        search.system, found.evidence,
     )
 
 
@@ -148,18 +141,9 @@ def _check_stability(search: Search) -> None:
         )
 
 
-def _explained(search: Search, error: NotCertifiedError) -> NotCertifiedError:
-    smallest = search.explaining_rate(error)
-    if smallest is None:
-        return error
-    synthesis = search.gain is None
-    if np.isfinite(smallest):
-        others = () if synthesis else ("another gain, such as synthesise_gain finds",)
-        return NotCertifiedError(
-            f"{error.args[0]}. Feasible at the states tried: rho from {smallest:.4g} on",
-            ("a larger rho", *others, "a smaller region"), smallest,
-        )
-    if synthesis:
+def _unstable(search: Search, text: str) -> NotCertifiedError:
+    """Why no rate is feasible."""
+    if search.gain is None:
         return NotCertifiedError(
             "no constant gain is shown to contract on the whole region: the semidefinite program "
             "is infeasible for every rate below 1",
@@ -167,13 +151,10 @@ def _explained(search: Search, error: NotCertifiedError) -> NotCertifiedError:
         )
     radii = _radii(search)
     return NotCertifiedError(
-        f"{error.args[0]}: no constant P shows contraction on the whole region, although A - L C "
+        f"{text}: no constant P shows contraction on the whole region, although A - L C "
         f"is stable at each of {radii.size} states (spectral radius up to {radii.max():.6g})",
         ("another gain, such as synthesise_gain finds", "a smaller region"),
     )
-
-
-Criterion = Literal["trade", "rate"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,31 +206,10 @@ def synthesise_gain(
         If there is no such gain, or none was found.
     """
     choice("criterion", criterion, get_args(Criterion))
-    if rho is not None:
-        checked_rate("rho", rho)
-    first, second = checked_weights(weights)
-    deadline = started(seconds)
     search = Search(
-        system, bounded_region(system, region, inputs), "synthesis", (first, second),
-        seconds=deadline.part(_SEARCH),
+        system, bounded_region(system, region, inputs), "synthesis", weights,
+        seconds=started(seconds),
     )
-    try:
-        found = search.find_best(criterion) if rho is None else search.find(rho)
-        made = stability(search, found)
-    except NotCertifiedError as error:
-        raise _explained(search, error) from error
+    made = _stability(search, rho)
     assert made.gain is not None
-    observer = Luenberger(made.gain)
-    try:
-        # For the gain as it is now, another P may give smaller constants.
-        again = certify_observer(
-            system, observer, search.region, rho=made.rho, weights=weights, seconds=deadline
-        )
-    except NotCertifiedError:
-        again = made
-
-    def size(one: ObserverStability) -> float:
-        return float(np.hypot(first * one.C_w, second * one.C_v))
-
-    better = again.evidence is made.evidence and size(again) < size(made)
-    return Synthesis(observer, again if better else made)
+    return Synthesis(Luenberger(made.gain), made)

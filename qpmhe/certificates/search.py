@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from ..errors import ModelError, OptionError
 from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
+from .decay import checked_rate
 from .enclosures import SmoothModel
 from .evaluation import find_jump, joint_jacobians
 from .evidence import Evidence, JumpError, NotCertifiedError, OutOfTimeError
@@ -62,7 +64,8 @@ class Search:
         gain: Array | None = None, seconds: float | Deadline = PART_SECONDS,
     ) -> None:
         self._deadline = Deadline.of(seconds)
-        self.system, self.region, self.gain, self._weights = system, region, gain, weights
+        self.system, self.region, self.gain = system, region, gain
+        self._weights = _checked_weights(weights)
         self.model = SmoothModel(system, region)
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
         self.jacobians = joint_jacobians(system, self.points)
@@ -90,7 +93,7 @@ class Search:
             )
         return self._program
 
-    def smallest_rate(self) -> float:
+    def _smallest_rate(self) -> float:
         """The smallest feasible rate at the chosen states, infinite if none below 1 is.
 
         Where the time is over before, the smallest one that was tried and is.
@@ -111,19 +114,28 @@ class Search:
                 high = middle
         return high
 
-    def explaining_rate(self, error: NotCertifiedError) -> float | None:
-        """`smallest_rate`, where an error does not say enough; None where the time is over.
-
-        A `JumpError` says more than that the time was over.
-        """
-        if isinstance(error, OutOfTimeError):
-            self.check_jumps()
-        if isinstance(error, (OutOfTimeError, JumpError)):
-            return None
+    def answer(
+        self, name: str, rate: float | None, advice: tuple[str, ...],
+        why: Callable[[Search, str], NotCertifiedError],
+    ) -> Found:
+        """An inequality with this rate, or with the best; `why` says why none is feasible."""
+        if rate is not None:
+            checked_rate(name, rate)
         try:
-            return self.smallest_rate()
+            return self._find_best() if rate is None else self._find(rate)
         except OutOfTimeError:
-            return None
+            raise
+        except NotCertifiedError as error:
+            try:
+                smallest = self._smallest_rate()
+            except OutOfTimeError:
+                raise error from None
+            if not np.isfinite(smallest):
+                raise why(self, error.args[0]) from error
+            raise NotCertifiedError(
+                f"{error.args[0]}. Feasible at the states tried: {name} from {smallest:.4g} on",
+                (f"a larger {name}", *advice, "a smaller region"), smallest,
+            ) from error
 
     def _feasible(self, rate: float, deadline: Deadline) -> Answer:
         return self._solved(rate, _MARGINS[0] * min(1.0, rate * rate), deadline, thorough=False)
@@ -150,7 +162,7 @@ class Search:
             ("more seconds", "a given rate, which spares the search for one", "a smaller model"),
         )
 
-    def best_rate(self, smallest: float) -> float:
+    def _best_rate(self, smallest: float) -> float:
         r"""The rate with the smallest :math:`\sqrt{d^2 \kappa + v^2 r} / (1 - \rho)`.
 
         That is what lasting disturbances and noise of sizes d and v make, up to a factor.
@@ -166,28 +178,26 @@ class Search:
             best = min(best, (np.sqrt(max(objective, 0.0)) / (1.0 - rate), rate))
         return best[1]
 
-    def find_best(self, criterion: str = "trade") -> Found:
+    def _find_best(self) -> Found:
         """An inequality with the best rate found."""
         share, refused = _ABOVE, NotCertifiedError("no rate was tried")
         for _ in range(_ATTEMPTS):
-            smallest = self.smallest_rate()
+            smallest = self._smallest_rate()
             if not np.isfinite(smallest):
                 raise NotCertifiedError(
                     "no rate below 1 was found for which the semidefinite program is feasible"
                 )
-            rate = smallest + share * (1.0 - smallest)
-            if criterion == "trade":
-                rate = max(rate, self.best_rate(smallest))
+            rate = max(smallest + share * (1.0 - smallest), self._best_rate(smallest))
             try:
-                return self.find(rate)
-            except (OutOfTimeError, JumpError):
+                return self._find(rate)
+            except (OutOfTimeError, _BrokenPairError):
                 raise
             except NotCertifiedError as error:
                 # What failed has left more states in the program, and moves the smallest rate.
                 refused, share = error, 3.0 * share
         raise refused
 
-    def find(self, rate: float) -> Found:
+    def _find(self, rate: float) -> Found:
         """An inequality with this rate, verified as far as can be."""
         level, size = 0, min(1.0, rate * rate)
         best: Found | None = None
@@ -288,7 +298,7 @@ class Search:
         return True
 
 
-def checked_weights(value: tuple[float, float]) -> tuple[float, float]:
+def _checked_weights(value: tuple[float, float]) -> tuple[float, float]:
     """Two positive numbers, checked."""
     try:
         first, second = value

@@ -154,6 +154,8 @@ class Problem:
         self._has_noise_free, self._clip = False, None
         if self.constrained:
             constraints = formulation.constraints
+            if window.has_own_bounds:
+                constraints = constraints.at(window.conditions)
             if self.observed is not None:
                 constraints = constraints.observed(self.observed)
             self._constrain(constraints)

@@ -37,6 +37,7 @@ class Settings:
     time_budget: float | None = None
     delay: int = 0
     isolated: bool = False
+    parameters: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         # Stored as Python's int: not all code that reads them accepts NumPy's integers.

@@ -34,6 +34,8 @@ def described(
     out: caps, backend and tolerances of the QPs, ``infeasible`` and ``warm_start``.
     """
     found: dict[str, Any] = {"candidate": settings.candidate, "sampling time": system.dt}
+    if settings.parameters:
+        found["number of parameters"] = len(settings.parameters)
     for name in SET_NAMES:
         _describe(f"set of {name}", getattr(system, name), found)
     _describe("observer", observer, found)

@@ -139,8 +139,7 @@ class Subproblem:
         if not (uniform and self._uniform):
             n = self._n
             self._added_bands[1:] = (
-                self._disturbance_band if uniform
-                else [band_of(weight[:n, :n]) for weight in weights]
+                self._disturbance_band if uniform else band_of(weights[:, :n, :n])
             )
             self._uniform = uniform
         # The candidate starts at the prior: no offset, and no gradient from it.
