@@ -228,23 +228,26 @@ class ConditionReader:
 
     def load(self, saved: dict[str, Any], usual: Conditions) -> Conditions:
         """The conditions of which `Conditions.state_dict` returned this; raises on a damaged one."""
-        values, found = dict(saved), {}
+        if not isinstance(saved, dict):
+            raise TypeError(f"conditions are {saved!r}")
+        p, values, found = self._system.p, dict(saved), {}
         for name in SET_NAMES:
             if name in values:
                 built = getattr(self._system, name)
                 if built is None:
                     raise mismatch(f"set of {name}")
-                given, sides = values.pop(name), []
-                for side in _SIDES:
-                    size = getattr(built, side).size
-                    sides.append(vector(name, given[side], size, finite=False))
-                found[name] = built.with_sides(*sides)
+                given, shapes = values.pop(name), [getattr(built, side).shape for side in _SIDES]
+                found[name] = built.with_sides(*(
+                    checked_array(name, given[side], shape, finite=False)
+                    for side, shape in zip(_SIDES, shapes, strict=True)
+                ))
                 self._check_rows(name, found[name], built)
         if "sampled" in values:
-            shape = (self._system.p,)
-            found["sampled"] = checked_array("sampled", values.pop("sampled"), shape, np.bool_)
+            found["sampled"] = checked_array("sampled", values.pop("sampled"), (p,), np.bool_)
         if "parameters" in values:
             found["parameters"] = self.parameters(values.pop("parameters"), usual)
+        for name, value in values.items():
+            checked_array(name, value, np.shape(value))
         return self.read(usual, bounds=None, **values)._replace(**found)
 
 
