@@ -87,7 +87,7 @@ class ConditionReader:
         self._system, self._cost = system, cost
         # The last set of each kind and what was made of it: the same object for equal sides.
         self._last: dict[str, tuple[tuple[bytes, ...], ConvexSet]] = {}
-        self._sensors: dict[bytes, tuple[NDArray[np.intp], Conditions | None]] = {}
+        self._sensors: dict[Any, tuple[NDArray[np.intp], Conditions | None]] = {}
 
     def read(
         self, usual: Conditions, *, noise_weight: ArrayLike | None = None,
@@ -179,22 +179,30 @@ class ConditionReader:
 
     def sensors(self, sensors: Any) -> tuple[NDArray[np.intp], Conditions | None]:
         """Indices of the sensors in the order given, and conditions; None if they are all."""
+        key: Any = None
+        if type(sensors) is list:
+            key = *sensors, *map(type, sensors)  # True is 1 otherwise
+        elif type(sensors) is np.ndarray:
+            key = sensors.tobytes(), sensors.dtype, sensors.shape
         try:
-            array = np.atleast_1d(np.asarray(sensors))
-        except ValueError:  # ragged
-            array = np.empty((0, 0))
-        key = array.dtype.str.encode() + array.tobytes()
-        found = self._sensors.get(key) if array.ndim == 1 else None
+            found = self._sensors.get(key)
+        except TypeError:  # a list of what has no hash
+            key = found = None
         if found is None:
-            index, mask = self._checked_mask(sensors, array)
+            index, mask = self._checked_mask(sensors)
             found = index, None if mask.all() else Conditions(sampled=mask)
             if len(self._sensors) >= _MOST_SENSORS:
                 self._sensors.clear()
-            self._sensors[key] = found
+            if key is not None:
+                self._sensors[key] = found
         return found
 
-    def _checked_mask(self, sensors: Any, array: NDArray[Any]) -> tuple[NDArray[np.intp], Mask]:
+    def _checked_mask(self, sensors: Any) -> tuple[NDArray[np.intp], Mask]:
         p = self._system.p
+        try:
+            array = np.atleast_1d(np.asarray(sensors))
+        except ValueError:  # lists of different lengths
+            array = np.empty((0, 0))
         if array.dtype == np.bool_:
             if array.shape != (p,):
                 raise ShapeError(

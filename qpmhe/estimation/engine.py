@@ -212,8 +212,7 @@ class PythonEngine:
             trajectory, residuals = trajectory.copy(), residuals.copy()
             filtered = window.filtered()
         if problem.observed is not None:
-            residuals = residuals.copy()
-            residuals[:, self._system.n :][~problem.observed] = np.nan
+            np.copyto(residuals[:, self._system.n :], np.nan, where=~problem.observed)
         estimate = Estimate(
             window.time - 1,
             trajectory,

@@ -375,7 +375,8 @@ class MovingHorizonEstimator:
         index, own = self._reader.sensors(sensors)
         self._partial.fill(np.nan)
         if y is not None:
-            given = np.atleast_1d(numbers("y", y, finite=False))
+            usual = type(y) is np.ndarray and y.ndim == 1 and y.dtype == np.float64
+            given = y if usual else np.atleast_1d(numbers("y", y, finite=False))
             if given.shape != index.shape:
                 raise ShapeError(
                     f"y has shape {given.shape}; expected {index.shape}, a component for each of "

@@ -82,6 +82,8 @@ class Stages:
         self._own: dict[int, Conditions] = {}  # of samples taken with other than the usual
         self._usual_weight = stage_weight
         self._weights = np.tile(stage_weight, (room, 1, 1))
+        #: Whether any stage may weigh its disturbance in its own way.
+        self.has_disturbance_weights: bool = not quadratic
         #: Whether any stage may be unusual; those from ``end`` on never are.
         self.unusual: bool = False
         # Weights of the quadratic form that majorises the cost at the candidate.
@@ -147,6 +149,11 @@ class Stages:
     def measurements(self) -> Array:
         """y, with any number where it is missing: a view."""
         return self._y[self.start : self.end]
+
+    @property
+    def weights(self) -> Array:
+        """The stages' weights, usual or not: a view."""
+        return self._weights[self.start : self.end]
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -300,6 +307,7 @@ class Stages:
             checked = checked_array("metric", covariance, self.metric.covariance.shape)
             self.metric.state = positive_definite("metric", checked), settled
         self.start, self.end, self.time, self.unusual = 0, length, time, True
+        self.has_disturbance_weights = True
 
 
 class StageView:

@@ -135,7 +135,7 @@ class Subproblem:
         if qp is None or qp.stages != count + 1:
             qp = self._new_qp(count + 1)
         weights = trial.weights
-        uniform = weights.ndim == 2
+        uniform = weights.ndim == 2 or problem.usual_disturbances
         if not (uniform and self._uniform):
             n = self._n
             self._added_bands[1:] = (
