@@ -212,7 +212,7 @@ class PythonEngine:
             trajectory, residuals = trajectory.copy(), residuals.copy()
             filtered = window.filtered()
         if problem.observed is not None:
-            np.copyto(residuals[:, self._system.n :], np.nan, where=~problem.observed)
+            residuals[:, self._system.n :][~problem.observed] = np.nan
         estimate = Estimate(
             window.time - 1,
             trajectory,
