@@ -244,7 +244,7 @@ CHANGES = {
                 "states": qpmhe.Box([-0.4, -1.0], [0.3, np.inf])
                 & qpmhe.Polytope([[1.0, 1.0]], [0.3]),
                 "disturbances": qpmhe.Box([-0.1, -0.2], [0.2, 0.1]),
-                "noises": qpmhe.Box([-0.4, -np.inf, -np.inf], [0.4, np.inf, np.inf]),
+                "noises": qpmhe.Box([-0.4, -np.inf, -5.0], [0.4, np.inf, 5.0]),
             }
         }, True,
     ),
@@ -285,11 +285,13 @@ def test_set_gives_the_estimator_that_was_made_with_the_values(name, change):
     mhe, record = estimator(**options), samples(20, 6, has_sets(name))
     for one in record[:12]:
         before = feed(mhe, one)
-    window, first = mhe._engine._window, before.candidate[0].copy()
+    window = mhe._engine._window
     prior = None if window.prior_covariance is None else window.prior_covariance.copy()
     metric = None if window.metric is None else window.metric.state
-    estimate = mhe.set(**changes)
-    made = changed(options, changes, initial_state=first, prior=prior)
+    estimate, first = mhe.set(**changes), before.candidate[0]
+    if "states" not in changes.get("bounds", {}) or changes["bounds"]["states"].violation(first) == 0:
+        np.testing.assert_array_equal(estimate.candidate[0], first)
+    made = changed(options, changes, initial_state=estimate.candidate[0], prior=prior)
     if metric is not None:
         made._engine._window.metric.state = metric
     for (y, u), own in record[8:12]:
@@ -312,3 +314,293 @@ def assert_close(found, expected):
     np.testing.assert_allclose(found.trajectory, expected.trajectory, rtol=0, atol=1e-8)
     assert found.candidate_cost == pytest.approx(expected.candidate_cost, rel=1e-9)
     assert found.cost == pytest.approx(expected.cost, rel=1e-7)
+
+
+def test_set_before_the_first_sample():
+    mhe = estimator(sets=SETS)
+    states = qpmhe.Box([0.6, -1.0], [1.0, np.inf])
+    assert mhe.set(bounds={"states": states}, noise_weight=np.eye(3)) is None
+    assert states.violation(mhe.state) == 0.0
+    made = changed(
+        {"sets": SETS}, {"bounds": {"states": states}, "noise_weight": np.eye(3)},
+        initial_state=mhe.state,
+    )
+    for one in samples(8, 7, True):
+        assert_close(feed(mhe, one), feed(made, one))
+    mhe.reset()
+    made.reset()
+    assert_close(feed(mhe, one), feed(made, one))
+
+
+# Bad input
+
+
+def wrong():
+    box = qpmhe.Box([-1.0, -1.0], [1.0, 1.0])
+    three = np.zeros(3)
+    bounds = [
+        (OptionError, ["bounds is 3", "dictionary"], {"bounds": 3}),
+        (OptionError, ["'outputs'", "'states'"], {"bounds": {"outputs": box}}),
+        (SetError, ["bounds['states'] is [0.0, 1.0]", "qpmhe.Box"],
+         {"bounds": {"states": [0.0, 1.0]}}),
+        (SetError, ["dimension 3", "expected 2"],
+         {"bounds": {"states": qpmhe.Box(three, three + 1.0)}}),
+        (OptionError, ["bounds component 1", "as wide as it ever is"],
+         {"bounds": {"noises": qpmhe.Box(-1.0 - three, 1.0 + three)}}),
+        (OptionError, ["general inequalities", "the same matrix"],
+         {"bounds": {"states": qpmhe.Polytope([[1.0, 2.0]], [1.0])}}),
+        (SetError, ["empty"], {"bounds": {"states": qpmhe.Box([1.2, 1.0], [1.5, np.inf])}}),
+        (OptionError, ["leaves no width to component 0"],
+         {"bounds": {"disturbances": qpmhe.Box([0.0, -1.0], [0.0, 1.0])}}),
+    ]
+    weights = [
+        (WeightError, ["noise_weight", "positive definite"], {"noise_weight": np.diag([1, 1, -1])}),
+        (ShapeError, ["noise_weight has shape (2, 2)", "(3, 3)"], {"noise_weight": np.eye(2)}),
+        (WeightError, ["disturbance_weight", "positive definite"],
+         {"disturbance_weight": np.zeros((2, 2))}),
+        (WeightError, ["disturbance_weight is not symmetric"],
+         {"disturbance_weight": [[1.0, 0.5], [0.0, 1.0]]}),
+        (ShapeError, ["disturbance_weight has shape (3, 3)", "(2, 2)"],
+         {"disturbance_weight": np.eye(3)}),
+    ]
+    parameters = [
+        (ShapeError, ["parameters has shape (3,)", "(2,)"], {"parameters": three}),
+        (ShapeError, ["parameters has shape ()", "(2,)"], {"parameters": 1.0}),
+        (InvalidInputError, ["parameters is", "finite"], {"parameters": [np.nan, 1.0]}),
+    ]
+    return bounds + weights + parameters
+
+
+WRONG_SENSORS = [
+    (InvalidInputError, ["sensors is [3]", "from 0 to 2"], [0.0], [3]),
+    (InvalidInputError, ["sensors is [-1]", "from 0 to 2"], [0.0], [-1]),
+    (InvalidInputError, ["sensors is [1, 1]", "at most once"], [0.0, 0.0], [1, 1]),
+    (InvalidInputError, ["sensors is []", "update(None)"], [], []),
+    (InvalidInputError, ["sensors is [False, False, False]", "update(None)"], [], [False] * 3),
+    (ShapeError, ["sensors has shape (2,)", "(3,)"], [0.0], [True, False]),
+    (InvalidInputError, ["sensors is [0.0]", "indices"], [0.0], [0.0]),
+    (InvalidInputError, ["sensors is [[0]]", "indices"], [0.0], [[0]]),
+    (InvalidInputError, ["sensors is [[0], [1, 2]]", "indices"], [0.0], [[0], [1, 2]]),
+    (InvalidInputError, ["sensors is 'speed'", "indices"], [0.0], "speed"),
+    (ShapeError, ["y has shape (3,)", "sensors=[0, 2]"], [0.0, 0.0, 0.0], [0, 2]),
+    (ShapeError, ["y has shape (1,)", "sensors=[0, 2]"], 0.0, [0, 2]),
+    (InvalidInputError, ["y is", "real numbers"], ["high", 1.0], [0, 2]),
+]
+Y, U = [0.1, 0.2, 0.3], [0.4]
+
+
+def unharmed(mhe, kind, fragments, call):
+    before = leaves(mhe.state_dict())
+    check(kind, fragments, lambda: call(mhe))
+    assert leaves(mhe.state_dict()) == before
+
+
+@pytest.mark.parametrize("count", [0, 6])
+def test_wrong_conditions_leave_the_estimator_as_it_was(count):
+    mhe, twin = estimator(sets=SETS, kalman="ExtendedKalman"), None
+    for one in samples(count, 8, True):
+        feed(mhe, one)
+    twin = pickle.loads(pickle.dumps(mhe))
+    for kind, fragments, given in wrong():
+        unharmed(mhe, kind, fragments, lambda one, given=given: one.update(Y, U, **given))
+        unharmed(mhe, kind, fragments, lambda one, given=given: one.set(**given))
+        right = {"noise_weight": np.eye(3), "disturbance_weight": np.eye(2), "parameters": [1, 1]}
+        both = right | given
+        unharmed(mhe, kind, fragments, lambda one, both=both: one.update(Y, U, **both))
+        unharmed(mhe, kind, fragments, lambda one, both=both: one.set(**both))
+    for kind, fragments, y, sensors in WRONG_SENSORS:
+        call = lambda one, y=y, sensors=sensors: one.update(y, U, sensors=sensors)  # noqa: E731
+        unharmed(mhe, kind, fragments, call)
+    for u in ([1.0, 2.0], [1.0, 2.0, 3.0], 1j):
+        text = "u has shape" if u != 1j else "u is"
+        unharmed(mhe, InvalidInputError, [text], lambda one, u=u: one.update(Y, u))
+    for one in samples(9, 9, True):
+        assert_same(numbers(feed(mhe, one)), numbers(feed(twin, one)))
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "fragments"),
+    [
+        ({"parameters": [1.0]}, InvalidInputError, ["parameters is [1.0]", "has none"]),
+        ({"bounds": {"states": SETS["states"]}}, OptionError, ["no set of states", "System("]),
+    ],
+    ids=["parameters", "bounds"],
+)
+def test_what_the_estimator_does_not_have(given, kind, fragments):
+    mhe = estimator(parameters=None)
+    unharmed(mhe, kind, fragments, lambda one: one.update(Y, [0.4, 1.0, 0.1], **given))
+    unharmed(mhe, kind, fragments, lambda one: one.set(**given))
+
+
+@pytest.mark.parametrize(
+    ("parameters", "kind", "fragments"),
+    [
+        ([1.0] * 4, ShapeError, ["parameters has 4 numbers", "at most 3"]),
+        ([[1.0]], ShapeError, ["parameters has shape (1, 1)", "(k,)"]),
+        ([np.inf], InvalidInputError, ["parameters is [inf]", "finite"]),
+        ("stiff", InvalidInputError, ["parameters is 'stiff'", "real numbers"]),
+    ],
+)
+def test_wrong_parameters_of_an_estimator(parameters, kind, fragments):
+    check(kind, fragments, lambda: estimator(parameters=parameters))
+
+
+def test_fixed_components_of_the_disturbance_stay_fixed():
+    fixed = qpmhe.Box([0.0, -1.0], [0.0, 1.0])
+    mhe = estimator(sets={"disturbances": fixed})
+    other = qpmhe.Box([-0.1, -1.0], [0.1, 1.0])
+    given = {"bounds": {"disturbances": other}}
+    unharmed(mhe, OptionError, ["frees component 0"], lambda one: one.update(Y, U, **given))
+    narrow = {"disturbances": qpmhe.Box([0.0, -0.01], [0.0, 0.01])}
+    for _ in range(5):
+        estimate = mhe.update(Y, U, bounds=narrow)
+        assert not estimate.disturbances[:, 0].any()
+    assert np.abs(estimate.disturbances[:, 1]).max() <= 0.01 + 1e-8
+
+
+def test_a_robust_loss_per_component_needs_a_diagonal_weight():
+    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=2, p=2)
+    cost = qpmhe.RobustCost(
+        prior=np.eye(2), disturbance=qpmhe.Huber(np.eye(2), per_component=True), noise=np.eye(2)
+    )
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(0.1 * np.eye(2)), cost, horizon=3, initial_state=[0.0, 0.0]
+    )
+    dense = [[2.0, 0.5], [0.5, 1.0]]
+    for call in (
+        lambda one: one.update([1.0, 1.0], disturbance_weight=dense),
+        lambda one: one.set(disturbance_weight=dense),
+    ):
+        unharmed(mhe, WeightError, ["diagonal"], call)
+
+
+# Memory
+
+
+@every
+def test_snapshots_and_pickles_keep_the_conditions(name):
+    mhe, record = estimator(**OPTIONS[name]), samples(40, 10, has_sets(name))
+    for t, one in enumerate(record[:20]):
+        feed(mhe, one)
+        if t == 11:
+            own = {"bounds": {"states": qpmhe.Box([-0.9, -1.0], [0.9, np.inf])}}
+            mhe.set(
+                disturbance_weight=np.diag([3.0, 2.0]), parameters=[0.8, 0.2],
+                **(own if has_sets(name) else {}),
+            )
+    restored, again = estimator(**OPTIONS[name]), pickle.loads(pickle.dumps(mhe))
+    restored.load_state_dict(mhe.state_dict())
+    assert leaves(restored.state_dict()) == leaves(mhe.state_dict())
+    for t, one in enumerate(record[20:]):
+        expected = numbers(feed(mhe, one))
+        for other in (restored, again):
+            assert_same(numbers(feed(other, one)), expected)
+        if t == 3:
+            expected = numbers(mhe.amend(21, [0.1, 0.2, 0.3]))
+            for other in (restored, again):
+                assert_same(numbers(other.amend(21, [0.1, 0.2, 0.3])), expected)
+        if t == 6:
+            expected = numbers(mhe.set(noise_weight=np.eye(3)))
+            for other in (restored, again):
+                assert_same(numbers(other.set(noise_weight=np.eye(3))), expected)
+
+
+def test_a_state_with_parameters_is_of_another_estimator():
+    mhe = estimator()
+    mhe.update(Y, U)
+    with pytest.raises(InvalidInputError, match="another number of parameters"):
+        estimator(parameters=None).load_state_dict(mhe.state_dict())
+
+
+def test_what_was_given_is_copied():
+    mhe, twin = estimator(sets=SETS), estimator(sets=SETS)
+    for one in samples(12, 11, True):
+        feed(twin, one)
+        (y, u), own = one
+        spoilt = {k: np.array(v) if k not in ("bounds", "dt") else v for k, v in own.items()}
+        if "bounds" in own:
+            spoilt["bounds"] = {k: qpmhe.Box(v.lower, v.upper) for k, v in own["bounds"].items()}
+        mhe.update(y, u, **spoilt)
+        for value in spoilt.values():
+            if isinstance(value, np.ndarray):
+                value[...] = 0
+        for box in spoilt.get("bounds", {}).values():
+            box.lower[...] = box.upper[...] = 0.0
+    assert leaves(mhe.state_dict()) == leaves(twin.state_dict())
+
+
+@pytest.mark.parametrize("name", ["plain", "sets", "sets, reinitialized", "sets, kalman"])
+def test_an_interrupted_change_was_not_made(name):
+    mhe, twin = estimator(**OPTIONS[name]), estimator(**OPTIONS[name])
+    rng, changes = np.random.default_rng(12), {"noise_weight": np.eye(3), "parameters": [0.7, 0.3]}
+    if has_sets(name):
+        changes["bounds"] = {"states": qpmhe.Box([-0.4, -1.0], [0.4, np.inf])}
+    for t, one in enumerate(samples(14, 13, has_sets(name))):
+        do = [lambda each, one=one: feed(each, one)]
+        if t in (0, 7):
+            do.append(lambda each: each.set(**changes))
+        for each in do:
+            if t in (0, 3, 4, 7, 12):
+                mhe.state_dict()  # in which solvers forget, as they do after an interrupt
+                twin.state_dict()
+                found, expected = interrupted(mhe, each, rng), each(twin)
+                assert_same(numbers(found), numbers(expected))
+            else:
+                each(mhe)
+                each(twin)
+    assert leaves(mhe.state_dict()) == leaves(twin.state_dict())
+
+
+# The step's work
+
+
+def test_a_sample_of_one_sensor_computes_nothing_twice(monkeypatch):
+    mhe, reduced = estimator(), []
+    plain = qpmhe.QuadraticCost._reduced
+    monkeypatch.setattr(
+        qpmhe.QuadraticCost, "_reduced",
+        lambda self, *arguments: reduced.append(1) or plain(self, *arguments),
+    )
+    for t in range(60):
+        mhe.update([0.1], U, sensors=[t % 3])
+    assert len(reduced) == 3
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+def test_the_compiled_step_refuses_by_name():
+    ca = pytest.importorskip("casadi")
+    system = qpmhe.from_casadi(
+        lambda x, u: [x[0] + 0.1 * x[1], x[1] - 0.1 * u[1] * ca.sin(x[0]) + 0.1 * u[0]],
+        lambda x, u: ca.vertcat(x[0], x[1]), n=2, m=2,
+        noises=qpmhe.Box([-5.0, -5.0], [5.0, 5.0]),
+    )
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(2))
+    mhe, python = (
+        qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger(0.2 * np.eye(2)), cost, horizon=4, initial_state=[0.1, 0.0],
+            engine=engine, parameters=[1.0],
+        )
+        for engine in ("compiled", "python")
+    )
+    assert mhe.engine == "compiled"
+    for t in range(8):
+        for given, name in (
+            ({"disturbance_weight": 2.0 * np.eye(2)}, "disturbance_weight"),
+            ({"bounds": {"noises": qpmhe.Box([-1.0, -1.0], [1.0, 1.0])}}, "bounds"),
+        ):
+            unharmed(
+                mhe, OptionError, ["engine='compiled'", name],
+                lambda one, given=given: one.update([0.1, 0.2], [0.3], **given),
+            )
+        unharmed(
+            mhe, OptionError, ["engine='compiled'", "sensors"],
+            lambda one: one.update([0.1], [0.3], sensors=[1]),
+        )
+        unharmed(mhe, OptionError, ["engine='compiled'", "set"], lambda one: one.set(parameters=2))
+        own = {"parameters": [1.5]} if t % 3 == 1 else {}
+        if t % 3 == 2:
+            own = {"noise_weight": np.diag([2.0, 3.0])}
+        found = mhe.update([0.1, 0.2], [0.3], **own)
+        assert found.cost == pytest.approx(python.update([0.1, 0.2], [0.3], **own).cost, rel=1e-9)
+    Y, U = np.zeros((5, 2)), np.ones((5, 1))
+    np.testing.assert_allclose(mhe.run(Y, U).states, python.run(Y, U).states, atol=1e-9)
