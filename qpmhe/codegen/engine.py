@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from .._checks import check_problem, positive_definite
 from ..costs import Cost
-from ..errors import InvalidInputError
+from ..errors import InvalidInputError, OptionError
+from ..estimation.conditions import Conditions, usual_conditions
 from ..estimation.covariance import window_covariances
 from ..estimation.estimate import DroppedRow, Estimate, Status
 from ..estimation.run import Run
@@ -47,6 +48,8 @@ class CompiledEngine:
     ) -> None:
         self._library = library = EstimatorLibrary(system, observer, cost, settings)
         self._system, self._cost, self._settings = system, cost, settings
+        #: What holds where a sample has nothing of its own, and the system with its sets.
+        self.usual, self.system = usual_conditions(settings), system
         n, p, m, horizon = system.n, system.p, system.m, settings.horizon
         self._sizes, self._delay = (n, p, horizon), settings.delay
         self._workspace = library.workspace()
@@ -101,10 +104,26 @@ class CompiledEngine:
         """Number of samples in the window."""
         return int(self._memory[0]["length"])
 
+    def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
+        """Refuse: samples in C have no usual conditions that could change."""
+        raise OptionError("engine='compiled' takes no set(...); take engine='python'.")
+
     def step(
-        self, y: Array, u: Array, dt: float | None, noise_weight: Array | None, began: float
+        self, y: Array, u: Array, dt: float | None, own: Conditions | None, began: float
     ) -> Estimate:
         """Take a sample in, and estimate."""
+        noise_weight = None
+        if own is not None:
+            noise_weight = own.noise_weight
+            for name, given in (
+                ("disturbance_weight", own.disturbance_weight is not None),
+                ("bounds", own.has_bounds), ("sensors", own.sampled is not None),
+            ):
+                if given:
+                    raise OptionError(
+                        f"engine='compiled' takes no {name} of single samples; take "
+                        "engine='python', or leave it out."
+                    )
         time = self._time.item()
         try:
             self._y[...] = y

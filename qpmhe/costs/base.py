@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -231,12 +232,23 @@ class Cost(ABC):
     def majorise_prior(self, offset: Array, weight: Array) -> Array:
         """The prior's counterpart of `majorise`, for offset and weight as of `prior_cost`."""
 
-    def joint_weight(self, noise: Array | None) -> Array:
-        """The weight of (w, v) with this weight (p, p) of the noise v; None for the usual one."""
+    def joint_weight(self, noise: Array | None, disturbance: Array | None = None) -> Array:
+        """The weight of (w, v) with these weights of v and w; None for the usual ones."""
         joint = np.zeros((self.n + self.p, self.n + self.p))
-        joint[: self.n, : self.n] = self.disturbance
+        joint[: self.n, : self.n] = self.disturbance if disturbance is None else disturbance
         joint[self.n :, self.n :] = self.noise if noise is None else noise
         return joint
+
+    def with_weights(self, noise: Array | None, disturbance: Array | None) -> Cost:
+        """The step's cost with other usual weights; None keeps one."""
+        other = copy(self)
+        if noise is not None:
+            other.noise = noise
+        if disturbance is not None:
+            other.disturbance = disturbance
+        other.stage_weight = other.joint_weight(None)
+        other._partial = OrderedDict()
+        return other
 
     def initial_weight(self, covariance: Array | None) -> Array:
         """The weight of the initial error, given the observer's covariance of it if it has one."""
@@ -244,17 +256,21 @@ class Cost(ABC):
             return np.asarray(self.prior)
         return self.observer_prior.weight(covariance)
 
-    def check_noise(self, noise: Array) -> None:  # noqa: B027 - most costs take any weight
-        """Raise a `WeightError` unless the cost can use this noise weight (p, p) of one sample."""
+    def check_weights(  # noqa: B027 - most costs take any weight
+        self, noise: Array | None, disturbance: Array | None
+    ) -> None:
+        """Raise a `WeightError` unless the cost can use these weights at single samples."""
 
-    def partial_weight(self, observed: Mask, noise: Array | None = None) -> Array:
+    def partial_weight(
+        self, observed: Mask, noise: Array | None = None, disturbance: Array | None = None
+    ) -> Array:
         """The stage weight where only the observed components of y are there, (p,) bool.
 
         It is zero on the others; those there weigh the inverse of their block of the covariance
-        of the noise, of which this sample may have a weight of its own.
+        of the noise. This sample may have weights of its own.
         """
-        if noise is not None:
-            return self._reduced(observed, noise)
+        if noise is not None or disturbance is not None:
+            return self._reduced(observed, self.noise if noise is None else noise, disturbance)
         key = observed.tobytes()
         joint = self._partial.pop(key, None)
         if joint is None:
@@ -266,13 +282,13 @@ class Cost(ABC):
                 self._partial.popitem(last=False)
         return joint
 
-    def _reduced(self, observed: Mask, weight: Array) -> Array:
+    def _reduced(self, observed: Mask, weight: Array, disturbance: Array | None = None) -> Array:
         reduced = np.zeros_like(weight)
         there = np.flatnonzero(observed)
         if there.size:
             block = inverse(weight)[np.ix_(there, there)]
             reduced[np.ix_(there, there)] = inverse(block)
-        return self.joint_weight(reduced)
+        return self.joint_weight(reduced, disturbance)
 
 
 def quadratic_form(residuals: Array, weights: Array) -> Array:

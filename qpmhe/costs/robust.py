@@ -86,9 +86,12 @@ class RobustCost(Cost):
         joint[:, n:, n:] = self.noise_loss.majorise(residuals[:, n:], weights[..., n:, n:])
         return joint
 
-    def check_noise(self, noise: Array) -> None:
-        """Check that the weight is diagonal where the loss is per component; see `Cost`."""
-        self.noise_loss.check_weight(noise)
+    def check_weights(self, noise: Array | None, disturbance: Array | None) -> None:
+        """Check that a weight is diagonal where its loss is per component; see `Cost`."""
+        if noise is not None:
+            self.noise_loss.check_weight(noise)
+        if disturbance is not None:
+            self.disturbance_loss.check_weight(disturbance)
 
     def prior_cost(self, offset: Array, weight: Array) -> float:
         """The loss of the initial error; see `Cost.prior_cost`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,10 @@ from .._linalg import inverse
 from ..costs import Cost
 from ..model.sets import ConvexSet
 from ..model.system import System
+from .conditions import Conditions
 from .estimate import DroppedRow
 from .limits import FEASIBLE
+from .snapshot import SET_NAMES
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -39,30 +41,52 @@ class Rows:
         The components that these bound.
     lower, upper : (r,) or (K, r) array
         Sides, infinite where there is none.
-    scale : (r,) array
+    scale : (r,) or (K, r) array
         The unit in which a miss of the row is measured: its width, or the standard deviation of
         M s if that is less.
     """
 
     __slots__ = (
-        "_columns", "_magnitudes", "bounds", "components", "lower", "matrix", "name", "scale",
-        "upper",
+        "_columns", "_deviation", "_magnitudes", "bounds", "components", "lower", "matrix", "name",
+        "scale", "upper",
     )
 
     def __init__(self, name: str, convex_set: ConvexSet, covariance: Array) -> None:
         d, components = convex_set.dimension, convex_set.bounded_components
         self.name, self.components, self.bounds = name, components, components.size
         self.matrix: Array = np.vstack((np.eye(d)[components], convex_set.matrix))
-        self.lower: Array = np.append(convex_set.lower[components], convex_set.row_lower)
-        self.upper: Array = np.append(convex_set.upper[components], convex_set.row_upper)
-        deviation = np.sqrt(np.einsum("ri,ij,rj->r", self.matrix, covariance, self.matrix))
-        width = self.upper - self.lower
-        self.scale: Array = np.where(width > 0.0, np.minimum(width, deviation), deviation)
+        self._deviation = np.sqrt(np.einsum("ri,ij,rj->r", self.matrix, covariance, self.matrix))
+        self.lower, self.upper = self._sides(convex_set)
+        self.scale: Array = self._scale()
         self._magnitudes = np.abs(self.matrix).T
         # Without general inequalities M s is a part of s, mostly the whole of it.
         self._columns: slice | NDArray[np.intp] | None = None
         if not convex_set.matrix.shape[0]:
             self._columns = slice(None) if components.size == d else components
+
+    def _sides(self, convex_set: ConvexSet) -> tuple[Array, Array]:
+        return (
+            np.append(convex_set.lower[self.components], convex_set.row_lower),
+            np.append(convex_set.upper[self.components], convex_set.row_upper),
+        )
+
+    def _scale(self) -> Array:
+        width, deviation = self.upper - self.lower, self._deviation
+        return np.where(width > 0.0, np.minimum(width, deviation), deviation)
+
+    def with_sides(self, sets: Sequence[ConvexSet | None]) -> Rows:
+        """A copy with the sides of these sets, one a point; None for the present ones."""
+        if all(one is None for one in sets):
+            return self
+        other = self._copy()
+        other.lower, other.upper = (
+            np.tile(side, (len(sets), 1)) for side in (self.lower, self.upper)
+        )
+        for k, one in enumerate(sets):
+            if one is not None:
+                other.lower[k], other.upper[k] = self._sides(one)
+        other.scale = other._scale()
+        return other
 
     def values(self, points: Array) -> Array:
         """M s at each point (K, r)."""
@@ -157,6 +181,16 @@ class Constraints:
                 # A NaN must not pass as a member.
                 worst = math.inf if math.isnan(largest) else max(worst, largest)
         return worst
+
+    def at(self, conditions: Sequence[Conditions]) -> Constraints:
+        """The constraints with the sides of each stage; those of the last for the newest state."""
+        rows: dict[str, Rows] = {}
+        for name in SET_NAMES:
+            mine: Rows | None = getattr(self, name)
+            if mine is not None:
+                sets = [getattr(own, name) for own in conditions]
+                rows[name] = mine.with_sides([*sets, sets[-1]] if name == "states" else sets)
+        return self._replaced(**rows)
 
     def observed(self, observed: Mask) -> Constraints:
         """The constraints without the rows of V on missing outputs; ``observed`` is (K, p) bool."""

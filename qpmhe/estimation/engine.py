@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections import deque
-from collections.abc import Iterable
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +19,47 @@ from ..costs import Cost
 from ..errors import InvalidInputError, ObserverWarning
 from ..model.system import System
 from ..observers import Observer
+from .conditions import ConditionReader, Conditions, usual_conditions
 from .covariance import window_covariances
 from .estimate import Estimate, Status
 from .optimizer import Optimizer
 from .problem import Formulation
 from .settings import Settings
-from .snapshot import check_description, check_size, checked_array, described, reading
+from .snapshot import (
+    SET_NAMES,
+    check_description,
+    check_size,
+    checked_array,
+    described,
+    reading,
+)
 from .stages import Mark
 from .subproblem import Subproblem
 from .watch import ObserverWatch
 from .window import Window
 
 Array = NDArray[np.float64]
+
+
+class Tools(NamedTuple):
+    """What a step uses; made anew where the usual conditions change."""
+
+    usual: Conditions
+    system: System
+    cost: Cost
+    formulation: Formulation
+    subproblem: Subproblem
+    optimizer: Optimizer
+
+
+class Memory(NamedTuple):
+    """What an estimator remembers from step to step."""
+
+    tools: Tools
+    window: Window
+    trajectory: Array | None
+    watched: tuple[int, int]
+    history: list[Array]
 
 
 class PythonEngine:
@@ -61,13 +89,12 @@ class PythonEngine:
             solver.prepare((settings.horizon + 1) * system.n)
         if system.kernel is not None:
             system.kernel.prepare(settings.horizon)
-        self._formulation = formulation = Formulation(system, observer, cost)
-        self._subproblem = Subproblem(system, cost, formulation.constraints, settings.horizon)
-        self._optimizer = Optimizer(self._subproblem, solver, settings)
+        self._reader = ConditionReader(system, cost)
+        self._tools = self._tools_for(usual_conditions(settings))
         self._with_terms = settings.qp_limit > 0
         self._reinitialized = settings.candidate == "reinitialized"
         self._smoothed = settings.arrival == "smoothed"
-        self._window = self._fresh_window(initial_state)
+        self._window = self._fresh_window(initial_state, self._tools)
         self._watch = ObserverWatch(settings.horizon)
         self._known_modes = system.call_modes()  # as found at construction
         self._undo_point: tuple[Mark, Array | None, tuple[int, int], tuple[Array, ...]]
@@ -78,12 +105,37 @@ class PythonEngine:
             [initial_state.copy()], maxlen=settings.horizon + 1 if self._reinitialized else 1
         )
 
-    def _fresh_window(self, initial_state: Array) -> Window:
+    def _tools_for(self, usual: Conditions) -> Tools:
+        """What a step uses under these usual conditions."""
+        system, cost, settings = self._system, self._cost, self._settings
+        if usual.has_bounds:
+            sets = (getattr(usual, name) or getattr(system, name) for name in SET_NAMES)
+            system = system.with_sets(*sets)
+        if not usual.noise_weight is usual.disturbance_weight is None:
+            cost = cost.with_weights(usual.noise_weight, usual.disturbance_weight)
+        formulation = Formulation(system, self._observer, cost)
+        subproblem = Subproblem(system, cost, formulation.constraints, settings.horizon)
+        return Tools(
+            usual, system, cost, formulation, subproblem,
+            Optimizer(subproblem, self._solver, settings),
+        )
+
+    def _fresh_window(self, initial_state: Array, tools: Tools) -> Window:
         settings = self._settings
         return Window(
-            self._system, self._observer, self._cost, settings.horizon, initial_state,
-            self._with_terms, settings.project_observer, self._reinitialized,
+            tools.system, self._observer, tools.cost, settings.horizon, initial_state,
+            self._with_terms, settings.project_observer, self._reinitialized, tools.usual,
         )
+
+    @property
+    def usual(self) -> Conditions:
+        """What holds where a sample has nothing of its own."""
+        return self._tools.usual
+
+    @property
+    def system(self) -> System:
+        """The system with its present sets."""
+        return self._tools.system
 
     @property
     def state(self) -> Array:
@@ -101,20 +153,20 @@ class PythonEngine:
         return self._window.length
 
     def step(
-        self, y: Array, u: Array, dt: float | None, noise_weight: Array | None, began: float
+        self, y: Array, u: Array, dt: float | None, own: Conditions | None, began: float
     ) -> Estimate:
         """Take the sample y(t), u(t), and estimate x(t+1)."""
         window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
             window.make_room()  # before the undo point: `undo` cannot reverse it
-        self._set_undo_point(reinitialized)
+        self._set_undo_point(reinitialized or window.moves_state(own))
         try:
             with np.errstate(all="ignore"):
                 if window.length == self._settings.horizon:
                     self._solver.shift()
                     if self._smoothed and self._trajectory is not None:
                         window.smoothed_prior = self._trajectory[1].copy()
-                window.push(y, u, dt, noise_weight)
+                window.push(y, u, dt, own)
                 if reinitialized:
                     window.reinitialize(self._history)
                 estimate = self._estimate(began)
@@ -136,9 +188,10 @@ class PythonEngine:
     def _estimate(self, began: float) -> Estimate:
         """Solve the present window's problem."""
         window, settings = self._window, self._settings
-        problem = self._formulation.problem(window)
+        tools = self._tools
+        problem = tools.formulation.problem(window)
         deadline = math.inf if settings.time_budget is None else began + settings.time_budget
-        outcome = self._optimizer.improve(problem, self._shifted, deadline)
+        outcome = tools.optimizer.improve(problem, self._shifted, deadline)
         trial, candidate, message = outcome.trial, problem.candidate, outcome.message
         status = Status.IMPROVED if outcome.improved else Status.CANDIDATE
         if outcome.events:
@@ -162,7 +215,6 @@ class PythonEngine:
             trajectory, residuals = trajectory.copy(), residuals.copy()
             filtered = window.filtered()
         if problem.observed is not None:
-            residuals = residuals.copy()
             residuals[:, self._system.n :][~problem.observed] = np.nan
         estimate = Estimate(
             window.time - 1,
@@ -228,31 +280,61 @@ class PythonEngine:
         self._window.roll_back(mark)
         self._history.clear()
         self._history.extend(history)
-        self._subproblem.forget()
+        self._tools.subproblem.forget()
         self._solver.forget()
 
     def reset(self, initial_state: Array) -> None:
         """Forget all measurements and start at this state."""
         self._solver.forget()
-        self.replace(self._fresh_window(initial_state), None, (0, 0), [initial_state.copy()])
+        window = self._fresh_window(initial_state, self._tools)
+        window.enter_states(0, 0)
+        self.replace(Memory(self._tools, window, None, (0, 0), [window.initial_state]))
+
+    def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
+        """Let other conditions hold at all samples of the window and from now on."""
+        began, before = perf_counter(), self.memory
+        usual = changes.over(before.tools.usual)
+        if parameters is not None:
+            usual = usual._replace(parameters=parameters)
+        with np.errstate(all="ignore"):
+            tools = self._tools_for(usual)
+            window = self._fresh_window(before.window.initial_state, tools)
+            window.take_over(before.window, changes, parameters)
+            if self._reinitialized and window.length:
+                estimates = before.history[:-1]
+                estimates[-window.length] = window.initial_state  # in the new X
+                window.reinitialize(estimates)
+            try:
+                self._solver.forget()
+                self._tools, self._window, self._trajectory = tools, window, None
+                estimate = self._estimate(began) if window.length else None
+                state = window.initial_state if estimate is None else estimate.state.copy()
+                self._history[-1] = state
+                self._watch.counts = before.watched  # no sample more
+                return estimate
+            except BaseException:
+                self.replace(before)
+                raise
 
     @property
-    def memory(self) -> tuple[Window, Array | None, tuple[int, int], deque[Array]]:
-        """The arguments of `replace`."""
-        return self._window, self._trajectory, self._watch.counts, self._history
+    def memory(self) -> Memory:
+        """What `replace` restores."""
+        return Memory(
+            self._tools, self._window, self._trajectory, self._watch.counts, list(self._history)
+        )
 
-    def replace(
-        self, window: Window, trajectory: Array | None, watched: tuple[int, int],
-        history: Iterable[Array],
-    ) -> None:
+    def replace(self, memory: Memory) -> None:
         """Replace the memory: all of it or, if interrupted, nothing."""
         before = self.memory
         try:
-            self._window, self._trajectory, self._watch.counts = window, trajectory, watched
-            self._history = deque(history, maxlen=self._history.maxlen)
+            self._use(memory)
         except BaseException:
-            self._window, self._trajectory, self._watch.counts, self._history = before
+            self._use(before)
             raise
+
+    def _use(self, memory: Memory) -> None:
+        self._tools, self._window, self._trajectory, self._watch.counts, history = memory
+        self._history = deque(history, maxlen=self._history.maxlen)
 
     def run(self, ys: Array, us: Array | None) -> None:
         """None: samples are taken one at a time only."""
@@ -262,7 +344,7 @@ class PythonEngine:
         if self._trajectory is None:
             raise InvalidInputError("there is no estimate yet; update first.")
         with np.errstate(all="ignore"):
-            problem = self._formulation.problem(self._window)
+            problem = self._tools.formulation.problem(self._window)
             trial = problem.evaluate(self._trajectory.copy())
             if trial.violation == math.inf:
                 raise InvalidInputError("the model has no finite values along the estimate.")
@@ -281,6 +363,7 @@ class PythonEngine:
             "problem": self._size(),
             "estimator": self._description(),
             "linearized": self._with_terms,
+            "usual": self._tools.usual.state_dict(),
             "window": self._window.state_dict(),
             "history": [state.copy() for state in self._history],
             "trajectory": None if self._trajectory is None else self._trajectory.copy(),
@@ -313,21 +396,23 @@ class PythonEngine:
                 self._system.use_call_modes(modes)
                 memory = self._checked_memory(state)
                 self._solver.forget()
-            self.replace(*memory)
+            self.replace(memory)
         except BaseException:
             self._system.use_call_modes(before)
             raise
 
-    def _checked_memory(
-        self, state: dict[str, Any]
-    ) -> tuple[Window, Array | None, tuple[int, int], list[Array]]:
-        """The memory in a state, as `replace` takes it."""
+    def _checked_memory(self, state: dict[str, Any]) -> Memory:
+        """The memory in a state."""
         n, with_terms = self._system.n, state["linearized"]
         if not isinstance(with_terms, bool):
             raise TypeError(f"linearized is {with_terms!r}")
-        loaded, recomputed = (self._fresh_window(np.zeros(n)) for _ in range(2))
+        tools = self._tools_for(self._reader.load(state["usual"], self._tools.usual))
+        loaded, recomputed = (self._fresh_window(np.zeros(n), tools) for _ in range(2))
         for one in (loaded, recomputed):
-            one.load_state_dict(state["window"], self._system.make_timed is not None)
+            one.load_state_dict(
+                state["window"], self._system.make_timed is not None,
+                lambda own: self._reader.load(own, tools.usual),
+            )
         if (loaded.smoothed_prior is None) == (self._smoothed and loaded.time > loaded.horizon):
             raise ValueError("there must be a smoothed prior once the window has moved on")
         history = [checked_array("history", one, (n,)) for one in state["history"]]
@@ -347,7 +432,8 @@ class PythonEngine:
             check_size("watched", found, lambda count: 0 <= count <= loaded.time)
             for found in state["watched"]
         )
-        return loaded if same_terms else recomputed, trajectory, (far, dropped), history
+        window = loaded if same_terms else recomputed
+        return Memory(tools, window, trajectory, (far, dropped), history)
 
     def _checked_modes(
         self, modes: Any, methods: Any

@@ -13,6 +13,7 @@ from ..costs import Cost
 from ..errors import CompilationError, EngineWarning
 from ..model.system import System
 from ..observers import Observer
+from .conditions import Conditions
 from .engine import PythonEngine
 from .estimate import Estimate
 from .run import Run
@@ -41,8 +42,19 @@ class Engine(Protocol):
     def reset(self, initial_state: Array) -> None:
         """Forget all measurements and start at this state."""
 
+    @property
+    def usual(self) -> Conditions:
+        """What holds where a sample has nothing of its own."""
+
+    @property
+    def system(self) -> System:
+        """The system with its present sets."""
+
+    def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
+        """Let other conditions hold at all samples of the window and from now on."""
+
     def step(
-        self, y: Array, u: Array, dt: float | None, noise_weight: Array | None, began: float
+        self, y: Array, u: Array, dt: float | None, own: Conditions | None, began: float
     ) -> Estimate:
         """Take the sample y(t), u(t), and estimate x(t+1)."""
 

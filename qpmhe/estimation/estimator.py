@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import warnings
+from collections.abc import Mapping
 from time import perf_counter
 from typing import Any
 
@@ -14,13 +15,15 @@ from qpmhe_solvers import Solver
 from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import integer, shown
 
-from .._checks import flag, positive, positive_definite, record, vector
+from .._checks import flag, numbers, positive, record, vector
 from .._linalg import inverse
 from ..costs import Cost
 from ..errors import InvalidInputError, ModelError, ObserverWarning, OptionError, ShapeError
+from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
 from ..observers.projection import NearestPoint
+from .conditions import ConditionReader, Conditions
 from .engines import engine_for
 from .estimate import Estimate
 from .run import Run
@@ -110,6 +113,10 @@ class MovingHorizonEstimator:
         theorem: this estimate has used N - 1 of the window's measurements already, so they count
         twice. The candidate stays the observer's trajectory, and its J then has a prior term.
         Where a loss has no finite value there, z(t-N) serves in this step.
+    parameters : (k,) array_like, optional
+        Usual values of parameters of the model, which are the last k of the system's m inputs:
+        ``u`` then has m - k numbers. They hold until `set` changes them; `update` takes values
+        for a single sample.
 
     Raises
     ------
@@ -150,11 +157,12 @@ class MovingHorizonEstimator:
         delay: int = 0,
         isolated: bool = False,
         arrival: str = "observer",
+        parameters: ArrayLike | None = None,
     ) -> None:
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
             engine, project_observer, infeasible, warm_start, candidate, time_budget, delay,
-            isolated, arrival,
+            isolated, arrival, _nominal(parameters),
         )
         self.system, self.observer, self.cost = system, observer, cost
         _require(system, System, "system", "qpmhe.System")
@@ -173,8 +181,17 @@ class MovingHorizonEstimator:
             )
         # A copy: this estimator may change how f and h are called (batched, or one by one).
         self._own_system = system.copy(cost.prior_deviations(observer.initial_covariance()))
-        self._initial_state: Array = self._checked_start(initial_state)
-        self._no_input = np.zeros(system.m)
+        nominal = self.settings.parameters
+        if len(nominal) > system.m:
+            raise ShapeError(
+                f"parameters has {len(nominal)} numbers; expected at most {system.m}, the system's "
+                "known inputs: parameters are the last of these. Make the system with a larger m."
+            )
+        self._inputs = system.m - len(nominal)  # numbers in the u of `update`
+        self._usual_input = np.append(np.zeros(self._inputs), nominal)
+        self._full_input = self._usual_input.copy()  # each sample's, overwritten
+        self._reader, self._partial = ConditionReader(system, cost), np.empty(system.p)
+        self._initial_state: Array = self._checked_start(initial_state, self._own_system)
         try:
             self._engine = engine_for(
                 self._own_system, observer, cost, self.settings, self._initial_state
@@ -185,9 +202,9 @@ class MovingHorizonEstimator:
                 f"{system.n} states do not fit into the memory ({error}); take a shorter one."
             ) from error
 
-    def _checked_start(self, initial_state: ArrayLike) -> Array:
-        state = vector("initial_state", initial_state, self.system.n)
-        return check_start(self._own_system, self.observer, self.cost, state)
+    def _checked_start(self, initial_state: ArrayLike, system: System) -> Array:
+        state = vector("initial_state", initial_state, system.n)
+        return check_start(system, self.observer, self.cost, state, u=self._usual_input)
 
     def reset(self, initial_state: ArrayLike | None = None) -> None:
         """Forget all measurements and start again.
@@ -205,7 +222,7 @@ class MovingHorizonEstimator:
         before, modes = self._initial_state, self._own_system.call_modes()
         try:
             if initial_state is not None:
-                self._initial_state = self._checked_start(initial_state)
+                self._initial_state = self._checked_start(initial_state, self._engine.system)
             self._engine.reset(self._initial_state)
         except BaseException:
             self._initial_state = before
@@ -244,6 +261,10 @@ class MovingHorizonEstimator:
         *,
         dt: float | None = None,
         noise_weight: ArrayLike | None = None,
+        disturbance_weight: ArrayLike | None = None,
+        bounds: Mapping[str, ConvexSet] | None = None,
+        parameters: ArrayLike | None = None,
+        sensors: ArrayLike | None = None,
     ) -> Estimate:
         """Take the measurement y(t) and the input u(t), and estimate x(t+1).
 
@@ -256,15 +277,27 @@ class MovingHorizonEstimator:
         ----------
         y : (p,) array_like
             y(t), or a scalar if p is 1. Components count as missing if they are masked, None,
-            pandas' NA or NaT, not finite, or so large that their square is not finite.
+            pandas' NA or NaT, not finite, or so large that their square is not finite. With
+            ``sensors``, the components that these name.
         u : (m,) array_like, optional
-            u(t), the input that acts from t to t+1 (and on y(t), if h depends on it), and any
-            known parameters of that time. Required if and only if the system has inputs.
+            u(t), the input that acts from t to t+1 (and on y(t), if h depends on it), without
+            the estimator's parameters. Required if and only if there are other inputs.
         dt : float, optional
             Length of the step from t to t+1 if not the sampling time; for a system made by
             `System.from_ode`.
-        noise_weight : (p, p) array_like, optional
-            Weight of this sample's noise, in place of the cost's.
+        noise_weight, disturbance_weight : (p, p) and (n, n) array_like, optional
+            Weights of this sample's v(t) and w(t), in place of the cost's. Kalman-type observers
+            take their inverses as covariances.
+        bounds : dict, optional
+            Sets for this sample, by ``"states"``, ``"disturbances"`` and ``"noises"``: the
+            system's with other sides. A `Box` changes the bounds of components, a `Polytope`
+            the sides of the general inequalities, and both together both. x(t+1) has this
+            sample's bounds until the next sample comes, with its own or the usual ones.
+        parameters : (k,) array_like, optional
+            Values of the parameters at this sample, in place of the usual ones.
+        sensors : int, array_like of int or (p,) array_like of bool, optional
+            The components of y that were sampled, in the order of ``y``; all if left out. The
+            others are not missing, but have no measurement at this time.
 
         Returns
         -------
@@ -273,20 +306,68 @@ class MovingHorizonEstimator:
 
         Raises
         ------
-        ShapeError, WeightError, InvalidInputError
+        ShapeError, WeightError, OptionError, SetError, InvalidInputError
             If an argument does not fit; the estimator is left as it was.
+
+        Notes
+        -----
+        Each sample keeps the weights, bounds, parameters and step length that it came with, as
+        long as it is in the window; `set` changes those of all samples.
         """
         began = perf_counter()
-        system = self.system
-        y_array = self._measurement(y)
-        u_array = self._no_input if u is None and system.m == 0 else self._input(u)
+        own: Conditions | None = None
+        if sensors is None:
+            y_array = self._measurement(y)
+        else:
+            y_array, own = self._sampled(y, sensors)
+        u_array = self._input(u, parameters)
         if dt is not None:
             dt = positive("dt", dt)
             self._check_step_length(dt)
-        if noise_weight is not None:
-            noise_weight = positive_definite("noise_weight", noise_weight, system.p)
-            self.cost.check_noise(noise_weight)
-        return self._engine.step(y_array, u_array, dt, noise_weight, began)
+        if not noise_weight is disturbance_weight is bounds is None:
+            found = self._reader.read(
+                self._engine.usual, noise_weight=noise_weight,
+                disturbance_weight=disturbance_weight, bounds=bounds,
+            )
+            own = found if own is None else own.over(found)
+        return self._engine.step(y_array, u_array, dt, own, began)
+
+    def set(
+        self,
+        *,
+        bounds: Mapping[str, ConvexSet] | None = None,
+        noise_weight: ArrayLike | None = None,
+        disturbance_weight: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+    ) -> Estimate | None:
+        """Change weights, bounds or parameters, for all samples of the window and all later ones.
+
+        The observer runs again from the start of the window, and the current state is estimated
+        again: as by an estimator that was made with these values and continues from there. What
+        single samples of the window had in their place is forgotten. `reset` keeps the changes.
+
+        Parameters
+        ----------
+        bounds, noise_weight, disturbance_weight, parameters : optional
+            As for `update`; what is left out stays as it is.
+
+        Returns
+        -------
+        Estimate or None
+            The estimate of the same state as before, None before the first measurement.
+
+        Raises
+        ------
+        ShapeError, WeightError, OptionError, SetError, InvalidInputError
+            If an argument does not fit; the estimator is left as it was.
+        """
+        usual = self._engine.usual
+        changes = self._reader.read(
+            usual, noise_weight=noise_weight, disturbance_weight=disturbance_weight,
+            bounds=bounds, drop_usual=False,
+        )
+        values = None if parameters is None else self._reader.parameters(parameters, usual)
+        return self._engine.set(changes, values)
 
     def _measurement(self, y: ArrayLike | None) -> Array:
         p = self.system.p
@@ -296,20 +377,57 @@ class MovingHorizonEstimator:
             return np.full(p, np.nan)
         return vector("y", y, p, finite=False)
 
-    def _input(self, u: ArrayLike | None) -> Array:
-        m = self.system.m
+    def _sampled(self, y: ArrayLike | None, sensors: ArrayLike) -> tuple[Array, Conditions | None]:
+        """y(t) with NaN where it was not sampled, and the conditions that say so."""
+        index, own = self._reader.sensors(sensors)
+        self._partial.fill(np.nan)
+        if y is not None:
+            usual = type(y) is np.ndarray and y.ndim == 1 and y.dtype == np.float64
+            given = y if usual else np.atleast_1d(numbers("y", y, finite=False))
+            if given.shape != index.shape:
+                raise ShapeError(
+                    f"y has shape {given.shape}; expected {index.shape}, a component for each of "
+                    f"sensors={index.tolist()}."
+                )
+            self._partial[index] = given
+        return self._partial, own
+
+    def _input(self, u: ArrayLike | None, parameters: ArrayLike | None = None) -> Array:
+        """u(t), the parameters behind the rest."""
+        count, full = self._inputs, self._full_input
         if u is None:
-            raise InvalidInputError(f"u is missing; the system has {m} inputs: update(y, u).")
-        if m == 0:
-            raise InvalidInputError("u was given, but the system has no inputs; leave it out.")
-        return vector("u", u, m, finite=False)
+            if count:
+                raise InvalidInputError(
+                    f"u is missing; the system has {count} inputs: update(y, u)."
+                )
+        elif count == 0:
+            beside = " beside its parameters" if self.system.m else ""
+            raise InvalidInputError(
+                f"u was given, but the system has no inputs{beside}; leave it out."
+            )
+        else:
+            full[:count] = vector("u", u, count, finite=False)
+        usual = self._engine.usual
+        if parameters is not None:
+            full[count:] = self._reader.parameters(parameters, usual)
+        elif usual.parameters is not None:
+            full[count:] = usual.parameters
+        return full
+
+    def _with_parameters(self, inputs: Array | None, samples: int) -> Array | None:
+        """The inputs of a record, with the usual parameters behind them."""
+        parameters = self._engine.usual.parameters
+        if parameters is None:
+            return inputs
+        behind = np.tile(parameters, (samples, 1))
+        return behind if inputs is None else np.hstack((inputs, behind))
 
     def _check_step_length(self, dt: float) -> None:
         """Check once, before a sample is taken, that the model takes step lengths."""
         own = self._own_system
         if "timed" not in own.__dict__:
             try:
-                own.timed.check(self._initial_state, np.append(self._no_input, dt))
+                own.timed.check(self._initial_state, np.append(self._usual_input, dt))
             except BaseException:
                 own.__dict__.pop("timed", None)
                 raise
@@ -381,14 +499,17 @@ class MovingHorizonEstimator:
         flag("covariances", covariances)
         us = None
         if inputs is not None:
-            us = record("inputs", inputs, self.system.m)
+            us = record("inputs", inputs, self._inputs)
             if len(us) != len(ys):
                 raise ShapeError(
                     f"inputs has {len(us)} samples; expected {len(ys)}, one for each measurement."
                 )
-        elif self.system.m:
+        elif self._inputs:
             self._input(None)
-        at_once = None if covariances else self._engine.run(ys, us)
+        if covariances:
+            at_once = None
+        else:
+            at_once = self._engine.run(ys, self._with_parameters(us, len(ys)))
         if at_once is not None:
             return at_once
         start, estimates, collected = self.state.copy(), [], []
@@ -487,18 +608,31 @@ class MovingHorizonEstimator:
         self.load_state_dict(saved["state"])
 
 
+def _nominal(parameters: ArrayLike | None) -> tuple[float, ...]:
+    if parameters is None:
+        return ()
+    values = np.atleast_1d(numbers("parameters", parameters))
+    if values.ndim != 1:
+        raise ShapeError(
+            f"parameters has shape {values.shape}; expected (k,), the usual values of the system's "
+            "last k inputs."
+        )
+    return tuple(values.tolist())
+
+
 def _require(value: object, kind: type, name: str, expected: str) -> None:
     if not isinstance(value, kind):
         raise InvalidInputError(f"{name} is {shown(value)}; expected a {expected}.")
 
 
 def check_start(
-    system: System, observer: Observer, cost: Cost, state: Array, name: str = "initial_state"
+    system: System, observer: Observer, cost: Cost, state: Array, name: str = "initial_state",
+    u: Array | None = None,
 ) -> Array:
     """Check that model and observer work at an initial state; return it, projected onto X."""
     try:
         state = _inside(system, observer, cost, state, name)
-        system.check(state, np.zeros(system.m))
+        system.check(state, np.zeros(system.m) if u is None else u)
         observer.check(system, state)
     except ModelError as error:
         if name == "initial_state":

@@ -99,6 +99,8 @@ class StageTerms:
         "_zeros", "gradient", "linear", "next_gradient", "panel", "residuals",
     )
 
+    names = ("linear", "panel", "gradient", "next_gradient")
+
     def __init__(self, stages: int, n: int, p: int) -> None:
         q = n + p
         self.linear: Array = np.zeros((stages, q, 1 + n))
@@ -153,9 +155,9 @@ class StageTerms:
         )
         np.multiply(span.next_gradient_last, factors[-1], out=self.next_gradient[count - 1])
 
-    def arrays(self) -> tuple[Array, ...]:
+    def arrays(self) -> dict[str, Array]:
         """The arrays, each with one entry a stage."""
-        return self.linear, self.panel, self.gradient, self.next_gradient
+        return {name: getattr(self, name) for name in self.names}
 
 
 def _panel_index(n: int, p: int) -> NDArray[np.intp]:

@@ -111,6 +111,8 @@ class Problem:
         Factors of the prior's cost and of the stages'; None without a discount.
     stage_weights : array
         Weights of the stages' cost, before discount and majorisation; one, or one for each stage.
+    usual_disturbances : bool
+        Whether all stages are known to weigh their disturbances as usual.
     model : System
         The model that takes these inputs, whose last column may be the length of the step.
     span : Span
@@ -122,7 +124,7 @@ class Problem:
     __slots__ = (
         "_clip", "_formulation", "_has_noise_free", "_prior_band", "candidate", "constrained",
         "constraints", "discounts", "inputs", "measurements", "model", "observed", "prior",
-        "prior_moved", "prior_weight", "span", "stage_weights", "time",
+        "prior_moved", "prior_weight", "span", "stage_weights", "time", "usual_disturbances",
     )
 
     _clip: tuple[Array, Array] | None
@@ -132,16 +134,16 @@ class Problem:
         self.prior, self.measurements, self.span = view.prior, view.measurements, view.span
         self.time = window.time - window.length
         self.observed: NDArray[np.bool_] | None = None
+        self.inputs, self.model = view.inputs, formulation.system
+        self.stage_weights = cost.stage_weight
         # `unusual` only saves time: it stays set for too long, and loading a snapshot sets it.
-        if window.unusual and (window.has_special_weights or window.has_irregular_steps):
-            self.inputs, self.model = window.inputs, window.model
-            self.stage_weights = window.stage_weights
+        if window.unusual:
             if window.has_special_weights:
-                self.observed = window.observed
-        else:
-            self.inputs, self.model = view.inputs, formulation.system
-            self.stage_weights = cost.stage_weight
+                self.stage_weights, self.observed = window.weights, window.observed
+            if window.has_irregular_steps:
+                self.inputs, self.model = window.inputs, window.model
         self.discounts = window.discounts if formulation.discounted else None
+        self.usual_disturbances = not (window.has_disturbance_weights or formulation.discounted)
         self.prior_weight, self._prior_band = formulation.prior_weight, formulation.prior_band
         if formulation.observer_prior is not None and window.prior_covariance is not None:
             self.prior_weight = formulation.observer_prior.weight(window.prior_covariance)
@@ -159,6 +161,8 @@ class Problem:
         self._has_noise_free, self._clip = False, None
         if self.constrained:
             constraints = formulation.constraints
+            if window.has_own_bounds:
+                constraints = constraints.at(window.conditions)
             if self.observed is not None:
                 constraints = constraints.observed(self.observed)
             self._constrain(constraints)

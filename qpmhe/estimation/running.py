@@ -31,7 +31,9 @@ class RunningObservers:
     ) -> None:
         n, p = gain.shape
         self._n, self._count, self._transposed_gain = n, horizon, gain.T.copy()
-        self._nearest, self._keep_inside = nearest, keep_inside
+        self._keep_inside = keep_inside
+        #: Projects onto X at the state to which the next call of `advance` leads.
+        self.nearest = nearest
         # Rings in time: states z(t) and residuals (L(t), v(t)), one row for each observer.
         self._states = np.zeros((horizon + 1, horizon, n))
         self._residuals = np.zeros((horizon, horizon, n + p))
@@ -57,10 +59,11 @@ class RunningObservers:
         np.matmul(error, self._transposed_gain, correction)
         np.add(predicted, correction, ahead)
         failed |= ~np.isfinite(np.einsum("ij,ij->i", ahead, ahead))  # its cost would overflow
-        if self._nearest is None:
+        nearest = self.nearest
+        if nearest is None:
             return
         self._events = [0] * count
-        for i in np.flatnonzero(~(self._nearest.contains(ahead) | failed)):
+        for i in np.flatnonzero(~(nearest.contains(ahead) | failed)):
             try:
                 self._events[i] = self._keep_inside(predicted[i], ahead[i], correction[i])
             except Exception:  # of linear algebra

@@ -39,6 +39,7 @@ class Settings:
     delay: int = 0
     isolated: bool = False
     arrival: str = "observer"
+    parameters: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         # Stored as Python's int: not all code that reads them accepts NumPy's integers.

@@ -36,6 +36,8 @@ def described(
     found: dict[str, Any] = {
         "candidate": settings.candidate, "arrival": settings.arrival, "sampling time": system.dt,
     }
+    if settings.parameters:
+        found["number of parameters"] = len(settings.parameters)
     for name in SET_NAMES:
         _describe(f"set of {name}", getattr(system, name), found)
     _describe("observer", observer, found)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from .._checks import positive_definite
 from ..observers.projection import ErrorMetric
+from .conditions import Conditions
 from .linearization import Span, Stage, StageTerms
 from .snapshot import check_size, checked_array, mismatch
 
@@ -20,6 +21,8 @@ Array = NDArray[np.float64]
 # Views are made in advance up to this horizon: beyond it they would take more memory than the
 # arrays, and making them is a small part of a step.
 _KEPT = 1000
+# Inputs, and costs and terms where the model fails.
+_MAY_OVERFLOW = ("u", "costs", *StageTerms.names)
 View = TypeVar("View")
 
 
@@ -29,13 +32,11 @@ class Mark(NamedTuple):
     start: int
     end: int
     time: int
-    last_special: int
-    last_irregular: int
     unusual: bool
-    own_noise: dict[int, Array] | None
+    own: dict[int, Conditions]
     smoothed_prior: Array | None
     metric: tuple[Array, bool] | None
-    arrays: list[Array] | None
+    arrays: dict[str, Array] | None
 
 
 def read_only(array: Array) -> Array:
@@ -53,7 +54,7 @@ class Stages:
     stage k, or to the state before it; the window consists of the stages ``start`` to ``end - 1``.
 
     A stage is *special* if its weight is not the usual one, *irregular* if its step length is
-    not, and *unusual* if either holds.
+    not, and *unusual* if either holds. What it was taken with is kept by its time.
     """
 
     def __init__(
@@ -77,11 +78,13 @@ class Stages:
         self._u[:, m] = step
         self._irregular = np.zeros(room, dtype=np.bool_)
         self._observed = np.ones((room, p), dtype=np.bool_)
-        # Stages where y is missing in part, or has a noise weight of its own.
+        # Stages where y is missing in part, or that have weights of their own.
         self._special = np.zeros(room, dtype=np.bool_)
-        self._own_noise: dict[int, Array] = {}  # noise weights given with a sample, by time
+        self._own: dict[int, Conditions] = {}  # of samples taken with other than the usual
         self._usual_weight = stage_weight
         self._weights = np.tile(stage_weight, (room, 1, 1))
+        #: Whether any stage may weigh its disturbance in its own way.
+        self.has_disturbance_weights: bool = not quadratic
         #: Whether any stage may be unusual; those from ``end`` on never are.
         self.unusual: bool = False
         # Weights of the quadratic form that majorises the cost at the candidate.
@@ -109,8 +112,6 @@ class Stages:
         self.smoothed_prior: Array | None = None
         self.time = 0  # number of samples pushed: the window ends at x(time)
         self.start = self.end = 0
-        # Times of the last stages of each kind; at first, long ago.
-        self._last_special = self._last_irregular = -self.horizon - 1
         # Time up to which running observers have taken the samples; -1 makes them start again.
         self._advanced_to = -1
         # Before the first stage in the arrays: the last state at which the model worked.
@@ -153,6 +154,11 @@ class Stages:
         return self._y[self.start : self.end]
 
     @property
+    def weights(self) -> Array:
+        """The stages' weights, usual or not: a view."""
+        return self._weights[self.start : self.end]
+
+    @property
     def observed(self) -> NDArray[np.bool_]:
         """Which components of y are not missing: a view."""
         return self._observed[self.start : self.end]
@@ -162,13 +168,23 @@ class Stages:
         """The observer's covariance at z(t-N), if it has one."""
         return None if self._covariances is None else self._covariances[self.start]
 
-    def _stage_arrays(self) -> tuple[Array, ...]:
-        arrays: tuple[Array | Any, ...] = (
-            self._y, self._u, self._irregular, self._observed, self._special,
-            self._weights, self._stage_costs,
-        )
-        shared = self._majorising_weights is self._weights
-        return arrays if shared else (*arrays, self._majorising_weights)
+    @property
+    def initial_state(self) -> Array:
+        """The first state of the window."""
+        return self._z[self.start].copy()
+
+    def _arrays(self) -> dict[str, Array]:
+        """All arrays, with a row for each stage; those of states have one more."""
+        found: dict[str, Any] = {
+            "z": self._z, "y": self._y, "u": self._u, "irregular": self._irregular,
+            "observed": self._observed, "special": self._special, "weights": self._weights,
+            "costs": self._stage_costs, **self.terms.arrays(),
+        }
+        if self._majorising_weights is not self._weights:
+            found["majorising_weights"] = self._majorising_weights
+        if self._covariances is not None:
+            found["covariance"] = self._covariances
+        return found
 
     def _last_good(self, before: int) -> tuple[Array, Array | None]:
         """State and covariance of the last stage before this one at which the model worked."""
@@ -190,9 +206,11 @@ class Stages:
             self._move_to_front(kept, earlier)
             raise
 
-    def _move_to_front(self, kept: list[Array], earlier: tuple[Array, Array | None]) -> None:
+    def _move_to_front(
+        self, kept: dict[str, Array], earlier: tuple[Array, Array | None]
+    ) -> None:
         self._earlier_state, self._earlier_covariance = earlier
-        keep = len(kept[0])
+        keep = len(kept["y"])
         self._write(kept, 0)
         if self.unusual:
             self._make_usual(keep)
@@ -204,29 +222,23 @@ class Stages:
         self._observed[first:], self._special[first:], self._irregular[first:] = True, False, False
         self._weights[first:], self._u[first:, -1] = self._usual_weight, self._step
 
-    def _copies(self) -> list[Array]:
+    def _copies(self) -> dict[str, Array]:
         """Copies of the window's part of all arrays."""
-        stages, points = slice(self.start, self.end), slice(self.start, self.end + 1)
-        arrays = [array[stages].copy() for array in (*self._stage_arrays(), *self.terms.arrays())]
-        arrays.append(self._z[points].copy())
-        if self._covariances is not None:
-            arrays.append(self._covariances[points].copy())
-        return arrays
+        start, end, room = self.start, self.end, self.room
+        return {
+            name: array[start : end + len(array) - room].copy()
+            for name, array in self._arrays().items()
+        }
 
-    def _write(self, kept: list[Array], first: int) -> None:
+    def _write(self, kept: dict[str, Array], first: int) -> None:
         """Write what `_copies` returned to the stages from ``first`` on."""
-        arrays = [*self._stage_arrays(), *self.terms.arrays(), self._z]
-        if self._covariances is not None:
-            arrays.append(self._covariances)
-        for array, part in zip(arrays, kept, strict=True):
-            array[first : first + len(part)] = part
+        for name, array in self._arrays().items():
+            array[first : first + len(kept[name])] = kept[name]
 
     def mark(self, whole: bool) -> Mark:
         """What `roll_back` needs; all stages if ``whole``."""
         return Mark(
-            self.start, self.end, self.time, self._last_special, self._last_irregular,
-            self.unusual, self._own_noise.copy() if self._own_noise else None,
-            self.smoothed_prior,
+            self.start, self.end, self.time, self.unusual, self._own.copy(), self.smoothed_prior,
             None if self.metric is None else self.metric.state,
             self._copies() if whole else None,
         )
@@ -235,9 +247,7 @@ class Stages:
         """Undo all changes since a mark, which must be later than the last `make_room`."""
         self._advanced_to = -1
         self.start, self.end, self.time = mark.start, mark.end, mark.time
-        self._last_special, self._last_irregular = mark.last_special, mark.last_irregular
-        self._own_noise = mark.own_noise or {}
-        self.smoothed_prior = mark.smoothed_prior
+        self._own, self.smoothed_prior = mark.own, mark.smoothed_prior
         if self.metric is not None and mark.metric is not None:
             self.metric.state = mark.metric
         if mark.arrays is not None:
@@ -248,58 +258,42 @@ class Stages:
 
     def state_dict(self) -> dict[str, Any]:
         """Copies of all data of the window."""
-        stages = slice(self.start, self.end)
-        points = slice(self.start, self.end + 1)
         earlier, covariance = self._last_good(self.start)
         metric = None if self.metric is None else self.metric.state
         return {
+            **self._copies(),
             "earlier": earlier.copy(),
             "earlier_covariance": None if covariance is None else covariance.copy(),
             "time": self.time,
             "smoothed_prior": None if self.smoothed_prior is None else self.smoothed_prior.copy(),
-            "z": self._z[points].copy(),
-            "covariance": None if self._covariances is None else self._covariances[points].copy(),
-            "stages": [array[stages].copy() for array in self._stage_arrays()],
-            "terms": [array[stages].copy() for array in self.terms.arrays()],
-            "own_noise": {time: weight.copy() for time, weight in self._own_noise.items()},
-            "last_special": self._last_special,
-            "last_irregular": self._last_irregular,
+            "own": {time: own.state_dict() for time, own in self._own.items()},
             "metric": metric and (metric[0].copy(), metric[1]),
         }
 
-    def load_state_dict(self, state: dict[str, Any], may_be_irregular: bool) -> None:
+    def load_state_dict(
+        self, state: dict[str, Any], may_be_irregular: bool,
+        read: Callable[[dict[str, Any]], Conditions],
+    ) -> None:
         """Load what `state_dict` of an equal window returned into a new window.
 
         Raises any exception on a damaged state; the window is unusable then.
         """
         time = check_size("time", state["time"], lambda found: found >= 0)
-        length = min(time, self.horizon)
-        for name, mine, saved in (
-            ("z", self._z, state["z"]),
-            ("covariance", self._covariances, state["covariance"]),
-        ):
-            if (mine is None) != (saved is None):
-                raise mismatch("observer")
-            if mine is not None:
-                mine[: length + 1] = checked_array(name, saved, (length + 1, *mine.shape[1:]))
+        length, arrays = min(time, self.horizon), self._arrays()
+        for name, what in (("covariance", "observer"), ("majorising_weights", "cost")):
+            if (name in arrays) != (name in state):
+                raise mismatch(what)
+        for name, array in arrays.items():
+            rows = length + len(array) - self.room
+            array[:rows] = checked_array(
+                name, state[name], (rows, *array.shape[1:]), array.dtype, name not in _MAY_OVERFLOW
+            )
         self._earlier_state = checked_array("earlier", state["earlier"], self._earlier_state.shape)
         if (prior := state["smoothed_prior"]) is not None:
             self.smoothed_prior = checked_array("smoothed_prior", prior, self._earlier_state.shape)
         if self._covariances is not None:
             saved, shape = state["earlier_covariance"], self._covariances.shape[1:]
             self._earlier_covariance = checked_array("earlier_covariance", saved, shape)
-        if len(state["stages"]) != len(self._stage_arrays()):
-            raise mismatch("cost")
-        for arrays, part, may_be_infinite in (
-            # Inputs, and costs and terms where the model fails.
-            (self._stage_arrays(), state["stages"], (self._u, self._stage_costs)),
-            (self.terms.arrays(), state["terms"], self.terms.arrays()),
-        ):
-            for array, saved in zip(arrays, part, strict=True):
-                finite = not any(array is one for one in may_be_infinite)
-                array[:length] = checked_array(
-                    "a stage", saved, (length, *array.shape[1:]), array.dtype, finite
-                )
         if not (self._stage_costs[:length] >= 0.0).all():
             raise ValueError("a stage's cost is not a number >= 0")
         steps, irregular = self._u[:length, -1], self._irregular[:length]
@@ -307,33 +301,19 @@ class Stages:
             may_be_irregular and np.isfinite(steps).all() and (steps > 0.0).all()
         )):
             raise ValueError("a step's length is impossible")
-        p = self._y.shape[1]
-        for when, weight in state["own_noise"].items():
+        for when, own in state["own"].items():
             when = check_size("a sample's time", when, lambda t: time - length <= t < time)
-            self._own_noise[when] = positive_definite(
-                "noise_weight", checked_array("noise_weight", weight, (p, p))
-            )
-        latest = [  # the times of the last special and irregular stages that are loaded
-            time - length + int(np.flatnonzero(flags[:length])[-1]) if flags[:length].any()
-            else -self.horizon - 1
-            for flags in (self._special, self._irregular)
-        ]
-        self._last_special = check_size(
-            "last_special", state["last_special"], lambda t: latest[0] <= t < time
-        )
-        self._last_irregular = check_size(
-            "last_irregular", state["last_irregular"], lambda t: latest[1] <= t < time
-        )
+            self._own[when] = read(own)
         if (self.metric is None) != (state["metric"] is None):
             raise mismatch("observer")
         if self.metric is not None:
             covariance, settled = state["metric"]
             if not isinstance(settled, bool):
                 raise TypeError(f"metric is {settled!r}")
-            n = self._z.shape[1]
-            checked = checked_array("metric", covariance, (n, n))
+            checked = checked_array("metric", covariance, self.metric.covariance.shape)
             self.metric.state = positive_definite("metric", checked), settled
         self.start, self.end, self.time, self.unusual = 0, length, time, True
+        self.has_disturbance_weights = True
 
 
 class StageView:

@@ -135,12 +135,11 @@ class Subproblem:
         if qp is None or qp.stages != count + 1:
             qp = self._new_qp(count + 1)
         weights = trial.weights
-        uniform = weights.ndim == 2
+        uniform = weights.ndim == 2 or problem.usual_disturbances
         if not (uniform and self._uniform):
             n = self._n
             self._added_bands[1:] = (
-                self._disturbance_band if uniform
-                else [band_of(weight[:n, :n]) for weight in weights]
+                self._disturbance_band if uniform else band_of(weights[:, :n, :n])
             )
             self._uniform = uniform
         # The candidate starts at the prior as a rule: no offset, and no gradient from it.

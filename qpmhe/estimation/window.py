@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from .._linalg import inverse
 from ..costs import Cost
 from ..model.functions import contained, raised
+from ..model.sets import ConvexSet
 from ..model.system import Function, System
 from ..observers import Observer, Sample
 from ..observers.projection import ErrorMetric, NearestPoint
+from .conditions import USUAL, Conditions
 from .estimate import Status
 from .limits import LARGEST
 from .linearization import Stage, StageTerms
@@ -28,6 +30,7 @@ _MISSING, _MODEL_FAILED = Status.MISSING.value, Status.MODEL_FAILED.value
 _PROJECTED, _PREDICTION_OUTSIDE, _METRIC_SINGULAR = (
     Status.OBSERVER_PROJECTED.value, Status.PREDICTION_OUTSIDE.value, Status.METRIC_SINGULAR.value
 )
+_OF_PROJECTION = _PROJECTED | _PREDICTION_OUTSIDE | _METRIC_SINGULAR
 # Observers run side by side if they hold at most this many numbers; otherwise `replay` does it.
 _MOST_RUNNING = 2**23
 
@@ -54,6 +57,7 @@ class Window(Stages):
         with_terms: bool,
         project: bool,
         reinitialized: bool = False,
+        usual: Conditions = USUAL,
     ) -> None:
         n, p, m = system.n, system.p, system.m
         self._system, self._observer, self._cost = system, observer, cost
@@ -65,17 +69,22 @@ class Window(Stages):
             cost.quadratic, system.dt or 0.0,
         )
         self._sample = Sample(system, np.zeros(m))
+        self._usual = usual
+        self._filled: Conditions | None = None  # those that are in the sample now
         self._evaluating = ""  # for messages: the function that is being evaluated
         #: Flags of `Status` for the stage computed last.
         self.events: int = 0
-        self._nearest: NearestPoint | None = None  # projects the observer onto X
+        # Projects the observer onto X: usually, and at the state that is being computed.
+        self._usual_nearest: NearestPoint | None = None
+        self._projections: dict[int, tuple[ConvexSet, NearestPoint]] = {}  # onto X of samples
         if project and system.states is not None:
-            self._nearest = NearestPoint(system.states)
+            self._usual_nearest = NearestPoint(system.states)
             if self._covariances is None or observer.metric is not None:
                 noise = np.sqrt(inverse(cost.noise).diagonal())
                 self.metric = ErrorMetric(
                     observer, cost.initial_weight(observer.initial_covariance()), noise
                 )
+        self._nearest = self._usual_nearest
         # For the re-initialised candidate; None where `replay` has to make it.
         self._observers: RunningObservers | None = None
         gain, simple = observer.constant_gain, not observer.needs_jacobians
@@ -100,20 +109,39 @@ class Window(Stages):
     @property
     def has_special_weights(self) -> bool:
         """Whether some stage of the window has a weight of its own."""
-        return self.time - self._last_special <= self.length
+        return self.unusual and bool(np.count_nonzero(self._special[self.start : self.end]))
 
     @property
     def has_irregular_steps(self) -> bool:
         """Whether some stage of the window has a step of unusual length."""
-        return self.time - self._last_irregular <= self.length
+        return self.unusual and bool(np.count_nonzero(self._irregular[self.start : self.end]))
+
+    @property
+    def has_own_bounds(self) -> bool:
+        """Whether some stage of the window has sets with other sides."""
+        return bool(self._own) and any(own.has_bounds for own in self._own.values())
+
+    @property
+    def conditions(self) -> list[Conditions]:
+        """What each stage was taken with."""
+        return [self._own.get(t, USUAL) for t in range(self.time - self.length, self.time)]
+
+    def moves_state(self, own: Conditions | None) -> bool:
+        """Whether a sample with these conditions may project z(t) onto another X."""
+        if self._nearest is None or (own is None and not self._own):
+            return False
+        states = None if own is None else own.states
+        return states is not self._own.get(self.time - 1, USUAL).states
 
     def push(
-        self, y: Array, u: Array, dt: float | None = None, noise_weight: Array | None = None
+        self, y: Array, u: Array, dt: float | None = None, own: Conditions | None = None
     ) -> None:
         """Store the sample y(t), u(t), and advance the observer to z(t+1)."""
         if self.end == self.room:
             self.make_room()
-        k, m = self.end, self._m
+        moves, failed = self.moves_state(own), self.time > 0 and self.newest_failed
+        k, m, time = self.end, self._m, self.time
+        self.end, self.time = k + 1, time + 1
         view = self._stage_views[k]
         view.y[...] = y
         if m:
@@ -121,20 +149,49 @@ class Window(Stages):
         if dt is not None:
             self._irregular[k] = self.unusual = True
             self._u[k, m] = dt
-            self._last_irregular = self.time
-        if noise_weight is not None:
-            self._own_noise[self.time] = noise_weight
-            self._set_weight(k, self.time)
+        if own is not None:
+            self._own[time] = own
+            if not own.noise_weight is own.disturbance_weight is None:
+                self._set_weight(k, time)
         if self._observers_ready:
-            self._find_observed(k, self.time)
+            self._find_observed(k, time)
+            if moves:
+                self._advanced_to = min(self._advanced_to, time - 1)
         else:
-            self._compute_stage(k, self.time)
-        self.end = k + 1
-        self.time += 1
-        if self.end - self.start > self.horizon:
+            events = self._move_state(k, time, failed) if moves else 0
+            self._compute_stage(k, time)
+            self.events |= events
+        if k + 1 - self.start > self.horizon:
             self.start += 1
-            if self._own_noise:
-                self._own_noise.pop(self.time - self.horizon - 1, None)
+            if self._own:
+                self._own.pop(time - self.horizon, None)
+
+    def _move_state(self, k: int, time: int, failed: bool) -> int:
+        """Put z(t) into the X that has come with its sample; return flags of `Status`."""
+        if time and not failed:
+            self._compute_stage(k - 1, time - 1)
+            return self.events & _OF_PROJECTION
+        self.enter_states(k, time)
+        return 0
+
+    def enter_states(self, k: int, time: int) -> None:
+        """Project the state before stage k onto its X: no correction leads there."""
+        nearest, covariance = self._projection(time), self.metric and self.metric.covariance
+        if self._covariances is not None and covariance is None:
+            covariance = self._covariances[k]
+        if nearest is not None and covariance is not None and not nearest.contains(self._z[k]):
+            self._z[k] = nearest(self._z[k], covariance).point
+
+    def _projection(self, time: int) -> NearestPoint | None:
+        """The projection onto X at a time: the newest sample's before its own has come."""
+        states = self._own.get(min(time, self.time - 1), USUAL).states if self._own else None
+        if states is None or self._usual_nearest is None:
+            return self._usual_nearest
+        if id(states) not in self._projections:
+            if len(self._projections) > 2 * self.horizon:
+                self._projections.clear()
+            self._projections[id(states)] = states, NearestPoint(states)
+        return self._projections[id(states)][1]
 
     def amend(self, time: int, y: Array) -> None:
         """Fill the finite components of y into a sample, and redo the stages from there on."""
@@ -145,6 +202,28 @@ class Window(Stages):
         self._observed[k] |= new
         self._set_weight(k, time)
         self.replay(self.time - time)
+
+    def take_over(
+        self, other: Window, changes: Conditions, parameters: Array | None
+    ) -> None:
+        """Take the samples of another window, without what changes, and run through them anew."""
+        length, m = other.length, self._m
+        mine, kept = self._arrays(), other._copies()
+        for name in ("y", "u", "irregular", "observed"):
+            mine[name][:length] = kept[name]
+        if parameters is not None:
+            self._u[:length, m - parameters.size : m] = parameters
+        if self._covariances is not None:
+            self._covariances[0] = kept["covariance"][0]
+        self._earlier_state, self._earlier_covariance = other._last_good(other.start)
+        if self.metric is not None and other.metric is not None:
+            self.metric.state = other.metric.state
+        self._own = {time: own.without(changes) for time, own in other._own.items()}
+        self.start, self.end, self.time, self.unusual = 0, length, other.time, True
+        self.enter_states(0, self.time - length)
+        for k in range(length):
+            self._set_weight(k, self.time - length + k)
+        self.replay(length)
 
     def replay(self, steps: int, state: Array | None = None) -> None:
         """Redo the last ``steps`` stages, from another state of the observer if one is given."""
@@ -173,16 +252,15 @@ class Window(Stages):
             observers.failed[:], self._advanced_to = True, first
         for time in range(self._advanced_to, now):
             k = self.end - (now - time)
-            self._fill_sample(k, self._find_observed(k, time))
+            self._fill_sample(k, time, self._find_observed(k, time))
+            observers.nearest = self._nearest = self._projection(time + 1)
             observers.advance(time, estimates[time - now], self._y[k], self._sample)
         self._advanced_to = now
         self._z[self.start : self.end + 1], self.residuals[...], self.events = (
             observers.trajectory(first, now)
         )
-        self.failure, sample = "", self._sample
-        if self._own_noise or sample.noise_weight is not None:
-            sample.noise_weight = self._own_noise.get(now - 1)
-        if sample.observed is not None:
+        self.failure = ""
+        if self._is_missing(now - 1, self._sample.observed):
             self.events |= _MISSING
         return not observers.failed[first % self.horizon] and self._set_all_stages()
 
@@ -210,7 +288,7 @@ class Window(Stages):
     def _compute_stage(self, k: int, time: int) -> None:
         """Compute stage k, of this time, from its sample and the observer's state."""
         y, observed = self._stage_views[k].y, self._find_observed(k, time)
-        self.failure = ""
+        self.failure, self._nearest = "", self._projection(time + 1)
         cost = self._evaluate_stage(k, time, observed)
         if not math.isfinite(cost) and observed is None:
             small = np.abs(y) < LARGEST
@@ -227,7 +305,7 @@ class Window(Stages):
         if (model_failed or jacobian_failed) and not self.failure:
             what = "the model, the observer or the cost" if model_failed else "a Jacobian"
             self.failure = f"{what} is not finite at x = {self._stage_views[k].z.tolist()}."
-        if observed is not None:
+        if self._is_missing(time, observed):
             self.events |= _MISSING
         if model_failed or jacobian_failed:
             self.events |= _MODEL_FAILED
@@ -238,35 +316,49 @@ class Window(Stages):
         if not math.isfinite(y.dot(y)):
             self._observed[k] = np.abs(y) < LARGEST  # False for NaN, too
             self._set_weight(k, time)
-        elif not self.unusual or self._observed[k].all():
+        elif not self.unusual or False not in self._observed[k].tolist():
             return None
         observed: NDArray[np.bool_] = self._observed[k]
         return observed
 
+    def _is_missing(self, time: int, observed: NDArray[np.bool_] | None) -> bool:
+        """Whether a component was sampled that is not there."""
+        if observed is None:
+            return False
+        sampled = self._own.get(time, USUAL).sampled
+        if sampled is None:
+            return True
+        return sampled.tobytes() != observed.tobytes() and bool((sampled & ~observed).any())
+
     def _set_weight(self, k: int, time: int) -> None:
-        """Set the weight of stage k from its observed components and its noise weight."""
-        own, observed = self._own_noise.get(time), self._observed[k]
-        complete = observed.all()
-        self._special[k] = own is not None or not complete
-        if not self._special[k]:
-            self._weights[k] = self._usual_weight
+        """Set the weight of stage k from its observed components and its own weights."""
+        own, observed = self._own.get(time, USUAL), self._observed[k]
+        weights = own.noise_weight, own.disturbance_weight
+        if weights[1] is not None:
+            self.has_disturbance_weights = True
+        if False in observed.tolist():  # NumPy's `all` takes ten times as long
+            self._stage_views[k].y[~observed] = 0.0  # any number: its weight is zero
+            self._weights[k] = self._cost.partial_weight(observed, *weights)
+            self._special[k] = self.unusual = True
             return
-        self.unusual = True
-        self._last_special = max(self._last_special, time)
-        self._y[k, ~observed] = 0.0  # any number: its weight is zero
-        if complete:
-            self._weights[k] = self._cost.joint_weight(own)
-        else:
-            self._weights[k] = self._cost.partial_weight(observed, own)
+        weight = self._usual_weight
+        if not weights[0] is weights[1] is None:
+            weight = self._cost.joint_weight(*weights)
+        self._weights[k] = weight
+        # A usual weight that was given as its own is as good as none.
+        self._special[k] = weight is not self._usual_weight and not np.array_equal(
+            weight, self._usual_weight
+        )
+        self.unusual |= bool(self._special[k])
 
     def _evaluate_stage(self, k: int, time: int, observed: NDArray[np.bool_] | None) -> float:
         """Evaluate the model and the observer at stage k; return its cost, or infinity."""
         view = self._stage_views[k]
         self.events = 0
         try:
-            self._evaluate_model(k, view, observed)
+            self._evaluate_model(k, time, view, observed)
             self._evaluating = "the observer's correction"
-            if not self._advance_observer(k, time, view):
+            if not self._advance_observer(k, view):
                 return math.inf
         except Exception as raising:  # a model function outside its domain: not bad input
             self.failure = raised(self._evaluating, raising, view.z)
@@ -280,12 +372,12 @@ class Window(Stages):
         return self._cost_and_terms(k)
 
     def _evaluate_model(
-        self, k: int, view: StageView, observed: NDArray[np.bool_] | None
+        self, k: int, time: int, view: StageView, observed: NDArray[np.bool_] | None
     ) -> None:
         """Write y - h(z), the Jacobians and, as z(t+1), f(z); fill the observer's `Sample`."""
         terms = view.terms
         self._evaluating = "the model"
-        model, u = self._fill_sample(k, observed)
+        model, u = self._fill_sample(k, time, observed)
         kernel = model.kernel if self._with_jacobians else None
         if kernel is None:
             usual = model is self._system
@@ -309,21 +401,28 @@ class Window(Stages):
         if observed is not None:
             terms.noise[~observed] = 0.0
 
-    def _fill_sample(self, k: int, observed: NDArray[np.bool_] | None) -> tuple[System, Array]:
+    def _fill_sample(
+        self, k: int, time: int, observed: NDArray[np.bool_] | None
+    ) -> tuple[System, Array]:
         """Fill the `Sample` that the observer gets for stage k; return its model and input."""
         model, u, sample = self._system, self._stage_views[k].u, self._sample
+        own = self._own.get(time, USUAL)
+        if own is not self._filled:
+            self._filled = own
+            if self._usual is not USUAL:
+                own = own.over(self._usual)
+            sample.noise_weight, sample.states = own.noise_weight, own.states
+            sample.disturbance_weight = own.disturbance_weight
         if self.unusual and self._irregular[k]:
             model, u = self._system.timed, self._u[k]
         sample.system, sample.u, sample.observed = model, u, observed
         return model, u
 
-    def _advance_observer(self, k: int, time: int, view: StageView) -> bool:
+    def _advance_observer(self, k: int, view: StageView) -> bool:
         """Add the correction to f(z), and project; whether state and covariance are finite."""
         sample, terms, z_next = self._sample, view.terms, view.z_next
         if self._observer.needs_jacobians:
             sample.f_jacobian, sample.h_jacobian = -terms.minus_a, -terms.minus_c
-        if self._own_noise or sample.noise_weight is not None:
-            sample.noise_weight = self._own_noise.get(time)
         if self._read_only_covariances is not None:
             sample.covariance = self._read_only_covariances[k]
         correction, posterior = self._correct(view.arguments[0], view.error, sample)
@@ -482,9 +581,7 @@ class Window(Stages):
     @property
     def stage_weights(self) -> Array:
         """One weight for all stages (q, q), or one for each where some is special."""
-        if self.has_special_weights:
-            return self._weights[self.start : self.end]
-        return self._cost.stage_weight
+        return self.weights if self.has_special_weights else self._cost.stage_weight
 
     @property
     def majorising_weights(self) -> Array:
@@ -514,52 +611,44 @@ class Window(Stages):
                 self._z[k + 1] = loaded._z[k + 1]
                 if self._covariances is not None and loaded._covariances is not None:
                     self._covariances[k + 1] = loaded._covariances[k + 1]
-        self._last_special, self._last_irregular = loaded._last_special, loaded._last_irregular
 
     def _check_stage(self, k: int, loaded: Window, terms: bool) -> None:
-        n, mine, saved = self._n, self.terms, loaded.terms
-        if not (
-            np.array_equal(self._special[k], loaded._special[k])
-            and np.array_equal(self._observed[k], loaded._observed[k])
-            and near(loaded._weights[k], self._weights[k], np.abs(self._weights[k]).max())
-        ):
-            raise mismatch("weight of the stages' cost")
-        y, fitting_error = np.abs(self._y[k]), mine.residuals[k, n:]
-        if not near(saved.residuals[k, n:], fitting_error, y + np.abs(fitting_error)):
-            raise mismatch("model (h)")
-        sizes = np.abs(loaded._z[: self.end + 1]).max(axis=0)
-        correction = mine.residuals[k, :n]
-        reached = np.maximum(sizes, np.abs(correction))
-        if not near(saved.residuals[k, :n], correction, reached):
-            raise mismatch("observer")
-        if not near(loaded._z[k + 1], self._z[k + 1], reached):
-            raise mismatch("model (f)")
+        for what, found, expected, size in self._comparisons(k, loaded, terms):
+            if not near(found, expected, size):
+                raise mismatch(what)
+
+    def _comparisons(
+        self, k: int, loaded: Window, terms: bool
+    ) -> Iterator[tuple[str, Array, Array, Array | float]]:
+        """What must agree, the loaded and the computed numbers, and the size of their terms."""
+        n, mine, saved, weight = self._n, self.terms, loaded.terms, self._weights[k]
+        flags = (np.append(one._observed[k], one._special[k]) * 1.0 for one in (loaded, self))
+        yield "weight of the stages' cost", *flags, 0.0
+        yield "weight of the stages' cost", loaded._weights[k], weight, np.abs(weight).max()
+        correction, v = mine.residuals[k, :n], mine.residuals[k, n:]
+        yield "model (h)", saved.residuals[k, n:], v, np.abs(self._y[k]) + np.abs(v)
+        reached = np.maximum(np.abs(loaded._z[: self.end + 1]).max(axis=0), np.abs(correction))
+        yield "observer", saved.residuals[k, :n], correction, reached
+        yield "model (f)", loaded._z[k + 1], self._z[k + 1], reached
         if self._covariances is not None and loaded._covariances is not None:
-            found, expected = loaded._covariances[k + 1], self._covariances[k + 1]
+            expected = self._covariances[k + 1]
             spread = np.sqrt(np.abs(expected.diagonal()))
-            if not near(found, expected, np.outer(spread, spread)):
-                raise mismatch("observer")
+            yield "observer", loaded._covariances[k + 1], expected, np.outer(spread, spread)
         r, weight = saved.residuals[k], loaded._weights[k]
-        cost = float(self._evaluate_costs(r[None], weight)[0])
+        cost = self._evaluate_costs(r[None], weight)[0]
         size = np.abs(r).dot(np.abs(weight)).dot(np.abs(r)) if self._quadratic else cost
-        if not near(loaded._stage_costs[k], cost, size):
-            raise mismatch("cost")
+        yield "cost", loaded._stage_costs[k], cost, size
         if not (terms and (self._with_terms or self._quadratic)):
             return
-        jacobian = mine.linear[k, :, 1:]
-        sizes = np.nan_to_num(np.abs(jacobian)).max(axis=1, keepdims=True)
-        if not near(saved.linear[k, :, 1:], jacobian, sizes):
-            raise mismatch("model (its Jacobians)")
-        majorising = self._majorising_weights[k]
-        if not near(loaded._majorising_weights[k], majorising, np.abs(majorising).max()):
-            raise mismatch("cost")
+        jacobian, weight = mine.linear[k, :, 1:], self._majorising_weights[k]
+        size = np.nan_to_num(np.abs(jacobian)).max(axis=1, keepdims=True)
+        yield "model (its Jacobians)", saved.linear[k, :, 1:], jacobian, size
+        yield "cost", loaded._majorising_weights[k], weight, np.abs(weight).max()
         exact, bound = StageTerms(1, n, r.size - n), StageTerms(1, n, r.size - n)
         exact.linear[0], weight = saved.linear[k], loaded._majorising_weights[k]
         bound.linear[0] = np.abs(exact.linear[0])
         exact.set_all(1, weight)
         bound.set_all(1, np.abs(weight))
-        for found, expected, size in zip(
-            saved.arrays(), exact.arrays(), bound.arrays(), strict=True
-        ):
-            if not near(found[k], expected[0], size[0]):
-                raise mismatch("weight of the stages' cost")
+        sizes = bound.arrays()
+        for name, expected in exact.arrays().items():
+            yield "weight of the stages' cost", saved.arrays()[name][k], expected[0], sizes[name][0]

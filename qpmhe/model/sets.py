@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -87,6 +88,26 @@ class ConvexSet:
         """
         touched: NDArray[np.bool_] = (components @ (self.matrix != 0.0).T.astype(np.intp)) > 0
         return touched
+
+    def with_sides(
+        self, lower: Array, upper: Array, row_lower: Array, row_upper: Array
+    ) -> ConvexSet:
+        """The same rows with other sides, shaped as this set's.
+
+        Raises
+        ------
+        SetError
+            If nothing is left.
+        """
+        other = copy(self)
+        other.lower, other.upper = lower.copy(), upper.copy()
+        other.row_lower, other.row_upper = row_lower.copy(), row_upper.copy()
+        crossed = (lower > upper).any() or (row_lower > row_upper).any()
+        if crossed or np.isnan(np.concatenate((lower, upper, row_lower, row_upper))).any():
+            raise SetError(f"the set is empty: a lower bound is not below the upper ({other!r}).")
+        if self.matrix.shape[0]:
+            other._check_not_empty()
+        return other
 
     def __and__(self, other: ConvexSet) -> ConvexSet:
         if not isinstance(other, ConvexSet):

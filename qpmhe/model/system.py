@@ -315,6 +315,18 @@ class System:
             other.use_scales(scales)
         return other
 
+    def with_sets(
+        self, states: ConvexSet | None, disturbances: ConvexSet | None, noises: ConvexSet | None
+    ) -> System:
+        """This system, its functions shared, with other sides of its sets."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        other.states, other.disturbances, other.noises = states, disturbances, noises
+        other.__dict__.pop("timed", None)
+        if self.make_timed is not None:
+            other.make_timed = lambda: self.timed
+        return other
+
     def use_scales(self, scales: ArrayLike) -> None:
         """Take typical magnitudes of the states, unless the user gave them with the system.
 

@@ -11,7 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import Array, positive_definite
 from .._linalg import inverse
 from ..errors import ShapeError
+from ..model.sets import ConvexSet
 from ..model.system import System
+
+# Two inversions of a covariance change its correlations by no more.
+_ROUNDING = 1e-9
 
 
 @dataclass(slots=True)
@@ -25,10 +29,14 @@ class Sample:
     f_jacobian, h_jacobian : (n, n) and (p, n) array or None
         Jacobians at z, if `Observer.needs_jacobians`.
     observed, noise_weight : (p,) bool and (p, p) array or None
-        Which components of y are not missing, and this sample's own noise weight; None if all
+        Which components of y are there, and this sample's own noise weight; None if all
         are there, or it has none.
     covariance : (n, n) array or None
         Covariance of x(t) - z(t), if the observer has one.
+    disturbance_weight : (n, n) array or None
+        This sample's own weight of the disturbance; None if it has none.
+    states : ConvexSet or None
+        The X that this sample came with; None for the system's.
     """
 
     system: System
@@ -38,6 +46,8 @@ class Sample:
     observed: NDArray[np.bool_] | None = None
     noise_weight: Array | None = None
     covariance: Array | None = None
+    disturbance_weight: Array | None = None
+    states: ConvexSet | None = None
 
 
 class Observer(ABC):
@@ -145,6 +155,21 @@ class KalmanType(Observer):
 
     def _noise_of(self, sample: Sample) -> Array:
         """The covariance of this sample's noise."""
-        if sample.noise_weight is None:
-            return self._noise
-        return inverse(sample.noise_weight)
+        return covariance_of(sample.noise_weight, self._noise)
+
+    def _disturbance_of(self, sample: Sample) -> Array:
+        """The covariance of this sample's disturbance."""
+        return covariance_of(sample.disturbance_weight, self._disturbance)
+
+
+def covariance_of(weight: Array | None, usual: Array) -> Array:
+    """The covariance of a sample's own weight, or the usual one, from which rounding is no change.
+
+    A weight that was computed from the usual covariance must lead to the same digits as none.
+    """
+    if weight is None:
+        return usual
+    covariance = inverse(weight)
+    deviations = np.sqrt(usual.diagonal())
+    near = np.abs(covariance - usual) <= _ROUNDING * np.multiply.outer(deviations, deviations)
+    return usual if near.all() else covariance

@@ -48,7 +48,8 @@ class ExtendedKalman(KalmanType):
         gain = solve(c @ covariance @ c.T + r, cross.T).T if v.size else cross
         # Joseph's form: symmetric, and positive semidefinite by construction.
         closed = a - gain @ c
-        following = closed @ covariance @ closed.T + gain @ r @ gain.T + self._disturbance
+        following = closed @ covariance @ closed.T + gain @ r @ gain.T
+        following = following + self._disturbance_of(sample)
         return gain @ v, 0.5 * (following + following.T)
 
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array, positive_definite
-from .._linalg import inverse, solve
+from .._linalg import solve
 from ..errors import ShapeError
 from ..model.system import System, checked_system
-from .base import Observer, Sample
+from .base import Observer, Sample, covariance_of
 from .design import linearize, stationary
 
 
@@ -125,11 +125,12 @@ class SteadyStateKalman(Observer):
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the covariance of the next error; see `Observer.correct`."""
-        if sample.observed is None and sample.noise_weight is None:
+        if sample.observed is sample.noise_weight is sample.disturbance_weight is None:
             closed, entering = self._closed, self._entering
         else:
             gain, r = self._given(self.gain, sample)
-            closed, entering = self._a - gain @ self._c, self._disturbance + gain @ r @ gain.T
+            q = covariance_of(sample.disturbance_weight, self._disturbance)
+            closed, entering = self._a - gain @ self._c, q + gain @ r @ gain.T
         following = closed @ self._before(sample) @ closed.T + entering
         return self.gain @ v, 0.5 * (following + following.T)
 
@@ -146,5 +147,4 @@ class SteadyStateKalman(Observer):
         """A gain without the columns of missing outputs, and this sample's noise covariance."""
         if sample.observed is not None:
             gain = np.where(sample.observed, gain, 0.0)
-        weight = sample.noise_weight
-        return gain, self._noise if weight is None else inverse(weight)
+        return gain, covariance_of(sample.noise_weight, self._noise)

@@ -85,10 +85,10 @@ class UnscentedKalman(KalmanType):
         ahead: Array = (f[1:] - f[0]) * roots
         seen, r, v = self._seen(points, inputs, roots, v, sample)
         if v.size == 0:
-            return np.zeros_like(z), ahead.T @ ahead + self._disturbance
+            return np.zeros_like(z), ahead.T @ ahead + self._disturbance_of(sample)
         gain = solve(seen.T @ seen + r, seen.T @ ahead).T
         left = ahead - seen @ gain.T
-        following = left.T @ left + gain @ r @ gain.T + self._disturbance
+        following = left.T @ left + gain @ r @ gain.T + self._disturbance_of(sample)
         return gain @ v, 0.5 * (following + following.T)
 
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
@@ -109,8 +109,9 @@ class UnscentedKalman(KalmanType):
             raise ValueError("the unscented Kalman observer needs a covariance")
         ahead = self._spread * np.linalg.cholesky(covariance).T
         moves, share = np.concatenate((ahead, -ahead)), np.ones(2 * z.size)
-        if sample.system.states is not None:
-            moves, share = _inside(z, moves, sample.system.states)
+        states = sample.system.states if sample.states is None else sample.states
+        if states is not None:
+            moves, share = _inside(z, moves, states)
         points = np.concatenate((z[None], z + moves))
         # Roots of the weights go into the deviations, so that sums become products.
         roots = (1.0 / (math.sqrt(2.0) * self._spread * share))[:, None]

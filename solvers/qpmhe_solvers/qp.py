@@ -36,11 +36,11 @@ def band_index(n: int) -> NDArray[np.intp]:
 
 
 def band_of(block: Array) -> Array:
-    """The band panel (n, 2n) of a symmetric diagonal block that couples to nothing."""
-    n = block.shape[0]
-    panel = np.zeros((n, 2 * n))
+    """The band panels (..., n, 2n) of symmetric diagonal blocks that couple to nothing."""
+    n = block.shape[-1]
+    panel = np.zeros((*block.shape[:-2], n, 2 * n))
     for column in range(n):
-        panel[column, : n - column] = block[column:, column]
+        panel[..., column, : n - column] = block[..., column:, column]
     return panel
 
 

@@ -198,7 +198,7 @@ def test_an_interrupt_out_of_what_the_user_wrote(where, candidate, monkeypatch):
             system, observer, cost, horizon=3, initial_state=[0.5, 0.4], candidate=candidate,
             warm_start=True, max_qps=2,
         )
-        solver = mhe._engine._optimizer._solver
+        solver = mhe._engine._solver
         monkeypatch.setattr(solver, "solve", ticking("solver", solver.solve))
         return mhe, bomb
 

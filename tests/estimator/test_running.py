@@ -109,10 +109,11 @@ def watched(mhe):
 def data(mhe):
     """All numbers of a window that a step may use."""
     window = mhe._engine._window
-    terms = window.terms.arrays() if mhe._engine._with_terms else [window.terms.residuals]
-    return [window.candidate.copy()] + [
-        array[window.start : window.end].copy() for array in (*window._stage_arrays(), *terms)
-    ]
+    arrays = window._copies()
+    if not mhe._engine._with_terms:
+        arrays = {k: v for k, v in arrays.items() if k not in window.terms.names}
+        arrays["residuals"] = window.residuals.copy()
+    return list(arrays.values())
 
 
 def results(estimate):

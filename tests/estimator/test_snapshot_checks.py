@@ -252,6 +252,7 @@ def at(value, path):
     return value
 
 
+OWN = {"noise_weight": np.eye(1)}
 JUNK = [
     None, 3, -1, 2**70, 0.5, np.nan, True, "text", "", b"bytes", [], (), {}, [1, 2], [[1, 2], [3]],
     {"a": 1}, object(), np.zeros(0), np.zeros((3, 3)), np.array(1.25), np.array(["a"]),
@@ -318,9 +319,10 @@ def test_damaged_states_are_refused_whole_or_harmless(engine, options):
             ) or (
                 path[:2] in (
                     ("window", "earlier"), ("window", "earlier_covariance"),
-                    ("window", "last_special"), ("window", "last_irregular"),
-                    ("window", "time"), ("window", "covariance"), ("window", "terms"),
-                    ("window", "stages"),
+                    ("window", "time"), ("window", "covariance"), ("window", "y"), ("window", "u"),
+                    ("window", "irregular"),
+                    ("window", "linear"), ("window", "panel"), ("window", "gradient"),
+                    ("window", "next_gradient"),
                 )
             ), path
             mhe.update(np.zeros(1), np.zeros(1))
@@ -338,13 +340,20 @@ def test_damaged_states_are_refused_whole_or_harmless(engine, options):
     [
         (("modes",), [[1, 2], [3]]), (("modes",), ["batched", "mixed"]), (("modes",), "ab"),
         (("modes",), ["batched"]), (("methods",), ["given", "given"]),
-        (("window", "own_noise"), None), (("window", "own_noise"), {-3: np.eye(1)}),
-        (("window", "own_noise"), {14: -np.eye(1)}), (("window", "own_noise"), {14: np.eye(2)}),
+        (("window", "own"), None), (("window", "own"), {-3: OWN}),
+        (("window", "own"), {14: {"noise_weight": -np.eye(1)}}),
+        (("window", "own"), {14: {"noise_weight": np.eye(2)}}),
+        (("window", "own"), {14: {"noise_weight": 3.0}}), (("window", "own"), {14: []}),
+        (("window", "own"), {14: {"sampled": np.ones(2, np.bool_)}}),
+        (("window", "own"), {14: {"parameters": np.ones(1)}}),
+        (("window", "own"), {14: {"states": {"lower": np.zeros(2)}}}),
+        (("window", "own"), {14: {"colour": np.zeros(2)}}), (("usual",), None), (("usual",), []),
+        (("usual",), {"disturbance_weight": np.eye(1)}),
+        (("usual",), {"noise_weight": 3.0 * np.eye(1)}),
         (("window", "time"), -1), (("window", "time"), 3), (("window", "time"), 15.0),
-        (("window", "last_special"), 15), (("window", "last_special"), -90),
-        (("window", "last_irregular"), 10**30), (("window", "z"), np.full((5, 2), np.nan)),
+        (("window", "z"), np.full((5, 2), np.nan)),
         (("window", "z"), np.zeros((5, 2))), (("window", "z"), np.zeros((5, 2), np.float32)),
-        (("window", "covariance"), np.zeros((5, 2, 2))), (("window", "stages"), []),
+        (("window", "weights"), []),
         (("trajectory",), None), (("linearized",), 1), (("watched",), (0, 16)),
         (("watched",), (-1, 0)), (("watched",), (0.0, 0)), (("estimator",), None),
         (("estimator",), {}),
@@ -362,6 +371,13 @@ def test_damage_that_was_seen(path, value):
     assert (mhe.time, mhe.state.tolist()) == (6, before.tolist())
 
 
+def test_a_covariance_where_the_observer_has_none():
+    state = fed("numpy").state_dict()
+    state["window"]["covariance"] = np.zeros((5, 2, 2))
+    with pytest.raises(InvalidInputError, match="another observer"):
+        fed("numpy").load_state_dict(state)
+
+
 @pytest.mark.parametrize("engine", ["numpy", pytest.param("compiled", marks=needed)])
 @pytest.mark.parametrize("factor", [0.0, 0.5, 1.0 + 1e-4, 2.0, np.inf, -1.0])
 def test_altered_costs_of_stages_are_refused(engine, factor):
@@ -370,7 +386,7 @@ def test_altered_costs_of_stages_are_refused(engine, factor):
     if engine == "compiled":
         state["memory"].view(mhe._engine._memory.dtype)[0]["stages"]["cost"][2] *= factor
     else:
-        state["window"]["stages"][6][2] *= factor
+        state["window"]["costs"][2] *= factor
     with pytest.raises(InvalidInputError):
         mhe.load_state_dict(state)
 

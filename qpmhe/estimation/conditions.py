@@ -1,0 +1,274 @@
+"""What a sample is taken with: weights, bounds, sensors and parameters, where they may change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qpmhe_solvers.values import shown
+
+from .._checks import positive_definite, vector
+from ..costs import Cost
+from ..errors import InvalidInputError, OptionError, ShapeError
+from ..model.sets import ConvexSet
+from ..model.system import System, checked_set
+from .settings import Settings
+from .snapshot import SET_NAMES, checked_array, mismatch
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_SIDES = ("lower", "upper", "row_lower", "row_upper")
+
+
+class Conditions(NamedTuple):
+    """What holds at a sample, or usually; None where nothing else than usual does.
+
+    Attributes
+    ----------
+    noise_weight, disturbance_weight : array or None
+        As in `MovingHorizonEstimator.update`.
+    states, disturbances, noises : ConvexSet or None
+        X, W and V: the rows of the system's sets with other sides.
+    sampled : (p,) bool array or None
+        The components of y that were sampled; None for all. The others are not missing.
+    parameters : (k,) array or None
+        The last inputs; only of usual conditions: a sample has them among its inputs.
+    """
+
+    noise_weight: Array | None = None
+    disturbance_weight: Array | None = None
+    states: ConvexSet | None = None
+    disturbances: ConvexSet | None = None
+    noises: ConvexSet | None = None
+    sampled: Mask | None = None
+    parameters: Array | None = None
+
+    @property
+    def has_bounds(self) -> bool:
+        """Whether a set has other sides."""
+        return not (self.states is self.disturbances is self.noises is None)
+
+    def over(self, usual: Conditions) -> Conditions:
+        """These conditions, and the usual ones where these say nothing."""
+        return Conditions(*(b if a is None else a for a, b in zip(self, usual, strict=True)))
+
+    def without(self, others: Conditions) -> Conditions:
+        """These conditions where the others say nothing."""
+        return Conditions(
+            *(a if b is None else None for a, b in zip(self, others, strict=True))
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Copies of all that is not None, as plain arrays."""
+        return {
+            name: {side: getattr(value, side).copy() for side in _SIDES}
+            if isinstance(value, ConvexSet) else value.copy()
+            for name, value in self._asdict().items() if value is not None
+        }
+
+
+USUAL = Conditions()
+
+
+class ConditionReader:
+    """Validates what a user gives with a sample.
+
+    Parameters
+    ----------
+    system, cost : System and Cost
+        Those that the estimator was made with.
+    """
+
+    def __init__(self, system: System, cost: Cost) -> None:
+        self._system, self._cost = system, cost
+        # The last set of each kind and what was made of it: the same object for equal sides.
+        self._last: dict[str, tuple[tuple[bytes, ...], ConvexSet]] = {}
+        self._sensors: dict[Any, tuple[NDArray[np.intp], Conditions | None]] = {}
+
+    def read(
+        self, usual: Conditions, *, noise_weight: ArrayLike | None = None,
+        disturbance_weight: ArrayLike | None = None,
+        bounds: Mapping[str, ConvexSet] | None = None, drop_usual: bool = True,
+    ) -> Conditions:
+        """Validated weights and bounds; without bounds that are equal to the usual ones."""
+        cost, weights = self._cost, []
+        for name, given, size in (
+            ("noise_weight", noise_weight, cost.noise.shape[0]),
+            ("disturbance_weight", disturbance_weight, cost.disturbance.shape[0]),
+        ):
+            weights.append(None if given is None else positive_definite(name, given, size))
+        cost.check_weights(*weights)
+        found = Conditions(*weights)
+        if bounds is None:
+            return found
+        if not isinstance(bounds, Mapping):
+            raise OptionError(
+                f"bounds is {shown(bounds)}; expected a dictionary, such as "
+                "{'states': qpmhe.Box(lower, upper)}."
+            )
+        for name, given in bounds.items():
+            if name not in SET_NAMES:
+                raise OptionError(
+                    f"bounds has the key {shown(name)}; expected one of "
+                    f"{', '.join(map(repr, SET_NAMES))}."
+                )
+        for name, given in bounds.items():
+            one = self._with_sides(name, given, getattr(usual, name))
+            if not (drop_usual and _alike(one, getattr(usual, name) or getattr(self._system, name))):
+                found = found._replace(**{name: one})
+        return found
+
+    def _with_sides(self, name: str, given: Any, usual: ConvexSet | None) -> ConvexSet:
+        """The rows of the system's set with the sides of another."""
+        built: ConvexSet | None = getattr(self._system, name)
+        if built is None:
+            raise OptionError(
+                f"bounds has {name!r}, but the system has no set of {name}; make it with "
+                f"System(..., {name}=...), as wide as it ever is, and narrow it here."
+            )
+        checked_set(f"bounds[{name!r}]", given, built.dimension)
+        usual = usual or built
+        key = tuple(
+            np.ascontiguousarray(getattr(one, side)).tobytes()
+            for one, sides in ((given, (*_SIDES, "matrix")), (usual, _SIDES)) for side in sides
+        )
+        if name in self._last and self._last[name][0] == key:
+            found = self._last[name][1]
+        else:
+            self._check_rows(name, given, built)
+            # A set without bounds of components, or without other rows, leaves these as they are.
+            bounds = given if given.bounded_components.size or not given.matrix.size else usual
+            rows = given if given.matrix.size else usual
+            found = usual.with_sides(bounds.lower, bounds.upper, rows.row_lower, rows.row_upper)
+        self._last[name] = key, found
+        return found
+
+    @staticmethod
+    def _check_rows(name: str, given: ConvexSet, built: ConvexSet) -> None:
+        """Check that only sides differ from those of the system's set."""
+        what = f"bounds[{name!r}] is {given!r}"
+        new = np.setdiff1d(given.bounded_components, built.bounded_components)
+        if new.size:
+            raise OptionError(
+                f"{what}, which bounds component {int(new[0])}; the system's set of {name} does "
+                "not. Give that component a bound in the system, as wide as it ever is, and narrow "
+                "it here."
+            )
+        if given.matrix.shape[0] and not np.array_equal(given.matrix, built.matrix):
+            raise OptionError(
+                f"{what}, whose general inequalities are not those of the system's set of {name}; "
+                "only their sides may change. Take the same matrix in the same order of rows."
+            )
+        if name == "disturbances":
+            fixed = np.zeros(built.dimension, np.bool_)
+            fixed[built.fixed_components] = True
+            same = (given.lower == built.lower) & (given.upper == built.upper)
+            changed = np.where(fixed, ~same, given.lower == given.upper)
+            if given.bounded_components.size and changed.any():
+                j = int(np.argmax(changed))
+                raise OptionError(
+                    f"{what}, which "
+                    + ("frees component" if fixed[j] else "leaves no width to component")
+                    + f" {j}; the components without a disturbance are those of the system. Make "
+                    "another estimator, or leave this component as it is."
+                )
+
+    def sensors(self, sensors: Any) -> tuple[NDArray[np.intp], Conditions | None]:
+        """Indices of the sensors in the order given, and conditions; None if they are all."""
+        key: Any = None
+        if type(sensors) is list:
+            key = *sensors, *map(type, sensors)  # True is 1 otherwise
+        elif type(sensors) is np.ndarray:
+            key = sensors.tobytes(), sensors.dtype, sensors.shape
+        try:
+            found = self._sensors.get(key)
+        except TypeError:  # a list of what has no hash
+            key = found = None
+        if found is None:
+            index, mask = self._checked_mask(sensors)
+            found = index, None if mask.all() else Conditions(sampled=mask)
+            if len(self._sensors) >= _MOST_SENSORS:
+                self._sensors.clear()
+            if key is not None:
+                self._sensors[key] = found
+        return found
+
+    def _checked_mask(self, sensors: Any) -> tuple[NDArray[np.intp], Mask]:
+        p = self._system.p
+        try:
+            array = np.atleast_1d(np.asarray(sensors))
+        except ValueError:  # lists of different lengths
+            array = np.empty((0, 0))
+        if array.dtype == np.bool_:
+            if array.shape != (p,):
+                raise ShapeError(
+                    f"sensors has shape {array.shape}; expected ({p},), True for each output that "
+                    "was sampled, or a list of indices."
+                )
+            array = np.flatnonzero(array)
+        whole = array.dtype.kind in "iu" and array.ndim == 1
+        if not (whole and array.size and array.min() >= 0 and array.max() < p):
+            raise InvalidInputError(
+                f"sensors is {shown(sensors)}; expected indices of outputs from 0 to {p - 1}, at "
+                "least one. For a sample without any, update(None)."
+            )
+        mask = np.zeros(p, np.bool_)
+        mask[array] = True
+        if mask.sum() != array.size:
+            raise InvalidInputError(
+                f"sensors is {shown(sensors)}; expected each output at most once. For a second "
+                "measurement of one, make it an output of its own."
+            )
+        return array.astype(np.intp), mask
+
+    def parameters(self, given: ArrayLike, usual: Conditions) -> Array:
+        """Validated values of the parameters."""
+        if usual.parameters is None:
+            raise InvalidInputError(
+                f"parameters is {shown(given)}, but the estimator has none; name their usual "
+                "values when it is made: MovingHorizonEstimator(..., parameters=...)."
+            )
+        return vector("parameters", given, usual.parameters.size)
+
+    def load(self, saved: dict[str, Any], usual: Conditions) -> Conditions:
+        """The conditions of which `Conditions.state_dict` returned this; raises on a damaged one."""
+        if not isinstance(saved, dict):
+            raise TypeError(f"conditions are {saved!r}")
+        p, values, found = self._system.p, dict(saved), {}
+        for name in SET_NAMES:
+            if name in values:
+                built = getattr(self._system, name)
+                if built is None:
+                    raise mismatch(f"set of {name}")
+                given, shapes = values.pop(name), [getattr(built, side).shape for side in _SIDES]
+                found[name] = built.with_sides(*(
+                    checked_array(name, given[side], shape, finite=False)
+                    for side, shape in zip(_SIDES, shapes, strict=True)
+                ))
+                self._check_rows(name, found[name], built)
+        if "sampled" in values:
+            found["sampled"] = checked_array("sampled", values.pop("sampled"), (p,), np.bool_)
+        if "parameters" in values:
+            found["parameters"] = self.parameters(values.pop("parameters"), usual)
+        for name, value in values.items():
+            checked_array(name, value, np.shape(value))
+        return self.read(usual, bounds=None, **values)._replace(**found)
+
+
+def usual_conditions(settings: Settings) -> Conditions:
+    """The usual conditions of a new estimator."""
+    if not settings.parameters:
+        return USUAL
+    return Conditions(parameters=np.array(settings.parameters))
+
+
+# So many combinations of sensors are remembered.
+_MOST_SENSORS = 1000
+
+
+def _alike(one: ConvexSet, other: ConvexSet) -> bool:
+    return all(np.array_equal(getattr(one, side), getattr(other, side)) for side in _SIDES)
