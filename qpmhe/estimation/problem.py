@@ -14,6 +14,7 @@ from qpmhe_solvers.qp import band_of
 from .._linalg import inverse
 from ..costs import Cost
 from ..model.functions import contained, raised_along
+from ..model.residuals import difference
 from ..model.system import System
 from ..observers import Observer
 from .constraints import Constraints
@@ -215,6 +216,8 @@ class Problem:
 
     def clipped(self, trajectory: Array) -> Array:
         """Clip each state to its bounds, in place; return the trajectory."""
+        if self.model.turns is not None:
+            trajectory = self.model.turns(trajectory)
         if self._clip is not None:
             np.clip(trajectory, *self._clip, out=trajectory)
         return trajectory
@@ -226,7 +229,7 @@ class Problem:
                 trajectory = self._rolled_out(trajectory)
             residuals = self._residuals(trajectory)
             weights, cost = self._weights_and_cost(residuals)
-            cost += self._prior_cost(trajectory[0] - self.prior)
+            cost += self._prior_cost(self.offset(trajectory))
         except Exception as error:  # a model function outside its domain, or a user's loss
             residuals = np.full_like(self.candidate.residuals, np.nan)
             return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf, error)
@@ -256,20 +259,34 @@ class Problem:
         for i in range(trajectory.shape[0] - 1):
             predicted = np.asarray(self.model.f(rolled_out[i], self.inputs[i]))
             rolled_out[i + 1, free] = predicted[free] + shift
-        return rolled_out
+        return rolled_out if self.model.turns is None else self.model.turns(rolled_out)
+
+    def offset(self, trajectory: Array) -> Array:
+        """The initial error x_0 [-] prior of a trajectory."""
+        return difference(self.model.state_residual, trajectory[0], self.prior)
 
     def _residuals(self, trajectory: Array) -> Array:
         """Residuals w and v of each stage; raises what the model raises."""
         model = self.model
         if model.kernel is not None:
-            return model.kernel.residuals(trajectory, self.measurements, self.inputs)
+            residuals = model.kernel.residuals(trajectory, self.measurements, self.inputs)
+            return self.wrapped(residuals, trajectory)
         states = trajectory[:-1]
         # Concatenating contiguous differences is faster than writing into columns.
         disturbances = trajectory[1:] - model.f.batch(states, self.inputs)
         noises = self.measurements - model.h.batch(states, self.inputs)
-        residuals: Array = np.concatenate((disturbances, noises), axis=1)
+        residuals = np.concatenate((disturbances, noises), axis=1)
         if residuals.shape != self.candidate.residuals.shape or residuals.dtype != np.float64:
             raise TypeError("f or h returned other than real numbers of the right shape")
+        return self.wrapped(residuals, trajectory)
+
+    def wrapped(self, residuals: Array, trajectory: Array) -> Array:
+        """Turn plain differences into residuals, in place."""
+        n, model = trajectory.shape[1], self.model
+        if model.state_residual is not None:
+            model.state_residual.wrap(residuals[:, :n], trajectory[1:])
+        if model.output_residual is not None:
+            model.output_residual.wrap(residuals[:, n:], self.measurements)
         return residuals
 
     def _weights_and_cost(self, residuals: Array) -> tuple[Array, float]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.functions import BatchedFunction
+from ..model.residuals import Residual
 from ..observers import Sample
 from ..observers.projection import NearestPoint
 
@@ -51,11 +52,15 @@ class RunningObservers:
             now[failed] = start  # a state at which the model is likely to work
         self._evaluate(sample.system.h, now, sample.u, error)
         np.subtract(y, error, error)
+        self._wrap(sample.system.output_residual, error, y)
         if sample.observed is not None:
             error[:, ~sample.observed] = 0.0
         self._evaluate(sample.system.f, now, sample.u, predicted)
         np.matmul(error, self._transposed_gain, correction)
         np.add(predicted, correction, ahead)
+        self._wrap(sample.system.state_residual, correction, ahead)
+        if (turns := sample.system.turns) is not None:
+            ahead[...], predicted[...] = turns(ahead), turns(predicted)
         failed |= ~np.isfinite(np.einsum("ij,ij->i", ahead, ahead))  # its cost would overflow
         if self._nearest is None:
             return
@@ -65,6 +70,13 @@ class RunningObservers:
                 self._events[i] = self._keep_inside(predicted[i], ahead[i], correction[i])
             except Exception:  # of linear algebra
                 failed[i] = True
+
+    def _wrap(self, residual: Residual | None, differences: Array, minuends: Array) -> None:
+        if residual is not None:
+            try:
+                residual.wrap(differences, minuends)
+            except Exception:  # a user's function
+                self.failed[:] = True
 
     def _evaluate(self, function: BatchedFunction, states: Array, u: Array, values: Array) -> None:
         """Write a function's values at all states, and mark those at which it raises."""
