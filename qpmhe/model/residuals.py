@@ -300,9 +300,9 @@ class Turns:
                 "their own (qpmhe.Box) only: with whole turns added, a sum means nothing."
             )
         bounded = angle & np.isfinite(lower)
-        middle = np.where(bounded, 0.5 * lower + 0.5 * upper, 0.0)
-        # From the middle to a bound is more than half a period where the residual moves it.
-        ends = np.where(bounded, (lower, upper), middle)
+        ends = np.where(bounded, (lower, upper), 0.0)
+        middle = 0.5 * ends[0] + 0.5 * ends[1]
+        # The residual moves what is half a period from the middle or more.
         free = bounded & (residual.aligned(ends, middle) != ends)[1]
         lower[free], upper[free] = -np.inf, np.inf
         self._residual, self._middle, self._bounded = residual, middle, bounded & ~free
