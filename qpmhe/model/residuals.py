@@ -38,7 +38,7 @@ class Residual(ABC):
     components: NDArray[np.intp]
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Array:
-        """a [-] b, for arrays (..., d)."""
+        """A [-] b, for arrays (..., d)."""
         a = np.asarray(a, np.float64)
         difference: Array = a - np.asarray(b, np.float64)
         self.wrap(difference, a)
@@ -62,7 +62,7 @@ class Residual(ABC):
 
 
 def difference(residual: Residual | None, a: Array, b: Array) -> Array:
-    """a [-] b, or a - b without a residual function."""
+    """A [-] b, or a - b without a residual function."""
     return a - b if residual is None else residual(a, b)
 
 
@@ -190,7 +190,8 @@ class _Given(Residual):
                 unit = float(np.abs(a - b)[now].min())
         self.components = np.flatnonzero(moved)
         for share in (0.01, 0.1, 1.0, 10.0):
-            self._check_slope(*(unit * share * rng.uniform(-1.0, 1.0, (2, dimension))), unit)
+            a, b = unit * share * rng.uniform(-1.0, 1.0, (2, dimension))
+            self._check_slope(a, b, unit)
 
     def _checked(self, a: Array, b: Array) -> Array:
         try:

@@ -147,7 +147,7 @@ def test_without_residual_functions_each_crossing_costs():
 
 @each_observer
 def test_states_may_go_on_where_only_the_measurement_wraps(observer):
-    x, y, u = record(2.0, 60)
+    _, y, u = record(2.0, 60)
     reference = estimator(plain(**SLOPES), observer).run(y, u)
     y[:, 2:] = wrapped(y[:, 2:])
     run = estimator(plain(**ANGLES, **SLOPES), observer).run(y, u)
@@ -156,7 +156,8 @@ def test_states_may_go_on_where_only_the_measurement_wraps(observer):
 
 @pytest.mark.parametrize("options", [
     {}, {"states": qpmhe.Box([-9.0, -9.0, -2.0], [9.0, 9.0, 3.0])},
-    {"disturbances": qpmhe.Box([-0.3] * 3, [0.3] * 3), "noises": qpmhe.Polytope(-np.eye(4), [0.3] * 4)},
+    {"disturbances": qpmhe.Box([-0.3] * 3, [0.3] * 3),
+     "noises": qpmhe.Polytope(-np.eye(4), [0.3] * 4)},
 ])
 @each_candidate
 @each_observer
@@ -343,7 +344,7 @@ def test_a_prediction_far_from_the_measurement_turns_the_short_way():
 
 
 def test_missing_and_late_measurements_and_covariances():
-    x, y, u = record(2.0, 40)
+    _, y, u = record(2.0, 40)
     seen = np.column_stack((y[:, :2], wrapped(y[:, 2:])))
     runs = []
     for system, data in ((plain(**SLOPES), y), (wrapping(**SLOPES), seen)):
@@ -384,7 +385,7 @@ def test_a_snapshot_continues_bit_for_bit(observer, candidate):
         {**ANGLES, "state_residual": qpmhe.angles([0, 2])},
     ):
         different = qpmhe.System(wrapped_step, wrapped_sight, n=3, p=4, m=2, **residuals)
-        with pytest.raises(InvalidInputError, match="another (output|state)_residual"):
+        with pytest.raises(InvalidInputError, match=r"another (output|state)_residual"):
             estimator(different, observer, **options).load_state_dict(state)
 
 
@@ -444,7 +445,8 @@ def from_jax(**options):
     def h(x):
         seen = [jnp.asarray(b) - x[:2] for b in (EAST, NORTH)]
         return jnp.stack([
-            *(jnp.hypot(*one) for one in seen), *(jnp.arctan2(one[1], one[0]) - x[2] for one in seen)
+            *(jnp.hypot(*one) for one in seen),
+            *(jnp.arctan2(one[1], one[0]) - x[2] for one in seen),
         ])
 
     return qpmhe.from_jax(
@@ -502,7 +504,7 @@ def test_every_way_to_make_a_system_takes_angles(make):
 def test_compiled_code_refuses_them_by_name():
     for name, one in ANGLES.items():
         system = from_casadi(**{name: one})
-        with pytest.raises(OptionError, match=f"residual function; take engine='python', or leave {name} out"):
+        with pytest.raises(OptionError, match=f"take engine='python', or leave {name} out"):
             estimator(system, engine="compiled", backend="auto")
         with pytest.raises(OptionError, match=name):
             qpmhe.codegen.write(estimator(system), "/nonexistent")

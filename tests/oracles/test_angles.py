@@ -81,7 +81,7 @@ def test_converged_cost_is_ipopts(seed, sets):
     system = rover.system(**SETS[sets])
     y = rover.record(rover.system(), 25)
     assert (np.abs(np.diff(y[:, 2:], axis=0)) > PI).sum() > 5
-    common = {"horizon": 6, "initial_state": rover.start + [0.3, -0.3, 0.3, 0.0]}
+    common = {"horizon": 6, "initial_state": rover.start + np.array([0.3, -0.3, 0.3, 0.0])}
     observer = qpmhe.ExtendedKalman(
         **{name: np.diag(np.square(one)) for name, one in rover.deviations.items()})
     mhe = qpmhe.MovingHorizonEstimator(system, observer, rover.cost, max_qps=None, **common)
