@@ -167,11 +167,11 @@ class Problem:
 
     def _move_prior(self, prior: Array) -> None:
         """Take another prior mean, unless the candidate has no finite prior cost there."""
-        offset = self.candidate.trajectory[0] - prior
         try:
+            offset = difference(self.model.state_residual, self.candidate.trajectory[0], prior)
             cost = self._prior_cost(offset)
             self.prior_weight_at(offset)
-        except Exception:  # a user's loss
+        except Exception:  # a user's loss or residual
             return
         if math.isfinite(cost):
             self.prior, self.prior_moved = prior, True

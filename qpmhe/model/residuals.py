@@ -258,6 +258,30 @@ class _Given(Residual):
         return _Given, (self._name, self._user, self._dimension)
 
 
+class _Extended(Residual):
+    """A residual of the first components of vectors that have plain ones behind."""
+
+    def __init__(self, first: Residual, count: int, dimension: int) -> None:
+        self._first, self._count, self._dimension = first, count, dimension
+        self.components = first.components
+
+    def wrap(self, differences: Array, minuends: Array) -> None:
+        """See `Residual.wrap`."""
+        self._first.wrap(differences[..., : self._count], minuends[..., : self._count])
+
+    def check(self, name: str, dimension: int) -> None:
+        """See `Residual.check`."""
+        if dimension != self._dimension:
+            raise ShapeError(f"{name} is for {self._dimension} components; expected {dimension}.")
+
+
+def extended(residual: Residual | None, count: int, dimension: int) -> Residual | None:
+    """The residual for vectors of this dimension, of which it knows the first components."""
+    if residual is None or count == dimension:
+        return residual
+    return _Extended(residual, count, dimension)
+
+
 def checked_residual(name: str, value: Any, dimension: int) -> Residual | None:
     """The residual for vectors of this dimension, from `angles`, a function, or None."""
     if value is None:

@@ -501,6 +501,40 @@ def test_every_way_to_make_a_system_takes_angles(make):
     assert np.array_equal(*states)
 
 
+@pytest.mark.parametrize("residuals", [ANGLES, dict.fromkeys(ANGLES, turned)])
+@pytest.mark.parametrize("augment", [
+    qpmhe.noisy_inputs,
+    lambda system: qpmhe.augment_parameters(system, nominal=[2.0], parameter_bounds=qpmhe.Box(
+        [1.5], [2.5])),
+])
+def test_parameters_and_errors_of_inputs_are_plain_beside_angles(augment, residuals):
+    x, y, u = record(2.0, 60)
+    seen = np.column_stack((y[:, :2], wrapped(y[:, 2:])))
+    runs = []
+    for system, data in ((plain(), y), (plain(**residuals), seen)):
+        larger = augment(system)
+        k = larger.n - 3
+        cost = qpmhe.QuadraticCost.from_covariances(
+            prior=np.diag([0.25, 0.25, 0.09, *[1e-4] * k]),
+            disturbance=np.diag([4e-4] * 3 + [1e-4] * k), noise=COVARIANCES["noise"])
+        mhe = qpmhe.MovingHorizonEstimator(
+            larger, qpmhe.Luenberger(np.vstack((GAIN, np.zeros((k, 4))))), cost, horizon=8,
+            initial_state=[0.7, 0.0, 0.9, *[2.0 if larger.m == 1 else 0.0] * k], max_qps=2)
+        runs.append(mhe.run(data, u[:, : larger.m]))
+    np.testing.assert_allclose(runs[1].states, runs[0].states, rtol=1e-7, atol=1e-7)
+    assert np.abs(runs[1].states[20:, :2] - x[20:, :2]).max() < 0.5
+
+
+def test_a_smoothed_prior_may_be_on_another_turn():
+    _, y, u = record(2.0, 60)
+    seen = np.column_stack((y[:, :2], wrapped(y[:, 2:])))
+    runs = [
+        estimator(system, "extended", arrival="smoothed").run(data, u)
+        for system, data in ((plain(**SLOPES), y), (wrapping(**SLOPES), seen))
+    ]
+    assert_same_errors(runs[1], runs[0])
+
+
 def test_compiled_code_refuses_them_by_name():
     for name, one in ANGLES.items():
         system = from_casadi(**{name: one})
