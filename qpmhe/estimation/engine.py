@@ -154,9 +154,11 @@ class PythonEngine:
                 status |= Status.FAILED_STAGE
         trajectory, residuals, filtered = trial.trajectory, trial.residuals, None
         if outcome.improved:
-            offset = difference(
-                self._system.state_residual, trajectory[-1], candidate.trajectory[-1]
-            )
+            offset = trajectory[-1] - candidate.trajectory[-1]
+            if problem.wraps:
+                offset = difference(
+                    self._system.state_residual, trajectory[-1], candidate.trajectory[-1]
+                )
             if self._watch.note(offset, problem.prior_weight, bool(outcome.dropped)):
                 status |= Status.OBSERVER_FAR
         else:

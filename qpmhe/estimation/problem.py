@@ -65,6 +65,7 @@ class Formulation:
         self.prior_cost = contained(cost.prior_cost)
         self.observer_prior = cost.observer_prior
         self.discounted = cost.discount < 1.0
+        self.wraps = not (system.output_residual is None and system.state_residual is None)
         #: Weight of the initial error of the first window.
         self.prior_weight: Array = cost.initial_weight(observer.initial_covariance())
         self.prior_band = band_of(self.prior_weight)
@@ -118,18 +119,21 @@ class Problem:
         The candidate's linearised stages.
     time : int
         Time of the first state.
+    wraps : bool
+        Whether the system has residual functions.
     """
 
     __slots__ = (
         "_clip", "_formulation", "_has_noise_free", "_prior_band", "candidate", "constrained",
         "constraints", "discounts", "inputs", "measurements", "model", "observed", "prior",
-        "prior_moved", "prior_weight", "span", "stage_weights", "time",
+        "prior_moved", "prior_weight", "span", "stage_weights", "time", "wraps",
     )
 
     _clip: tuple[Array, Array] | None
 
     def __init__(self, formulation: Formulation, window: Window) -> None:
         self._formulation, view, cost = formulation, window.view, formulation.cost
+        self.wraps = formulation.wraps
         self.prior, self.measurements, self.span = view.prior, view.measurements, view.span
         self.time = window.time - window.length
         self.observed: NDArray[np.bool_] | None = None
@@ -228,8 +232,12 @@ class Problem:
             if self._has_noise_free:
                 trajectory = self._rolled_out(trajectory)
             residuals = self._residuals(trajectory)
+            offset = trajectory[0] - self.prior
+            if self.wraps:
+                self.wrap(residuals, trajectory)
+                offset = self.offset(trajectory)
             weights, cost = self._weights_and_cost(residuals)
-            cost += self._prior_cost(self.offset(trajectory))
+            cost += self._prior_cost(offset)
         except Exception as error:  # a model function outside its domain, or a user's loss
             residuals = np.full_like(self.candidate.residuals, np.nan)
             return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf, error)
@@ -269,25 +277,23 @@ class Problem:
         """Residuals w and v of each stage; raises what the model raises."""
         model = self.model
         if model.kernel is not None:
-            residuals = model.kernel.residuals(trajectory, self.measurements, self.inputs)
-            return self.wrapped(residuals, trajectory)
+            return model.kernel.residuals(trajectory, self.measurements, self.inputs)
         states = trajectory[:-1]
         # Concatenating contiguous differences is faster than writing into columns.
         disturbances = trajectory[1:] - model.f.batch(states, self.inputs)
         noises = self.measurements - model.h.batch(states, self.inputs)
-        residuals = np.concatenate((disturbances, noises), axis=1)
+        residuals: Array = np.concatenate((disturbances, noises), axis=1)
         if residuals.shape != self.candidate.residuals.shape or residuals.dtype != np.float64:
             raise TypeError("f or h returned other than real numbers of the right shape")
-        return self.wrapped(residuals, trajectory)
+        return residuals
 
-    def wrapped(self, residuals: Array, trajectory: Array) -> Array:
-        """Turn plain differences into residuals, in place."""
+    def wrap(self, residuals: Array, trajectory: Array) -> None:
+        """Turn the plain differences of a trajectory into residuals, in place."""
         n, model = trajectory.shape[1], self.model
         if model.state_residual is not None:
             model.state_residual.wrap(residuals[:, :n], trajectory[1:])
         if model.output_residual is not None:
             model.output_residual.wrap(residuals[:, n:], self.measurements)
-        return residuals
 
     def _weights_and_cost(self, residuals: Array) -> tuple[Array, float]:
         """The weights of `Trial`, and the stages' cost."""

@@ -52,15 +52,18 @@ class RunningObservers:
             now[failed] = start  # a state at which the model is likely to work
         self._evaluate(sample.system.h, now, sample.u, error)
         np.subtract(y, error, error)
-        self._wrap(sample.system.output_residual, error, y)
+        model = sample.system
+        if model.output_residual is not None:
+            self._wrap(model.output_residual, error, y)
         if sample.observed is not None:
             error[:, ~sample.observed] = 0.0
         self._evaluate(sample.system.f, now, sample.u, predicted)
         np.matmul(error, self._transposed_gain, correction)
         np.add(predicted, correction, ahead)
-        self._wrap(sample.system.state_residual, correction, ahead)
-        if (turns := sample.system.turns) is not None:
-            ahead[...], predicted[...] = turns(ahead), turns(predicted)
+        if model.state_residual is not None:
+            self._wrap(model.state_residual, correction, ahead)
+            if model.turns is not None:
+                ahead[...], predicted[...] = model.turns(ahead), model.turns(predicted)
         failed |= ~np.isfinite(np.einsum("ij,ij->i", ahead, ahead))  # its cost would overflow
         if self._nearest is None:
             return
@@ -71,12 +74,11 @@ class RunningObservers:
             except Exception:  # of linear algebra
                 failed[i] = True
 
-    def _wrap(self, residual: Residual | None, differences: Array, minuends: Array) -> None:
-        if residual is not None:
-            try:
-                residual.wrap(differences, minuends)
-            except Exception:  # a user's function
-                self.failed[:] = True
+    def _wrap(self, residual: Residual, differences: Array, minuends: Array) -> None:
+        try:
+            residual.wrap(differences, minuends)
+        except Exception:  # a user's function
+            self.failed[:] = True
 
     def _evaluate(self, function: BatchedFunction, states: Array, u: Array, values: Array) -> None:
         """Write a function's values at all states, and mark those at which it raises."""

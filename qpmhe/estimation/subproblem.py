@@ -116,7 +116,9 @@ class Subproblem:
         step = difference(problem.model.state_residual, trial.trajectory, around.trajectory)
         linearised = around.residuals + np.matmul(self._minus_jacobian, step[:-1, :, None])[:, :, 0]
         linearised[:, :n] += step[1:]
-        curvature = problem.wrapped(trial.residuals - linearised, trial.trajectory)
+        curvature = trial.residuals - linearised
+        if problem.wraps:
+            problem.wrap(curvature, trial.trajectory)
         values = qp.rows_times(step)
         missed = np.maximum(qp.row_lower - values, values - qp.row_upper)
         margin = 2.0 * np.maximum(missed, 0.0)
@@ -146,7 +148,9 @@ class Subproblem:
             )
             self._uniform = uniform
         # The candidate starts at the prior as a rule: no offset, and no gradient from it.
-        offset = self._no_offset if at_prior else problem.offset(trial.trajectory)
+        offset = self._no_offset if at_prior else trial.trajectory[0] - problem.prior
+        if problem.wraps and not at_prior:
+            offset = problem.offset(trial.trajectory)
         prior_band = problem.prior_band_at(offset)
         if prior_band is not self._prior_band:
             self._added_bands[0] = self._prior_band = prior_band
