@@ -27,6 +27,7 @@ from .estimation.estimator import MovingHorizonEstimator
 from .estimation.run import Run
 from .model.noisy_inputs import noisy_inputs
 from .model.parameters import augment_parameters
+from .model.residuals import angles
 from .model.sets import Box, ConvexSet, Polytope
 from .model.system import System
 from .observers import (
@@ -82,6 +83,7 @@ __all__ = [
     "System",
     "UnscentedKalman",
     "__version__",
+    "angles",
     "augment_parameters",
     "batch",
     "codegen",

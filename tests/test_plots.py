@@ -44,6 +44,25 @@ def test_states_with_bands(case):
     assert len(axes[0].figure.legends) == 1
 
 
+def test_estimates_of_angles_are_drawn_on_the_turn_of_the_truth():
+    system, observer, cost, scenario = qpmhe.models.vehicle()
+    record = scenario.simulate(0, 60)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=5, initial_state=scenario.initial_estimate)
+    run = mhe.run(record.measurements, record.inputs, covariances=True)
+    far = np.abs(run.states - record.states)[:, 2].max()
+    assert far > 6.0
+    for residual, most in ((None, np.inf), (system.state_residual, 1.0)):
+        panel = plots.states(run, truth=record.states, residual=residual)[2]
+        drawn = lines(panel)
+        error = np.abs(drawn["estimate"][:, 1] - drawn["real"][:, 1]).max()
+        assert error < most
+        assert error == far or residual is not None
+        low, high = panel.collections[0].get_paths()[0].get_extents().get_points()[:, 1]
+        assert low < drawn["estimate"][1:, 1].min()
+        assert high > drawn["estimate"][1:, 1].max()
+
+
 def test_the_window_stands_at_its_times(case):
     _, _, estimate = case
     axes = plots.window(estimate)

@@ -69,7 +69,11 @@ def _observer(example: Example, kind: str) -> Observer:
         return qpmhe.UnscentedKalman(prior=prior, **covariances)
     record = scenario.simulate(DESIGN_SEED)
     inputs = () if record.inputs is None else (record.inputs.mean(axis=0),)
-    about = (system, record.states.mean(axis=0), *inputs)
+    states = record.states
+    if system.state_residual is not None:  # angles that do not jump
+        steps = system.state_residual(states[1:], states[:-1])
+        states = np.vstack((states[:1], states[0] + np.cumsum(steps, axis=0)))
+    about = (system, states.mean(axis=0), *inputs)
     if kind == "steady":
         return qpmhe.SteadyStateKalman(*about, prior=prior, **covariances)
     if kind == "constant":

@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qpmhe_solvers.values import shown
+
 from .._checks import Array, numbers
 from ..errors import SetError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
+from .evidence import CertificateError
 
 # Of a polytope's vertices and corners, as starting points of searches; more add little.
 _MOST_CORNERS = 256
@@ -126,6 +129,13 @@ def bounded_region(
 ) -> Region:
     """Check a set of states, and put a box around it."""
     checked_system(system)
+    for name in ("output_residual", "state_residual"):
+        if getattr(system, name) is not None:
+            raise CertificateError(
+                f"the system has {name} = {shown(getattr(system, name))}: certificates take plain "
+                f"differences only. Leave {name} out, with outputs and states that do not wrap "
+                "within the region."
+            )
     if isinstance(region, Region):
         if region.n != system.n or region.lower.size != system.n + system.m:
             raise SetError(

@@ -36,6 +36,12 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             "engine='compiled' does not yet project the observer onto X; take engine='python', or "
             "leave states out."
         )
+    for name in ("output_residual", "state_residual"):
+        if getattr(system, name) is not None:
+            return (
+                f"engine='compiled' does not yet take a residual function; take engine='python', "
+                f"or leave {name} out."
+            )
     if observer.constant_gain is None or observer.filter_gain is None:
         return (
             f"{type(observer).__name__} has no C form; take an observer with constant gain "

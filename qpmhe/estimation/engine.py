@@ -17,6 +17,7 @@ from qpmhe_solvers.solver import ContainedSolver
 from .._checks import check_problem
 from ..costs import Cost
 from ..errors import InvalidInputError, ObserverWarning
+from ..model.residuals import difference
 from ..model.system import System
 from ..observers import Observer
 from .conditions import ConditionReader, Conditions, usual_conditions
@@ -207,6 +208,10 @@ class PythonEngine:
         trajectory, residuals, filtered = trial.trajectory, trial.residuals, None
         if outcome.improved:
             offset = trajectory[-1] - candidate.trajectory[-1]
+            if problem.wraps:
+                offset = difference(
+                    self._system.state_residual, trajectory[-1], candidate.trajectory[-1]
+                )
             if self._watch.note(offset, problem.prior_weight, bool(outcome.dropped)):
                 status |= Status.OBSERVER_FAR
         else:
@@ -350,7 +355,7 @@ class PythonEngine:
                 raise InvalidInputError("the model has no finite values along the estimate.")
             return window_covariances(
                 problem.model, trial.trajectory, problem.inputs, trial.weights,
-                problem.prior_weight_at(trial.trajectory[0] - problem.prior),
+                problem.prior_weight_at(problem.offset(trial.trajectory)),
                 problem.constraints.noise_free,
             )
 

@@ -646,6 +646,8 @@ def _inside(
 ) -> Array:
     if system.states is None:
         return state
+    if system.turns is not None:
+        state = system.turns(state)
     nearest = NearestPoint(system.states)
     if nearest.contains(state):
         return state

@@ -14,6 +14,7 @@ from qpmhe_solvers.qp import band_of
 from .._linalg import inverse
 from ..costs import Cost
 from ..model.functions import contained, raised_along
+from ..model.residuals import difference
 from ..model.system import System
 from ..observers import Observer
 from .constraints import Constraints
@@ -64,6 +65,7 @@ class Formulation:
         self.prior_cost = contained(cost.prior_cost)
         self.observer_prior = cost.observer_prior
         self.discounted = cost.discount < 1.0
+        self.wraps = not (system.output_residual is None and system.state_residual is None)
         #: Weight of the initial error of the first window.
         self.prior_weight: Array = cost.initial_weight(observer.initial_covariance())
         self.prior_band = band_of(self.prior_weight)
@@ -119,18 +121,22 @@ class Problem:
         The candidate's linearised stages.
     time : int
         Time of the first state.
+    wraps : bool
+        Whether the system has residual functions.
     """
 
     __slots__ = (
         "_clip", "_formulation", "_has_noise_free", "_prior_band", "candidate", "constrained",
         "constraints", "discounts", "inputs", "measurements", "model", "observed", "prior",
         "prior_moved", "prior_weight", "span", "stage_weights", "time", "usual_disturbances",
+        "wraps",
     )
 
     _clip: tuple[Array, Array] | None
 
     def __init__(self, formulation: Formulation, window: Window) -> None:
         self._formulation, view, cost = formulation, window.view, formulation.cost
+        self.wraps = formulation.wraps
         self.prior, self.measurements, self.span = view.prior, view.measurements, view.span
         self.time = window.time - window.length
         self.observed: NDArray[np.bool_] | None = None
@@ -170,11 +176,11 @@ class Problem:
 
     def _move_prior(self, prior: Array) -> None:
         """Take another prior mean, unless the candidate has no finite prior cost there."""
-        offset = self.candidate.trajectory[0] - prior
         try:
+            offset = difference(self.model.state_residual, self.candidate.trajectory[0], prior)
             cost = self._prior_cost(offset)
             self.prior_weight_at(offset)
-        except Exception:  # a user's loss
+        except Exception:  # a user's loss or residual
             return
         if math.isfinite(cost):
             self.prior, self.prior_moved = prior, True
@@ -219,6 +225,8 @@ class Problem:
 
     def clipped(self, trajectory: Array) -> Array:
         """Clip each state to its bounds, in place; return the trajectory."""
+        if self.model.turns is not None:
+            trajectory = self.model.turns(trajectory)
         if self._clip is not None:
             np.clip(trajectory, *self._clip, out=trajectory)
         return trajectory
@@ -229,8 +237,12 @@ class Problem:
             if self._has_noise_free:
                 trajectory = self._rolled_out(trajectory)
             residuals = self._residuals(trajectory)
+            offset = trajectory[0] - self.prior
+            if self.wraps:
+                self.wrap(residuals, trajectory)
+                offset = self.offset(trajectory)
             weights, cost = self._weights_and_cost(residuals)
-            cost += self._prior_cost(trajectory[0] - self.prior)
+            cost += self._prior_cost(offset)
         except Exception as error:  # a model function outside its domain, or a user's loss
             residuals = np.full_like(self.candidate.residuals, np.nan)
             return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf, error)
@@ -260,7 +272,11 @@ class Problem:
         for i in range(trajectory.shape[0] - 1):
             predicted = np.asarray(self.model.f(rolled_out[i], self.inputs[i]))
             rolled_out[i + 1, free] = predicted[free] + shift
-        return rolled_out
+        return rolled_out if self.model.turns is None else self.model.turns(rolled_out)
+
+    def offset(self, trajectory: Array) -> Array:
+        """The initial error x_0 [-] prior of a trajectory."""
+        return difference(self.model.state_residual, trajectory[0], self.prior)
 
     def _residuals(self, trajectory: Array) -> Array:
         """Residuals w and v of each stage; raises what the model raises."""
@@ -275,6 +291,14 @@ class Problem:
         if residuals.shape != self.candidate.residuals.shape or residuals.dtype != np.float64:
             raise TypeError("f or h returned other than real numbers of the right shape")
         return residuals
+
+    def wrap(self, residuals: Array, trajectory: Array) -> None:
+        """Turn the plain differences of a trajectory into residuals, in place."""
+        n, model = trajectory.shape[1], self.model
+        if model.state_residual is not None:
+            model.state_residual.wrap(residuals[:, :n], trajectory[1:])
+        if model.output_residual is not None:
+            model.output_residual.wrap(residuals[:, n:], self.measurements)
 
     def _weights_and_cost(self, residuals: Array) -> tuple[Array, float]:
         """The weights of `Trial`, and the stages' cost."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.functions import BatchedFunction
+from ..model.residuals import Residual
 from ..observers import Sample
 from ..observers.projection import NearestPoint
 
@@ -53,11 +54,18 @@ class RunningObservers:
             now[failed] = start  # a state at which the model is likely to work
         self._evaluate(sample.system.h, now, sample.u, error)
         np.subtract(y, error, error)
+        model = sample.system
+        if model.output_residual is not None:
+            self._wrap(model.output_residual, error, y)
         if sample.observed is not None:
             error[:, ~sample.observed] = 0.0
         self._evaluate(sample.system.f, now, sample.u, predicted)
         np.matmul(error, self._transposed_gain, correction)
         np.add(predicted, correction, ahead)
+        if model.state_residual is not None:
+            self._wrap(model.state_residual, correction, ahead)
+            if model.turns is not None:
+                ahead[...], predicted[...] = model.turns(ahead), model.turns(predicted)
         failed |= ~np.isfinite(np.einsum("ij,ij->i", ahead, ahead))  # its cost would overflow
         nearest = self.nearest
         if nearest is None:
@@ -68,6 +76,12 @@ class RunningObservers:
                 self._events[i] = self._keep_inside(predicted[i], ahead[i], correction[i])
             except Exception:  # of linear algebra
                 failed[i] = True
+
+    def _wrap(self, residual: Residual, differences: Array, minuends: Array) -> None:
+        try:
+            residual.wrap(differences, minuends)
+        except Exception:  # a user's function
+            self.failed[:] = True
 
     def _evaluate(self, function: BatchedFunction, states: Array, u: Array, values: Array) -> None:
         """Write a function's values at all states, and mark those at which it raises."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..costs import Cost
 from ..errors import InvalidInputError
+from ..model.residuals import Residual
 from ..model.system import System, probe_points
 from ..observers import Observer
 from .settings import Settings
@@ -40,6 +41,10 @@ def described(
         found["number of parameters"] = len(settings.parameters)
     for name in SET_NAMES:
         _describe(f"set of {name}", getattr(system, name), found)
+    for name, size in (("output_residual", system.p), ("state_residual", system.n)):
+        residual = getattr(system, name)
+        if residual is not None:
+            found[name] = _values_of(residual, size)
     _describe("observer", observer, found)
     _describe("cost", cost, found)
     for name in ("prior", "disturbance", "noise", "discount"):
@@ -54,6 +59,13 @@ def described(
                 continue
         found[f"model ({name})"] = values
     return found
+
+
+def _values_of(residual: Residual, size: int) -> Array:
+    """Differences of points of all magnitudes: who wraps them otherwise is another."""
+    a, b = np.random.default_rng(20210829).uniform(-1.0, 1.0, (2, 32, size))
+    powers = np.arange(-8, 24)[:, None]
+    return residual(np.ldexp(a, powers), np.ldexp(b, powers))
 
 
 def _describe(name: str, value: Any, found: dict[str, Any]) -> None:

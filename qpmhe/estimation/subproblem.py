@@ -12,6 +12,7 @@ from qpmhe_solvers.qp import band_of
 
 from ..costs import Cost
 from ..model.functions import raised_along
+from ..model.residuals import difference
 from ..model.system import System
 from .constraints import Constraints, Rows
 from .limits import BEYOND
@@ -111,10 +112,13 @@ class Subproblem:
         trial up to third order: a second-order correction. The rows are also tightened: by a
         share of the shift, for the third order, and by twice what the solver's step misses.
         """
-        n, step = self._n, trial.trajectory - around.trajectory
+        n = self._n
+        step = difference(problem.model.state_residual, trial.trajectory, around.trajectory)
         linearised = around.residuals + np.matmul(self._minus_jacobian, step[:-1, :, None])[:, :, 0]
         linearised[:, :n] += step[1:]
         curvature = trial.residuals - linearised
+        if problem.wraps:
+            problem.wrap(curvature, trial.trajectory)
         values = qp.rows_times(step)
         missed = np.maximum(qp.row_lower - values, values - qp.row_upper)
         margin = 2.0 * np.maximum(missed, 0.0)
@@ -144,6 +148,8 @@ class Subproblem:
             self._uniform = uniform
         # The candidate starts at the prior as a rule: no offset, and no gradient from it.
         offset = self._no_offset if at_prior else trial.trajectory[0] - problem.prior
+        if problem.wraps and not at_prior:
+            offset = problem.offset(trial.trajectory)
         prior_band = problem.prior_band_at(offset)
         if prior_band is not self._prior_band:
             self._added_bands[0] = self._prior_band = prior_band

@@ -91,6 +91,8 @@ class Window(Stages):
         small = horizon * horizon * (2 * n + p) <= _MOST_RUNNING
         if reinitialized and gain is not None and small and simple and self._covariances is None:
             self._observers = RunningObservers(gain, horizon, self._nearest, self._keep_inside)
+        self._output_residual, self._state_residual = system.output_residual, system.state_residual
+        self._turns = system.turns
         self._correct = contained(observer.correct)
         self._has_filter = type(observer).filter is not Observer.filter
         self._evaluate_costs, self._majorise = contained(cost.stage_costs), contained(cost.majorise)
@@ -398,6 +400,9 @@ class Window(Stages):
             view.z_next[...], output, jacobian = kernel.stage(view.z, u)
             np.subtract(view.y, output, terms.noise)
             np.negative(jacobian, terms.linear[:, 1:])
+        if self._output_residual is not None:
+            self._evaluating = "output_residual"
+            self._output_residual.wrap(terms.noise, view.y)
         if observed is not None:
             terms.noise[~observed] = 0.0
 
@@ -429,6 +434,12 @@ class Window(Stages):
         terms.disturbance[...] = correction
         predicted = z_next.copy() if self._nearest is not None else None
         z_next += correction
+        if self._state_residual is not None:
+            self._evaluating = "state_residual"
+            self._state_residual.wrap(terms.disturbance, z_next)
+            if self._turns is not None:
+                z_next[...] = self._turns(z_next)
+                predicted = None if predicted is None else self._turns(predicted)
         if self._covariances is not None:
             if posterior is None or not np.isfinite(posterior).all():
                 return False
@@ -473,6 +484,8 @@ class Window(Stages):
                 found = nearest(inside + correction, covariance)
         z_next[...] = found.point
         np.subtract(z_next, predicted, correction)
+        if self._state_residual is not None:
+            self._state_residual.wrap(correction, z_next)
         return events if found.reached else events | _METRIC_SINGULAR
 
     def filtered(self) -> Array | None:
@@ -487,6 +500,8 @@ class Window(Stages):
             state = np.array(found[0], np.float64)
             if not np.isfinite(state).all():
                 return None
+            if self._turns is not None:
+                state = self._turns(state)
             if self._nearest is not None and not self._nearest.contains(state):
                 state = self._nearest(state, found[1]).point
         except Exception:  # a user's observer: z(t) serves instead

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError
 from .functions import BatchedFunction, Probes, Trusted
+from .residuals import Residual
 from .sets import ConvexSet
 
 Array = NDArray[Any]
@@ -54,8 +55,9 @@ class Jacobian:
         inputs: int,
         probes: Probes,
         states: ConvexSet | None = None,
+        residual: Residual | None = None,
     ) -> None:
-        self.function, self._inputs = function, inputs
+        self.function, self._inputs, self._residual = function, inputs, residual
         n = probes[0][0].size
         self._eye: Array = np.eye(n)
         self._bounds = None if states is None else (states.lower, states.upper)
@@ -127,17 +129,25 @@ class Jacobian:
         # Copies: a function may return one and the same array every time.
         if side is None:
             ahead = np.array(self.function.batch(at + moves, u_all))
-            behind = np.asarray(self.function.batch(at - moves, u_all))
+            behind = self._aligned(self.function.batch(at - moves, u_all), ahead)
             return np.swapaxes((ahead - behind) / (2 * length), -1, -2)
         side = side[..., columns, None]
         central = side == 0.0
         value = np.array(self.function.batch(x, u))[..., None, :]
         near = np.array(self.function.batch(at + np.where(central, 1.0, side) * moves, u_all))
-        far = np.asarray(
-            self.function.batch(at + np.where(central, -1.0, 2.0 * side) * moves, u_all)
+        far = self._aligned(
+            self.function.batch(at + np.where(central, -1.0, 2.0 * side) * moves, u_all), value
         )
+        near = self._aligned(near, value)
         rise = np.where(central, near - far, side * (4.0 * near - far - 3.0 * value))
         return np.swapaxes(rise / (2 * length), -1, -2)
+
+    def _aligned(self, values: Array, references: Array) -> Array:
+        """Values on the turn of others nearby, where an angle may jump between them."""
+        values = np.asarray(values)
+        if self._residual is None:
+            return values
+        return self._residual.aligned(values, np.broadcast_to(references, values.shape))
 
     def _side(self, x: Array, step: Array) -> Array | None:
         """1 or -1 where a central difference would leave the bounds and this side has room."""
@@ -313,7 +323,8 @@ class Jacobian:
             for j, step in enumerate(sign * _DIFFERENCE_STEP * size):
                 try:
                     with np.errstate(all="ignore"):
-                        side[:, j] = (self.function(x + step * self._eye[j], u) - value) / step
+                        ahead = self._aligned(self.function(x + step * self._eye[j], u), value)
+                        side[:, j] = (ahead - value) / step
                 except Exception:  # outside the function's domain
                     continue
             sides.append(side)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InvalidInputError
 from .augmentation import Augmentation, augmented, chosen, product
 from .functions import Trusted
+from .residuals import extended
 from .system import System, SystemOptions, checked_system
 
 Array = NDArray[Any]
@@ -74,6 +75,8 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
         "states": product(system.states, n, None, noisy.size),
         "disturbances": product(system.disturbances, n, None, noisy.size),
         "noises": system.noises,
+        "output_residual": system.output_residual,
+        "state_residual": extended(system.state_residual, n, n + noisy.size),
     }
     held = augmented(system, Augmentation(n, m, np.zeros(0), noisy), **options)
     made = _without_memory(held, n, options)

@@ -15,6 +15,7 @@ from .._checks import dimension, flag, numbers
 from ..errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
 from .augmentation import Augmentation, augmented, chosen, product
 from .functions import BatchedFunction, Parametric, Probes
+from .residuals import extended
 from .sets import Box, ConvexSet
 from .system import System, checked_set, probe_points
 
@@ -150,6 +151,8 @@ def augment_parameters(
         "noises": noises,
     }
     if isinstance(f, System):
+        options["output_residual"] = f.output_residual
+        options["state_residual"] = extended(f.state_residual, n, change.n)
         system = augmented(f, change, **options)
     else:
         probes = _probes(probe_points(states, n, m), values, moved, parameter_bounds)

@@ -17,6 +17,7 @@ from ..errors import InvalidInputError, ModelError, OptionError, SetError
 from .derivatives import Jacobian
 from .discretize import discretize
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
+from .residuals import Residual, Turns, checked_residual
 from .sets import ConvexSet
 
 if TYPE_CHECKING:
@@ -46,6 +47,8 @@ class SystemOptions(TypedDict, total=False):
     disturbances: ConvexSet | None
     noises: ConvexSet | None
     scales: ArrayLike | None
+    output_residual: Residual | Function | None
+    state_residual: Residual | Function | None
 
 
 class _Moved:
@@ -95,14 +98,22 @@ class System:
         shares of them, and a given Jacobian is compared with differences where they are known.
         Left out, an estimator takes the standard deviations of its prior; a system alone takes
         1 for its steps and compares nothing.
+    output_residual, state_residual : Angles or callable, optional
+        How outputs, and states, are subtracted, where components are angles: `qpmhe.angles`, or
+        a function (a, b) of two vectors to a [-] b. It is zero where a = b, and a - b but for
+        constants, such as whole turns, everywhere. Then :math:`v = y \ominus h` and
+        :math:`w = x(t+1) \ominus f`, which W and V bound. Bounds of X on an angle hold for the
+        state moved by whole turns to between them, if they can.
 
     Raises
     ------
     ModelError
         If a function returns the wrong shape, changes its argument, or a given Jacobian is
-        not the derivative.
+        not the derivative, or a residual function not a difference.
+    InvalidInputError
+        If a component that does not exist is declared an angle.
     SetError
-        If a set has the wrong dimension.
+        If a set has the wrong dimension, or X an angle in a general row or with one bound only.
     OptionError, ShapeError
         If a scale is not above zero, or there is not one for each state.
 
@@ -129,6 +140,8 @@ class System:
         disturbances: ConvexSet | None = None,
         noises: ConvexSet | None = None,
         scales: ArrayLike | None = None,
+        output_residual: Residual | Function | None = None,
+        state_residual: Residual | Function | None = None,
     ) -> None:
         self.n, self.p, self.m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m, 0)
         #: Typical magnitudes of the states, (n,); None if they are not known.
@@ -138,12 +151,24 @@ class System:
         self.states = checked_set("states", states, self.n)
         self.disturbances = checked_set("disturbances", disturbances, self.n)
         self.noises = checked_set("noises", noises, self.p)
+        #: How outputs and states are subtracted; None for plain differences.
+        self.output_residual = checked_residual("output_residual", output_residual, self.p)
+        self.state_residual = checked_residual("state_residual", state_residual, self.n)
+        #: Moves angles into the turn between their bounds; None where X bounds no angle.
+        self.turns: Turns | None = None
+        if self.states is not None and self.state_residual is not None:
+            turns = Turns(self.state_residual, self.states)
+            self.states, self.turns = turns.states, turns or None
         probes = probe_points(self.states, self.n, self.m)
         self.f = BatchedFunction("f", f, (self.n,), self.m, probes)
         self.h = BatchedFunction("h", h, (self.p,), self.m, probes)
         check_inputs(self.m, f=self.f.takes_input, h=self.h.takes_input)
-        self.f_jacobian = Jacobian(self.f, f_jacobian, self.m, probes, self.states)
-        self.h_jacobian = Jacobian(self.h, h_jacobian, self.m, probes, self.states)
+        self.f_jacobian = Jacobian(
+            self.f, f_jacobian, self.m, probes, self.states, self.state_residual
+        )
+        self.h_jacobian = Jacobian(
+            self.h, h_jacobian, self.m, probes, self.states, self.output_residual
+        )
         #: The Jacobian of the rate of a discretised ODE, where the user gave it.
         self.rate_jacobian: Jacobian | None = None
         if scales is not None:
@@ -168,6 +193,7 @@ class System:
                 "f_jacobian": f_jacobian, "h_jacobian": h_jacobian,
                 "states": states, "disturbances": disturbances, "noises": noises,
                 "scales": scales,
+                "output_residual": output_residual, "state_residual": state_residual,
             },
         )
 

@@ -12,6 +12,7 @@ from qpmhe_solvers.values import finite, shown
 
 from .._checks import Array, count, dimension, positive, positive_definite, vector
 from ..errors import InvalidInputError, ModelError, OptionError
+from ..model.residuals import difference
 from ..model.sets import ConvexSet
 from ..model.system import System, checked_system
 
@@ -51,6 +52,7 @@ class Scenario:
     Disturbance and noise are normal and white. Where the system has sets, they are truncated:
     w(t) to those with :math:`w \in \mathbb W` and :math:`f(x, u) + w \in \mathbb X`, v(t) to
     :math:`\mathbb V`, by drawing again. Components of a set that have zero width are set.
+    Angles are recorded between minus and plus half a period, or in the turn about their bounds.
 
     Parameters
     ----------
@@ -105,7 +107,7 @@ class Scenario:
         checked_system(self.system)
         n, p = self.system.n, self.system.p
         for name in ("initial_state", "initial_estimate"):
-            state = vector(name, getattr(self, name), n)
+            state = _within_turn(self.system, vector(name, getattr(self, name), n))
             _check_member(name, state, self.system.states)
             object.__setattr__(self, name, state)
         for name, size in (("disturbance_covariance", n), ("noise_covariance", p)):
@@ -166,8 +168,9 @@ class Scenario:
             noise = _inside(v[t], spread_v, generator, (system.noises, 0.0))
             if noise is None:
                 raise ModelError(f"no noise of sample {t} lies in {system.noises!r}; widen it.")
-            measurements[t] = self._measured(system.h(x, u), noise)
-            reached = system.f(x, u)
+            measured = self._measured(system.h(x, u), noise)
+            measurements[t] = difference(system.output_residual, measured, np.zeros(system.p))
+            reached = _within_turn(system, system.f(x, u))
             disturbance = _inside(
                 w[t], spread_w, generator, (system.disturbances, 0.0), (system.states, reached)
             )
@@ -176,7 +179,7 @@ class Scenario:
                     f"the simulated state cannot go on inside of the sets at sample {t}: it is "
                     f"{reached.tolist()} without disturbance. Widen the sets, or simulate less."
                 )
-            states[t + 1] = reached + disturbance
+            states[t + 1] = _within_turn(system, reached + disturbance)
         return Record(states, measurements, inputs if system.m else None)
 
     def _measured(self, output: Array, noise: Array) -> Array:
@@ -189,6 +192,13 @@ class Scenario:
 
 def _factor(covariance: Array) -> Array:
     return np.asarray(np.linalg.cholesky(covariance).T, np.float64)
+
+
+def _within_turn(system: System, state: Array) -> Array:
+    if system.state_residual is None:
+        return state
+    state = system.state_residual(state, np.zeros(system.n))
+    return state if system.turns is None else system.turns(state)
 
 
 def _check_member(name: str, state: Array, states: ConvexSet | None) -> None:

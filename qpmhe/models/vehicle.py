@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
+from ..model.residuals import angles
 from ..model.system import System
 from ..observers import OutputInjection
 from .example import Array, Example, make_example
 
-# East of all of the path, so that atan2 does not jump on it.
 _BEACONS = np.array([[9.0, -5.0], [10.0, 6.0]])  # m
 _DT = 0.2  # s
 _RANGE_NOISE, _BEARING_NOISE = 0.2, 0.05  # m, rad
@@ -85,9 +85,9 @@ def vehicle(method: str = "rk4") -> Example:
 
     State (position in m, heading in rad), inputs speed (m/s) and turn rate (rad/s), known
     beacons :math:`b_1 = (9, -5)` m and :math:`b_2 = (10, 6)` m. The driver of the scenario,
-    who knows where he is, follows a figure eight of 10 m by 5 m; the beacons stand east of
-    it, so that y is smooth all along. Bearings are not wrapped: they go on beyond
-    :math:`\pm\pi` as the heading does, which a front end does that follows them.
+    who knows where he is, follows a figure eight of 10 m by 5 m. Heading and bearings are
+    angles, recorded in :math:`[-\pi, \pi)`: both jump on the path, and `qpmhe.angles`
+    declares them.
 
     The sampling time is 0.2 s, N = 20; disturbances have standard deviations of 0.02 m and
     0.02 rad a step, the noise 0.2 m and 0.05 rad. The estimation starts 1 m and 1.1 m beside
@@ -108,6 +108,7 @@ def vehicle(method: str = "rk4") -> Example:
     system = System.from_ode(
         _rate, _output, dt=_DT, n=3, p=4, m=2, method=method,
         rate_jacobian=_rate_jacobian, h_jacobian=_output_jacobian,
+        output_residual=angles([2, 3]), state_residual=angles([2]),
     )
     return make_example(
         system, OutputInjection(_correction), prior=[1.0, 1.0, 0.5],

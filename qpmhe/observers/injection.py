@@ -12,6 +12,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import Array, positive_definite
 from ..errors import ModelError
+from ..model.residuals import difference
 from ..model.system import System
 from .base import Observer, Sample
 
@@ -94,5 +95,5 @@ def _change_of_output(system: System, one: Array, other: Array) -> Array:
             )
     except Exception:  # outside its domain
         return np.zeros(system.p)
-    change = second - first
+    change = difference(system.output_residual, second, first)
     return change if np.isfinite(change).all() else np.zeros(system.p)

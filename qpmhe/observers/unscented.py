@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from .._checks import Array, positive
 from .._linalg import solve
+from ..model.residuals import difference
 from ..model.sets import ConvexSet
 from .base import KalmanType, Sample
 
@@ -82,7 +83,7 @@ class UnscentedKalman(KalmanType):
         """K v and the next covariance; see `Observer.correct`."""
         _, points, roots, inputs = self._sigma_points(z, sample)
         f = sample.system.f.batch(points, inputs)
-        ahead: Array = (f[1:] - f[0]) * roots
+        ahead: Array = difference(sample.system.state_residual, f[1:], f[0]) * roots
         seen, r, v = self._seen(points, inputs, roots, v, sample)
         if v.size == 0:
             return np.zeros_like(z), ahead.T @ ahead + self._disturbance_of(sample)
@@ -123,9 +124,10 @@ class UnscentedKalman(KalmanType):
     ) -> tuple[Array, Array, Array]:
         """Deviations, noise covariance and fitting error of the outputs that are there."""
         h, r, there = sample.system.h.batch(points, inputs), self._noise_of(sample), sample.observed
+        seen = difference(sample.system.output_residual, h[1:], h[0])
         if there is not None:
-            h, r, v = h[:, there], r[np.ix_(there, there)], v[there]
-        return (h[1:] - h[0]) * roots, r, v
+            seen, r, v = seen[:, there], r[np.ix_(there, there)], v[there]
+        return seen * roots, r, v
 
 
 def _inside(z: Array, moves: Array, states: ConvexSet) -> tuple[Array, Array]:

@@ -14,11 +14,12 @@ from .style import REAL, STYLES, panels
 if TYPE_CHECKING:
     from ..estimation.estimate import Estimate
     from ..estimation.run import Run
+    from ..model.residuals import Residual
 
 
 def trajectories(
     times: Array, truth: Array | None, estimates: Mapping[str, Array], labels: Sequence[str],
-    time_label: str, axes: Any = None,
+    time_label: str, axes: Any = None, *, residual: Residual | None = None,
 ) -> list[Any]:
     """True states and estimates over time, one panel a state, as in the paper's figure.
 
@@ -36,6 +37,9 @@ def trajectories(
         Label of the time axis, with its unit.
     axes : sequence of n matplotlib Axes, optional
         Where to draw; a figure is made if left out: ``axes[0].figure`` of the axes returned.
+    residual : optional
+        The system's ``state_residual``: the estimates of angles are drawn on the turn on which
+        the truth is.
 
     Raises
     ------
@@ -48,6 +52,8 @@ def trajectories(
     length, n = when.size, len(names)
     curves = named_curves(estimates, length, n, len(STYLES))
     real = None if truth is None else curve("truth", truth, length, n)
+    if real is not None and residual is not None:
+        curves = {label: residual.aligned(values, real) for label, values in curves.items()}
     drawn = panels(n, axes)
     for j, panel in enumerate(drawn):
         if real is not None:
@@ -64,7 +70,7 @@ def trajectories(
 def states(
     run: Run, *, dt: float = 1.0, labels: Sequence[str] | None = None,
     time_label: str = "time t (samples)", truth: Array | None = None, sigmas: float = 2.0,
-    axes: Any = None,
+    axes: Any = None, residual: Residual | None = None,
 ) -> list[Any]:
     """The estimates of a run, with bands of their covariances where it has them.
 
@@ -74,7 +80,7 @@ def states(
         Of `MovingHorizonEstimator.run`, with ``covariances=True`` for the bands.
     dt : float
         Time between samples, in the unit of ``time_label``.
-    labels, time_label, truth, axes
+    labels, time_label, truth, axes, residual
         As for `trajectories`.
     sigmas : float
         Half the width of a band, in standard deviations.
@@ -93,13 +99,15 @@ def states(
     times = positive("dt", dt) * np.arange(count, dtype=np.float64)
     sigmas = positive("sigmas", sigmas)
     drawn = trajectories(
-        times, truth, {"estimate": run.states}, _names(labels, n), time_label, axes
+        times, truth, {"estimate": run.states}, _names(labels, n), time_label, axes,
+        residual=residual,
     )
     if run.covariances is not None and len(run):
         half = sigmas * np.sqrt(np.diagonal(run.covariances, axis1=1, axis2=2))
         for j, panel in enumerate(drawn):
+            middle = panel.lines[-1].get_ydata()[1:]
             panel.fill_between(
-                times[1:], run.states[1:, j] - half[:, j], run.states[1:, j] + half[:, j],
+                times[1:], middle - half[:, j], middle + half[:, j],
                 color=STYLES[0]["color"], alpha=0.18, linewidth=0.0,
                 label=f"± {sigmas:g} standard deviations",
             )

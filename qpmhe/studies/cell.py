@@ -136,16 +136,17 @@ def _measured(task: Task, limit: float) -> Result:
     if "time" in task.parts:
         _warm_up(task, limit)
     run = _run(_estimator(example, task), record, limit, "covariance" in task.parts)
-    scenario = example.scenario
+    scenario, residual = example.scenario, example.system.state_residual
     settled = int(np.ceil(scenario.settling_time / scenario.dt - 1e-9))
     row: Result = {
         **_fields(task), "outcome": "done", "reason": "", "environment": environment(),
-        **metrics.accuracy(run.states, record.states, settled), **metrics.outcomes(run),
+        **metrics.accuracy(run.states, record.states, settled, residual),
+        **metrics.outcomes(run),
     }
     if "time" in task.parts:
         row |= metrics.timing(run.times)
     if run.covariances is not None:
-        row["nees"] = metrics.consistency(run.states, record.states, run.covariances)
+        row["nees"] = metrics.consistency(run.states, record.states, run.covariances, residual)
     if "accuracy" in task.parts:
         try:
             reference = _reference(task, record, limit)
@@ -156,7 +157,9 @@ def _measured(task: Task, limit: float) -> Result:
     if task.keep:
         row["trajectory"] = {
             "times": scenario.dt * np.arange(cell.steps + 1, dtype=np.float64),
-            "states": record.states, "estimates": run.states,
+            "states": record.states,
+            "estimates": run.states if residual is None
+            else residual.aligned(run.states, record.states),
             "labels": list(scenario.labels), "title": scenario.title,
             "time_unit": scenario.time_unit,
         }

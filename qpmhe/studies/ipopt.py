@@ -15,6 +15,7 @@ from ..errors import InvalidInputError
 from ..estimation.estimate import Estimate, Status
 from ..estimation.problem import Formulation
 from ..estimation.window import Window
+from ..model.residuals import Angles, Residual
 from ..model.system import System
 from ..observers import Observer
 
@@ -83,12 +84,13 @@ class IpoptEstimator:
         ca, n, p = self._casadi, self._system.n, self._system.p
         states = ca.SX.sym("x", n, count + 1)
         prior, measured = ca.SX.sym("prior", n), ca.SX.sym("y", p, count)
-        offset = states[:, 0] - prior
+        offset = self._wrapped(self._system.state_residual, states[:, 0] - prior)
         objective = offset.T @ self._prior @ offset
         disturbances, noises = [], []
         for i in range(count):
-            disturbances.append(states[:, i + 1] - self._f(states[:, i]))
-            noises.append(measured[:, i] - self._h(states[:, i]))
+            w, v = states[:, i + 1] - self._f(states[:, i]), measured[:, i] - self._h(states[:, i])
+            disturbances.append(self._wrapped(self._system.state_residual, w))
+            noises.append(self._wrapped(self._system.output_residual, v))
             objective += disturbances[i].T @ self._cost.disturbance @ disturbances[i]
             objective += noises[i].T @ self._cost.noise @ noises[i]
         rows, bounds = self._rows(ca.horzsplit(states), disturbances, noises)
@@ -108,6 +110,18 @@ class IpoptEstimator:
         }
         self._programs[count] = ca.nlpsol("mhe", "ipopt", program, self._options), limits
         return self._programs[count]
+
+    def _wrapped(self, residual: Residual | None, plain: Any) -> Any:
+        """The same branch as in `Angles.wrap`; its derivative is that of the difference."""
+        if residual is None:
+            return plain
+        if not isinstance(residual, Angles):
+            raise InvalidInputError(
+                "the comparison with Ipopt takes residual functions made by qpmhe.angles only."
+            )
+        for j, period in zip(residual.components.tolist(), residual.periods.tolist(), strict=True):
+            plain[j] -= period * self._casadi.floor(plain[j] / period + 0.5)
+        return plain
 
     def _rows(
         self, states: list[Any], disturbances: list[Any], noises: list[Any]

@@ -9,6 +9,7 @@ import numpy as np
 from .._checks import Array
 from ..estimation.estimate import Status
 from ..estimation.run import Run
+from ..model.residuals import Residual, difference
 
 _FAILURES = (
     Status.SOLVER_FAILED | Status.NO_DECREASE | Status.MODEL_FAILED | Status.FAILED_STAGE
@@ -16,7 +17,9 @@ _FAILURES = (
 )
 
 
-def accuracy(estimates: Array, states: Array, settled: int) -> dict[str, Any]:
+def accuracy(
+    estimates: Array, states: Array, settled: int, residual: Residual | None = None
+) -> dict[str, Any]:
     r"""Root mean square errors of the estimates of x(0), ..., x(T), arrays of (T + 1, n).
 
     ``rmse_states`` lists the error :math:`\epsilon_j` of each state in its unit over all t,
@@ -28,12 +31,13 @@ def accuracy(estimates: Array, states: Array, settled: int) -> dict[str, Any]:
         s_j^2 = \frac1{T+1} \sum_{t=0}^T (x_j(t) - \hat x_j(0))^2
 
     with the scales of `scales`: 1 is the error of keeping the initial estimate for ever. NaN
-    where no time counts as settled.
+    where no time counts as settled. Differences are those of the system's state residual.
     """
     with np.errstate(all="ignore"):
-        sizes = scales(states, estimates[0])
-        squares = (estimates - states) ** 2
-        late, relative = squares[settled:], ((estimates - states) / sizes) ** 2
+        sizes = scales(states, estimates[0], residual)
+        errors = difference(residual, estimates, states)
+        squares = errors**2
+        late, relative = squares[settled:], (errors / sizes) ** 2
         return {
             "rmse": _root(relative),
             "rmse_settled": _root(relative[settled:]),
@@ -42,13 +46,13 @@ def accuracy(estimates: Array, states: Array, settled: int) -> dict[str, Any]:
         }
 
 
-def scales(states: Array, initial_estimate: Array) -> Array:
+def scales(states: Array, initial_estimate: Array, residual: Residual | None = None) -> Array:
     """Each state's root mean square distance from its initial estimate, which is a scale (n,).
 
     A state that never leaves its initial estimate has its own size as scale, and one that is
     always zero has its unit.
     """
-    distance = np.sqrt(((states - initial_estimate) ** 2).mean(axis=0))
+    distance = np.sqrt((difference(residual, states, initial_estimate) ** 2).mean(axis=0))
     size = np.abs(states).max(axis=0)
     found: Array = np.where(distance > 0.0, distance, np.where(size > 0.0, size, 1.0))
     return found
@@ -58,7 +62,9 @@ def _root(squares: Array) -> float:
     return float(np.sqrt(squares.mean())) if squares.size else float("nan")
 
 
-def consistency(estimates: Array, states: Array, covariances: Array) -> float:
+def consistency(
+    estimates: Array, states: Array, covariances: Array, residual: Residual | None = None
+) -> float:
     r"""The mean normalised estimation error squared (NEES), n on average if consistent.
 
     .. math::
@@ -67,7 +73,8 @@ def consistency(estimates: Array, states: Array, covariances: Array) -> float:
     Times at which P(t), (T, n, n) in all, is not finite or singular are left out.
     """
     values = []
-    for error, covariance in zip(estimates[1:] - states[1:], covariances, strict=True):
+    errors = difference(residual, estimates[1:], states[1:])
+    for error, covariance in zip(errors, covariances, strict=True):
         try:
             values.append(float(error @ np.linalg.solve(covariance, error)))
         except np.linalg.LinAlgError:

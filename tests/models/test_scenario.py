@@ -47,6 +47,28 @@ def test_feedback_sees_the_true_state_and_cannot_change_it():
     assert np.array_equal(U, -0.5 * X[:-1])
 
 
+def test_angles_are_recorded_in_one_turn():
+    def made(states=None, **changes):
+        of = qpmhe.System(
+            lambda x: x + 40.0, lambda x: x, n=1, p=1, states=states,
+            output_residual=qpmhe.angles([0], 360.0), state_residual=qpmhe.angles([0], 360.0))
+        changes = {"disturbance_covariance": [[4.0]], "initial_state": [200.0]} | changes
+        return scenario(of, **changes)
+
+    X, Y = made().simulate(0, 200)
+    assert X[0] == -160.0
+    for angle in (X, Y):
+        assert -180.0 <= angle.min() < -150.0 < 150.0 < angle.max() < 180.0
+    assert np.abs(qpmhe.angles([0], 360.0)(X[1:], X[:-1]) - 40.0).max() < 10.0
+    # Where X bounds the angle, in the turn about its bounds.
+    bounds = qpmhe.Box([10.0], [350.0])
+    X, _ = made(bounds, initial_state=[-160.0], initial_estimate=[-300.0]).simulate(0, 3)
+    assert X[0] == 200.0
+    assert (np.diff(X[:, 0]) > 30.0).all()
+    with pytest.raises(InvalidInputError, match="outside of the state set"):
+        made(bounds, initial_estimate=[5.0])
+
+
 def test_noise_is_truncated_to_its_sets():
     of = system(disturbances=qpmhe.Box([-0.2], [0.1]), noises=qpmhe.Box([-0.05], [0.1]))
     record = scenario(of, steps=4000).simulate(0)

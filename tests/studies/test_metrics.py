@@ -208,3 +208,22 @@ def test_models_with_inputs_are_run_with_them():
     row = row_of(1, backend="auto", horizon=5, model=name, keep=True)
     assert row["trajectory"]["estimates"] == pytest.approx(run.states, rel=1e-9, abs=1e-12)
     np.testing.assert_array_equal(row["trajectory"]["states"], record.states)
+
+
+def test_errors_of_angles_are_those_of_the_shorter_way_round():
+    rng = np.random.default_rng(2)
+    t = np.arange(60.0)
+    states = np.column_stack((np.sin(0.1 * t), 180.0 + 20.0 * np.sin(0.2 * t)))
+    estimates = states + rng.standard_normal((60, 2)) * [0.1, 4.0]
+    covariances = np.tile(np.diag([0.01, 16.0]), (59, 1, 1))
+    assert np.abs(states[:, 1] - estimates[0, 1]).max() < 180.0  # the same scale, then
+    residual = qpmhe.angles([1], 360.0)
+    wrapped = [residual(one, np.zeros(2)) for one in (estimates, states)]
+    assert np.abs(np.diff(wrapped[1][:, 1])).max() > 300.0
+    plain = metrics.accuracy(estimates, states, 20)
+    found = metrics.accuracy(*wrapped, 20, residual)
+    for name, value in plain.items():
+        assert found[name] == pytest.approx(value)
+    assert metrics.consistency(*wrapped, covariances, residual) == pytest.approx(
+        metrics.consistency(estimates, states, covariances))
+    assert metrics.accuracy(*wrapped, 20)["rmse_states"][1] > 5.0 * plain["rmse_states"][1]

@@ -74,6 +74,19 @@ def test_a_study_runs_once_and_more_cells_are_added(path, monkeypatch):
     assert handed == []
 
 
+def test_errors_of_a_heading_that_wraps(path):
+    """Two crossings in the record: whole turns are no errors, nor jumps in the figures."""
+    grid = {"models": ["vehicle"], "backends": ["banded"], "qps": [0, 1], "seeds": 1, "steps": 100}
+    run(Study(**grid, measure="accuracy", covariances=True), path, progress=False)
+    store = Store(path)
+    for row in store.frame().itertuples():
+        assert row.rmse_states[2] < 0.1
+        assert row.nees < 30.0
+        drawn = store.trajectory(row.key)
+        assert np.abs(np.diff(drawn["states"][:, 2])).max() > 6.0
+        assert np.abs(drawn["estimates"] - drawn["states"])[:, 2].max() < 1.0
+
+
 def test_accuracy_and_time_are_measured_apart(path):
     run(Study(**SMALL, measure="accuracy"), path, progress=False)
     frame = Store(path).frame()

@@ -1,0 +1,112 @@
+"""Converged J with angles that wrap against Ipopt's, on random problems."""
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.studies.ipopt import IpoptEstimator
+
+pytest.importorskip("casadi")
+
+PI = np.pi
+SETS = {
+    "free": {},
+    "X": {"states": qpmhe.Box([-4.0, -4.0, -np.inf, 1.65], [4.0, 4.0, np.inf, 1.75])},
+    "W and V": {
+        "disturbances": qpmhe.Box([-0.4, -0.4, -0.03, -0.02], [0.4, 0.4, 0.03, 0.02]),
+        "noises": qpmhe.Polytope([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, -1.0]], [0.16, 0.16]),
+    },
+}
+
+
+class Rover:
+    """A rover of unknown turn rate about 1.7 rad per sample among beacons anywhere."""
+
+    def __init__(self, seed):
+        rng = np.random.default_rng(seed)
+        self.beacons = rng.uniform(2.0, 6.0, (2, 2)) * rng.choice([-1.0, 1.0], (2, 2))
+        self.speed = rng.uniform(0.2, 0.6)
+        self.start = np.append(rng.uniform(-0.5, 0.5, 2), [rng.uniform(-PI, PI), 1.7])
+        self.rng = rng
+        self.deviations = {
+            "prior": [0.5, 0.5, 0.4, 0.1], "disturbance": [0.1, 0.1, 0.03, 0.02],
+            "noise": [0.2, 0.2, 0.1, 0.1],
+        }
+        self.cost = qpmhe.QuadraticCost.from_covariances(
+            **{name: np.diag(np.square(one)) for name, one in self.deviations.items()})
+
+    def f(self, x, m=np):
+        return [x[0] + self.speed * m.cos(x[2]), x[1] + self.speed * m.sin(x[2]), x[2] + x[3], x[3]]
+
+    def h(self, x, m=np):
+        seen = [(east - x[0], north - x[1]) for east, north in self.beacons]
+        angle = m.arctan2
+        return [
+            *(m.sqrt(e * e + n * n) for e, n in seen), *(angle(n, e) - x[2] for e, n in seen)
+        ]
+
+    def system(self, **sets):
+        """With f and h that wrap, each in its own way."""
+
+        def f(x):
+            value = np.array(self.f(x))
+            value[2] = np.arctan2(np.sin(value[2]), np.cos(value[2]))
+            return value
+
+        def h(x):
+            value = np.array(self.h(x))
+            value[2:] = (value[2:] + PI) % (2.0 * PI) - PI
+            return value
+
+        return qpmhe.System(
+            f, h, n=4, p=4, state_residual=qpmhe.angles([2]), output_residual=qpmhe.angles([2, 3]),
+            **sets,
+        )
+
+    def record(self, system, steps):
+        x, y = self.start, []
+        for _ in range(steps):
+            noise = self.rng.normal(0.0, self.deviations["noise"])
+            y.append(system.output_residual(system.h(x, np.zeros(0)) + noise, np.zeros(4)))
+            x = np.array(self.f(x)) + self.rng.normal(0.0, self.deviations["disturbance"])
+        return np.array(y)
+
+
+@pytest.mark.parametrize("sets", SETS)
+@pytest.mark.parametrize("seed", range(6))
+def test_converged_cost_is_ipopts(seed, sets):
+    import casadi as ca
+
+    rover = Rover(seed)
+    system = rover.system(**SETS[sets])
+    y = rover.record(rover.system(), 25)
+    assert (np.abs(np.diff(y[:, 2:], axis=0)) > PI).sum() > 5
+    common = {"horizon": 6, "initial_state": rover.start + np.array([0.3, -0.3, 0.3, 0.0])}
+    observer = qpmhe.ExtendedKalman(
+        **{name: np.diag(np.square(one)) for name, one in rover.deviations.items()})
+    mhe = qpmhe.MovingHorizonEstimator(system, observer, rover.cost, max_qps=None, **common)
+    ipopt = IpoptEstimator(
+        system, observer, rover.cost, tolerance=1e-10, **common,
+        f=lambda x: ca.vertcat(*rover.f(ca.vertsplit(x), ca)),
+        h=lambda x: ca.vertcat(*rover.h(ca.vertsplit(x), ca)),
+    )
+    compared = 0
+    for one in y:
+        ours, theirs = mhe.update(one), ipopt.update(one)
+        assert ours.candidate_cost == pytest.approx(theirs.candidate_cost, rel=1e-9)
+        if qpmhe.Status.IMPROVED in ours.status & theirs.status and not ours.dropped:
+            assert ours.cost == pytest.approx(theirs.cost, rel=1e-6)
+            compared += 1
+    assert compared > (20 if sets == "free" else 8)
+
+
+def test_ipopt_takes_no_other_residual_function():
+    rover = Rover(0)
+    system = qpmhe.System(
+        rover.f, rover.h, n=4, p=4, output_residual=lambda a, b: a - b)
+    made = IpoptEstimator(
+        system, qpmhe.Luenberger(np.zeros((4, 4))), rover.cost, horizon=3,
+        initial_state=rover.start, f=lambda x: x, h=lambda x: x,
+    )
+    with pytest.raises(qpmhe.errors.InvalidInputError, match=r"qpmhe\.angles only"):
+        made.update(np.zeros(4))
