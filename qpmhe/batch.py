@@ -219,7 +219,8 @@ class BatchEstimator:
         ShapeError, InvalidInputError
             If an argument does not fit, before any sample is taken.
         """
-        ys = _record(Y, self.members, self.system.p)
+        remedy = f"a record for each member, with a row for each sample. {_MISSING}"
+        ys = _shaped("Y", Y, ((self.members, None, self.system.p),), remedy)
         shape, n = ys.shape[:2], self.system.n
         us = _inputs(U, (*shape, self.system.m), "run(Y, U)")
         if not isinstance(self._engine, _Looped):
@@ -440,12 +441,6 @@ def _measurements(value: ArrayLike | None, members: int, p: int) -> Array:
         value = [nothing if row is None else row for row in value]
     remedy = f"a row for each member. {_MISSING}"
     return _shaped("Y", value, ((members, p),), remedy)
-
-
-def _record(value: ArrayLike, members: int, p: int) -> Array:
-    """Measurements (K, T, p) of a record."""
-    remedy = f"a record for each member, with a row for each sample. {_MISSING}"
-    return _shaped("Y", value, ((members, None, p),), remedy)
 
 
 def _inputs(value: ArrayLike | None, shape: tuple[int, ...], call: str) -> Array:

@@ -14,7 +14,7 @@ import pytest
 
 SEED = 1
 # The share of the cases beyond the first that a test keeps.
-SHARE = 0.1
+SHARE = 0.05
 # Examples of each property whose test names no number: in the sample, and in all.
 FEW, MANY = 8, 25
 # Begun first, so that no long test is the last one: most of these tests start processes.
