@@ -143,7 +143,10 @@ class ConditionReader:
             # A set without bounds of components, or without other rows, leaves these as they are.
             bounds = given if given.bounded_components.size or not given.matrix.size else usual
             rows = given if given.matrix.size else usual
-            found = usual.with_sides(bounds.lower, bounds.upper, rows.row_lower, rows.row_upper)
+            lower, upper = bounds.lower, bounds.upper
+            if name == "states" and self._system.turns is not None:
+                lower, upper = self._system.turns.sides(lower, upper)
+            found = usual.with_sides(lower, upper, rows.row_lower, rows.row_upper)
         self._last[name] = key, found
         return found
 

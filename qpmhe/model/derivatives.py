@@ -28,6 +28,8 @@ _ENTRY, _ROW, _VALUE = 1e-5, 1e-7, 5e-10
 _SLACK = 10.0
 # Steps that must agree, not in phase with what oscillates, as shares of the first.
 _PARTS = (1.0, 0.62, 0.23)
+# An angle must turn by less than half its period within so many steps.
+_FAR = 8.0
 # How often, and by how much, a step is shortened at most where differences curve within it.
 _SHORTER = [2.0 ** (-4 * k) for k in range(11)]
 
@@ -209,7 +211,15 @@ class Jacobian:
         return {
             j: slopes[0] / size[j] for j, slopes in found.items()
             if np.all(np.ptp(slopes, axis=0) <= _ENTRY * np.abs(slopes[-1]) + floor)
+            and not self._turns_far(value, np.abs(slopes).max(axis=0) + floor)
         }
+
+    def _turns_far(self, value: Array, scaled_slope: Array) -> bool:
+        """Whether an angle may turn so far within a step that its differences say nothing."""
+        if self._residual is None:
+            return False
+        reached = value + _FAR * _DIFFERENCE_STEP * scaled_slope
+        return bool((self._residual.aligned(reached, value) != reached).any())
 
     def _choose(self, probes: Probes) -> None:
         works = self._complex_step_works(probes)

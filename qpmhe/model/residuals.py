@@ -325,12 +325,13 @@ class Turns:
                 "their own (qpmhe.Box) only: with whole turns added, a sum means nothing."
             )
         bounded = angle & np.isfinite(lower)
+        self._residual = residual
         ends = np.where(bounded, (lower, upper), 0.0)
         middle = 0.5 * ends[0] + 0.5 * ends[1]
         # The residual moves what is half a period from the middle or more.
         free = bounded & (residual.aligned(ends, middle) != ends)[1]
         lower[free], upper[free] = -np.inf, np.inf
-        self._residual, self._middle, self._bounded = residual, middle, bounded & ~free
+        self._middle, self._bounded = middle, bounded & ~free
         self.states: ConvexSet | None = states
         if free.any():
             self.states = ConvexSet(
@@ -341,6 +342,29 @@ class Turns:
 
     def __bool__(self) -> bool:
         return bool(self._bounded.any())
+
+    def sides(self, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """Other bounds of the states, moved by whole turns into this turn.
+
+        Raises
+        ------
+        SetError
+            If they do not fit into it, or an angle has one bound only.
+        """
+        given = np.isfinite(lower) & np.isfinite(upper) & self._bounded
+        ends = np.where(given, (lower, upper), 0.0)
+        middle = 0.5 * ends[0] + 0.5 * ends[1]
+        ends += np.where(given, self(np.where(given, middle, self._middle)) - middle, 0.0)
+        inside = (self(np.where(given, ends, self._middle)) == ends).all(axis=0)
+        wrong = self._bounded & ~np.where(given, inside, lower == -upper)
+        if wrong.any():
+            j = int(np.argmax(wrong))
+            raise SetError(
+                f"component {j} of the states, an angle, is to be bounded by lower {lower[j]} and "
+                f"upper {upper[j]}; expected two bounds less than half a period from "
+                f"{self._middle[j]}, the middle of the system's own, or from it by whole turns."
+            )
+        return np.where(given, ends[0], lower), np.where(given, ends[1], upper)
 
     def __call__(self, points: Array) -> Array:
         """Points (..., n) in this turn; the same array where all are."""

@@ -272,7 +272,7 @@ class System:
                 Trusted(_timed_by_input(step, m)), Trusted(_without_last(system.h.batch, m)),
                 n=n, p=p, m=m + 1,
                 f_jacobian=step_jacobian and Trusted(_timed_by_input(step_jacobian, m)),
-                h_jacobian=Trusted(_without_last(system.h_jacobian.batch, m)),
+                h_jacobian=h_jacobian and Trusted(_without_last(system.h_jacobian.batch, m)),
                 **options,
             )
 

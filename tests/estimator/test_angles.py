@@ -668,3 +668,41 @@ def test_sets_that_mean_nothing_on_a_circle(residual):
             qpmhe.System(step, sight, **INPUTS, states=states, state_residual=residual)
     both = {"disturbances": below, "noises": qpmhe.Polytope([[0.0, 1.0, 1.0, 0.0]], [1.0])}
     qpmhe.System(step, sight, **INPUTS, **ANGLES, **both)  # of W and V they do mean something
+
+
+@each_candidate
+def test_bounds_that_change_while_running_may_be_written_in_another_turn(candidate):
+    def box(lower, upper):
+        return {"states": qpmhe.Box([lower, -9.0], [upper, 9.0])}
+
+    y, runs = needle_record(), []
+    for wraps, turn in ((False, 0.0), (True, -360.0), (True, 720.0)):
+        states = box(150.0 + turn, 230.0 + turn)["states"]
+        mhe = needle(compass(states, wraps), candidate=candidate, start=(180.0 + turn, 0.0))
+        data, estimates = _degrees(y) if wraps else y, []
+        for t, one in enumerate(data):
+            narrow = box(170.0 + 0.1 * t, 185.0 + 0.1 * t)
+            if wraps:
+                narrow = box(*(narrow["states"].lower[0] - 360.0 * (t % 3) + [0.0, 15.0]))
+            estimates.append(mhe.update(one, bounds=narrow if t % 4 < 3 else None))
+        mhe.set(bounds=box(175.0 - turn, 180.0 - turn))
+        runs.append((estimates, mhe.update(data[0]).trajectory - [turn, 0.0]))
+    for estimates, last in runs[1:]:
+        for one, other in zip(runs[0][0], estimates, strict=True):
+            error = other.state - one.state
+            assert _degrees(error[0]) == pytest.approx(0.0, abs=1e-6)
+            assert other.cost == pytest.approx(one.cost, rel=1e-6)
+        np.testing.assert_allclose(last, runs[0][1], atol=1e-6)
+
+
+@pytest.mark.parametrize(("lower", "upper"), [
+    (-np.inf, 190.0), (170.0, np.inf), (-20.0, 20.0), (170.0, 500.0), (-190.0, 190.0),
+])
+def test_bounds_that_leave_the_turn_are_refused(lower, upper):
+    mhe = needle(compass(qpmhe.Box([170.0, -9.0], [190.0, 9.0])))
+    before = mhe.update([-179.0])
+    with pytest.raises(SetError, match=r"component 0 of the states, an angle.*from 180\.0"):
+        mhe.update([-179.0], bounds={"states": qpmhe.Box([lower, -9.0], [upper, 9.0])})
+    assert mhe.time == 1
+    assert np.array_equal(mhe.state, before.state)
+    mhe.update([-179.0], bounds={"states": qpmhe.Box([-np.inf, -9.0], [np.inf, 9.0])})

@@ -31,6 +31,12 @@ def box(draw, size, width):
     )
 
 
+def some_angles(draw, size):
+    """Some of the components as angles of random periods, or None."""
+    which = np.flatnonzero(draw.random(size) < 0.2)
+    return qpmhe.angles(which, draw.uniform(0.5, 8.0, which.size)) if which.size else None
+
+
 def case(draw):
     """An estimator on a random small problem, and its options."""
     n, p = int(draw.integers(1, 4)), int(draw.integers(1, 3))
@@ -46,7 +52,8 @@ def case(draw):
 
     system = qpmhe.System(
         f, h, n=n, p=p, states=box(draw, n, edge), disturbances=box(draw, n, 0.3),
-        noises=box(draw, p, 0.5),
+        noises=box(draw, p, 0.5), state_residual=some_angles(draw, n),
+        output_residual=some_angles(draw, p),
     )
     covariances = {
         "prior": np.diag(draw.uniform(0.1, 2, n)), "disturbance": np.diag(draw.uniform(0.01, 1, n)),

@@ -76,6 +76,28 @@ class Drawn:
         self.weighted = rng.random(SAMPLES) < 0.1
         self.irregular = (rng.random(SAMPLES) < 0.1) & (self.method != "discrete")
         self.late = int(rng.integers(SAMPLES - HORIZON, SAMPLES)), rng.standard_normal(self.p)
+        self.periods = self.draw_periods()
+
+    def draw_periods(self):
+        """Periods of the states and outputs that are angles, NaN of the others."""
+        rng = np.random.default_rng([self.seed, 1])
+        states, outputs = (
+            np.where(rng.random(size) < share, rng.uniform(0.7, 4.0, size), np.nan)
+            for size, share in ((self.n, 0.2), (self.p, 0.3))
+        )
+        if self.sets["states"] is not None:
+            low, high, rows = self.sets["states"]
+            bounded = np.isfinite(low) & np.isfinite(high)
+            states = np.where(bounded, states, np.nan) if rows is None else np.full(self.n, np.nan)
+        return {"state_residual": states, "output_residual": outputs}
+
+    def residuals(self, units):
+        made = {}
+        for name, scale in (("state_residual", units.states), ("output_residual", units.outputs)):
+            which = np.flatnonzero(np.isfinite(self.periods[name]))
+            if which.size:
+                made[name] = qpmhe.angles(which, (self.periods[name] * scale)[which])
+        return made
 
     def spd(self, size, level):
         root = self.rng.standard_normal((size, size)) + 2.0 * np.eye(size)
@@ -175,6 +197,7 @@ class Drawn:
             functions = [lambda x, one=one: one(x) for one in functions]
         rate_, h_, rate_jacobian_, h_jacobian_ = functions
         options = {"n": self.n, "p": self.p, "m": self.m, **self.convex_sets(units)}
+        options |= self.residuals(units)
         given = self.derivative == "given"
         if given:
             options["h_jacobian"] = h_jacobian_
