@@ -50,17 +50,17 @@ class Conditions(NamedTuple):
     @property
     def has_bounds(self) -> bool:
         """Whether a set has other sides."""
-        return not (self.states is self.disturbances is self.noises is None)
+        return not all(one is None for one in (self.states, self.disturbances, self.noises))
 
     def over(self, usual: Conditions) -> Conditions:
         """These conditions, and the usual ones where these say nothing."""
-        return Conditions(*(b if a is None else a for a, b in zip(self, usual, strict=True)))
+        pairs: Any = zip(self, usual, strict=True)
+        return Conditions(*(b if a is None else a for a, b in pairs))
 
     def without(self, others: Conditions) -> Conditions:
         """These conditions where the others say nothing."""
-        return Conditions(
-            *(a if b is None else None for a, b in zip(self, others, strict=True))
-        )
+        pairs: Any = zip(self, others, strict=True)
+        return Conditions(*(a if b is None else None for a, b in pairs))
 
     def state_dict(self) -> dict[str, Any]:
         """Copies of all that is not None, as plain arrays."""
@@ -95,34 +95,35 @@ class ConditionReader:
         bounds: Mapping[str, ConvexSet] | None = None, drop_usual: bool = True,
     ) -> Conditions:
         """Validated weights and bounds; without bounds that are equal to the usual ones."""
-        cost, weights = self._cost, []
-        for name, given, size in (
-            ("noise_weight", noise_weight, cost.noise.shape[0]),
-            ("disturbance_weight", disturbance_weight, cost.disturbance.shape[0]),
-        ):
-            weights.append(None if given is None else positive_definite(name, given, size))
-        cost.check_weights(*weights)
-        found = Conditions(*weights)
+        cost, noise, disturbance = self._cost, None, None
+        if noise_weight is not None:
+            noise = positive_definite("noise_weight", noise_weight, len(cost.noise))
+        if disturbance_weight is not None:
+            size = len(cost.disturbance)
+            disturbance = positive_definite("disturbance_weight", disturbance_weight, size)
+        cost.check_weights(noise, disturbance)
+        found: dict[str, Any] = {"noise_weight": noise, "disturbance_weight": disturbance}
         if bounds is None:
-            return found
+            return Conditions(**found)
         if not isinstance(bounds, Mapping):
             raise OptionError(
                 f"bounds is {shown(bounds)}; expected a dictionary, such as "
                 "{'states': qpmhe.Box(lower, upper)}."
             )
-        for name, given in bounds.items():
+        for name in bounds:
             if name not in SET_NAMES:
                 raise OptionError(
                     f"bounds has the key {shown(name)}; expected one of "
                     f"{', '.join(map(repr, SET_NAMES))}."
                 )
         for name, given in bounds.items():
-            one = self._with_sides(name, given, getattr(usual, name))
-            if not (drop_usual and _alike(one, getattr(usual, name) or getattr(self._system, name))):
-                found = found._replace(**{name: one})
-        return found
+            before = getattr(usual, name) or getattr(self._system, name)
+            one = self._with_sides(name, given, before)
+            if not (drop_usual and _alike(one, before)):
+                found[name] = one
+        return Conditions(**found)
 
-    def _with_sides(self, name: str, given: Any, usual: ConvexSet | None) -> ConvexSet:
+    def _with_sides(self, name: str, given: Any, usual: Any) -> ConvexSet:
         """The rows of the system's set with the sides of another."""
         built: ConvexSet | None = getattr(self._system, name)
         if built is None:
@@ -131,7 +132,6 @@ class ConditionReader:
                 f"System(..., {name}=...), as wide as it ever is, and narrow it here."
             )
         checked_set(f"bounds[{name!r}]", given, built.dimension)
-        usual = usual or built
         key = tuple(
             np.ascontiguousarray(getattr(one, side)).tobytes()
             for one, sides in ((given, (*_SIDES, "matrix")), (usual, _SIDES)) for side in sides
@@ -238,7 +238,7 @@ class ConditionReader:
         return vector("parameters", given, usual.parameters.size)
 
     def load(self, saved: dict[str, Any], usual: Conditions) -> Conditions:
-        """The conditions of which `Conditions.state_dict` returned this; raises on a damaged one."""
+        """The conditions that `Conditions.state_dict` described; raises anything if damaged."""
         if not isinstance(saved, dict):
             raise TypeError(f"conditions are {saved!r}")
         p, values, found = self._system.p, dict(saved), {}

@@ -72,7 +72,8 @@ class Rows:
 
     def _scale(self) -> Array:
         width, deviation = self.upper - self.lower, self._deviation
-        return np.where(width > 0.0, np.minimum(width, deviation), deviation)
+        scale: Array = np.where(width > 0.0, np.minimum(width, deviation), deviation)
+        return scale
 
     def with_sides(self, sets: Sequence[ConvexSet | None]) -> Rows:
         """A copy with the sides of these sets, one a point; None for the present ones."""

@@ -112,7 +112,7 @@ class PythonEngine:
         if usual.has_bounds:
             sets = (getattr(usual, name) or getattr(system, name) for name in SET_NAMES)
             system = system.with_sets(*sets)
-        if not usual.noise_weight is usual.disturbance_weight is None:
+        if usual.noise_weight is not None or usual.disturbance_weight is not None:
             cost = cost.with_weights(usual.noise_weight, usual.disturbance_weight)
         formulation = Formulation(system, self._observer, cost)
         subproblem = Subproblem(system, cost, formulation.constraints, settings.horizon)

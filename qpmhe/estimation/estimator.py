@@ -324,7 +324,7 @@ class MovingHorizonEstimator:
         if dt is not None:
             dt = positive("dt", dt)
             self._check_step_length(dt)
-        if not noise_weight is disturbance_weight is bounds is None:
+        if not (noise_weight is None and disturbance_weight is None and bounds is None):
             found = self._reader.read(
                 self._engine.usual, noise_weight=noise_weight,
                 disturbance_weight=disturbance_weight, bounds=bounds,
@@ -382,8 +382,10 @@ class MovingHorizonEstimator:
         index, own = self._reader.sensors(sensors)
         self._partial.fill(np.nan)
         if y is not None:
-            usual = type(y) is np.ndarray and y.ndim == 1 and y.dtype == np.float64
-            given = y if usual else np.atleast_1d(numbers("y", y, finite=False))
+            if type(y) is np.ndarray and y.ndim == 1 and y.dtype == np.float64:
+                given = y
+            else:
+                given = np.atleast_1d(numbers("y", y, finite=False))
             if given.shape != index.shape:
                 raise ShapeError(
                     f"y has shape {given.shape}; expected {index.shape}, a component for each of "
@@ -506,10 +508,8 @@ class MovingHorizonEstimator:
                 )
         elif self._inputs:
             self._input(None)
-        if covariances:
-            at_once = None
-        else:
-            at_once = self._engine.run(ys, self._with_parameters(us, len(ys)))
+        whole = self._with_parameters(us, len(ys))
+        at_once = None if covariances else self._engine.run(ys, whole)
         if at_once is not None:
             return at_once
         start, estimates, collected = self.state.copy(), [], []

@@ -171,7 +171,8 @@ class Stages:
     @property
     def initial_state(self) -> Array:
         """The first state of the window."""
-        return self._z[self.start].copy()
+        state: Array = self._z[self.start].copy()
+        return state
 
     def _arrays(self) -> dict[str, Array]:
         """All arrays, with a row for each stage; those of states have one more."""

@@ -153,7 +153,7 @@ class Window(Stages):
             self._u[k, m] = dt
         if own is not None:
             self._own[time] = own
-            if not own.noise_weight is own.disturbance_weight is None:
+            if own.noise_weight is not None or own.disturbance_weight is not None:
                 self._set_weight(k, time)
         if self._observers_ready:
             self._find_observed(k, time)
@@ -178,11 +178,13 @@ class Window(Stages):
 
     def enter_states(self, k: int, time: int) -> None:
         """Project the state before stage k onto its X: no correction leads there."""
-        nearest, covariance = self._projection(time), self.metric and self.metric.covariance
-        if self._covariances is not None and covariance is None:
-            covariance = self._covariances[k]
-        if nearest is not None and covariance is not None and not nearest.contains(self._z[k]):
-            self._z[k] = nearest(self._z[k], covariance).point
+        nearest = self._projection(time)
+        if nearest is None or nearest.contains(self._z[k]):
+            return
+        if self.metric is not None:
+            self._z[k] = nearest(self._z[k], self.metric.covariance).point
+        elif self._covariances is not None:
+            self._z[k] = nearest(self._z[k], self._covariances[k]).point
 
     def _projection(self, time: int) -> NearestPoint | None:
         """The projection onto X at a time: the newest sample's before its own has come."""
@@ -218,6 +220,7 @@ class Window(Stages):
         if self._covariances is not None:
             self._covariances[0] = kept["covariance"][0]
         self._earlier_state, self._earlier_covariance = other._last_good(other.start)
+        self.smoothed_prior = other.smoothed_prior
         if self.metric is not None and other.metric is not None:
             self.metric.state = other.metric.state
         self._own = {time: own.without(changes) for time, own in other._own.items()}
@@ -344,7 +347,7 @@ class Window(Stages):
             self._special[k] = self.unusual = True
             return
         weight = self._usual_weight
-        if not weights[0] is weights[1] is None:
+        if any(one is not None for one in weights):
             weight = self._cost.joint_weight(*weights)
         self._weights[k] = weight
         # A usual weight that was given as its own is as good as none.
@@ -413,11 +416,11 @@ class Window(Stages):
         model, u, sample = self._system, self._stage_views[k].u, self._sample
         own = self._own.get(time, USUAL)
         if own is not self._filled:
+            self._filled = None  # an interrupt may leave half of it
+            whole = own if self._usual is USUAL else own.over(self._usual)
+            sample.noise_weight, sample.states = whole.noise_weight, whole.states
+            sample.disturbance_weight = whole.disturbance_weight
             self._filled = own
-            if self._usual is not USUAL:
-                own = own.over(self._usual)
-            sample.noise_weight, sample.states = own.noise_weight, own.states
-            sample.disturbance_weight = own.disturbance_weight
         if self.unusual and self._irregular[k]:
             model, u = self._system.timed, self._u[k]
         sample.system, sample.u, sample.observed = model, u, observed
@@ -637,8 +640,8 @@ class Window(Stages):
     ) -> Iterator[tuple[str, Array, Array, Array | float]]:
         """What must agree, the loaded and the computed numbers, and the size of their terms."""
         n, mine, saved, weight = self._n, self.terms, loaded.terms, self._weights[k]
-        flags = (np.append(one._observed[k], one._special[k]) * 1.0 for one in (loaded, self))
-        yield "weight of the stages' cost", *flags, 0.0
+        flags = [np.append(one._observed[k], one._special[k]) * 1.0 for one in (loaded, self)]
+        yield "weight of the stages' cost", flags[0], flags[1], 0.0
         yield "weight of the stages' cost", loaded._weights[k], weight, np.abs(weight).max()
         correction, v = mine.residuals[k, :n], mine.residuals[k, n:]
         yield "model (h)", saved.residuals[k, n:], v, np.abs(self._y[k]) + np.abs(v)

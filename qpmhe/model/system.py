@@ -344,7 +344,7 @@ class System:
     def with_sets(
         self, states: ConvexSet | None, disturbances: ConvexSet | None, noises: ConvexSet | None
     ) -> System:
-        """This system, its functions shared, with other sides of its sets."""
+        """The same system, its functions shared, with other sides of its sets."""
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__)
         other.states, other.disturbances, other.noises = states, disturbances, noises

@@ -125,7 +125,8 @@ class SteadyStateKalman(Observer):
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the covariance of the next error; see `Observer.correct`."""
-        if sample.observed is sample.noise_weight is sample.disturbance_weight is None:
+        own = sample.observed, sample.noise_weight, sample.disturbance_weight
+        if all(one is None for one in own):
             closed, entering = self._closed, self._entering
         else:
             gain, r = self._given(self.gain, sample)

@@ -42,7 +42,7 @@ class Record:
         rng = np.random.default_rng(seed)
         x, self.samples = START + rng.normal(0.0, 0.3, 2), []
         changing = set(kind.split("+"))
-        for t in range(STEPS):
+        for _ in range(STEPS):
             own, parameters = {}, np.array([0.3, 2.0])
             if "weights" in changing and rng.random() < 0.7:
                 own["noise_weight"] = weight(rng, 2, 20.0)
