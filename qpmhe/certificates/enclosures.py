@@ -307,13 +307,6 @@ def _model_graph(
     return evaluate
 
 
-def _method(name: str) -> Callable[[Any], Any]:
-    def apply(value: Any) -> Any:
-        return getattr(np, name)(value)
-
-    return apply
-
-
 @lru_cache(maxsize=1)
 def _operations() -> dict[int, Callable[..., Any]]:
     ca = import_casadi()
@@ -330,5 +323,5 @@ def _operations() -> dict[int, Callable[..., Any]]:
     }
     for code, name in named.items():
         if hasattr(ca, f"OP_{code}"):
-            known[getattr(ca, f"OP_{code}")] = _method(name)
+            known[getattr(ca, f"OP_{code}")] = getattr(np, name)
     return known

@@ -68,24 +68,14 @@ class DecayingSums:
     noise: float
 
     def __post_init__(self) -> None:
-        for name in ("rate", "initial", "disturbance", "noise"):
+        object.__setattr__(self, "rate", checked_rate("rate", self.rate))
+        # Less than 1 contradicts the bound at t = 0, |e(0)| <= initial |e(0)|.
+        for name, least in (("initial", 1.0), ("disturbance", 0.0), ("noise", 0.0)):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-                raise OptionError(f"{name} is {value!r}; expected a number.")
+            number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+            if not number or not value >= least:
+                raise OptionError(f"{name} is {value!r}; expected a number >= {least:g}.")
             object.__setattr__(self, name, float(value))
-        if not 0.0 < self.rate < 1.0:
-            raise OptionError(
-                f"rate is {self.rate!r}; expected a number in (0, 1): without decay there is "
-                "no bound by decaying sums."
-            )
-        if not self.initial >= 1.0:
-            raise OptionError(
-                f"initial is {self.initial!r}; expected at least 1, since at t = 0 the bound "
-                "says |e(0)| <= initial |e(0)|."
-            )
-        for name in ("disturbance", "noise"):
-            if not getattr(self, name) >= 0.0:
-                raise OptionError(f"{name} is {getattr(self, name)!r}; expected at least 0.")
 
     @property
     def constants(self) -> tuple[float, float, float]:
