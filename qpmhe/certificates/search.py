@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import Array, positive
-from ..errors import ModelError, OptionError
+from ..errors import OptionError
 from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
@@ -36,8 +36,6 @@ _PAIRS = 2000
 # the former solves; how far off the time that a program is expected to take may be.
 _CHOICE, _VERIFICATION = 0.5, 0.6
 _PROGRAMS, _MISJUDGED = 20, 4.0
-_WRONG = 1e-3  # more than a derivative computed in some other way may be off
-_WORK = 5e4  # entries of second derivatives that come with an enclosure of the first
 _MOST_POINTS = 24  # Jacobians that a program starts with
 
 
@@ -73,8 +71,6 @@ class Search:
         self.model = SmoothModel(system, region)
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
         self.jacobians = joint_jacobians(system, self.points)
-        if not self.model.reason:
-            _check_derivatives(self.model, system, self.points, self.jacobians)
         if kind is None:
             outputs = self.jacobians[:, system.n :]
             same = self.model.affine_output or (
@@ -85,6 +81,13 @@ class Search:
         each = expected_seconds(system.n, system.p, kind)
         affordable = _CHOICE * self._deadline.left / (_PROGRAMS * each)
         self._chosen = _far_apart(self.jacobians, int(np.clip(affordable, 1, _MOST_POINTS)))
+        if not self.model.reason and "given" in system.derivatives.values():
+            # What is given may be wrong, and would make the program another one.
+            chosen = self.points[self._chosen]
+            true = self.model.enclose(chosen, chosen).centre
+            self.jacobians[self._chosen] = np.where(
+                np.isfinite(true), true, self.jacobians[self._chosen]
+            )
         self.scales = _typical_scales(region, self.jacobians, system.n)
         self._program: Program | None = None
 
@@ -319,31 +322,6 @@ def _checked_weights(value: tuple[float, float]) -> tuple[float, float]:
     except (TypeError, ValueError) as error:
         raise OptionError(f"weights is {value!r}; expected two numbers > 0.") from error
     return positive("weights[0]", first), positive("weights[1]", second)
-
-
-def _check_derivatives(model: SmoothModel, system: System, points: Array, jacobians: Array) -> None:
-    """Raise a ModelError where a given Jacobian is not the derivative, at states far apart."""
-    n = system.n
-    if "given" not in system.derivatives.values():
-        return
-    few = int(np.clip(_WORK / (jacobians[0].size * points.shape[1]), 1, _MOST_POINTS))
-    chosen = _far_apart(jacobians, few)
-    points, jacobians = points[chosen], jacobians[chosen]
-    enclosure = model.enclose(points, points)
-    for name, rows in (("f", slice(None, n)), ("h", slice(n, None))):
-        if system.derivatives[name] != "given":
-            continue
-        true, given = enclosure.centre[:, rows], jacobians[:, rows]
-        size = np.abs(true).max(axis=(1, 2)) + np.abs(given).max(axis=(1, 2))
-        apart = np.abs(given - true).max(axis=(1, 2)) - enclosure.error[:, rows].max(axis=(1, 2))
-        wrong = apart > _WRONG * (size + 1.0)
-        if wrong.any():
-            k = int(np.argmax(wrong))
-            raise ModelError(
-                f"{name}_jacobian is {given[k].tolist()} at {points[k].tolist()}, but the "
-                f"derivative of {name} there is {np.round(true[k], 9).tolist()}. Correct it, or "
-                "leave it out."
-            )
 
 
 def _far_apart(jacobians: Array, count: int = _MOST_POINTS) -> NDArray[np.intp]:
