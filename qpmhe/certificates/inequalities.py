@@ -332,14 +332,8 @@ def rounded_up(value: float, operations: int = 8) -> float:
 def euclidean_constants(P: Array, V: Array, rate: float) -> tuple[float, float, float]:
     r"""Constants of the sums in def:RGES and def:eIOSS.
 
-    From :math:`|e^+|_P \le \rho |e|_P + |w|_P + |v|_V`, by induction,
-
-    .. math::
-        |e(t)|_P \le \rho^t |e_0|_P
-        + \sum_{\tau=1}^t \rho^{\tau-1} (|w(t-\tau)|_P + |v(t-\tau)|_V) .
-
-    With :math:`\sqrt{\underline\lambda(P)}\, |e| \le |e|_P \le \sqrt{\bar\lambda(P)}\, |e|`,
-    the constants of the definitions, whose sums discount by :math:`\rho^\tau`, are
+    From :math:`|e^+|_P \le \rho |e|_P + |w|_P + |v|_V`, by induction, and as the sums of the
+    definitions discount by one power of the rate more,
 
     .. math::
         c_p = \sqrt{\bar\lambda(P) / \underline\lambda(P)}, \quad c_w = c_p / \rho, \quad

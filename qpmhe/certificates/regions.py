@@ -132,15 +132,8 @@ def bounded_region(
                 f"the region is of {region.n} states and {region.lower.size - region.n} inputs; "
                 f"expected {system.n} and {system.m}."
             )
-        if inputs is not None and not (
-            isinstance(inputs, Box)
-            and np.array_equal(inputs.lower, region.lower[region.n :])
-            and np.array_equal(inputs.upper, region.upper[region.n :])
-        ):
-            raise SetError(
-                f"inputs is {inputs!r}, but the region that was passed already has bounds on "
-                "the inputs; leave inputs out, or pass a qpmhe.Box of states with them."
-            )
+        if inputs is not None:
+            raise SetError("the region already has bounds on the inputs; leave inputs out.")
         return region
     chosen = system.states if region is None else region
     if chosen is None:
