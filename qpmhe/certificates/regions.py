@@ -28,15 +28,12 @@ class Region:
     Parameters
     ----------
     states : ConvexSet
-    inputs : Box or None
-        Bounds on the inputs u; None for a system without.
     lower, upper : (n + m,) array
         Corners of a box around states and inputs. It holds them all: for a polytope, its
         sides are proved by duality and rounded outward.
     """
 
     states: ConvexSet
-    inputs: Box | None
     lower: Array
     upper: Array
 
@@ -164,7 +161,7 @@ def bounded_region(
             f"the region is unbounded in {which}; expected a bounded set. Intersect it with the "
             "states that occur: region & qpmhe.Box(lower, upper)."
         )
-    return Region(chosen, inputs, lower, upper)
+    return Region(chosen, lower, upper)
 
 
 def stated_region(region: Any) -> Region | None:
@@ -173,7 +170,7 @@ def stated_region(region: Any) -> Region | None:
         return region
     if not isinstance(region, ConvexSet):
         raise SetError(f"region is {region!r}; expected a qpmhe.Box or a qpmhe.Polytope.")
-    return Region(region, None, *_bounds(region))
+    return Region(region, *_bounds(region))
 
 
 def _bounds(states: ConvexSet) -> tuple[Array, Array]:

@@ -16,7 +16,6 @@ from .deadline import Deadline
 
 Kind = Literal["output weight", "output injection", "observer", "synthesis"]
 
-_SOLVERS = ("CLARABEL", "SCS")
 # c_p beyond 1e4 would be a certificate of nothing, and spoils the conditioning.
 _MOST_CONDITION = 1e8
 # Seconds for one entry of a factorisation, as measured for 10 to 30 states: a rough guide.
@@ -51,7 +50,7 @@ def started(seconds: float | Deadline) -> Deadline:
     To import them for the first time takes seconds, which are not the search's.
     """
     Deadline.of(seconds)  # refused before anything is loaded
-    for module in ("cvxpy", "scipy.optimize", *(name.lower() for name in _SOLVERS)):
+    for module in ("cvxpy", "scipy.optimize", "clarabel"):
         with contextlib.suppress(ImportError):  # raised where it is needed
             importlib.import_module(module)
     return Deadline.of(seconds)
@@ -61,12 +60,6 @@ def expected_seconds(n: int, p: int, kind: Kind) -> float:
     """About how long a program takes for each Jacobian, apart from what all of them take."""
     size = 2 * n + (p if kind == "output injection" else 0)
     return _SECONDS * (size * (size + 1) / 2) ** 3
-
-
-def _time_limit(solver: str, seconds: float) -> dict[str, float]:
-    if not math.isfinite(seconds):
-        return {}
-    return {"time_limit" if solver == "CLARABEL" else "time_limit_secs": max(seconds, _LEAST)}
 
 
 class Program:
@@ -130,27 +123,23 @@ class Program:
             cp.Minimize(first**2 * condition + second**2 * output), constraints
         )
 
-    def solve(
-        self, rate: float, margin: float, *, thorough: bool = True, seconds: float = math.inf
-    ) -> Answer:
+    def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
         """Solve for a rate."""
         self._rate2.value, self._margin.value = rate * rate, margin
         self._rest.value = max(rate * rate - margin, 0.0)
-        status, deadline = "no solver", Deadline(max(seconds, _LEAST))
-        for solver in _SOLVERS if thorough else _SOLVERS[:1]:
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
-                    self._problem.solve(solver=solver, **_time_limit(solver, deadline.left))
-                status = str(self._problem.status)
-            except Exception as error:  # a solver may raise anything, and the next may not
-                status = f"{solver} raised {type(error).__name__}"
-                continue
-            if status in ("infeasible", "infeasible_inaccurate"):
-                return Answer("infeasible")
-            if self._P.value is not None and np.isfinite(self._P.value).all():
-                return self._answer(status)
-        return Answer(status)
+        limit = {"time_limit": max(seconds, _LEAST)} if math.isfinite(seconds) else {}
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self._problem.solve(solver="CLARABEL", **limit)
+        except Exception as error:  # a solver may raise anything
+            return Answer(f"the solver raised {type(error).__name__}")
+        status = str(self._problem.status)
+        if status in ("infeasible", "infeasible_inaccurate"):
+            return Answer("infeasible")
+        if self._P.value is None or not np.isfinite(self._P.value).all():
+            return Answer(status)
+        return self._answer(status)
 
     def _answer(self, status: str) -> Answer:
         d, s = self._d, self._s

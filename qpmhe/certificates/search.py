@@ -145,9 +145,9 @@ class Search:
             ) from error
 
     def _feasible(self, rate: float, deadline: Deadline) -> Answer:
-        return self._solved(rate, _MARGINS[0] * min(1.0, rate * rate), deadline, thorough=False)
+        return self._solved(rate, _MARGINS[0] * min(1.0, rate * rate), deadline)
 
-    def _solved(self, rate: float, margin: float, deadline: Deadline, *, thorough: bool) -> Answer:
+    def _solved(self, rate: float, margin: float, deadline: Deadline) -> Answer:
         """What the program returns; an error if there is no time for it, or not enough."""
         if deadline.passed:
             raise self._out_of_time("it was over while matrices were sought and verified")
@@ -156,7 +156,7 @@ class Search:
                 f"a semidefinite program for {self.system.n} states takes about "
                 f"{self.program.expected_seconds:.2g} s, and {deadline.left:.2g} s were left"
             )
-        answer = self.program.solve(rate, margin, thorough=thorough, seconds=deadline.left)
+        answer = self.program.solve(rate, margin, deadline.left)
         if answer.status == "user_limit" and deadline.passed:
             raise self._out_of_time(
                 f"a semidefinite program for {self.system.n} states was not solved in time"
@@ -211,7 +211,7 @@ class Search:
         status = "no round was left"
         for turn in range(1, _ROUNDS + 1):
             try:
-                answer = self._solved(rate, _MARGINS[level] * size, self._deadline, thorough=True)
+                answer = self._solved(rate, _MARGINS[level] * size, self._deadline)
             except OutOfTimeError:
                 if best is None:
                     raise

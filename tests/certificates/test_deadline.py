@@ -205,7 +205,7 @@ def test_solver_keeps_to_its_time():
     J = np.vstack((A, np.eye(n)[:2]))[None].repeat(4, axis=0)
     program = Program("output weight", J, Scales(np.ones(n), np.ones(2)), (1.0, 1.0))
     assert program.solve(0.9, 1e-6).P is not None
-    assert program.solve(0.9, 1e-6, thorough=False, seconds=1e-4).status == "user_limit"
+    assert program.solve(0.9, 1e-6, seconds=1e-4).status == "user_limit"
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, math.nan, True, "long", None])
