@@ -13,7 +13,7 @@ from .evidence import (
 from .monitor import Hypotheses, Monitor, MonitorSummary, monitor, monitored_run
 from .properties import Detectability, ObserverStability
 from .regions import Region
-from .report import Report, certify_model, error_and_bounds
+from .report import Report, certify_model
 from .theorem import DecayingSums, Sizes, theorem
 
 __all__ = [
@@ -21,5 +21,5 @@ __all__ = [
     "Hypotheses", "MismatchError", "Monitor", "MonitorSummary", "NotCertifiedError",
     "ObserverStability", "OutOfTimeError", "Region", "Report", "Sizes", "Synthesis",
     "audit", "certify", "certify_detectability", "certify_model", "certify_observer",
-    "error_and_bounds", "monitor", "monitored_run", "synthesise_gain", "theorem",
+    "monitor", "monitored_run", "synthesise_gain", "theorem",
 ]

@@ -15,7 +15,7 @@ from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel, evaluated, joint_jacobians
 from .evidence import Evidence, NotCertifiedError, OutOfTimeError
-from .inequalities import ErrorContraction, Form, Matrices, OutputInjection, OutputWeight, definite
+from .inequalities import Form, Matrices, definite
 from .regions import Region
 from .sdp import Answer, Kind, Program, Scales, expected_seconds
 from .theorem import checked_rate
@@ -107,7 +107,7 @@ class Search:
         """
         deadline = self._deadline.part(_CHOICE)
         low, high = 0.0, _LARGEST_RATE
-        if self._feasible(high, deadline).P is None:
+        if self._feasible(high, deadline).form is None:
             return np.inf
         while high - low > _TOLERANCE * (1.0 - low):
             middle = 0.5 * (low + high)
@@ -115,7 +115,7 @@ class Search:
                 answer = self._feasible(middle, deadline)
             except OutOfTimeError:
                 break
-            if answer.P is None:
+            if answer.form is None:
                 low = middle
             else:
                 high = middle
@@ -216,11 +216,10 @@ class Search:
                 if best is None:
                     raise
                 break
-            if answer.P is None:
+            if answer.form is None:
                 status = answer.status
                 break
-            form = self._form(answer, rate)
-            outcome = self._verified(form)
+            outcome = self._verified(answer.form)
             if isinstance(outcome, Found):
                 if outcome.evidence is Evidence.PROVED or self.model.reason:
                     return outcome
@@ -238,23 +237,6 @@ class Search:
             else f"no matrix that passes the verification was found for the rate {rate:.6g} "
             f"(solver status: {status})"
         )
-
-    def _form(self, answer: Answer, rate: float) -> Form:
-        P, Y, R, M, N = answer.P, answer.Y, answer.R, answer.M, answer.N
-        assert P is not None
-        if R is not None:
-            # The solver's tolerance may leave it below zero; a larger R asks for less.
-            values, vectors = np.linalg.eigh(R)
-            R = (vectors * np.maximum(values, 0.0)) @ vectors.T
-            R = 0.5 * (R + R.T)
-        if self.gain is not None:
-            return ErrorContraction(P, self.gain, rate)
-        if R is not None and Y is None:
-            return OutputWeight(P, R, rate)
-        assert Y is not None
-        if R is not None and M is not None and N is not None:
-            return OutputInjection(P, R, Y, M, N, rate)
-        return ErrorContraction(P, np.asarray(np.linalg.solve(P, Y), np.float64), rate)
 
     def _verified(self, form: Form) -> Found | Cover:
         """What was shown, or the cover with the states where the inequality fails."""

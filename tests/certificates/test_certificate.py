@@ -12,7 +12,7 @@ from qpmhe.certificates.certificate import certify
 from qpmhe.certificates.contraction import certify_detectability, certify_observer, synthesise_gain
 from qpmhe.certificates.evidence import CertificateError, Evidence, NotCertifiedError
 from qpmhe.certificates.properties import Detectability, ObserverStability
-from qpmhe.certificates.report import LABELS, error_and_bounds
+from qpmhe.certificates.report import LABELS
 from qpmhe.certificates.theorem import DecayingSums, theorem
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
 
@@ -320,7 +320,7 @@ def test_no_observer_is_named_by_its_certification(reactor):
 
 def test_figure_shows_error_and_bounds():
     times = np.arange(5.0)
-    axes = error_and_bounds(
+    axes = qpmhe.plots.error_and_bounds(
         times, np.array([1.0, 0.5, 0.0, 0.2, 0.1]),
         {LABELS["paper"]: np.full(5, 30.0), LABELS["weighted"]: np.full(5, np.inf)},
         diameter=3.0, time_label="t (s)",
@@ -330,4 +330,4 @@ def test_figure_shows_error_and_bounds():
     assert labels == ["error", LABELS["paper"], LABELS["weighted"]]
     assert axes.get_ylim()[1] > 30.0
     with pytest.raises(ShapeError, match="error"):
-        error_and_bounds(times, np.ones(4), {})
+        qpmhe.plots.error_and_bounds(times, np.ones(4), {})
