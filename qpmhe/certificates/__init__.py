@@ -14,12 +14,12 @@ from .monitor import Hypotheses, Monitor, MonitorSummary, monitor, monitored_run
 from .properties import Detectability, ObserverStability
 from .regions import Region
 from .report import Report, certify_model
-from .theorem import DecayingSums, Sizes, theorem
+from .theorem import DecayingSums, Sizes, TheoremConstants
 
 __all__ = [
     "Audit", "Certificate", "CertificateError", "DecayingSums", "Detectability", "Evidence",
     "Hypotheses", "MismatchError", "Monitor", "MonitorSummary", "NotCertifiedError",
-    "ObserverStability", "OutOfTimeError", "Region", "Report", "Sizes", "Synthesis",
+    "ObserverStability", "OutOfTimeError", "Region", "Report", "Sizes", "Synthesis", "TheoremConstants",
     "audit", "certify", "certify_detectability", "certify_model", "certify_observer",
-    "monitor", "monitored_run", "synthesise_gain", "theorem",
+    "monitor", "monitored_run", "synthesise_gain",
 ]

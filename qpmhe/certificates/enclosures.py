@@ -316,12 +316,8 @@ def _operations() -> dict[int, Callable[..., Any]]:
         ca.OP_POW: operator.pow, ca.OP_CONSTPOW: operator.pow, ca.OP_FABS: operator.abs,
         ca.OP_SQ: lambda s: s * s, ca.OP_TWICE: lambda s: 2.0 * s, ca.OP_INV: lambda s: 1.0 / s,
     }
-    named = {
-        "SQRT": "sqrt", "SIN": "sin", "COS": "cos", "TAN": "tan", "EXP": "exp", "LOG": "log",
-        "TANH": "tanh", "ATAN": "arctan", "SINH": "sinh", "COSH": "cosh",
-        "EXPM1": "expm1", "LOG1P": "log1p",
-    }
-    for code, name in named.items():
+    for code in ["SQRT", "SIN", "COS", "TAN", "EXP", "LOG", "TANH", "ATAN", "SINH", "COSH", "EXPM1", "LOG1P"]:
         if hasattr(ca, f"OP_{code}"):
+            name = {"ATAN": "arctan"}.get(code, code.lower())
             known[getattr(ca, f"OP_{code}")] = getattr(np, name)
     return known

@@ -14,7 +14,7 @@ from ..costs import Cost, CostConstants
 from ..errors import OptionError
 from .inequalities import Matrices, norms
 from .properties import Detectability, ObserverStability
-from .theorem import Sizes, TheoremConstants, decaying_sums, theorem
+from .theorem import Sizes, TheoremConstants, decaying_sums
 
 Kind = Literal["paper", "summed", "weighted", "measured"]
 
@@ -265,7 +265,7 @@ def bounds_for(
     constants: CostConstants, *, lipschitz: float, output: Matrices | None = None,
 ) -> HorizonBounds:
     """The bounds that follow from what was certified."""
-    plain = theorem(
+    plain = TheoremConstants(
         detectability.sums, stability.sums, constants, kappa=stability.kappa,
         lipschitz=lipschitz, horizon=horizon,
     )

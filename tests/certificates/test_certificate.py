@@ -13,7 +13,7 @@ from qpmhe.certificates.contraction import certify_detectability, certify_observ
 from qpmhe.certificates.evidence import CertificateError, Evidence, NotCertifiedError
 from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.certificates.report import LABELS
-from qpmhe.certificates.theorem import DecayingSums, theorem
+from qpmhe.certificates.theorem import DecayingSums, TheoremConstants
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
 
 SLACK = 1 + 1e-9
@@ -28,7 +28,7 @@ def test_the_reactors_constants_are_the_theorems(reactor):
     assert observed.C_p == pytest.approx(1.0, abs=1e-6)  # it contracts with P = I
     for N in (1, 5, 10):
         paper = certificate.of(N).paper
-        again = theorem(
+        again = TheoremConstants(
             DecayingSums(0.9, detected.c_p, detected.c_w, detected.c_v),
             DecayingSums(0.95, observed.C_p, observed.C_w, np.sqrt(0.5)),  # 1 / L_h
             certificate.audit.constants, kappa=np.sqrt(0.005), lipschitz=np.sqrt(2.0), horizon=N,
