@@ -19,7 +19,7 @@ from .theorem import DecayingSums, Sizes, TheoremConstants
 __all__ = [
     "Audit", "Certificate", "CertificateError", "DecayingSums", "Detectability", "Evidence",
     "Hypotheses", "MismatchError", "Monitor", "MonitorSummary", "NotCertifiedError",
-    "ObserverStability", "OutOfTimeError", "Region", "Report", "Sizes", "Synthesis", "TheoremConstants",
-    "audit", "certify", "certify_detectability", "certify_model", "certify_observer",
-    "monitor", "monitored_run", "synthesise_gain",
+    "ObserverStability", "OutOfTimeError", "Region", "Report", "Sizes", "Synthesis",
+    "TheoremConstants", "audit", "certify", "certify_detectability", "certify_model",
+    "certify_observer", "monitor", "monitored_run", "synthesise_gain",
 ]

@@ -76,15 +76,8 @@ class Region:
         away = np.zeros(lower.shape[0], dtype=np.bool_)
         if self.is_box:
             return away
-        low, high = lower[:, : self.n], upper[:, : self.n]
-        rows = self.states.matrix
-        positive, negative = np.maximum(rows, 0.0), np.minimum(rows, 0.0)
-        least = low @ positive.T + high @ negative.T
-        most = high @ positive.T + low @ negative.T
-        size = np.maximum(np.abs(low), np.abs(high)) @ np.abs(rows).T
-        rounding = 4.0 * (self.n + 2) * np.finfo(np.float64).eps * size
-        above = least - rounding > self.states.row_upper
-        away |= np.any(above | (most + rounding < self.states.row_lower), axis=1)
+        least, most = _row_bounds(self.states.matrix, lower[:, : self.n], upper[:, : self.n])
+        away |= np.any((least > self.states.row_upper) | (most < self.states.row_lower), axis=1)
         return away
 
     def sample(self, count: int, generator: np.random.Generator) -> Array:
@@ -202,6 +195,16 @@ def _inequalities(states: ConvexSet) -> tuple[Array, Array]:
     return G[finite], g[finite]
 
 
+def _row_bounds(rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Outward bounds on linear forms over boxes; exact where a form is a coordinate."""
+    positive, negative = np.maximum(rows, 0.0).T, np.minimum(rows, 0.0).T
+    single = (np.count_nonzero(rows, axis=1) == 1) & (np.abs(rows).sum(axis=1) == 1.0)
+    terms = np.where(single, 0.0, 4.0 * (rows.shape[1] + 2))
+    size = np.maximum(np.abs(low), np.abs(high)) @ np.abs(rows).T
+    rounding = terms * np.finfo(np.float64).eps * size
+    return low @ positive + high @ negative - rounding, high @ positive + low @ negative + rounding
+
+
 def _support(G: Array, g: Array, e: Array) -> tuple[Array, float, float]:
     """A vertex that maximises e^T x over G x <= g, y^T g, and a bound on |G^T y - e|_1.
 
@@ -234,14 +237,11 @@ def beyond(inner: Region, outer: Region) -> str:
     eye, inputs = np.eye(size), slice(n, outer.lower.size)
     G = np.vstack((np.pad(G, ((0, 0), (0, size - n))), eye[inputs], -eye[inputs]))
     g = np.concatenate((g, outer.upper[inputs], -outer.lower[inputs]))
-    largest = np.maximum(np.abs(inner.lower), np.abs(inner.upper))
     for row, limit in zip(G, g, strict=True):
         same = (own == row[:n]).all(axis=1) & (not row[n:].any())
         if same.any() and sides[same].min() <= limit:
             continue
-        most = float(np.maximum(row * inner.lower, row * inner.upper).sum())
-        if np.count_nonzero(row) > 1:
-            most += 4.0 * (size + 2) * np.finfo(np.float64).eps * float(np.abs(row) @ largest)
+        most = float(_row_bounds(row[None], inner.lower, inner.upper)[1][0])
         if not most <= limit:
             terms = " + ".join(
                 f"{row[j]:.6g} {'x' if j < n else 'u'}[{j if j < n else j - n}]"

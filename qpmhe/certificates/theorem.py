@@ -207,7 +207,9 @@ class TheoremConstants:
             if not 0.0 <= value < math.inf:
                 raise OptionError(f"{name} is {value!r}; expected a finite number >= 0.")
         if not 0.0 < self.cost.exponent < math.inf:
-            raise OptionError(f"the cost's exponent is {self.cost.exponent!r}; expected a number > 0.")
+            raise OptionError(
+                f"the cost's exponent is {self.cost.exponent!r}; expected a number > 0."
+            )
         for name in ("prior", "disturbance", "noise"):
             lower, upper = getattr(self.cost, name)
             if not 0.0 < lower <= upper < math.inf:
