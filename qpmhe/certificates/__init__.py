@@ -13,13 +13,13 @@ from .evidence import (
 from .monitor import Hypotheses, Monitor, MonitorSummary, monitor, monitored_run
 from .properties import Detectability, ObserverStability
 from .regions import Region
-from .report import Report, certify_model, error_and_bounds
-from .theorem import DecayingSums, Sizes, theorem
+from .report import Report, certify_model
+from .theorem import DecayingSums, Sizes, TheoremConstants
 
 __all__ = [
     "Audit", "Certificate", "CertificateError", "DecayingSums", "Detectability", "Evidence",
     "Hypotheses", "MismatchError", "Monitor", "MonitorSummary", "NotCertifiedError",
     "ObserverStability", "OutOfTimeError", "Region", "Report", "Sizes", "Synthesis",
-    "audit", "certify", "certify_detectability", "certify_model", "certify_observer",
-    "error_and_bounds", "monitor", "monitored_run", "synthesise_gain", "theorem",
+    "TheoremConstants", "audit", "certify", "certify_detectability", "certify_model",
+    "certify_observer", "monitor", "monitored_run", "synthesise_gain",
 ]

@@ -71,7 +71,8 @@ def _correction_findings(
             True, Evidence.PROVED, f"kappa = |L| = {kappa:.6g}, of a constant gain", kappa
         )
     if observer.initial_covariance() is not None or observer.needs_jacobians:
-        return none(True, Evidence.ASSUMED, f"{kind} multiplies v by its gain of the moment"), bound(
+        varying = f"{kind} multiplies v by its gain of the moment"
+        return none(True, Evidence.ASSUMED, varying), bound(
             None, None,
             f"{kind} has a gain that follows from what was measured: state its bound, "
             "ObserverStability.assumed(kappa=...)",

@@ -41,47 +41,73 @@ class Cover:
     late: bool = False  # whether it ended because the time was over
 
 
+class _Cells:
+    """The cells of a region that remain, each with the bound of the cell that it is a part of."""
+
+    def __init__(self, region: Region) -> None:
+        self._region = region
+        self.lower, self.upper = region.lower[None], region.upper[None]
+        self.inherited = np.array([np.inf])
+        self.taken = 0
+
+    def take(self, most: int) -> tuple[Array, Array]:
+        """The cells with the largest inherited bounds, which decide the result."""
+        order = np.argsort(self.inherited, kind="stable")
+        rest, chosen = order[:-most], order[-most:]
+        low, high = self.lower[chosen], self.upper[chosen]
+        self.lower, self.upper = self.lower[rest], self.upper[rest]
+        self.inherited = self.inherited[rest]
+        self.taken += len(chosen)
+        return low, high
+
+    def halve(
+        self, low: Array, high: Array, enclosure: Enclosure, left: NDArray[Any], bounds: Array
+    ) -> None:
+        """Put the halves of cells back, along the coordinates that make most of the error."""
+        region, rows = self._region, np.arange(low.shape[0])
+        corners = np.abs(enclosure.slopes[left]).sum(axis=(2, 3))
+        scores = enclosure.excess[left] + _CORNER_SHARE * corners
+        known = np.isfinite(scores).all(axis=1) & (scores.max(axis=1) > 0.0)
+        width = np.where(region.upper > region.lower, region.upper - region.lower, np.inf)
+        which = np.where(known[:, None], scores, (high - low) / width).argmax(axis=1)
+        middle = 0.5 * (low[rows, which] + high[rows, which])
+        first_high, second_low = high.copy(), low.copy()
+        first_high[rows, which] = second_low[rows, which] = middle
+        lower, upper = np.vstack((low, second_low)), np.vstack((first_high, high))
+        stay = ~region.outside(lower, upper)
+        self.lower = np.vstack((self.lower, lower[stay]))
+        self.upper = np.vstack((self.upper, upper[stay]))
+        self.inherited = np.append(self.inherited, np.tile(bounds, 2)[stay])
+
+
 def cover(
     model: SmoothModel, region: Region, form: Form, most_cells: int = _MOST_CELLS,
     seconds: float | Deadline = PART_SECONDS,
 ) -> Cover:
     """Show an inequality on a region by dividing it until each cell is shown."""
-    deadline = Deadline.of(seconds)
-    chunk = _chunk(model.n, model.p, region.lower.size)
-    lower, upper = region.lower[None], region.upper[None]
-    cells, margin = 0, np.inf
+    deadline, cells, margin = Deadline.of(seconds), _Cells(region), np.inf
+    corners = 2 ** min(region.lower.size, MOST_ACTIVE)
+    chunk = int(np.clip(_WORK / (corners * (2 * model.n + model.p) ** 3), 1, _CHUNK))
     nowhere = np.empty((0, region.lower.size)), np.empty((0, model.n + model.p, model.n))
-    while lower.shape[0]:
-        if cells and deadline.passed:
-            return Cover(False, cells, margin, *nowhere, late=True)
-        taken = lower[-chunk:], upper[-chunk:]
-        lower, upper = lower[:-chunk], upper[:-chunk]
-        cells += taken[0].shape[0]
-        enclosure = model.enclose(*taken)
+    while len(cells.lower):
+        if cells.taken and deadline.passed:
+            return Cover(False, cells.taken, margin, *nowhere, late=True)
+        low, high = cells.take(chunk)
+        enclosure = model.enclose(low, high)
         shown, least = _shown(form, enclosure)
         margin = min(margin, float(least[shown].min(initial=np.inf)))
         if shown.all():
             continue
         left = np.flatnonzero(~shown)
-        low, high = taken[0][left], taken[1][left]
+        low, high, centres = low[left], high[left], enclosure.centre[left]
         middle = 0.5 * (low + high)
-        broken = _broken(form, enclosure.centre[left])
-        broken &= region.contains(middle[:, : model.n])
+        broken = _broken(form, centres) & region.contains(middle[:, : model.n])
         if broken.any():
-            return Cover(False, cells, margin, middle[broken], enclosure.centre[left][broken])
-        if cells > most_cells:
-            return Cover(False, cells, margin, *nowhere)
-        low, high, _ = _halved(
-            region, low, high, _scores(region, enclosure, left, low, high, _CORNER_SHARE)
-        )
-        lower, upper = np.vstack((lower, low)), np.vstack((upper, high))
-    return Cover(True, cells, margin, *nowhere)
-
-
-def _chunk(n: int, p: int, coordinates: int) -> int:
-    """How many cells to look at at once."""
-    corners = 2 ** min(coordinates, MOST_ACTIVE)
-    return int(np.clip(_WORK / (corners * (2 * n + p) ** 3), 1, _CHUNK))
+            return Cover(False, cells.taken, margin, middle[broken], centres[broken])
+        if cells.taken > most_cells:
+            return Cover(False, cells.taken, margin, *nowhere)
+        cells.halve(low, high, enclosure, left, np.full(len(left), np.inf))
+    return Cover(True, cells.taken, margin, *nowhere)
 
 
 def _shown(form: Form, enclosure: Enclosure) -> tuple[NDArray[np.bool_], Array]:
@@ -102,38 +128,10 @@ def _shown(form: Form, enclosure: Enclosure) -> tuple[NDArray[np.bool_], Array]:
 def _broken(form: Form, jacobians: Array) -> NDArray[np.bool_]:
     """Where the inequality does not hold at a single Jacobian."""
     known = np.isfinite(jacobians).all(axis=(1, 2))
-    broken = np.zeros(jacobians.shape[0], dtype=np.bool_)
-    if known.any():
-        single = form.matrices(Matrices.exact(jacobians[known])).middle
-        broken[known] = np.linalg.eigvalsh(
-            0.5 * single + 0.5 * np.swapaxes(single, 1, 2)
-        )[:, 0] <= 0.0
+    single = form.matrices(Matrices.exact(jacobians[known])).middle
+    broken = np.zeros(len(jacobians), dtype=np.bool_)
+    broken[known] = np.linalg.eigvalsh(0.5 * single + 0.5 * np.swapaxes(single, 1, 2))[:, 0] <= 0.0
     return broken
-
-
-def _scores(
-    region: Region, enclosure: Enclosure, left: NDArray[Any], low: Array, high: Array,
-    corner_share: float,
-) -> Array:
-    """What each coordinate adds to the error of the cells that are left, (B, N)."""
-    corners = np.abs(enclosure.slopes[left]).sum(axis=(2, 3))
-    scores = enclosure.excess[left] + corner_share * corners
-    known = np.isfinite(scores).all(axis=1) & (scores.max(axis=1) > 0.0)
-    width = np.where(region.upper > region.lower, region.upper - region.lower, np.inf)
-    return np.where(known[:, None], scores, (high - low) / width)
-
-
-def _halved(
-    region: Region, low: Array, high: Array, scores: Array
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Halves of cells along their largest scores, and which of all are not outside the region."""
-    rows, which = np.arange(low.shape[0]), scores.argmax(axis=1)
-    middle = 0.5 * (low[rows, which] + high[rows, which])
-    first_high, second_low = high.copy(), low.copy()
-    first_high[rows, which] = second_low[rows, which] = middle
-    lower, upper = np.vstack((low, second_low)), np.vstack((first_high, high))
-    stay = ~region.outside(lower, upper)
-    return lower[stay], upper[stay], stay
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,58 +155,41 @@ def output_lipschitz(
     is one number; otherwise cells are divided until the bound exceeds the largest norm seen
     by a thousandth at most, or the time is over; f is not used.
     """
-    deadline = Deadline.of(seconds)
+    deadline, n = Deadline.of(seconds), system.n
     model = model or SmoothModel(system, region)
     points = region.sample(_SAMPLES, np.random.default_rng(20210829))
-    x, u = points[:, : system.n], points[:, system.n :]
     check_values(system, points, output_only=True)
-    gradients = evaluated("the Jacobian of h", system.h_jacobian, x, u)
-    usable = np.isfinite(gradients).all(axis=(-2, -1))
-    norms = np.full(len(x), np.inf)
-    norms[usable] = np.linalg.norm(gradients[usable], 2, axis=(-2, -1))
-    worst = int(norms.argmax())
-    attained, at = float(norms[worst]), points[worst]
+    gradients = evaluated("the Jacobian of h", system.h_jacobian, points[:, :n], points[:, n:])
+    attained, at = _largest(gradients, points, np.inf)
 
     def seen(why: str) -> LipschitzConstant:
-        return LipschitzConstant(
-            attained, Evidence.SAMPLED, attained, at, f"largest of {norms.size} gradients; {why}"
-        )
+        note = f"largest of {len(points)} gradients; {why}"
+        return LipschitzConstant(attained, Evidence.SAMPLED, attained, at, note)
 
     if model.output_reason:
         return seen(f"h cannot be run with intervals ({model.output_reason})")
-    lower, upper = region.lower[None], region.upper[None]
-    inherited = np.array([np.inf])  # the bound on the cell that each was a part of
-    bound, cells, end = 0.0, 0, ""
-    while lower.shape[0]:
-        if cells and (deadline.passed or cells > _MOST_OUTPUT_CELLS):
+    cells, bound, end = _Cells(region), 0.0, ""
+    while len(cells.lower):
+        if cells.taken and (deadline.passed or cells.taken > _MOST_OUTPUT_CELLS):
             end = ", when its time was over" if deadline.passed else ", the most that are allowed"
-            bound = max(bound, float(inherited.max()))
+            bound = max(bound, float(cells.inherited.max()))
             if np.isfinite(bound):
                 break
-            return seen(f"no bound was found with {cells} cells{end}")
-        # The largest bounds first: they decide the result.
-        order = np.argsort(inherited, kind="stable")
-        lower, upper, inherited = lower[order], upper[order], inherited[order]
-        low, high = lower[-_CHUNK:], upper[-_CHUNK:]
-        lower, upper, inherited = lower[:-_CHUNK], upper[:-_CHUNK], inherited[:-_CHUNK]
-        cells += low.shape[0]
+            return seen(f"no bound was found with {cells.taken} cells{end}")
+        low, high = cells.take(_CHUNK)
         enclosure = model.enclose(low, high, output_only=True)
-        bounds = _norm_bounds(enclosure)
-        largest, middle = _largest(enclosure, 0.5 * low + 0.5 * high, region)
-        if largest > attained:
-            attained, at = largest, middle
+        bounds, middles = _norm_bounds(enclosure), 0.5 * low + 0.5 * high
+        inside = region.contains(middles[:, :n])
+        if inside.any():
+            largest, where = _largest(enclosure.centre[inside], middles[inside], -np.inf)
+            if largest > attained:
+                attained, at = largest, where
         goal = np.inf if model.affine_output else attained * (1.0 + _TOLERANCE)
-        open_ = ~(bounds <= goal)
-        bound = max(bound, float(bounds[~open_].max(initial=0.0)))
-        if not open_.any():
-            continue
-        low, high = low[open_], high[open_]
-        low, high, stay = _halved(
-            region, low, high, _scores(region, enclosure, open_, low, high, 1.0)
-        )
-        lower, upper = np.vstack((lower, low)), np.vstack((upper, high))
-        inherited = np.append(inherited, np.tile(bounds[open_], 2)[stay])
-    how = "h is affine" if model.affine_output else f"bounded on {cells} cells{end}"
+        left = np.flatnonzero(~(bounds <= goal))
+        bound = max(bound, float(np.delete(bounds, left).max(initial=0.0)))
+        if left.size:
+            cells.halve(low[left], high[left], enclosure, left, bounds[left])
+    how = "h is affine" if model.affine_output else f"bounded on {cells.taken} cells{end}"
     return LipschitzConstant(bound, Evidence.PROVED, attained, at, how)
 
 
@@ -224,16 +205,13 @@ def constant_output(system: System, region: Region) -> Matrices | None:
     return Matrices(corners[:, 0], error)
 
 
-def _largest(enclosure: Enclosure, middles: Array, region: Region) -> tuple[float, Array]:
-    """The largest norm of the Jacobian of h in the middle of a cell, and where."""
-    usable = np.isfinite(enclosure.centre).all(axis=(1, 2)) & region.contains(
-        middles[:, : region.n]
-    )
-    norms = np.full(middles.shape[0], -np.inf)
-    with np.errstate(all="ignore"):
-        norms[usable] = np.linalg.norm(enclosure.centre[usable], 2, axis=(-2, -1))
+def _largest(jacobians: Array, points: Array, unknown: float) -> tuple[float, Array]:
+    """The largest norm of some Jacobians, and where; those that are not finite count as given."""
+    usable = np.isfinite(jacobians).all(axis=(-2, -1))
+    norms = np.full(len(jacobians), unknown)
+    norms[usable] = np.linalg.norm(jacobians[usable], 2, axis=(-2, -1))
     worst = int(norms.argmax())
-    return float(norms[worst]), middles[worst]
+    return float(norms[worst]), points[worst]
 
 
 def _norm_bounds(enclosure: Enclosure) -> Array:

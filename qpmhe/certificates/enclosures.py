@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-import operator
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._checks import Array
-from ..codegen.expressions import CasadiModel, import_casadi
+from ..codegen.graph import model_graph
 from ..errors import ModelError
 from ..model.system import System
 from .intervals import Interval, Jet, OutsideDomainError, variables
@@ -23,12 +19,7 @@ from .regions import Region
 _REMEDY = "Take a smaller region, or make the model defined on all of it."
 
 
-class _Batched(Protocol):
-    @property
-    def batch(self) -> Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]: ...
-
-
-def evaluated(name: str, function: _Batched, x: Array, u: Array) -> Array:
+def evaluated(name: str, function: Any, x: Array, u: Array) -> Array:
     """A function's values; the state is named where it raises."""
     with np.errstate(all="ignore"):
         try:
@@ -37,7 +28,7 @@ def evaluated(name: str, function: _Batched, x: Array, u: Array) -> Array:
             raise ModelError(_raised(name, function, x, u, error)) from error
 
 
-def _raised(name: str, function: _Batched, x: Array, u: Array, first: Exception) -> str:
+def _raised(name: str, function: Any, x: Array, u: Array, first: Exception) -> str:
     for k in range(len(x)):
         try:
             np.array(function.batch(x[k : k + 1], u[k : k + 1]), np.float64)
@@ -145,8 +136,8 @@ class SmoothModel:
         self._system, self._region = system, region
         self._graph = self._output_graph = None
         if system.symbolic is not None:
-            self._graph = _model_graph(system.symbolic)
-            self._output_graph = _model_graph(system.symbolic, output_only=True)
+            self._graph = model_graph(system.symbolic)
+            self._output_graph = model_graph(system.symbolic, output_only=True)
         self.n, self.p = system.n, system.p
         self.affine_output = False
         middle = 0.5 * (region.lower + region.upper)[None]
@@ -264,71 +255,3 @@ class SmoothModel:
                 lost = ~(np.isfinite(jet.value.low) & np.isfinite(jet.value.high))
                 gradient[:, row, :, lost] = hessian[:, row, :, :, lost] = np.nan
         return Interval(*gradient), Interval(*hessian)
-
-
-def _model_graph(
-    model: CasadiModel, *, output_only: bool = False
-) -> Callable[[Sequence[Any]], list[Any]]:
-    """A CasADi model's f and h as a function of a list of n + m numbers of any kind."""
-    ca = import_casadi()
-    x, u = ca.SX.sym("x", model.n), ca.SX.sym("u", model.m)
-    column = model.h.expand()(x, u)
-    if not output_only:
-        column = ca.vertcat(model.step().expand()(x, u, model.dt or 0.0), column)
-    column, size = ca.densify(column), column.numel()
-    function = ca.Function("model", [ca.vertcat(x, u)], [column])
-    known = _operations()
-    instructions = [
-        (
-            function.instruction_id(k), list(function.instruction_input(k)),
-            list(function.instruction_output(k)),
-            function.instruction_constant(k)
-            if function.instruction_id(k) == ca.OP_CONST else 0.0,
-        )
-        for k in range(function.n_instructions())
-    ]
-
-    def evaluate(values: Sequence[Any]) -> list[Any]:
-        work: dict[int, Any] = {}
-        results: list[Any] = [0.0] * size
-        for code, arguments, targets, constant in instructions:
-            if code == ca.OP_INPUT:
-                work[targets[0]] = values[arguments[1]]
-            elif code == ca.OP_CONST:
-                work[targets[0]] = float(constant)
-            elif code == ca.OP_OUTPUT:
-                results[targets[1]] = work[arguments[0]]
-            elif code in known:
-                work[targets[0]] = known[code](*(work[i] for i in arguments))
-            else:
-                raise OutsideDomainError(f"operation {code} of CasADi, which is not smooth")
-        return results
-
-    return evaluate
-
-
-def _method(name: str) -> Callable[[Any], Any]:
-    def apply(value: Any) -> Any:
-        return getattr(np, name)(value)
-
-    return apply
-
-
-@lru_cache(maxsize=1)
-def _operations() -> dict[int, Callable[..., Any]]:
-    ca = import_casadi()
-    known: dict[int, Callable[..., Any]] = {
-        ca.OP_ADD: operator.add, ca.OP_SUB: operator.sub, ca.OP_MUL: operator.mul,
-        ca.OP_DIV: operator.truediv, ca.OP_NEG: operator.neg, ca.OP_ASSIGN: operator.pos,
-        ca.OP_POW: operator.pow, ca.OP_CONSTPOW: operator.pow, ca.OP_FABS: operator.abs,
-        ca.OP_SQ: lambda s: s * s, ca.OP_TWICE: lambda s: 2.0 * s, ca.OP_INV: lambda s: 1.0 / s,
-    }
-    named = {
-        "SQRT": "sqrt", "SIN": "sin", "COS": "cos", "TAN": "tan", "EXP": "exp", "LOG": "log",
-        "TANH": "tanh", "ATAN": "arctan", "SINH": "sinh", "COSH": "cosh",
-        "EXPM1": "expm1", "LOG1P": "log1p",
-    }
-    for code, name in named.items():
-        if hasattr(ca, f"OP_{code}"):
-            known[getattr(ca, f"OP_{code}")] = _method(name)
-    return known

@@ -18,6 +18,7 @@ in (A, C) that is positive definite.
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -68,20 +69,16 @@ def _square(P: Array, rate: float) -> Matrices:
     )
 
 
-def _assemble(blocks: list[list[Matrices | None]], sizes: list[int], cells: int) -> Matrices:
-    """Blocks on and above the diagonal as one symmetric matrix; None is zero."""
-    k = sum(sizes)
-    middle, radius = np.zeros((2, cells, k, k))
-    at = np.cumsum([0, *sizes])
-    for i, row in enumerate(blocks):
-        for j, block in enumerate(row, start=i):
-            if block is None:
-                continue
-            rows, columns = slice(at[i], at[i + 1]), slice(at[j], at[j + 1])
-            middle[:, rows, columns], radius[:, rows, columns] = block.middle, block.radius
-            if j > i:
-                middle[:, columns, rows] = np.swapaxes(block.middle, -1, -2)
-                radius[:, columns, rows] = np.swapaxes(block.radius, -1, -2)
+def _assemble(rows: list[list[Matrices]]) -> Matrices:
+    """Blocks as one matrix."""
+    cells = np.broadcast_shapes(*(each.middle.shape[:-2] for row in rows for each in row))
+    middle, radius = (
+        np.block([
+            [np.broadcast_to(part(each), cells + each.middle.shape[-2:]) for each in row]
+            for row in rows
+        ])
+        for part in (operator.attrgetter("middle"), operator.attrgetter("radius"))
+    )
     return Matrices(middle, radius)
 
 
@@ -116,11 +113,10 @@ class OutputWeight:
 
     def matrices(self, jacobian: Matrices) -> Matrices:
         """The matrix above; see `Form.matrices`."""
-        n = self.P.shape[0]
-        A, C = _parts(jacobian, n)
+        A, C = _parts(jacobian, self.P.shape[0])
         P = Matrices.exact(self.P)
         lower = _square(self.P, self.rate) + C.T @ (Matrices.exact(self.R) @ C)
-        return _assemble([[P, P @ A], [lower]], [n, n], A.middle.shape[0])
+        return _assemble([[P, P @ A], [(P @ A).T, lower]])
 
     def excess(self, dx: Array, df: Array, dh: Array) -> Array:
         """The first inequality's left-hand side less its right-hand one; see `Form.excess`."""
@@ -159,16 +155,12 @@ class OutputInjection:
 
     def matrices(self, jacobian: Matrices) -> Matrices:
         """The matrix above; see `Form.matrices`."""
-        n, p = self.Y.shape
-        A, C = _parts(jacobian, n)
+        A, C = _parts(jacobian, self.P.shape[0])
         P, Y, M, N = (Matrices.exact(one) for one in (self.P, self.Y, self.M, self.N))
-        crossed = C.T @ M
-        blocks: list[list[Matrices | None]] = [
-            [P, P @ A + Y @ C, -Y],
-            [_square(self.P, self.rate) + crossed + crossed.T, C.T @ N - M.T],
-            [Matrices.exact(self.R) - N - N.T],
-        ]
-        return _assemble(blocks, [n, n, p], A.middle.shape[0])
+        side, crossed, mixed = P @ A + Y @ C, C.T @ M, C.T @ N - M.T
+        lower = _square(self.P, self.rate) + crossed + crossed.T
+        noise = Matrices.exact(self.R) - N - N.T
+        return _assemble([[P, side, -Y], [side.T, lower, mixed], [-Y.T, mixed.T, noise]])
 
     excess = OutputWeight.excess
 
@@ -193,11 +185,10 @@ class ErrorContraction:
 
     def matrices(self, jacobian: Matrices) -> Matrices:
         """The matrix above; see `Form.matrices`."""
-        n = self.P.shape[0]
-        A, C = _parts(jacobian, n)
+        A, C = _parts(jacobian, self.P.shape[0])
         P = Matrices.exact(self.P)
         closed = P @ (A - Matrices.exact(self.gain) @ C)
-        return _assemble([[P, closed], [_square(self.P, self.rate)]], [n, n], A.middle.shape[0])
+        return _assemble([[P, closed], [closed.T, _square(self.P, self.rate)]])
 
     def excess(self, dx: Array, df: Array, dh: Array) -> Array:
         """What the error grows to less what it may; see `Form.excess`."""
@@ -332,14 +323,8 @@ def rounded_up(value: float, operations: int = 8) -> float:
 def euclidean_constants(P: Array, V: Array, rate: float) -> tuple[float, float, float]:
     r"""Constants of the sums in def:RGES and def:eIOSS.
 
-    From :math:`|e^+|_P \le \rho |e|_P + |w|_P + |v|_V`, by induction,
-
-    .. math::
-        |e(t)|_P \le \rho^t |e_0|_P
-        + \sum_{\tau=1}^t \rho^{\tau-1} (|w(t-\tau)|_P + |v(t-\tau)|_V) .
-
-    With :math:`\sqrt{\underline\lambda(P)}\, |e| \le |e|_P \le \sqrt{\bar\lambda(P)}\, |e|`,
-    the constants of the definitions, whose sums discount by :math:`\rho^\tau`, are
+    From :math:`|e^+|_P \le \rho |e|_P + |w|_P + |v|_V`, by induction, and as the sums of the
+    definitions discount by one power of the rate more,
 
     .. math::
         c_p = \sqrt{\bar\lambda(P) / \underline\lambda(P)}, \quad c_w = c_p / \rho, \quad

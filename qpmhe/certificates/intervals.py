@@ -335,11 +335,6 @@ class Jet:
             self.hessian * first + _outer(self.gradient, self.gradient) * second,
         )
 
-    def square(self) -> Jet:
-        """s^2, as ``np.square`` calls it."""
-        squared: Jet = self**2
-        return squared
-
     def sqrt(self) -> Jet:
         """The square root; its derivatives need values above zero."""
         if not self.value.positive():
@@ -353,20 +348,10 @@ class Jet:
         value = self.value.exp()
         return self._composed(value, value, value)
 
-    def expm1(self) -> Jet:
-        """The exponential minus one."""
-        shifted: Jet = self.exp() - 1.0
-        return shifted
-
     def log(self) -> Jet:
         """The natural logarithm."""
         inverse = self.value.log(), self.value.reciprocal()
         return self._composed(*inverse, -inverse[1].square())
-
-    def log1p(self) -> Jet:
-        """The natural logarithm of one plus s."""
-        shifted: Jet = (self + 1.0).log()
-        return shifted
 
     def sin(self) -> Jet:
         """The sine."""
@@ -377,21 +362,6 @@ class Jet:
         """The cosine."""
         sine, cosine = self.value.sin(), self.value.cos()
         return self._composed(cosine, -sine, -cosine)
-
-    def tan(self) -> Jet:
-        """The tangent."""
-        quotient: Jet = self.sin() / self.cos()
-        return quotient
-
-    def sinh(self) -> Jet:
-        """The hyperbolic sine."""
-        half: Jet = (self.exp() - (-self).exp()) * 0.5
-        return half
-
-    def cosh(self) -> Jet:
-        """The hyperbolic cosine."""
-        half: Jet = (self.exp() + (-self).exp()) * 0.5
-        return half
 
     def tanh(self) -> Jet:
         """The hyperbolic tangent."""
@@ -416,10 +386,6 @@ class Jet:
             raise OutsideDomainError("an angle that may jump, or be of a point at the origin")
         side = quarter if self.value.positive() else -quarter
         return Jet.__add__(-(abscissa / self).arctan(), side)  # type: ignore[no-any-return]
-
-    def conjugate(self) -> Jet:
-        """The jet itself, which is real."""
-        return self
 
     @property
     def real(self) -> Jet:
@@ -450,31 +416,27 @@ class Jet:
             raise OutsideDomainError("a comparison whose outcome is not the same on the set")
         return outcomes.pop()
 
-    def __lt__(self, other: Any) -> bool:
-        return self._compared(other, operator.lt)
-
-    def __le__(self, other: Any) -> bool:
-        return self._compared(other, operator.le)
-
-    def __gt__(self, other: Any) -> bool:
-        return self._compared(other, operator.gt)
-
-    def __ge__(self, other: Any) -> bool:
-        return self._compared(other, operator.ge)
-
-    def __eq__(self, other: object) -> bool:
-        return self._compared(other, operator.eq)
-
-    def __ne__(self, other: object) -> bool:
-        return self._compared(other, operator.ne)
-
-    __hash__ = object.__hash__
-
     def __bool__(self) -> bool:
         raise OutsideDomainError("a truth value of something that is not one number")
 
     def __float__(self) -> float:
         raise OutsideDomainError("a conversion to float, as by math functions or float arrays")
+
+
+# What NumPy calls by name, composed of the above.
+for _name, _function in {
+    "square": lambda s: s**2,
+    "expm1": lambda s: s.exp() - 1.0,
+    "log1p": lambda s: (s + 1.0).log(),
+    "tan": lambda s: s.sin() / s.cos(),
+    "sinh": lambda s: (s.exp() - (-s).exp()) * 0.5,
+    "cosh": lambda s: (s.exp() + (-s).exp()) * 0.5,
+    "conjugate": lambda s: s,
+}.items():
+    setattr(Jet, _name, _function)
+for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
+    _holds = getattr(operator, _name)
+    setattr(Jet, f"__{_name}__", lambda s, other, holds=_holds: s._compared(other, holds))
 
 
 def _number(value: Any, *, jets: bool = False) -> Any:

@@ -31,15 +31,12 @@ class Region:
     Parameters
     ----------
     states : ConvexSet
-    inputs : Box or None
-        Bounds on the inputs u; None for a system without.
     lower, upper : (n + m,) array
         Corners of a box around states and inputs. It holds them all: for a polytope, its
         sides are proved by duality and rounded outward.
     """
 
     states: ConvexSet
-    inputs: Box | None
     lower: Array
     upper: Array
 
@@ -82,15 +79,8 @@ class Region:
         away = np.zeros(lower.shape[0], dtype=np.bool_)
         if self.is_box:
             return away
-        low, high = lower[:, : self.n], upper[:, : self.n]
-        rows = self.states.matrix
-        positive, negative = np.maximum(rows, 0.0), np.minimum(rows, 0.0)
-        least = low @ positive.T + high @ negative.T
-        most = high @ positive.T + low @ negative.T
-        size = np.maximum(np.abs(low), np.abs(high)) @ np.abs(rows).T
-        rounding = 4.0 * (self.n + 2) * np.finfo(np.float64).eps * size
-        above = least - rounding > self.states.row_upper
-        away |= np.any(above | (most + rounding < self.states.row_lower), axis=1)
+        least, most = _row_bounds(self.states.matrix, lower[:, : self.n], upper[:, : self.n])
+        away |= np.any((least > self.states.row_upper) | (most < self.states.row_lower), axis=1)
         return away
 
     def sample(self, count: int, generator: np.random.Generator) -> Array:
@@ -142,15 +132,8 @@ def bounded_region(
                 f"the region is of {region.n} states and {region.lower.size - region.n} inputs; "
                 f"expected {system.n} and {system.m}."
             )
-        if inputs is not None and not (
-            isinstance(inputs, Box)
-            and np.array_equal(inputs.lower, region.lower[region.n :])
-            and np.array_equal(inputs.upper, region.upper[region.n :])
-        ):
-            raise SetError(
-                f"inputs is {inputs!r}, but the region that was passed already has bounds on "
-                "the inputs; leave inputs out, or pass a qpmhe.Box of states with them."
-            )
+        if inputs is not None:
+            raise SetError("the region already has bounds on the inputs; leave inputs out.")
         return region
     chosen = system.states if region is None else region
     if chosen is None:
@@ -181,7 +164,7 @@ def bounded_region(
             f"the region is unbounded in {which}; expected a bounded set. Intersect it with the "
             "states that occur: region & qpmhe.Box(lower, upper)."
         )
-    return Region(chosen, inputs, lower, upper)
+    return Region(chosen, lower, upper)
 
 
 def stated_region(region: Any) -> Region | None:
@@ -190,7 +173,7 @@ def stated_region(region: Any) -> Region | None:
         return region
     if not isinstance(region, ConvexSet):
         raise SetError(f"region is {region!r}; expected a qpmhe.Box or a qpmhe.Polytope.")
-    return Region(region, None, *_bounds(region))
+    return Region(region, *_bounds(region))
 
 
 def _bounds(states: ConvexSet) -> tuple[Array, Array]:
@@ -220,6 +203,16 @@ def _inequalities(states: ConvexSet) -> tuple[Array, Array]:
     g = np.concatenate((states.upper, -states.lower, states.row_upper, -states.row_lower))
     finite = np.isfinite(g)
     return G[finite], g[finite]
+
+
+def _row_bounds(rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Outward bounds on linear forms over boxes; exact where a form is a coordinate."""
+    positive, negative = np.maximum(rows, 0.0).T, np.minimum(rows, 0.0).T
+    single = (np.count_nonzero(rows, axis=1) == 1) & (np.abs(rows).sum(axis=1) == 1.0)
+    terms = np.where(single, 0.0, 4.0 * (rows.shape[1] + 2))
+    size = np.maximum(np.abs(low), np.abs(high)) @ np.abs(rows).T
+    rounding = terms * np.finfo(np.float64).eps * size
+    return low @ positive + high @ negative - rounding, high @ positive + low @ negative + rounding
 
 
 def _support(G: Array, g: Array, e: Array) -> tuple[Array, float, float]:
@@ -254,14 +247,11 @@ def beyond(inner: Region, outer: Region) -> str:
     eye, inputs = np.eye(size), slice(n, outer.lower.size)
     G = np.vstack((np.pad(G, ((0, 0), (0, size - n))), eye[inputs], -eye[inputs]))
     g = np.concatenate((g, outer.upper[inputs], -outer.lower[inputs]))
-    largest = np.maximum(np.abs(inner.lower), np.abs(inner.upper))
     for row, limit in zip(G, g, strict=True):
         same = (own == row[:n]).all(axis=1) & (not row[n:].any())
         if same.any() and sides[same].min() <= limit:
             continue
-        most = float(np.maximum(row * inner.lower, row * inner.upper).sum())
-        if np.count_nonzero(row) > 1:
-            most += 4.0 * (size + 2) * np.finfo(np.float64).eps * float(np.abs(row) @ largest)
+        most = float(_row_bounds(row[None], inner.lower, inner.upper)[1][0])
         if not most <= limit:
             terms = " + ".join(
                 f"{row[j]:.6g} {'x' if j < n else 'u'}[{j if j < n else j - n}]"

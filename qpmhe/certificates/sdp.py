@@ -13,10 +13,10 @@ import numpy as np
 
 from .._checks import Array
 from .deadline import Deadline
+from .inequalities import ErrorContraction, Form, OutputInjection, OutputWeight
 
 Kind = Literal["output weight", "output injection", "observer", "synthesis"]
 
-_SOLVERS = ("CLARABEL", "SCS")
 # c_p beyond 1e4 would be a certificate of nothing, and spoils the conditioning.
 _MOST_CONDITION = 1e8
 # Seconds for one entry of a factorisation, as measured for 10 to 30 states: a rough guide.
@@ -34,15 +34,11 @@ class Scales:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a program returned, in the units of the system; Y is P K or P L."""
+    """What a program returned."""
 
     status: str  # ``solved``, ``infeasible``, or what stopped the solver
     objective: float = np.inf
-    P: Array | None = None
-    Y: Array | None = None
-    R: Array | None = None
-    M: Array | None = None
-    N: Array | None = None
+    form: Form | None = None  # filled in, in the units of the system
 
 
 def started(seconds: float | Deadline) -> Deadline:
@@ -51,7 +47,7 @@ def started(seconds: float | Deadline) -> Deadline:
     To import them for the first time takes seconds, which are not the search's.
     """
     Deadline.of(seconds)  # refused before anything is loaded
-    for module in ("cvxpy", "scipy.optimize", *(name.lower() for name in _SOLVERS)):
+    for module in ("cvxpy", "scipy.optimize", "clarabel"):
         with contextlib.suppress(ImportError):  # raised where it is needed
             importlib.import_module(module)
     return Deadline.of(seconds)
@@ -61,12 +57,6 @@ def expected_seconds(n: int, p: int, kind: Kind) -> float:
     """About how long a program takes for each Jacobian, apart from what all of them take."""
     size = 2 * n + (p if kind == "output injection" else 0)
     return _SECONDS * (size * (size + 1) / 2) ** 3
-
-
-def _time_limit(solver: str, seconds: float) -> dict[str, float]:
-    if not math.isfinite(seconds):
-        return {}
-    return {"time_limit" if solver == "CLARABEL" else "time_limit_secs": max(seconds, _LEAST)}
 
 
 class Program:
@@ -86,7 +76,7 @@ class Program:
         n = jacobians.shape[2]
         p = jacobians.shape[1] - n
         self.expected_seconds = jacobians.shape[0] * expected_seconds(n, p, kind)
-        self._d, self._s, self._kind = scales.states, scales.outputs, kind
+        self._d, self._s, self._kind, self._gain = scales.states, scales.outputs, kind, gain
         d, s = self._d, self._s
         self._rate2, self._margin = cp.Parameter(nonneg=True), cp.Parameter(nonneg=True)
         self._rest = cp.Parameter(nonneg=True)
@@ -130,40 +120,46 @@ class Program:
             cp.Minimize(first**2 * condition + second**2 * output), constraints
         )
 
-    def solve(
-        self, rate: float, margin: float, *, thorough: bool = True, seconds: float = math.inf
-    ) -> Answer:
+    def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
         """Solve for a rate."""
         self._rate2.value, self._margin.value = rate * rate, margin
         self._rest.value = max(rate * rate - margin, 0.0)
-        status, deadline = "no solver", Deadline(max(seconds, _LEAST))
-        for solver in _SOLVERS if thorough else _SOLVERS[:1]:
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
-                    self._problem.solve(solver=solver, **_time_limit(solver, deadline.left))
-                status = str(self._problem.status)
-            except Exception as error:  # a solver may raise anything, and the next may not
-                status = f"{solver} raised {type(error).__name__}"
-                continue
-            if status in ("infeasible", "infeasible_inaccurate"):
-                return Answer("infeasible")
-            if self._P.value is not None and np.isfinite(self._P.value).all():
-                return self._answer(status)
-        return Answer(status)
+        limit = {"time_limit": max(seconds, _LEAST)} if math.isfinite(seconds) else {}
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self._problem.solve(solver="CLARABEL", **limit)
+        except Exception as error:  # a solver may raise anything
+            return Answer(f"the solver raised {type(error).__name__}")
+        status = str(self._problem.status)
+        if status in ("infeasible", "infeasible_inaccurate"):
+            return Answer("infeasible")
+        if self._P.value is None or not np.isfinite(self._P.value).all():
+            return Answer(status)
+        return Answer(
+            "solved" if status == "optimal" else status, float(self._problem.value),
+            self._form(rate),
+        )
 
-    def _answer(self, status: str) -> Answer:
+    def _form(self, rate: float) -> Form:
         d, s = self._d, self._s
-        P = np.asarray(self._P.value) / np.outer(d, d)
+
+        def value(variable: Any, rows: Array, columns: Array) -> Array:
+            return np.asarray(variable.value, np.float64) / np.outer(rows, columns)
+
+        P = value(self._P, d, d)
         P = 0.5 * (P + P.T)
-        Y = R = M = N = None
-        if self._kind in ("output injection", "synthesis"):
-            Y = np.asarray(self._Y.value) / np.outer(d, s)
-        if self._kind in ("output weight", "output injection"):
-            R = np.asarray(self._R.value) / np.outer(s, s)
-            R = 0.5 * (R + R.T)
-        if self._kind == "output injection":
-            M = np.asarray(self._M.value) / np.outer(s, d)
-            N = np.asarray(self._N.value) / np.outer(s, s)
-        objective = float(self._problem.value)
-        return Answer("solved" if status == "optimal" else status, objective, P, Y, R, M, N)
+        if self._gain is not None:
+            return ErrorContraction(P, self._gain, rate)
+        if self._kind == "synthesis":
+            gain = np.asarray(np.linalg.solve(P, value(self._Y, d, s)), np.float64)
+            return ErrorContraction(P, gain, rate)
+        R = value(self._R, s, s)
+        # The solver's tolerance may leave it below zero; a larger R asks for less.
+        values, vectors = np.linalg.eigh(0.5 * (R + R.T))
+        R = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        R = 0.5 * (R + R.T)
+        if self._kind == "output weight":
+            return OutputWeight(P, R, rate)
+        Y, M, N = value(self._Y, d, s), value(self._M, s, d), value(self._N, s, s)
+        return OutputInjection(P, R, Y, M, N, rate)

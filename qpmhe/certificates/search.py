@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import Array, positive
-from ..errors import ModelError, OptionError
+from ..errors import OptionError
 from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel, evaluated, joint_jacobians
 from .evidence import Evidence, NotCertifiedError, OutOfTimeError
-from .inequalities import ErrorContraction, Form, Matrices, OutputInjection, OutputWeight, definite
+from .inequalities import Form, Matrices, definite
 from .regions import Region
 from .sdp import Answer, Kind, Program, Scales, expected_seconds
 from .theorem import checked_rate
@@ -36,8 +36,6 @@ _PAIRS = 2000
 # the former solves; how far off the time that a program is expected to take may be.
 _CHOICE, _VERIFICATION = 0.5, 0.6
 _PROGRAMS, _MISJUDGED = 20, 4.0
-_WRONG = 1e-3  # more than a derivative computed in some other way may be off
-_WORK = 5e4  # entries of second derivatives that come with an enclosure of the first
 _MOST_POINTS = 24  # Jacobians that a program starts with
 
 
@@ -73,8 +71,6 @@ class Search:
         self.model = SmoothModel(system, region)
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
         self.jacobians = joint_jacobians(system, self.points)
-        if not self.model.reason:
-            _check_derivatives(self.model, system, self.points, self.jacobians)
         if kind is None:
             outputs = self.jacobians[:, system.n :]
             same = self.model.affine_output or (
@@ -85,6 +81,13 @@ class Search:
         each = expected_seconds(system.n, system.p, kind)
         affordable = _CHOICE * self._deadline.left / (_PROGRAMS * each)
         self._chosen = _far_apart(self.jacobians, int(np.clip(affordable, 1, _MOST_POINTS)))
+        if not self.model.reason and "given" in system.derivatives.values():
+            # What is given may be wrong, and would make the program another one.
+            chosen = self.points[self._chosen]
+            true = self.model.enclose(chosen, chosen).centre
+            self.jacobians[self._chosen] = np.where(
+                np.isfinite(true), true, self.jacobians[self._chosen]
+            )
         self.scales = _typical_scales(region, self.jacobians, system.n)
         self._program: Program | None = None
 
@@ -104,7 +107,7 @@ class Search:
         """
         deadline = self._deadline.part(_CHOICE)
         low, high = 0.0, _LARGEST_RATE
-        if self._feasible(high, deadline).P is None:
+        if self._feasible(high, deadline).form is None:
             return np.inf
         while high - low > _TOLERANCE * (1.0 - low):
             middle = 0.5 * (low + high)
@@ -112,7 +115,7 @@ class Search:
                 answer = self._feasible(middle, deadline)
             except OutOfTimeError:
                 break
-            if answer.P is None:
+            if answer.form is None:
                 low = middle
             else:
                 high = middle
@@ -142,9 +145,9 @@ class Search:
             ) from error
 
     def _feasible(self, rate: float, deadline: Deadline) -> Answer:
-        return self._solved(rate, _MARGINS[0] * min(1.0, rate * rate), deadline, thorough=False)
+        return self._solved(rate, _MARGINS[0] * min(1.0, rate * rate), deadline)
 
-    def _solved(self, rate: float, margin: float, deadline: Deadline, *, thorough: bool) -> Answer:
+    def _solved(self, rate: float, margin: float, deadline: Deadline) -> Answer:
         """What the program returns; an error if there is no time for it, or not enough."""
         if deadline.passed:
             raise self._out_of_time("it was over while matrices were sought and verified")
@@ -153,7 +156,7 @@ class Search:
                 f"a semidefinite program for {self.system.n} states takes about "
                 f"{self.program.expected_seconds:.2g} s, and {deadline.left:.2g} s were left"
             )
-        answer = self.program.solve(rate, margin, thorough=thorough, seconds=deadline.left)
+        answer = self.program.solve(rate, margin, deadline.left)
         if answer.status == "user_limit" and deadline.passed:
             raise self._out_of_time(
                 f"a semidefinite program for {self.system.n} states was not solved in time"
@@ -208,16 +211,15 @@ class Search:
         status = "no round was left"
         for turn in range(1, _ROUNDS + 1):
             try:
-                answer = self._solved(rate, _MARGINS[level] * size, self._deadline, thorough=True)
+                answer = self._solved(rate, _MARGINS[level] * size, self._deadline)
             except OutOfTimeError:
                 if best is None:
                     raise
                 break
-            if answer.P is None:
+            if answer.form is None:
                 status = answer.status
                 break
-            form = self._form(answer, rate)
-            outcome = self._verified(form)
+            outcome = self._verified(answer.form)
             if isinstance(outcome, Found):
                 if outcome.evidence is Evidence.PROVED or self.model.reason:
                     return outcome
@@ -235,23 +237,6 @@ class Search:
             else f"no matrix that passes the verification was found for the rate {rate:.6g} "
             f"(solver status: {status})"
         )
-
-    def _form(self, answer: Answer, rate: float) -> Form:
-        P, Y, R, M, N = answer.P, answer.Y, answer.R, answer.M, answer.N
-        assert P is not None
-        if R is not None:
-            # The solver's tolerance may leave it below zero; a larger R asks for less.
-            values, vectors = np.linalg.eigh(R)
-            R = (vectors * np.maximum(values, 0.0)) @ vectors.T
-            R = 0.5 * (R + R.T)
-        if self.gain is not None:
-            return ErrorContraction(P, self.gain, rate)
-        if R is not None and Y is None:
-            return OutputWeight(P, R, rate)
-        assert Y is not None
-        if R is not None and M is not None and N is not None:
-            return OutputInjection(P, R, Y, M, N, rate)
-        return ErrorContraction(P, np.asarray(np.linalg.solve(P, Y), np.float64), rate)
 
     def _verified(self, form: Form) -> Found | Cover:
         """What was shown, or the cover with the states where the inequality fails."""
@@ -319,31 +304,6 @@ def _checked_weights(value: tuple[float, float]) -> tuple[float, float]:
     except (TypeError, ValueError) as error:
         raise OptionError(f"weights is {value!r}; expected two numbers > 0.") from error
     return positive("weights[0]", first), positive("weights[1]", second)
-
-
-def _check_derivatives(model: SmoothModel, system: System, points: Array, jacobians: Array) -> None:
-    """Raise a ModelError where a given Jacobian is not the derivative, at states far apart."""
-    n = system.n
-    if "given" not in system.derivatives.values():
-        return
-    few = int(np.clip(_WORK / (jacobians[0].size * points.shape[1]), 1, _MOST_POINTS))
-    chosen = _far_apart(jacobians, few)
-    points, jacobians = points[chosen], jacobians[chosen]
-    enclosure = model.enclose(points, points)
-    for name, rows in (("f", slice(None, n)), ("h", slice(n, None))):
-        if system.derivatives[name] != "given":
-            continue
-        true, given = enclosure.centre[:, rows], jacobians[:, rows]
-        size = np.abs(true).max(axis=(1, 2)) + np.abs(given).max(axis=(1, 2))
-        apart = np.abs(given - true).max(axis=(1, 2)) - enclosure.error[:, rows].max(axis=(1, 2))
-        wrong = apart > _WRONG * (size + 1.0)
-        if wrong.any():
-            k = int(np.argmax(wrong))
-            raise ModelError(
-                f"{name}_jacobian is {given[k].tolist()} at {points[k].tolist()}, but the "
-                f"derivative of {name} there is {np.round(true[k], 9).tolist()}. Correct it, or "
-                "leave it out."
-            )
 
 
 def _far_apart(jacobians: Array, count: int = _MOST_POINTS) -> NDArray[np.intp]:

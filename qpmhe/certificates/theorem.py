@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -68,24 +68,14 @@ class DecayingSums:
     noise: float
 
     def __post_init__(self) -> None:
-        for name in ("rate", "initial", "disturbance", "noise"):
+        object.__setattr__(self, "rate", checked_rate("rate", self.rate))
+        # Less than 1 contradicts the bound at t = 0, |e(0)| <= initial |e(0)|.
+        for name, least in (("initial", 1.0), ("disturbance", 0.0), ("noise", 0.0)):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-                raise OptionError(f"{name} is {value!r}; expected a number.")
+            number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+            if not number or not value >= least:
+                raise OptionError(f"{name} is {value!r}; expected a number >= {least:g}.")
             object.__setattr__(self, name, float(value))
-        if not 0.0 < self.rate < 1.0:
-            raise OptionError(
-                f"rate is {self.rate!r}; expected a number in (0, 1): without decay there is "
-                "no bound by decaying sums."
-            )
-        if not self.initial >= 1.0:
-            raise OptionError(
-                f"initial is {self.initial!r}; expected at least 1, since at t = 0 the bound "
-                "says |e(0)| <= initial |e(0)|."
-            )
-        for name in ("disturbance", "noise"):
-            if not getattr(self, name) >= 0.0:
-                raise OptionError(f"{name} is {getattr(self, name)!r}; expected at least 0.")
 
     @property
     def constants(self) -> tuple[float, float, float]:
@@ -171,16 +161,67 @@ Triple = tuple[float, float, float]
 class TheoremConstants:
     """All constants of the theorem for one horizon, with the paper's symbols.
 
-    Made by `theorem`. Triples are in the order initial error, disturbance, noise: p, w, v
-    and 1, 2, 3 in the paper.
+    Triples are in the order initial error, disturbance, noise: p, w, v and 1, 2, 3 in the paper.
+
+    Parameters
+    ----------
+    detectability : DecayingSums
+        eta, c_p, c_w, c_v of (eq:eIOSS).
+    observer : DecayingSums
+        rho, C_p, C_w, C_v of (eq:RGES), with C_v > 0.
+    cost : CostConstants
+        a and the constants of (eq:exp_bounds), from ``cost.constants``.
+    kappa : float
+        Of (eq:kappa); 0 for an observer that never corrects.
+    lipschitz : float
+        L_h, in units of the output per unit of the state.
+    horizon : int
+        N >= 1.
+
+    Raises
+    ------
+    OptionError
+        If a constant is outside of its range.
+
+    Examples
+    --------
+    >>> from qpmhe.certificates.theorem import DecayingSums, TheoremConstants
+    >>> from qpmhe.costs import CostConstants
+    >>> half = DecayingSums(0.5, 1.0, 2.0, 1.0)
+    >>> cost = CostConstants(2.0, (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
+    >>> constants = TheoremConstants(half, half, cost, kappa=0.0, lipschitz=1.0, horizon=1)
+    >>> constants.c_bar, constants.rho_bar_1, constants.rho_bar_2
+    (9.0, 4.0, 1.0)
     """
 
-    horizon: int
     detectability: DecayingSums
     observer: DecayingSums
     cost: CostConstants
-    kappa: float
-    lipschitz: float
+    kappa: float = field(kw_only=True)
+    lipschitz: float = field(kw_only=True)
+    horizon: int = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        count("horizon", self.horizon, 1)
+        for name, value in (("kappa", self.kappa), ("lipschitz", self.lipschitz)):
+            if not 0.0 <= value < math.inf:
+                raise OptionError(f"{name} is {value!r}; expected a finite number >= 0.")
+        if not 0.0 < self.cost.exponent < math.inf:
+            raise OptionError(
+                f"the cost's exponent is {self.cost.exponent!r}; expected a number > 0."
+            )
+        for name in ("prior", "disturbance", "noise"):
+            lower, upper = getattr(self.cost, name)
+            if not 0.0 < lower <= upper < math.inf:
+                raise OptionError(
+                    f"the cost's constants of its {name} term are {(lower, upper)!r}; expected "
+                    "0 < lower <= upper, both finite."
+                )
+        if not self.observer.noise > 0.0:
+            raise OptionError(
+                "the observer's C_v is 0, which makes L_bar = max(L_h, 1/C_v) infinite; pass a "
+                "larger one, which holds as well, such as 1 / L_h."
+            )
 
     @cached_property
     def L_bar(self) -> float:  # noqa: N802 - the paper's symbol
@@ -278,65 +319,6 @@ class TheoremConstants:
     def result(self) -> DecayingSums:
         """(eq:RGES_result): the estimator's own robust stability."""
         return DecayingSums(self.lam, *self.C)
-
-
-def theorem(
-    detectability: DecayingSums, observer: DecayingSums, cost: CostConstants, *, kappa: float,
-    lipschitz: float, horizon: int,
-) -> TheoremConstants:
-    """Compute the theorem's constants from those of its assumptions.
-
-    Parameters
-    ----------
-    detectability : DecayingSums
-        eta, c_p, c_w, c_v of (eq:eIOSS).
-    observer : DecayingSums
-        rho, C_p, C_w, C_v of (eq:RGES), with C_v > 0.
-    cost : CostConstants
-        a and the constants of (eq:exp_bounds), from ``cost.constants``.
-    kappa : float
-        Of (eq:kappa); 0 for an observer that never corrects.
-    lipschitz : float
-        L_h, in units of the output per unit of the state.
-    horizon : int
-        N >= 1.
-
-    Raises
-    ------
-    OptionError
-        If a constant is outside of its range.
-
-    Examples
-    --------
-    >>> from qpmhe.certificates.theorem import DecayingSums
-    >>> from qpmhe.costs import CostConstants
-    >>> half = DecayingSums(0.5, 1.0, 2.0, 1.0)
-    >>> cost = CostConstants(2.0, (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
-    >>> constants = theorem(half, half, cost, kappa=0.0, lipschitz=1.0, horizon=1)
-    >>> constants.c_bar, constants.rho_bar_1, constants.rho_bar_2
-    (9.0, 4.0, 1.0)
-    """
-    count("horizon", horizon, 1)
-    for name, value in (("kappa", kappa), ("lipschitz", lipschitz)):
-        if not 0.0 <= value < math.inf:
-            raise OptionError(f"{name} is {value!r}; expected a finite number >= 0.")
-    if not 0.0 < cost.exponent < math.inf:
-        raise OptionError(f"the cost's exponent is {cost.exponent!r}; expected a number > 0.")
-    for name in ("prior", "disturbance", "noise"):
-        lower, upper = getattr(cost, name)
-        if not 0.0 < lower <= upper < math.inf:
-            raise OptionError(
-                f"the cost's constants of its {name} term are {(lower, upper)!r}; expected "
-                "0 < lower <= upper, both finite."
-            )
-    if not observer.noise > 0.0:
-        raise OptionError(
-            "the observer's C_v is 0, which makes L_bar = max(L_h, 1/C_v) infinite; pass a "
-            "larger one, which holds as well, such as 1 / L_h."
-        )
-    return TheoremConstants(
-        int(horizon), detectability, observer, cost, float(kappa), float(lipschitz)
-    )
 
 
 def _power(base: float, exponent: float) -> float:

@@ -14,7 +14,7 @@ from ..costs import Cost, CostConstants
 from ..errors import OptionError
 from .inequalities import Matrices, norms
 from .properties import Detectability, ObserverStability
-from .theorem import Sizes, TheoremConstants, decaying_sums, theorem
+from .theorem import Sizes, TheoremConstants, decaying_sums
 
 Kind = Literal["paper", "summed", "weighted", "measured"]
 
@@ -40,21 +40,11 @@ class Norms:
 class WindowBound:
     r"""A bound of the estimator's error along the theorem's proof, with all sums kept.
 
-    With k = min(t, N) the window's length, E the bound of the observer's error, and the
-    norms of `Norms`,
-
-    .. math::
-        \begin{aligned}
-        E(t+1) &= \rho E(t) + \text{entering}(t) \\
-        \hat J(t)^{1/a} &\le j(t) = \Big(\sum_{i=t-k}^{t-1}
-            (\ell E(i) + \text{misfit}(i))^a\Big)^{1/a} \\
-        |x(t) - \hat x(t)| &\le s\,(\alpha_k\, j(t) + G_k(t))
-        \end{aligned}
-
-    where G_k is what detectability makes of the true disturbances and noises of the window,
-    step by step from p E(t-N), or from the initial error itself as long as t <= N, and
-    :math:`\alpha_k` the most that it makes of estimated ones that cost 1. See the page "What
-    is guaranteed, and what is not" for the derivation.
+    With the window's length k = min(t, N) and the bound E(t) of the observer's error, the error
+    is at most :math:`s (\alpha_k j(t) + G_k(t))`, where j(t) bounds the root of the candidate's
+    cost, G_k(t) is what detectability makes of the true disturbances and noises of the window,
+    and :math:`\alpha_k` the most that it makes of estimated ones that cost 1. Derived in "What
+    is guaranteed, and what is not" of the documentation.
     """
 
     kind: Literal["summed", "weighted"]
@@ -62,8 +52,8 @@ class WindowBound:
     rho: float
     eta: float
     exponent: float  # a
-    slope: float  # l
-    entry: float  # p
+    slope: float  # from the observer's error to the root of a stage's cost
+    entry: float  # from the observer's norm to detectability's
     alphas: Array = field(repr=False)  # (N + 1,): alpha_0, ..., alpha_N
     scales: Array = field(repr=False)  # (1 + n,): s, and that of each component of the error
     norms: Norms = field(repr=False)
@@ -131,13 +121,7 @@ class WindowBound:
 def summed_bound(constants: TheoremConstants, n: int = 1, p: int = 1) -> WindowBound:
     r"""Sums and Hoelder's inequality in place of geometric majorants and factors 3.
 
-    It needs no more than the theorem does: the Euclidean constants of detectability,
-    observer and cost, for a >= 1. It keeps
-
-    - the sums over the window, instead of their bounds by the newest time (eq:proof_rho5);
-    - the norm of a sum, by Minkowski's inequality, instead of (eq:Kprop) twice;
-    - that one cost pays for all parts of the estimate, by Hoelder's inequality: with
-      1/a + 1/b = 1,
+    It needs no more than the theorem does, and a >= 1. With 1/a + 1/b = 1,
 
     .. math::
         \alpha_k^b = (c_p \eta^k \underline c_p^{-1/a})^b + \sum_{\tau=1}^k \big(
@@ -180,24 +164,13 @@ def weighted_bound(
 ) -> WindowBound:
     r"""The quadratic cost's own weights, and the norms of the Lyapunov functions.
 
-    From detectability and from an observer with constant gain K, for its error e,
-
-    .. math::
-        \begin{aligned}
-        |\Delta x^+|_P &\le \sqrt{\eta^2 |\Delta x|_P^2 + |\Delta h|_V^2} + |\Delta w|_P \\
-        |e^+|_O &\le \rho |e|_O + |w - K v|_O
-        \end{aligned}
-
-    With the cost's weights :math:`\Pi, Q, R` the candidate costs
-    :math:`\sum |v_z|_M^2`, :math:`M = K^\top Q K + R`. Step by step, a cost of 1 pays for at
-    most
+    With the cost's weights :math:`\Pi, Q, R` and the largest eigenvalue lambda,
 
     .. math::
         \alpha_0^2 = \lambda(P \Pi^{-1}), \qquad
-        \alpha_{k+1}^2 = \max\{\eta^2 \alpha_k^2, \lambda(V R^{-1})\} + \lambda(P Q^{-1})
+        \alpha_{k+1}^2 = \max\{\eta^2 \alpha_k^2, \lambda(V R^{-1})\} + \lambda(P Q^{-1}) .
 
-    where lambda is the largest eigenvalue. The slope is the largest
-    :math:`|\Delta h|_M / |\Delta x|_O`.
+    The slope is the largest :math:`|\Delta h|_M / |\Delta x|_O`, M that of `fit_weight`.
     """
     P, V, O, K = detectability.P, detectability.V, stability.P, stability.gain  # noqa: E741
     assert P is not None
@@ -268,15 +241,15 @@ class HorizonBounds:
 
     def to_dict(self, sizes: Sizes) -> dict[str, Any]:
         """All constants in types that JSON knows."""
-        c = self.paper
+        names = (
+            "L_bar", "c_bar", "eta_bar", "rho_bar_1", "rho_bar_2", "C_bar", "C_prime",
+            "C_double_prime", "C",
+        )
         content: dict[str, Any] = {
-            "horizon": c.horizon,
-            "paper": {
-                "L_bar": c.L_bar, "c_bar": c.c_bar, "eta_bar": c.eta_bar,
-                "rho_bar_1": c.rho_bar_1, "rho_bar_2": c.rho_bar_2, "C_bar": list(c.C_bar),
-                "C_prime": list(c.C_prime), "C_double_prime": list(c.C_double_prime),
-                "C": list(c.C), "lambda": c.lam,
-                "limit": c.result.limit(sizes.disturbance, sizes.noise),
+            "horizon": self.paper.horizon,
+            "paper": {name: getattr(self.paper, name) for name in names} | {
+                "lambda": self.paper.lam,
+                "limit": self.paper.result.limit(sizes.disturbance, sizes.noise),
             },
         }
         if self.window is not None:
@@ -292,7 +265,7 @@ def bounds_for(
     constants: CostConstants, *, lipschitz: float, output: Matrices | None = None,
 ) -> HorizonBounds:
     """The bounds that follow from what was certified."""
-    plain = theorem(
+    plain = TheoremConstants(
         detectability.sums, stability.sums, constants, kappa=stability.kappa,
         lipschitz=lipschitz, horizon=horizon,
     )

@@ -12,8 +12,8 @@ from qpmhe.certificates.certificate import certify
 from qpmhe.certificates.contraction import certify_detectability, certify_observer, synthesise_gain
 from qpmhe.certificates.evidence import CertificateError, Evidence, NotCertifiedError
 from qpmhe.certificates.properties import Detectability, ObserverStability
-from qpmhe.certificates.report import LABELS, error_and_bounds
-from qpmhe.certificates.theorem import DecayingSums, theorem
+from qpmhe.certificates.report import LABELS
+from qpmhe.certificates.theorem import DecayingSums, TheoremConstants
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
 
 SLACK = 1 + 1e-9
@@ -28,7 +28,7 @@ def test_the_reactors_constants_are_the_theorems(reactor):
     assert observed.C_p == pytest.approx(1.0, abs=1e-6)  # it contracts with P = I
     for N in (1, 5, 10):
         paper = certificate.of(N).paper
-        again = theorem(
+        again = TheoremConstants(
             DecayingSums(0.9, detected.c_p, detected.c_w, detected.c_v),
             DecayingSums(0.95, observed.C_p, observed.C_w, np.sqrt(0.5)),  # 1 / L_h
             certificate.audit.constants, kappa=np.sqrt(0.005), lipschitz=np.sqrt(2.0), horizon=N,
@@ -320,7 +320,7 @@ def test_no_observer_is_named_by_its_certification(reactor):
 
 def test_figure_shows_error_and_bounds():
     times = np.arange(5.0)
-    axes = error_and_bounds(
+    axes = qpmhe.plots.error_and_bounds(
         times, np.array([1.0, 0.5, 0.0, 0.2, 0.1]),
         {LABELS["paper"]: np.full(5, 30.0), LABELS["weighted"]: np.full(5, np.inf)},
         diameter=3.0, time_label="t (s)",
@@ -330,4 +330,4 @@ def test_figure_shows_error_and_bounds():
     assert labels == ["error", LABELS["paper"], LABELS["weighted"]]
     assert axes.get_ylim()[1] > 30.0
     with pytest.raises(ShapeError, match="error"):
-        error_and_bounds(times, np.ones(4), {})
+        qpmhe.plots.error_and_bounds(times, np.ones(4), {})

@@ -204,8 +204,8 @@ def test_solver_keeps_to_its_time():
     A = 0.9 * np.eye(n) + 0.1 * np.random.default_rng(2).standard_normal((n, n))
     J = np.vstack((A, np.eye(n)[:2]))[None].repeat(4, axis=0)
     program = Program("output weight", J, Scales(np.ones(n), np.ones(2)), (1.0, 1.0))
-    assert program.solve(0.9, 1e-6).P is not None
-    assert program.solve(0.9, 1e-6, thorough=False, seconds=1e-4).status == "user_limit"
+    assert program.solve(0.9, 1e-6).form is not None
+    assert program.solve(0.9, 1e-6, seconds=1e-4).status == "user_limit"
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, math.nan, True, "long", None])

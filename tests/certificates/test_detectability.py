@@ -200,7 +200,7 @@ def test_solvers_that_lie_prove_nothing(monkeypatch):
     """A matrix that does not satisfy the inequality is never called proved."""
     system = qpmhe.models.batch_reactor()[0]
     for P in (np.eye(2), -np.eye(2), np.full((2, 2), np.nan)):
-        wrong = Answer("solved", 1.0, P, None, 1e-3 * np.eye(1))
+        wrong = Answer("solved", 1.0, OutputWeight(P, 1e-3 * np.eye(1), 0.9))
         monkeypatch.setattr(Program, "solve", lambda *_, wrong=wrong, **__: wrong)
         with pytest.raises(NotCertifiedError, match="no matrix that passes"):
             certify_detectability(system, REACTOR, eta=0.9)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from qpmhe.certificates.theorem import DecayingSums, Sizes, decaying_sums, theorem
+from qpmhe.certificates.theorem import DecayingSums, Sizes, TheoremConstants, decaying_sums
 from qpmhe.costs import CostConstants
 from qpmhe.errors import OptionError, ShapeError
 
@@ -16,7 +16,7 @@ COST = CostConstants(2.0, (1.0, 2.0), (50.0, 100.0), (20.0, 25.0))
 
 def made(detectability=DETECTABILITY, observer=OBSERVER, cost=COST, kappa=0.2, lipschitz=1.4,
          horizon=10):
-    return theorem(
+    return TheoremConstants(
         detectability, observer, cost, kappa=kappa, lipschitz=lipschitz, horizon=horizon
     )
 
@@ -215,7 +215,7 @@ def scalar(rng):
     rho, eta = rng.uniform(0.4, 0.9, 2)
     gain, injected = (slope - rng.choice([-1, 1], 2) * (rho, eta)) / output
     weights = rng.uniform(0.2, 5.0, 3)
-    constants = theorem(
+    constants = TheoremConstants(
         DecayingSums(eta, 1.0, 1.0 / eta, abs(injected) / eta),
         DecayingSums(rho, 1.0, 1.0 / rho, abs(gain) / rho),
         CostConstants(2.0, *((weight, weight) for weight in weights)),

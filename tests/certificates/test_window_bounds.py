@@ -7,7 +7,7 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates.properties import Detectability, ObserverStability
-from qpmhe.certificates.theorem import DecayingSums, theorem
+from qpmhe.certificates.theorem import DecayingSums, TheoremConstants
 from qpmhe.certificates.window_bounds import largest, summed_bound, weighted_bound
 from qpmhe.costs import CostConstants
 from qpmhe.errors import OptionError
@@ -20,7 +20,7 @@ def drawn(rng, exponent=2.0):
         low = rng.uniform(0.1, 5.0)
         return low, low * rng.uniform(1.0, 4.0)
 
-    return theorem(
+    return TheoremConstants(
         DecayingSums(rng.uniform(0.3, 0.97), *rng.uniform(1.0, 3.0, 3)),
         DecayingSums(rng.uniform(0.3, 0.97), *rng.uniform(1.0, 2.0, 3)),
         CostConstants(exponent, pair(), pair(), pair()),
@@ -104,7 +104,7 @@ def scalar(slope, output, gain, injected, weights, horizon, P=1.7, O=0.3):  # no
     """Summed and weighted bound of a scalar system, whose constants are exact."""
     rho, eta = abs(slope - gain * output), abs(slope - injected * output)
     prior, disturbance, noise = weights
-    constants = theorem(
+    constants = TheoremConstants(
         DecayingSums(eta, 1.0, 1.0 / eta, abs(injected) / eta),
         DecayingSums(rho, 1.0, 1.0 / rho, abs(gain) / rho),
         CostConstants(2.0, *((weight, weight) for weight in weights)),
