@@ -126,7 +126,7 @@ def build(source: ModelSource) -> Any:
     raised if the file cannot be imported, has changed since it was found, or lacks the function,
     or if the function raises; the text names the line in the user's file.
     """
-    with _neighbours(source):
+    with _import_path(source.where.rpartition(":")[0]):
         function = _function(source)
         try:
             return function(**_arguments(source.name, source.arguments))
@@ -240,7 +240,7 @@ def module_file(place: str) -> Path | None:
     """The file of a module, found without importing it; packages above it are imported."""
     importlib.invalidate_caches()
     try:
-        with _working_directory():
+        with _import_path(place):
             specification = importlib.util.find_spec(place)
     except Exception:  # importing the module reports what is wrong
         return None
@@ -268,7 +268,7 @@ def imported(place: str) -> tuple[ModuleType, str]:
     _imported_as[place] = now
     if place.endswith(".py"):
         return _import_file(Path(place)), now
-    with _working_directory():
+    with _import_path(place):
         return importlib.import_module(place), now
 
 
@@ -300,28 +300,20 @@ def _forget(files: set[Path]) -> None:
 
 
 @contextlib.contextmanager
-def _in_path(folder: str, position: int) -> Iterator[None]:
-    sys.path.insert(position, folder)
+def _import_path(place: str) -> Iterator[None]:
+    """Let a file import those beside it; a module may lie in the working directory."""
+    is_file = place.endswith(".py")
+    folder = str(Path(place).parent if is_file else Path.cwd())
+    # A console script has its own folder in the path, not the one it is called from.
+    if not is_file and ("" in sys.path or folder in sys.path):
+        yield
+        return
+    sys.path.insert(0 if is_file else len(sys.path), folder)
     try:
         yield
     finally:
         with contextlib.suppress(ValueError):  # the model may have changed the path
             sys.path.remove(folder)
-
-
-def _neighbours(source: ModelSource) -> contextlib.AbstractContextManager[None]:
-    """Let a file import those beside it."""
-    if not source.is_file:
-        return contextlib.nullcontext()
-    return _in_path(str(Path(source.where.rpartition(":")[0]).parent), 0)
-
-
-def _working_directory() -> contextlib.AbstractContextManager[None]:
-    """A console script has its own folder in the path, not the one it is called from."""
-    here = str(Path.cwd())
-    if "" in sys.path or here in sys.path:
-        return contextlib.nullcontext()
-    return _in_path(here, len(sys.path))
 
 
 def _import_file(path: Path) -> ModuleType:

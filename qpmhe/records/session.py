@@ -160,7 +160,9 @@ def estimate_record(
     output = Output(out)
     _check_files(str(record), output)
     found = _found(output, resume, overwrite)
-    every = _samples_between(checkpoint_every, found)
+    every = found.every if found is not None else _EVERY
+    if checkpoint_every is not None:
+        every = count("--checkpoint-every", checkpoint_every, 1)
     with contextlib.ExitStack() as stack:
         stack.callback(output.close)
         if output.path is None:  # neither a model nor a solver may print among the rows
@@ -180,6 +182,7 @@ def estimate_record(
         identity = loaded.identity | {
             "dt": dt, "time_scale": time_scale, "equal_steps": equal_steps,
             "states": list(loaded.states), "covariances": covariances, "step_time": step_time,
+            "checkpoint_every": every,
         }
         session = _Session(
             loaded, rows, steps, reader, output, Checkpoint(identity, every),
@@ -226,20 +229,6 @@ def _found(output: Output, resume: bool, overwrite: bool) -> Checkpoint | None:
         "continue by --resume (a finished one, if the record has grown), start again by "
         "--overwrite, or give another --out."
     )
-
-
-def _samples_between(wanted: int | None, found: Checkpoint | None) -> int:
-    """How many samples lie between checkpoints: as before, if an estimation is resumed."""
-    if wanted is not None:
-        count("--checkpoint-every", wanted, 1)
-    if found is None:
-        return wanted or _EVERY
-    if wanted not in (None, found.every):
-        raise CheckpointError(
-            f"the checkpoint was made with --checkpoint-every {found.every}, not {wanted}; leave "
-            "the option out."
-        )
-    return found.every
 
 
 class _Session:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
 
 from qpmhe_solvers import backend
@@ -140,7 +140,11 @@ class _Processes:
             self._executor.shutdown(wait=True, kill_workers=True)
             self._executor = None
 
-    close = restart
+    def close(self) -> None:
+        """End the workers."""
+        if self._executor is not None:
+            sleep(0.1)  # loky raises in its thread where it is ended right after a submission
+        self.restart()
 
 
 class _Cluster:

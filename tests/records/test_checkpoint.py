@@ -32,7 +32,7 @@ def cut(here):
         ({"initial_state": [0.4, 0.0]}, "initial_state"),
         ({"max_qps": None}, "max_qps 2, now None"),
         ({"equal_steps": True}, "equal_steps"),
-        ({"checkpoint_every": 30}, "checkpoint-every 20"),
+        ({"checkpoint_every": 30}, "checkpoint_every 20, now 30"),
         ({"covariances": "std"}, "covariances 'none', now 'std'"),
         ({"outputs": "y=u"}, "not those"),
     ],
