@@ -135,7 +135,8 @@ def augment_parameters(
         n, p, m = f.n, f.p, _other_inputs(arguments, values.size)
         states, disturbances, noises = f.states, f.disturbances, f.noises
     else:
-        n, p, m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m or 0, 0)
+        n, p = dimension("n", n, 1), dimension("p", p, 1)
+        m = dimension("m", 0 if m is None else m, 0)
         alone = ", the dimension of x alone: the parameters are added here"
         checked_set("states", states, n, alone)
         checked_set("disturbances", disturbances, n, alone)

@@ -588,7 +588,9 @@ def test_parameters_that_drift_are_followed():
     for t in range(80):
         u = np.array([2.0 * np.sin(0.3 * t)])
         estimate = mhe.update(x[0], u)
-        x = rk4(lambda x, u: driven_rate(x, u, [theta, TRUE[1]]))(x, u, DT)
+        x = rk4(lambda x, known: driven_rate(x, known[:1], known[1:]))(
+            x, np.array([*u, theta, TRUE[1]]), DT
+        )
         theta += 0.02
         found.append(estimate.state[2] - theta)
     assert np.abs(found[40:]).mean() < 0.2
