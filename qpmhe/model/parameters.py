@@ -220,8 +220,11 @@ def _check_bounds(bounds: ConvexSet | None, nominal: Array) -> None:
 
 def _function(name: str, written: Any, size: int, m: int, probes: Probes) -> BatchedFunction:
     """A user's function of x and (u, theta), tried at the nominal parameters and near them."""
-    if not callable(written):
-        raise ModelError(f"{name} is {shown(written)}; expected a function.")
+    if not callable(written) or type(written).__module__.startswith("casadi"):
+        raise ModelError(
+            f"{name} is {shown(written)}; expected a function of NumPy arrays. Make a System of a "
+            "model in another language, with the parameters as its last inputs, and give that as f."
+        )
     arguments = ("x", "u", "theta") if m else ("x", "theta")
     try:
         signature = inspect.signature(written)
