@@ -195,12 +195,17 @@ def test_finite_differences_have_the_scales_of_the_augmented_state():
     np.testing.assert_allclose(1e9 * run.states[:, 0], large.states[:, 0], rtol=1e-7)
 
 
+def swing(x, u):
+    return np.stack([x[..., 1], u[..., 0] - np.sin(x[..., 0])], axis=-1)
+
+
+def angle(x):
+    return x[..., :1]
+
+
 @pytest.mark.parametrize("stop", [2, 9, 15])
 def test_irregular_steps_and_snapshots(stop):
-    def rate(x, u):
-        return np.stack([x[..., 1], u[..., 0] - np.sin(x[..., 0])], axis=-1)
-
-    plant = qpmhe.System.from_ode(rate, lambda x: x[..., :1], dt=0.1, n=2, p=1, m=1)
+    plant = qpmhe.System.from_ode(swing, angle, dt=0.1, n=2, p=1, m=1)
     cost = qpmhe.QuadraticCost.from_covariances(
         prior=np.diag([0.1, 0.1, 0.04]), disturbance=np.diag([1e-4, 1e-4, 0.04]), noise=1e-2
     )
