@@ -216,6 +216,7 @@ class Window(Stages):
         if self._covariances is not None:
             self._covariances[0] = kept["covariance"][0]
         self._earlier_state, self._earlier_covariance = other._last_good(other.start)
+        self.smoothed_prior = other.smoothed_prior
         if self.metric is not None and other.metric is not None:
             self.metric.state = other.metric.state
         self._own = {time: own.without(changes) for time, own in other._own.items()}
