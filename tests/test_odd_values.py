@@ -64,7 +64,7 @@ def amended(**options):
 
 CALLS = [
     (estimator, "system observer cost horizon initial_state backend max_qps max_solver_iterations "
-     "solver_tolerance tolerance engine project_observer infeasible warm_start candidate "
+     "solver_tolerance tolerance engine project_observer infeasible warm_start candidate arrival "
      "time_budget delay isolated"),
     (lambda **options: estimator().update(**({"y": [1.0]} | options)), "y u dt noise_weight"),
     (amended, "time y"),
@@ -115,7 +115,10 @@ CALLS = [
     (made(qpmhe.augment_parameters, {
         "f": lambda x, theta: x * theta[0], "h": lambda x, theta: x[:1], "nominal": [1.0], "n": 2,
         "p": 1,
-    }), "f h nominal n p m estimated parameter_bounds states disturbances"),
+    }), "f h nominal n p m estimated parameter_bounds states disturbances drifting dt method"),
+    (made(qpmhe.noisy_inputs, {
+        "system": qpmhe.System(lambda x, u: x + u, lambda x: x, n=1, p=1, m=1),
+    }), "system inputs"),
     (made(SCENARIO.simulate, {"seed": 0, "steps": 3}), "seed steps"),
 ]
 

@@ -119,24 +119,7 @@ def from_jax(
     if length is not None:
         system.dt = length
         system.make_timed = partial(_assembled, _Model(programs, None), m + 1, options)
-
-    def augmented(change: Augmentation, others: SystemOptions) -> System:
-        jnp: Any = need("jax.numpy", "from_jax", "jax")
-
-        def join(*parts: Any) -> Any:
-            return jnp.hstack(parts)
-
-        def of_both(name: str, function: Function) -> Function:
-            both = takes_input(name, function, m)
-            return lambda x, v: jnp.asarray(function(x, v) if both else function(x))
-
-        return from_jax(
-            change.of_one_state(of_both("f", f), join, 1.0 if dt is None else 0.0),
-            change.of_one_state(of_both("h", h), join),
-            n=change.n, p=p, m=change.m, dt=dt, method=method, **others,
-        )
-
-    system.make_augmented = augmented
+    system.make_augmented = partial(_augmented, f, h, p, m, dt, method)
     system.recipe = (
         from_jax,
         {"f": f, "h": h, "n": n, "p": p, "m": m, "dt": dt, "method": method, **options},
@@ -156,6 +139,26 @@ def _assembled(model: _Model, m: int, options: SystemOptions) -> System:
         )
     system.kernel = model
     return system
+
+
+def _augmented(
+    f: Function, h: Function, p: int, m: int, dt: float | None, method: str,
+    change: Augmentation, options: SystemOptions,
+) -> System:
+    jnp: Any = need("jax.numpy", "from_jax", "jax")
+
+    def join(*parts: Any) -> Any:
+        return jnp.hstack(parts)
+
+    def of_both(name: str, function: Function) -> Function:
+        both = takes_input(name, function, m)
+        return lambda x, v: jnp.asarray(function(x, v) if both else function(x))
+
+    return from_jax(
+        change.of_one_state(of_both("f", f), join, 1.0 if dt is None else 0.0),
+        change.of_one_state(of_both("h", h), join),
+        n=change.n, p=p, m=change.m, dt=dt, method=method, **options,
+    )
 
 
 class _Model:

@@ -178,21 +178,14 @@ class Problem:
         """Take another prior mean, unless the candidate has no finite prior cost there."""
         try:
             offset = difference(self.model.state_residual, self.candidate.trajectory[0], prior)
-            cost = self._prior_cost(offset)
+            cost = self._formulation.prior_cost(offset, self.prior_weight)
             self.prior_weight_at(offset)
         except Exception:  # a user's loss or residual
             return
         if math.isfinite(cost):
             self.prior, self.prior_moved = prior, True
-            self.candidate.cost += cost
-
-    def _prior_cost(self, offset: Array) -> float:
-        formulation, weight = self._formulation, self.prior_weight
-        if formulation.quadratic:
-            cost = float(offset.dot(weight).dot(offset))
-        else:
-            cost = formulation.prior_cost(offset, weight)
-        return cost if self.discounts is None else float(self.discounts[0]) * cost
+            factor = 1.0 if self.discounts is None else float(self.discounts[0])
+            self.candidate.cost += factor * cost
 
     def _constrain(self, constraints: Constraints) -> None:
         self.constraints = constraints
@@ -233,6 +226,7 @@ class Problem:
 
     def evaluate(self, trajectory: Array) -> Trial:
         """Evaluate a trajectory (K + 1, n); never raises, whatever the model does."""
+        formulation, prior_weight = self._formulation, self.prior_weight
         try:
             if self._has_noise_free:
                 trajectory = self._rolled_out(trajectory)
@@ -242,7 +236,11 @@ class Problem:
                 self.wrap(residuals, trajectory)
                 offset = self.offset(trajectory)
             weights, cost = self._weights_and_cost(residuals)
-            cost += self._prior_cost(offset)
+            if formulation.quadratic:
+                prior_cost = float(offset.dot(prior_weight).dot(offset))
+            else:
+                prior_cost = formulation.prior_cost(offset, prior_weight)
+            cost += prior_cost if self.discounts is None else float(self.discounts[0]) * prior_cost
         except Exception as error:  # a model function outside its domain, or a user's loss
             residuals = np.full_like(self.candidate.residuals, np.nan)
             return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf, error)

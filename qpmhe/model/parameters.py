@@ -136,7 +136,8 @@ def augment_parameters(
         n, p, m = f.n, f.p, _other_inputs(arguments, values.size)
         states, disturbances, noises = f.states, f.disturbances, f.noises
     else:
-        n, p, m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m or 0, 0)
+        n, p = dimension("n", n, 1), dimension("p", p, 1)
+        m = dimension("m", 0 if m is None else m, 0)
         alone = ", the dimension of x alone: the parameters are added here"
         checked_set("states", states, n, alone)
         checked_set("disturbances", disturbances, n, alone)
@@ -222,8 +223,11 @@ def _check_bounds(bounds: ConvexSet | None, nominal: Array) -> None:
 
 def _function(name: str, written: Any, size: int, m: int, probes: Probes) -> BatchedFunction:
     """A user's function of x and (u, theta), tried at the nominal parameters and near them."""
-    if not callable(written):
-        raise ModelError(f"{name} is {shown(written)}; expected a function.")
+    if not callable(written) or type(written).__module__.startswith("casadi"):
+        raise ModelError(
+            f"{name} is {shown(written)}; expected a function of NumPy arrays. Make a System of a "
+            "model in another language, with the parameters as its last inputs, and give that as f."
+        )
     arguments = ("x", "u", "theta") if m else ("x", "theta")
     try:
         signature = inspect.signature(written)

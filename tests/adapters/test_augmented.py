@@ -339,3 +339,12 @@ def test_wrong_arguments_with_a_system_are_named(changes, error, words):
 def test_wrong_arguments_of_noisy_inputs_are_named(arguments, error, words):
     with pytest.raises(getattr(qpmhe.errors, error), match=words):
         qpmhe.noisy_inputs(*arguments)
+
+
+def test_functions_of_other_packages_are_to_be_systems_first():
+    ca = pytest.importorskip("casadi")
+    x, theta = ca.SX.sym("x"), ca.SX.sym("theta")
+    f = ca.Function("f", [x, theta], [theta * x])
+    for written in (f, [x]):
+        with pytest.raises(qpmhe.errors.ModelError, match="Make a System of a model"):
+            qpmhe.augment_parameters(written, lambda x, theta: x, n=1, p=1, nominal=[0.5])

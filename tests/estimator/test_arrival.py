@@ -171,6 +171,19 @@ def test_a_late_measurement_keeps_the_windows_prior():
         kept.follow(estimate.trajectory)
 
 
+def test_what_is_set_for_the_whole_window_keeps_its_prior():
+    ys = record(14)
+    mhe, other = estimator(arrival="smoothed"), plain_record()
+    for t, y in enumerate(ys):
+        estimate = mhe.update(y)
+        other.push(swing, y)
+        if t == 9:
+            estimate = mhe.set(noise_weight=3.0 * R)
+            other.R, other.noise_weights = 3.0 * R, [3.0 * R] * len(other.ys)
+        check_numbers(estimate, other, other.improved(other.candidate))
+        other.follow(estimate.trajectory)
+
+
 def test_after_a_reset_the_prior_is_the_initial_state():
     ys = record(12)
     used, new = estimator(arrival="smoothed"), estimator(arrival="smoothed")

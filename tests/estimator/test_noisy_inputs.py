@@ -1,5 +1,7 @@
 """Inputs with white errors: the Kalman filter with B Qu B', and Ipopt on a nonlinear plant."""
 
+import pickle
+
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
@@ -191,3 +193,42 @@ def test_finite_differences_have_the_scales_of_the_augmented_state():
         ), horizon=5, initial_state=[1.0, 0.0],
     ).run(1e9 * y, np.ones((10, 1)))
     np.testing.assert_allclose(1e9 * run.states[:, 0], large.states[:, 0], rtol=1e-7)
+
+
+def swing(x, u):
+    return np.stack([x[..., 1], u[..., 0] - np.sin(x[..., 0])], axis=-1)
+
+
+def angle(x):
+    return x[..., :1]
+
+
+@pytest.mark.parametrize("stop", [2, 9, 15])
+def test_irregular_steps_and_snapshots(stop):
+    plant = qpmhe.System.from_ode(swing, angle, dt=0.1, n=2, p=1, m=1)
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=np.diag([0.1, 0.1, 0.04]), disturbance=np.diag([1e-4, 1e-4, 0.04]), noise=1e-2
+    )
+
+    def made():
+        return qpmhe.MovingHorizonEstimator(
+            qpmhe.noisy_inputs(plant), qpmhe.Luenberger([0.2, 0.1, 0.0]), cost, horizon=5,
+            initial_state=[0.3, 0.0, 0.0],
+        )
+
+    def feed(mhe, times):
+        return [
+            mhe.update([0.3 * np.cos(t)], [0.1], dt=0.25 if t % 4 == 3 else None) for t in times
+        ]
+
+    whole, loaded = made(), made()
+    feed(whole, range(stop))
+    loaded.load_state_dict(whole.state_dict())
+    restored = pickle.loads(pickle.dumps(whole))
+    expected = feed(whole, range(stop, 20))
+    for one in (loaded, restored):
+        for found, other in zip(feed(one, range(stop, 20)), expected, strict=True):
+            assert (found.trajectory == other.trajectory).all()
+    x, e = expected[-1].trajectory[:, :2], expected[-1].trajectory[:, 2:]
+    step = plant.timed.f(x[-2], np.append(0.1 + e[-2], 0.25))
+    np.testing.assert_allclose(expected[-1].disturbances[-1, :2], x[-1] - step, atol=1e-14)

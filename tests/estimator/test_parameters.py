@@ -1,5 +1,7 @@
 """Parameters beside the state: constant in every window, and found where they show."""
 
+import pickle
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -15,6 +17,8 @@ from qpmhe import (
     augment_parameters,
 )
 from qpmhe_solvers import backend
+
+from .plain import euler, rk4
 
 DT = 0.1
 TRUE = np.array([3.0, 0.8])  # stiffness and damping
@@ -461,6 +465,14 @@ def build(**changes):
         ({"n": 0}, "OptionError", "n is 0; expected an integer >= 1"),
         ({"p": 1.5}, "OptionError", "p is 1.5"),
         ({"m": -1}, "OptionError", "m is -1"),
+        ({"n": None}, "OptionError", "n is None"),
+        ({"h": None}, "ModelError", "h is None; expected a function"),
+        ({"dt": 0.0}, "OptionError", "dt is 0.0; expected a finite number > 0"),
+        ({"dt": -0.1}, "OptionError", "dt is -0.1"),
+        ({"dt": "fast"}, "OptionError", "dt is 'fast'"),
+        ({"dt": 0.1, "method": "trapezoid"}, "OptionError", "method is 'trapezoid'"),
+        ({"method": "rk4"}, "OptionError", "method is 'rk4', but dt is missing"),
+        ({"drifting": "yes"}, "OptionError", "drifting is 'yes'; expected True or False"),
     ],
 )
 def test_wrong_arguments_are_named(changes, error, words):
@@ -497,3 +509,113 @@ def test_bounds_keep_trials_inside_the_domain_of_the_model():
         parameter_bounds=Box([10.24], [10.26]),
     )
     assert system.derivatives == {"f": "complex step", "h": "complex step"}
+
+
+def spring_rate(x, theta):
+    return np.stack(
+        [x[..., 1], -theta[..., 0] * x[..., 0] - theta[..., 1] * x[..., 1]], axis=-1
+    )
+
+
+def driven_rate(x, u, theta):
+    return np.array([x[1], u[0] - theta[0] * x[0] - theta[1] * x[1]])
+
+
+@pytest.mark.parametrize(("method", "step"), [(None, rk4), ("rk4", rk4), ("euler", euler)])
+@pytest.mark.parametrize("m", [0, 1])
+def test_a_rate_is_discretised(m, method, step):
+    f, h = (spring_rate, position) if m == 0 else (driven_rate, lambda x, u, theta: x[0])
+    system = augment_parameters(
+        f, h, n=2, p=1, m=m, nominal=NOMINAL, estimated=[0], dt=DT, method=method
+    )
+    assert (system.dt, system.n, system.derivatives["f"]) == (DT, 3, "complex step")
+    generator = np.random.default_rng(4)
+    z, u = generator.normal(size=(6, 3)), generator.normal(size=(6, m))
+
+    def following(z, u, dt):
+        theta = np.array([z[2], NOMINAL[1]])
+
+        def rate(x, u):
+            return f(x, theta) if m == 0 else f(x, u, theta)
+
+        return np.append(step(rate)(z[:2], u, dt), z[2])
+
+    for zi, ui in zip(z, u, strict=True):
+        np.testing.assert_allclose(system.f(zi, ui), following(zi, ui, DT), rtol=1e-14)
+        found = system.timed.f(zi, np.append(ui, 0.25))
+        np.testing.assert_allclose(found, following(zi, ui, 0.25), rtol=1e-14)
+        slope = [following(zi + 1e-30j * unit, ui, DT).imag / 1e-30 for unit in np.eye(3)]
+        np.testing.assert_allclose(system.f_jacobian(zi, ui).T, slope, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        system.f.batch(z, u), [following(*pair, DT) for pair in zip(z, u, strict=True)], rtol=1e-14
+    )
+
+
+def test_a_rate_with_irregular_steps_finds_the_constant():
+    system = augment_parameters(
+        spring_rate, position, n=2, p=1, nominal=NOMINAL, estimated=[0], dt=DT
+    )
+    cost = QuadraticCost(prior=np.diag([10.0, 10.0, 1e-3]), disturbance=1e6 * np.eye(3), noise=1e6)
+    mhe = MovingHorizonEstimator(
+        system, Luenberger([0.0, -0.05, 0.0]), cost, horizon=15, initial_state=[*START, 2.0],
+        max_qps=None,
+    )
+    x, generator = START, np.random.default_rng(3)
+    for _ in range(30):
+        dt = DT * generator.uniform(0.5, 2.0)
+        estimate = mhe.update(x[0] + 1e-3 * generator.normal(), dt=dt)
+        x = rk4(lambda x, _: spring_rate(x, TRUE))(x, None, dt)
+        assert estimate.cost <= estimate.candidate_cost
+        assert spread(estimate) == 0.0
+    assert estimate.state[2] == pytest.approx(TRUE[0], rel=0.02)
+    np.testing.assert_allclose(estimate.state[:2], x, atol=0.01)
+
+
+def test_parameters_that_drift_are_followed():
+    theta, x, found = 2.0, START, []
+    system = augment_parameters(
+        driven_rate, lambda x, u, theta: x[:1], n=2, p=1, m=1, nominal=NOMINAL, estimated=[0],
+        dt=DT, drifting=True, disturbances=POSITION_EXACT,
+    )
+    assert system.disturbances.upper.tolist() == [0.0, np.inf, np.inf]
+    cost = QuadraticCost.from_covariances(
+        prior=np.diag([0.1, 0.1, 0.2]), disturbance=np.diag([1e-6, 1e-6, 1e-2]), noise=1e-6
+    )
+    mhe = MovingHorizonEstimator(
+        system, Luenberger([0.0, -0.05, 0.0]), cost, horizon=15, initial_state=[*START, theta],
+        max_qps=None, candidate="reinitialized",
+    )
+    for t in range(80):
+        u = np.array([2.0 * np.sin(0.3 * t)])
+        estimate = mhe.update(x[0], u)
+        x = rk4(lambda x, known: driven_rate(x, known[:1], known[1:]))(
+            x, np.array([*u, theta, TRUE[1]]), DT
+        )
+        theta += 0.02
+        found.append(estimate.state[2] - theta)
+    assert np.abs(found[40:]).mean() < 0.2
+    assert np.ptp(estimate.trajectory[:, 2]) > 0.05
+
+
+@pytest.mark.parametrize("options", [{}, {"dt": DT, "method": "euler"}, {"drifting": True}])
+def test_they_pickle_and_so_do_their_estimators(options):
+    nominal = np.array(NOMINAL)
+    system = augment_parameters(
+        spring_rate, position, n=2, p=1, nominal=nominal, estimated=[True, False],
+        parameter_bounds=Box([0.5], [9.0]), **options,
+    )
+    nominal[:] = 7.0  # the user's own: the system has taken a copy
+    loaded = pickle.loads(pickle.dumps(system))
+    z = np.array([[1.0, 0.5, 2.5], [0.1, -0.5, 1.5]])
+    nothing = np.zeros((2, 0))
+    assert (loaded.f.batch(z, nothing) == system.f.batch(z, nothing)).all()
+    assert loaded.states.upper.tolist() == system.states.upper.tolist()
+    cost = QuadraticCost(prior=1e-2 * np.eye(3), disturbance=np.eye(3), noise=1.0)
+    mhe = MovingHorizonEstimator(
+        system, Luenberger([0.0, -0.05, 0.0]), cost, horizon=4, initial_state=[*START, 2.0]
+    )
+    _, outputs = record(12)
+    mhe.run(outputs[:6])
+    other = pickle.loads(pickle.dumps(mhe))
+    for y in outputs[6:]:
+        assert (mhe.update(y).trajectory == other.update(y).trajectory).all()
