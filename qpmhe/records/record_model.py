@@ -58,10 +58,7 @@ def load_record_model(text: str, **options: Any) -> RecordModel:
         "file": source.fingerprint,
         "engine at work": estimator.engine,
         "initial_state": estimator.initial_state.tolist(),
-        **{
-            key: value.item() if hasattr(value, "item") else value
-            for key, value in vars(estimator.settings).items()
-        },
+        **vars(estimator.settings),
     }
     names = {
         kind: _names(name, kind, signals[kind], getattr(estimator.system, size))

@@ -19,7 +19,7 @@ import numpy as np
 from .._checks import count
 from ..errors import InvalidInputError, OptionError
 from ..estimation.estimate import Estimate, Status
-from .checkpoints import Checkpoint, CheckpointError, WriteError, load, save, versions
+from .checkpoints import Checkpoint, CheckpointError, WriteError, load, plain, save, versions
 from .measurements import ColumnNames, FieldReader, Measurement, RecordReader, seconds_between
 from .output import Output, RowFormat, standard_output_for_rows
 from .record_model import RecordModel, load_record_model
@@ -30,7 +30,7 @@ _EVERY = 100
 # A mistake in the model's code, rather than a state at which it has no value.
 _MISTAKE = re.compile(
     r" raised (TypeError|NameError|UnboundLocalError|AttributeError|ImportError|"
-    r"ModuleNotFoundError)\b| returned (?!not)"
+    r"ModuleNotFoundError)\b| returned (shape|other than|\w+; expected)"
 )
 
 
@@ -179,11 +179,11 @@ def estimate_record(
             missing=(missing,) if isinstance(missing, str) else missing,
         )
         stack.callback(reader.close)
-        identity = loaded.identity | {
+        identity = plain(loaded.identity | {
             "dt": dt, "time_scale": time_scale, "equal_steps": equal_steps,
             "states": list(loaded.states), "covariances": covariances, "step_time": step_time,
             "checkpoint_every": every,
-        }
+        })
         session = _Session(
             loaded, rows, steps, reader, output, Checkpoint(identity, every),
             seconds=checkpoint_seconds, report=report, progress=progress,

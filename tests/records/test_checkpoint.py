@@ -138,3 +138,22 @@ def test_versions_are_told(cut):
     save(path, replace(load(path), versions={"qpmhe": "0.0"}))
     told = estimate_record(CONTINUOUS, "record.csv", "out.csv", resume=True, **OPTIONS)
     assert "0.0" in told.notes[0]
+
+
+def test_a_solver_object_and_options_that_json_knows_otherwise(here):
+    Path("mine.py").write_text(
+        "import numpy as np, qpmhe\n"
+        "def make():\n"
+        "    system, observer, cost, scenario = qpmhe.models.batch_reactor()\n"
+        "    return qpmhe.MovingHorizonEstimator(system, observer, cost, horizon=np.int64(4),\n"
+        "        initial_state=(3, 0), backend=qpmhe.solvers.create('banded'))\n"
+    )
+    text = ["time,y", *(f"{k / 10},{5 - k / 50}" for k in range(60))]
+    put("record.csv", text)
+    estimate_record("mine.py:make", "record.csv", "whole.csv", time_scale=np.int64(1), **OPTIONS)
+    put("record.csv", text[:51])
+    estimate_record("mine.py:make", "record.csv", "out.csv", **OPTIONS)
+    put("record.csv", text)
+    told = estimate_record("mine.py:make", "record.csv", "out.csv", resume=True, **OPTIONS)
+    assert told.before == 40
+    assert Path("out.csv").read_bytes() == Path("whole.csv").read_bytes()
