@@ -79,13 +79,17 @@ class Angles(Residual):
 
     def __init__(self, components: NDArray[np.intp], periods: Array) -> None:
         self.components, self.periods = components, periods
+        # Neighbours are a slice, which is faster than an index.
+        first = int(components[0])
+        neighbours = np.array_equal(components, np.arange(first, first + components.size))
+        self._place = slice(first, first + components.size) if neighbours else components
 
     def wrap(self, differences: Array, minuends: Array) -> None:
         """See `Residual.wrap`."""
-        part = differences[..., self.components]
+        part = differences[..., self._place]
         turns = np.floor(part / self.periods + 0.5)
-        if turns.any():  # also for NaN
-            differences[..., self.components] = part - turns * self.periods
+        if np.count_nonzero(turns):  # also for NaN
+            differences[..., self._place] = part - turns * self.periods
 
     def check(self, name: str, dimension: int) -> None:
         """See `Residual.check`."""
