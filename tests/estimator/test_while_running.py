@@ -608,7 +608,7 @@ def test_the_compiled_step_refuses_by_name():
 
 def test_bounds_of_an_angle_lie_in_its_turn():
     system = qpmhe.System(
-        lambda x: x + [0.3, 0.0], lambda x: x, n=2, p=2, state_residual=qpmhe.angles([0]),
+        lambda x: x + np.array([0.3, 0.0]), lambda x: x, n=2, p=2, state_residual=qpmhe.angles([0]),
         output_residual=qpmhe.angles([0]), states=qpmhe.Box([2.0, -np.inf], [6.0, np.inf]),
     )
     cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(2))
@@ -625,3 +625,12 @@ def test_bounds_of_an_angle_lie_in_its_turn():
         box = qpmhe.Box([3.1, -np.inf], [3.5 + 0.1 * t, np.inf])
         estimate = mhe.update([3.0 + 0.3 * t - 2.0 * np.pi, 0.0], bounds={"states": box})
         assert box.violation(estimate.trajectory[-1]) <= 1e-9
+
+
+def test_a_batch_has_no_parameters():
+    mhe = estimator()
+    with pytest.raises(qpmhe.errors.UnknownOptionError, match=r"'parameters'.*inputs"):
+        qpmhe.BatchEstimator(
+            mhe.system, mhe.observer, mhe.cost, members=2, horizon=3,
+            initial_states=[0.5, 0.0], parameters=[1.0],
+        )
