@@ -86,6 +86,11 @@ class BatchEstimator:
                 "BatchEstimator has no option 'initial_state'; pass initial_states, one for all "
                 "members or one for each."
             )
+        if "parameters" in options:
+            raise UnknownOptionError(
+                "BatchEstimator has no option 'parameters'; give them among the inputs of each "
+                "member."
+            )
         states = _starts(initial_states, self.members, system.n)
         self.system, self.observer, self.cost = system, observer, cost
         if isinstance(observer, Observer):
