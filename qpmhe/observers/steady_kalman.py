@@ -104,6 +104,11 @@ class SteadyStateKalman(Observer):
                 f"the observer is for {n} states and {p} outputs; expected {system.n} and "
                 f"{system.p}, the system's."
             )
+        if len(self._own) != system.r:
+            raise ShapeError(
+                f"disturbance covariance has shape {self._own.shape}; expected ({system.r}, "
+                f"{system.r}). Make the observer with the estimator's system."
+            )
 
     @property
     def constant_gain(self) -> Array | None:
@@ -132,8 +137,10 @@ class SteadyStateKalman(Observer):
             closed, entering = self._closed, self._entering
         else:
             gain, r = self._given(self.gain, sample)
-            own = covariance_of(sample.disturbance_weight, self._own)
-            q = self._disturbance if own is self._own else sample.system.state_covariance(own)
+            entered = covariance_of(sample.disturbance_weight, self._own)
+            q = self._disturbance
+            if entered is not self._own:
+                q = sample.system.state_covariance(entered)
             closed, entering = self._a - gain @ self._c, q + gain @ r @ gain.T
         following = closed @ self._before(sample) @ closed.T + entering
         return self.gain @ v, 0.5 * (following + following.T)
