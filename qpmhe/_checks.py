@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 # The largest index, which counts, sizes and seeds must not exceed.
 _MOST = 2**63 - 1
 
+#: Eigenvalues of correlations below this are rounding.
+SINGULAR = 1e-12
+
 
 def numbers(name: str, value: ArrayLike, *, finite: bool = True) -> Array:
     """A float copy of value; real, and finite unless told otherwise.
@@ -96,6 +99,42 @@ def record(name: str, values: ArrayLike, width: int) -> Array:
 
 def positive_definite(name: str, value: ArrayLike, size: int | None = None) -> Array:
     """A symmetric positive definite float copy of value; a scalar will do where size is 1."""
+    matrix, smallest = _symmetric(name, value, size)
+    if smallest <= 0.0:
+        eigenvalue = float(np.linalg.eigvalsh(matrix)[0])
+        raise WeightError(
+            f"{name} has the eigenvalue {min(max(smallest, -1.0), eigenvalue):.3g}; expected a "
+            "positive definite matrix. For directions without disturbance give a singular "
+            "covariance of the disturbance, or the system a disturbance_matrix."
+        )
+    return matrix
+
+
+def positive_semidefinite(
+    name: str, value: ArrayLike, size: int | None = None
+) -> tuple[Array, bool]:
+    """A copy of a covariance, and whether it is singular."""
+    matrix, smallest = _symmetric(name, value, size)
+    if smallest < -SINGULAR:
+        raise WeightError(
+            f"{name} has the eigenvalue {float(np.linalg.eigvalsh(matrix)[0]):.3g}; expected a "
+            "positive semidefinite matrix: no variance is below 0."
+        )
+    return matrix, smallest <= SINGULAR
+
+
+def check_prior_size(prior: Array, least: int) -> Array:
+    """The prior's weight, if it has a row for each state: no fewer than disturbances."""
+    if prior.shape[0] < least:
+        raise ShapeError(
+            f"prior has shape {prior.shape}; expected ({least}, {least}), as the disturbance has, "
+            "or more rows with a disturbance_matrix."
+        )
+    return prior
+
+
+def _symmetric(name: str, value: ArrayLike, size: int | None) -> tuple[Array, float]:
+    """A symmetric copy, and the smallest eigenvalue of its correlations."""
     matrix = np.atleast_2d(numbers(name, value))
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise ShapeError(f"{name} has shape {matrix.shape}; expected a square matrix.")
@@ -111,16 +150,12 @@ def positive_definite(name: str, value: ArrayLike, size: int | None = None) -> A
             "Pass (M + M.T) / 2 if that is what is meant."
         )
     matrix = 0.5 * (matrix + matrix.T)
+    if matrix[sizes == 0.0].any():  # a variance of zero, but correlated: indefinite in any unit
+        return matrix, -np.inf
+    sizes[sizes == 0.0] = 1.0
     with np.errstate(all="ignore"):
         correlations = matrix / np.multiply.outer(sizes, sizes)
-    smallest = float(np.linalg.eigvalsh(correlations)[0]) if sizes.all() else 0.0
-    if smallest <= 0.0:
-        smallest = min(smallest, float(np.linalg.eigvalsh(matrix)[0]))
-        raise WeightError(
-            f"{name} has the eigenvalue {smallest:.3g}; expected a positive definite matrix. "
-            "A direction without noise belongs into the sets, not into a singular matrix."
-        )
-    return matrix
+    return matrix, float(np.linalg.eigvalsh(correlations)[0])
 
 
 def count(name: str, value: Any, least: int, remedy: str = "", most: int = _MOST) -> int:

@@ -7,11 +7,14 @@ digit of a result.
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Exponents = NDArray[np.int32]
+_EPS = float(np.finfo(np.float64).eps)
 
 
 def unit_diagonal(matrix: Array) -> tuple[Array, Exponents, int]:
@@ -21,7 +24,7 @@ def unit_diagonal(matrix: Array) -> tuple[Array, Exponents, int]:
     """
     exponents = np.frexp(matrix.diagonal())[1]
     # The first component's unit takes the square root of the whole's: an odd power is left.
-    whole = int(exponents[0]) % 2
+    whole = int(exponents[:1].sum()) % 2
     units: Exponents = (exponents - whole) // 2
     scaled: Array = np.ldexp(matrix, -whole - units[:, None] - units)
     return scaled, units, whole
@@ -43,3 +46,19 @@ def solve(matrix: Array, side: Array) -> Array:
     found = np.linalg.solve(scaled, np.ldexp(side, -whole - units[:, None]))
     result: Array = np.ldexp(found, -units[:, None])
     return result
+
+
+def cholesky(matrix: Array) -> Array:
+    """A lower triangular S (d, d) with ``S S' = matrix``, positive semidefinite.
+
+    In a singular matrix, pivots of the size of rounding give columns of zeros.
+    """
+    with suppress(np.linalg.LinAlgError):
+        return np.asarray(np.linalg.cholesky(matrix))
+    left, factor = matrix.copy(), np.zeros_like(matrix)
+    least = matrix.shape[0] * _EPS * matrix.diagonal()
+    for j, pivot in enumerate(least):
+        if left[j, j] > pivot:
+            factor[j:, j] = left[j:, j] / np.sqrt(left[j, j])
+            left -= np.multiply.outer(factor[:, j], factor[:, j])
+    return factor

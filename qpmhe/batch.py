@@ -112,7 +112,7 @@ class BatchEstimator:
 
     def _checked(self, states: Array) -> Array:
         """The initial states, if a single estimator takes each of them."""
-        own = self.system.copy(_scales(self.cost, self.observer))
+        own = self.system.copy(_scales(self.system, self.cost, self.observer))
         _, first, which = np.unique(states, axis=0, return_index=True, return_inverse=True)
         checked = [
             check_start(own, self.observer, self.cost, states[k], f"initial_states[{k}]")
@@ -271,7 +271,7 @@ class _Looped:
         self, system: System, observer: Observer, cost: Cost, settings: Settings, states: Array
     ) -> None:
         self._delay = settings.delay
-        scaled = system.copy(_scales(cost, observer))
+        scaled = system.copy(_scales(system, cost, observer))
         self._engines = [
             PythonEngine(scaled.copy(), observer, cost, settings, state.copy())
             for state in states
@@ -419,11 +419,11 @@ class BatchRun:
         return float(has.mean()) if has.size else 0.0
 
 
-def _scales(cost: object, observer: Observer) -> Array | None:
+def _scales(system: System, cost: object, observer: Observer) -> Array | None:
     """What a single estimator's copy of the system has for `System.scales`."""
     if not isinstance(cost, Cost):  # which the single estimator refuses
         return None
-    return cost.prior_deviations(observer.initial_covariance())
+    return cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix)
 
 
 def _starts(value: ArrayLike, members: int, n: int) -> Array:

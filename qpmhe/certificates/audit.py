@@ -19,7 +19,7 @@ from .branch_and_bound import output_lipschitz
 from .contraction import gain_if_constant
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import evaluated
-from .evidence import Evidence, json_ready
+from .evidence import CertificateError, Evidence, json_ready
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
 from .regions import Region, bounded_region
 
@@ -285,6 +285,13 @@ def checked_ingredients(system: Any, observer: Any, cost: Any) -> None:
         raise InvalidInputError(
             f"cost is {cost!r}; expected a cost, such as qpmhe.QuadraticCost(prior=..., "
             "disturbance=..., noise=...)."
+        )
+    if system.disturbance_matrix is not None or cost.disturbance_factor is not None:
+        raise CertificateError(
+            "the system has a disturbance_matrix, or the cost a singular covariance of the "
+            "disturbance; expected a disturbance of each state. Its constants grow with the "
+            "horizon where corrections are no such disturbances, which certificates do not cover: "
+            "give each state a small disturbance of its own."
         )
     if (cost.n, cost.p) != (system.n, system.p):
         raise ShapeError(

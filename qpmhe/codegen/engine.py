@@ -225,7 +225,7 @@ class CompiledEngine:
                 inputs,
                 weights * factors[1:, None, None],
                 np.asarray(cost.prior) * factors[0],
-                np.empty(0, np.intp),
+                np.eye(model.n),
             )
 
     def state_dict(self) -> dict[str, Any]:

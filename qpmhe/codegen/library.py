@@ -31,6 +31,13 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     """Why an estimator has no C form, with the remedy; empty if it has one."""
     if system.symbolic is None:
         return "the system has no CasADi form; make it with qpmhe.from_casadi."
+    if system.disturbance_matrix is not None:
+        return "engine='compiled' does not yet take a disturbance_matrix; take engine='python'."
+    if cost.disturbance_factor is not None:
+        return (
+            "engine='compiled' does not yet take a singular covariance of the disturbance; take "
+            "engine='python'."
+        )
     if system.states is not None:
         return (
             "engine='compiled' does not yet project the observer onto X; take engine='python', or "

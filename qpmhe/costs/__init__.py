@@ -1,11 +1,13 @@
 """Costs: what the prior, the disturbances and the noises weigh."""
 
 from .base import Cost, CostConstants, ObserverPrior
+from .lifted import LiftedCost, lifted
 from .losses import Huber, Loss, Power, Quadratic
 from .quadratic import QuadraticCost
 from .robust import RobustCost
+from .subspace import Subspace
 
 __all__ = [
-    "Cost", "CostConstants", "Huber", "Loss", "ObserverPrior", "Power", "Quadratic",
-    "QuadraticCost", "RobustCost",
+    "Cost", "CostConstants", "Huber", "LiftedCost", "Loss", "ObserverPrior", "Power", "Quadratic",
+    "QuadraticCost", "RobustCost", "Subspace", "lifted",
 ]

@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.values import finite, shown
 
-from .._checks import Array
+from .._checks import SINGULAR, Array
 from .._linalg import inverse
 from ..errors import OptionError
+from .subspace import Subspace
 
 Mask = NDArray[np.bool_]
 
 # Weights for patterns of missing components are kept up to so many bytes, and a few in any case.
 _KEPT_BYTES = 2**22
 _KEPT_LEAST = 8
-# Eigenvalues of correlations below this are rounding.
-_LEAST_EIGENVALUE = 1e-12
 # In place of a variance of zero: its weight acts as infinity, and its square does not overflow.
 _NO_VARIANCE = 2.0**-500
 
@@ -126,7 +125,7 @@ def _relative_inverse(covariance: Array) -> Array:
     deviations = np.sqrt(np.maximum(variances, _NO_VARIANCE))
     products = np.multiply.outer(deviations, deviations)
     values, vectors = np.linalg.eigh(covariance / products)
-    weight: Array = (vectors / np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T
+    weight: Array = (vectors / np.maximum(values, SINGULAR)) @ vectors.T
     return weight / products
 
 
@@ -140,20 +139,28 @@ class Cost(ABC):
     Parameters
     ----------
     prior, disturbance, noise : array
-        Weights of the initial error (n, n) or the `ObserverPrior` for it, of w and of v (p, p).
+        Weights of the initial error (n, n) or the `ObserverPrior` for it, of w (r, r) and of v
+        (p, p). r is n, or the number of columns of the system's ``disturbance_matrix``.
     discount : float
         gamma, 1 for none.
 
     Attributes
     ----------
-    n, p : int
-        Numbers of states and outputs.
-    stage_weight : (n + p, n + p) array
+    p : int
+        Number of outputs.
+    stage_weight : (r + p, r + p) array
         The weights of w and v as one.
     """
 
     #: Whether the terms are the quadratic forms themselves, which makes weights constant.
     quadratic: bool = False
+
+    #: F (r, s) where the covariance of w is singular: w is F times what ``disturbance`` weighs.
+    disturbance_factor: Array | None = None
+
+    #: The directions of the disturbances, of a `LiftedCost`; None for all.
+    space: Subspace | None = None
+
 
     def __init__(
         self, prior: Array | ObserverPrior, disturbance: Array, noise: Array, discount: float
@@ -163,12 +170,36 @@ class Cost(ABC):
             raise OptionError(f"discount is {shown(discount)}; expected a number in (0, 1].")
         self.discount = factor
         self.prior, self.disturbance, self.noise = prior, disturbance, noise
-        self.n, self.p = disturbance.shape[0], noise.shape[0]
+        self.p = noise.shape[0]
         self.stage_weight = self.joint_weight(noise)
         # By pattern, the least recently used first. Estimators in several threads may share it:
         # each of its methods is atomic, and a matrix that two of them compute is the same.
         self._partial: OrderedDict[bytes, Array] = OrderedDict()
         self._kept = max(_KEPT_LEAST, _KEPT_BYTES // self.stage_weight.nbytes)
+
+    @property
+    def r(self) -> int:
+        """Dimension of the disturbance w."""
+        factor = self.disturbance_factor
+        return len(self.disturbance if factor is None else factor)
+
+    @property
+    def n(self) -> int:
+        """Number of states: with an `ObserverPrior`, which has none, the dimension of w."""
+        return self.r if isinstance(self.prior, ObserverPrior) else len(self.prior)
+
+    def directions(self, matrix: Array | None) -> Array | None:
+        """The matrix that maps what ``disturbance`` weighs to states; None for the identity.
+
+        Parameters
+        ----------
+        matrix : (n, r) array or None
+            The system's ``disturbance_matrix``.
+        """
+        factor = self.disturbance_factor
+        if matrix is None or factor is None:
+            return factor if matrix is None else matrix
+        return matrix @ factor
 
     @property
     def observer_prior(self) -> ObserverPrior | None:
@@ -187,24 +218,35 @@ class Cost(ABC):
         """What the step in C needs of the cost; None for a cost that it cannot compute."""
         return None
 
-    def prior_deviations(self, covariance: Array | None) -> Array:
-        """Standard deviations (n,) of the initial error: typical magnitudes of the states.
+    def prior_deviations(self, covariance: Array | None, matrix: Array | None = None) -> Array:
+        """The square roots of `prior_variances`: typical magnitudes of the states."""
+        deviations: Array = np.sqrt(self.prior_variances(covariance, matrix))
+        return deviations
 
-        Where the disturbance w has a larger one, or an observer knows no initial error, they
-        are those of w.
+    def prior_variances(self, covariance: Array | None, matrix: Array | None = None) -> Array:
+        """Variances (n,) of the initial error, as typical squares of the states.
+
+        Where the disturbance has a larger one, or an observer knows no initial error, they
+        are the disturbance's; 1 where neither has any.
 
         Parameters
         ----------
         covariance : (n, n) array or None
             The observer's covariance of the initial error, for an `ObserverPrior`.
+        matrix : (n, r) array or None
+            The system's ``disturbance_matrix``.
         """
-        variances: Array = inverse(self.disturbance).diagonal()
+        spread, directions = inverse(self.disturbance), self.directions(matrix)
+        variances: Array = (
+            spread.diagonal() if directions is None
+            else np.einsum("ij,jk,ik->i", directions, spread, directions)
+        )
         if not isinstance(self.prior, ObserverPrior):
             covariance = inverse(self.prior)
-        if covariance is not None and covariance.shape == self.disturbance.shape:
+        if covariance is not None and covariance.shape == (variances.size, variances.size):
             initial = covariance.diagonal()
             variances = np.where(np.isfinite(initial), np.fmax(variances, initial), variances)
-        return np.sqrt(variances)
+        return np.where(variances > 0.0, variances, 1.0)
 
     @property
     @abstractmethod
@@ -234,9 +276,10 @@ class Cost(ABC):
 
     def joint_weight(self, noise: Array | None, disturbance: Array | None = None) -> Array:
         """The weight of (w, v) with these weights of v and w; None for the usual ones."""
-        joint = np.zeros((self.n + self.p, self.n + self.p))
-        joint[: self.n, : self.n] = self.disturbance if disturbance is None else disturbance
-        joint[self.n :, self.n :] = self.noise if noise is None else noise
+        size = self.disturbance.shape[0]
+        joint = np.zeros((size + self.p, size + self.p))
+        joint[:size, :size] = self.disturbance if disturbance is None else disturbance
+        joint[size:, size:] = self.noise if noise is None else noise
         return joint
 
     def with_weights(self, noise: Array | None, disturbance: Array | None) -> Cost:

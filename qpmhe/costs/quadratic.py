@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from qpmhe_solvers.errors import report_unknown_options
 
-from .._checks import Array, positive_definite
-from .._linalg import inverse
+from .._checks import SINGULAR, Array, check_prior_size, positive_definite, positive_semidefinite
+from .._linalg import inverse, unit_diagonal
 from .base import Cost, CostConstants, CostForm, ObserverPrior, quadratic_form
 
 
@@ -29,8 +29,9 @@ class QuadraticCost(Cost):
     prior : (n, n) array_like or ObserverPrior
         Weight P of the prior, symmetric positive definite, or the rule to take it from a
         Kalman-type observer.
-    disturbance, noise : (n, n) and (p, p) array_like
-        Weights Q of the disturbance w and R of the noise v, symmetric positive definite.
+    disturbance, noise : (r, r) and (p, p) array_like
+        Weights Q of the disturbance w and R of the noise v, symmetric positive definite. r is n,
+        or the number of columns of the system's ``disturbance_matrix``.
     discount : float
         Factor in (0, 1] by which a stage's cost shrinks with each step of age, the prior's
         with the window's length; 1 is the paper's cost.
@@ -54,7 +55,7 @@ class QuadraticCost(Cost):
         if isinstance(prior, ObserverPrior):
             first = prior
         else:
-            first = positive_definite("prior", prior, w.shape[0])
+            first = check_prior_size(positive_definite("prior", prior), w.shape[0])
         super().__init__(first, w, positive_definite("noise", noise), discount)
 
     @classmethod
@@ -62,20 +63,31 @@ class QuadraticCost(Cost):
         cls, *, prior: ArrayLike | ObserverPrior, disturbance: ArrayLike, noise: ArrayLike,
         discount: float = 1.0,
     ) -> QuadraticCost:
-        """The same cost, given the covariances of initial error, w and v; see `QuadraticCost`."""
-        return cls(
+        """The same cost, given the covariances of initial error, w and v; see `QuadraticCost`.
+
+        The covariance of w may be singular, symmetric positive semidefinite: every estimate then
+        follows the model exactly in the directions in which w has no variance.
+        """
+        covariance, singular = positive_semidefinite("disturbance covariance", disturbance)
+        cost = cls(
             prior=(
                 prior if isinstance(prior, ObserverPrior) else _inverse("prior covariance", prior)
             ),
-            disturbance=_inverse("disturbance covariance", disturbance),
+            disturbance=np.eye(len(covariance)) if singular else inverse(covariance),
             noise=_inverse("noise covariance", noise),
             discount=discount,
         )
+        if singular:
+            cost.disturbance_factor, cost.disturbance = _factor(covariance)
+            cost.stage_weight = cost.joint_weight(None)
+        return cost
 
     @property
     def c_form(self) -> CostForm | None:
         """The weights, unless the prior's varies or a derived class computes another cost."""
         if isinstance(self.prior, ObserverPrior) or type(self) is not QuadraticCost:
+            return None
+        if self.disturbance_factor is not None:
             return None
         return CostForm(self.prior, self.disturbance, self.noise, self.discount)
 
@@ -84,9 +96,10 @@ class QuadraticCost(Cost):
         """Constants of (eq:exp_bounds): extreme eigenvalues of the weights, a = 2.
 
         None with a discount: the bounds then shrink with the age of a stage. None with an
-        `ObserverPrior` without bounds: its weight may be anything.
+        `ObserverPrior` without bounds: its weight may be anything. None with a singular
+        covariance: no number bounds the cost of what has no variance.
         """
-        if self.discount < 1.0:
+        if self.discount < 1.0 or self.disturbance_factor is not None:
             return None
         prior = (
             self.prior.bounds if isinstance(self.prior, ObserverPrior) else _extremes(self.prior)
@@ -114,6 +127,21 @@ class QuadraticCost(Cost):
 
 def _inverse(name: str, covariance: ArrayLike) -> Array:
     return inverse(positive_definite(name, covariance))
+
+
+def _factor(covariance: Array) -> tuple[Array, Array]:
+    """F (r, s) of full rank and a weight W with F W^-1 F' the covariance."""
+    # By correlations: no unit matters.
+    scaled, units, whole = unit_diagonal(covariance)
+    sizes = np.sqrt(scaled.diagonal())
+    scale = np.where(sizes > 0.0, sizes, 1.0)
+    values, vectors = np.linalg.eigh(scaled / np.outer(scale, scale))
+    there = values > SINGULAR
+    factor: Array = np.ldexp(
+        scale[:, None] * vectors[:, there] * np.sqrt(values[there]), units[:, None]
+    )
+    factor[sizes == 0.0] = 0.0
+    return factor, np.ldexp(np.eye(factor.shape[1]), -whole)
 
 
 def _extremes(weight: Array) -> tuple[float, float]:

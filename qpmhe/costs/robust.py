@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from qpmhe_solvers.errors import report_unknown_options
 
-from .._checks import Array, positive_definite
+from .._checks import Array, check_prior_size, positive_definite
 from ..errors import InvalidInputError
 from .base import Cost, CostConstants, ObserverPrior
 from .losses import Loss, Quadratic
@@ -46,14 +46,14 @@ class RobustCost(Cost):
     ) -> None:
         self.disturbance_loss = _loss("disturbance", disturbance)
         self.noise_loss = _loss("noise", noise)
-        n = self.disturbance_loss.dimension
+        r = self.disturbance_loss.dimension
         weight: Array | ObserverPrior
         if isinstance(prior, ObserverPrior):
             weight = prior
-            self.prior_loss: Loss = Quadratic(np.eye(n))
+            self.prior_loss: Loss = Quadratic(np.eye(r))
         else:
             self.prior_loss = _loss("prior", prior)
-            weight = positive_definite("prior", self.prior_loss.weight, n)
+            weight = check_prior_size(positive_definite("prior", self.prior_loss.weight), r)
         super().__init__(weight, self.disturbance_loss.weight, self.noise_loss.weight, discount)
 
     @property
@@ -74,16 +74,16 @@ class RobustCost(Cost):
 
     def stage_costs(self, residuals: Array, weights: Array) -> Array:
         """The losses of w and v added; see `Cost.stage_costs`."""
-        n = self.n
-        w_cost = self.disturbance_loss.cost(residuals[:, :n], weights[..., :n, :n])
-        return np.add(w_cost, self.noise_loss.cost(residuals[:, n:], weights[..., n:, n:]))
+        r = self.r
+        w_cost = self.disturbance_loss.cost(residuals[:, :r], weights[..., :r, :r])
+        return np.add(w_cost, self.noise_loss.cost(residuals[:, r:], weights[..., r:, r:]))
 
     def majorise(self, residuals: Array, weights: Array) -> Array:
         """Reweighted forms; see `Cost.majorise`."""
-        n, q = self.n, self.n + self.p
+        r, q = self.r, self.r + self.p
         joint = np.zeros((residuals.shape[0], q, q))
-        joint[:, :n, :n] = self.disturbance_loss.majorise(residuals[:, :n], weights[..., :n, :n])
-        joint[:, n:, n:] = self.noise_loss.majorise(residuals[:, n:], weights[..., n:, n:])
+        joint[:, :r, :r] = self.disturbance_loss.majorise(residuals[:, :r], weights[..., :r, :r])
+        joint[:, r:, r:] = self.noise_loss.majorise(residuals[:, r:], weights[..., r:, r:])
         return joint
 
     def check_weights(self, noise: Array | None, disturbance: Array | None) -> None:

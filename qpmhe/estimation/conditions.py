@@ -99,8 +99,13 @@ class ConditionReader:
         if noise_weight is not None:
             noise = positive_definite("noise_weight", noise_weight, len(cost.noise))
         if disturbance_weight is not None:
-            size = len(cost.disturbance)
-            disturbance = positive_definite("disturbance_weight", disturbance_weight, size)
+            disturbance = positive_definite("disturbance_weight", disturbance_weight, cost.r)
+            if cost.disturbance_factor is not None:
+                raise OptionError(
+                    "disturbance_weight was given, but the cost has a singular covariance of the "
+                    "disturbance, of which no weight is the inverse; give the system a "
+                    "disturbance_matrix in place of the singular covariance."
+                )
         cost.check_weights(noise, disturbance)
         found: dict[str, Any] = {"noise_weight": noise, "disturbance_weight": disturbance}
         if bounds is None:

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._linalg import inverse
-from ..costs import Cost
-from ..model.sets import ConvexSet
+from ..costs import Cost, Subspace
+from ..errors import SetError
+from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from .conditions import Conditions
 from .estimate import DroppedRow
@@ -22,6 +23,13 @@ Mask = NDArray[np.bool_]
 
 # Rounding of a difference, as a share of its terms: a residual may miss a row by that much more.
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
+
+
+# A row is the combination of others if less than this share of it is not.
+_DEPENDENT = 1e-9
+
+# A correction is in the range of the disturbances if less than this share of it is not.
+_IN_RANGE = 1e-12
 
 
 class Rows:
@@ -44,20 +52,29 @@ class Rows:
     scale : (r,) or (K, r) array
         The unit in which a miss of the row is measured: its width, or the standard deviation of
         M s if that is less.
+    fixed : (r,) bool array
+        Rows that are never dropped: the components that have no width.
+    numbers : (r,) array
+        As in `DroppedRow`.
     """
 
     __slots__ = (
-        "_columns", "_deviation", "_magnitudes", "bounds", "components", "lower", "matrix", "name",
-        "scale", "upper",
+        "_columns", "_deviation", "_kept", "_magnitudes", "bounds", "components", "fixed", "lower",
+        "matrix", "name", "numbers", "scale", "upper",
     )
 
     def __init__(self, name: str, convex_set: ConvexSet, covariance: Array) -> None:
         d, components = convex_set.dimension, convex_set.bounded_components
         self.name, self.components, self.bounds = name, components, components.size
         self.matrix: Array = np.vstack((np.eye(d)[components], convex_set.matrix))
+        self._kept: Mask | None = None
         self._deviation = np.sqrt(np.einsum("ri,ij,rj->r", self.matrix, covariance, self.matrix))
         self.lower, self.upper = self._sides(convex_set)
         self.scale: Array = self._scale()
+        fixed = self.lower == self.upper
+        self.fixed: Mask = fixed & (np.arange(fixed.size) < self.bounds)
+        general = np.arange(d, d + convex_set.matrix.shape[0])
+        self.numbers: NDArray[np.intp] = np.append(components, general)
         self._magnitudes = np.abs(self.matrix).T
         # Without general inequalities M s is a part of s, mostly the whole of it.
         self._columns: slice | NDArray[np.intp] | None = None
@@ -65,10 +82,12 @@ class Rows:
             self._columns = slice(None) if components.size == d else components
 
     def _sides(self, convex_set: ConvexSet) -> tuple[Array, Array]:
-        return (
-            np.append(convex_set.lower[self.components], convex_set.row_lower),
-            np.append(convex_set.upper[self.components], convex_set.row_upper),
-        )
+        lower = np.append(convex_set.lower[self.components], convex_set.row_lower)
+        upper = np.append(convex_set.upper[self.components], convex_set.row_upper)
+        if self._kept is None:
+            return lower, upper
+        noise_free = np.zeros(len(self.matrix) - int(self._kept.sum()))
+        return np.append(lower[self._kept], noise_free), np.append(upper[self._kept], noise_free)
 
     def _scale(self) -> Array:
         width, deviation = self.upper - self.lower, self._deviation
@@ -124,6 +143,22 @@ class Rows:
         touched: Mask = (components @ (self._magnitudes != 0.0).astype(np.intp)) > 0
         return touched
 
+    def mapped(self, through: Array | None, noise_free: Array, left_out: Mask) -> Rows:
+        """The rows on d, where s = T d, without some; and behind them N' d = 0, noise-free."""
+        other, kept, nothing = self._copy(), ~left_out, np.zeros(noise_free.shape[1])
+        matrix = self.matrix if through is None else self.matrix @ through
+        other._kept, other.matrix = kept, np.vstack((matrix[kept], noise_free.T))
+        other.lower = np.append(self.lower[kept], nothing)
+        other.upper = np.append(self.upper[kept], nothing)
+        # A row on a disturbance without variance has no deviation; N has a variance of 1.
+        deviation = np.where(self._deviation > 0.0, self._deviation, 1.0)
+        other._deviation = np.append(deviation[kept], nothing + 1.0)
+        other.scale = other._scale()
+        other.fixed = np.append(self.fixed[kept], nothing == 0.0)
+        other.numbers = np.append(self.numbers[kept], np.full(nothing.size, -1))
+        other._columns, other._magnitudes = None, np.abs(other.matrix).T
+        return other
+
     def _copy(self) -> Rows:
         other = object.__new__(Rows)
         for name in Rows.__slots__:
@@ -132,30 +167,57 @@ class Rows:
 
 
 class Constraints:
-    """The rows of X, W and V; immutable.
+    """The rows of X, W and V, and the directions without disturbance; immutable.
 
     Attributes
     ----------
     states, disturbances, noises : Rows or None
-        The inequalities on x, w and v.
+        The inequalities on x, on d = x+ - f(x) and on v.
     noise_free : (k,) array
         Components whose disturbance is a constant, so that their states follow the model.
     constant : (k,) array
         These constants.
+    basis : (n, n - k) array
+        The directions in which there are disturbances.
+    directions : Directions or None
+        The noise-free directions in place of these components, for a `LiftedCost`.
     """
 
-    __slots__ = ("constant", "disturbances", "noise_free", "noises", "states")
+    __slots__ = (
+        "basis", "constant", "directions", "disturbances", "noise_free", "noises", "states",
+    )
 
     def __init__(self, system: System, cost: Cost, prior_covariance: Array) -> None:
         self.states = _rows("states", system.states, prior_covariance)
-        self.disturbances = _rows("disturbances", system.disturbances, inverse(cost.disturbance))
         self.noises = _rows("noises", system.noises, inverse(cost.noise))
-        disturbances = system.disturbances
+        disturbances, spread = system.disturbances, inverse(cost.disturbance)
         self.noise_free: NDArray[np.intp] = np.empty(0, np.intp)
         self.constant: Array = np.empty(0)
-        if disturbances is not None:
-            self.noise_free = disturbances.fixed_components
-            self.constant = disturbances.lower[self.noise_free]
+        self.directions: Directions | None = None
+        if cost.space is None:
+            self.disturbances = _rows("disturbances", disturbances, spread)
+            if disturbances is not None:
+                self.noise_free = disturbances.fixed_components
+                self.constant = disturbances.lower[self.noise_free]
+            self.basis = np.delete(np.eye(system.n), self.noise_free, axis=1)
+        else:
+            self._lift(system, cost.space, spread)
+
+    def _lift(self, system: System, space: Subspace, spread: Array) -> None:
+        """Set the rows on d and the noise-free directions of a `LiftedCost`."""
+        through, disturbances = space.to_disturbances, system.disturbances
+        if disturbances is None:
+            unbounded = np.full(system.r, np.inf)
+            disturbances = Box(-unbounded, unbounded)
+        if through is not None:
+            spread = through @ spread @ through.T
+        rows = Rows("disturbances", disturbances, spread)
+        directions = Directions(rows, space)
+        self.basis = directions.basis
+        if self.basis.shape[1] < system.n:
+            self.directions = directions
+        mapped = rows.mapped(through, space.noise_free, directions.repeated)
+        self.disturbances = mapped if len(mapped.matrix) else None
 
     def __bool__(self) -> bool:
         return any((self.states, self.disturbances, self.noises))
@@ -204,7 +266,7 @@ class Constraints:
     ) -> Constraints:
         """The constraints without the rows that a trajectory misses; noise-free ones stay."""
         left = {
-            rows.name: rows.without(self._droppable(rows, misses), points)
+            rows.name: rows.without((misses > FEASIBLE) & ~rows.fixed, points)
             for rows, points, sizes in self._parts(trajectory, residuals, measurements)
             if (misses := rows.misses(points, sizes)) is not None
         }
@@ -219,29 +281,85 @@ class Constraints:
             misses = rows.misses(points, sizes)
             if misses is None:
                 continue
-            numbers = np.append(  # as in `DroppedRow.row`
-                rows.components, rows.matrix.shape[1] + np.arange(len(rows.matrix) - rows.bounds)
-            )
             below = rows.values(points) < rows.lower
             found += [
                 DroppedRow(
-                    rows.name, int(numbers[r]), "lower" if below[k, r] else "upper", first + int(k)
+                    rows.name, int(rows.numbers[r]), "lower" if below[k, r] else "upper",
+                    first + int(k),
                 )
                 for k, r in np.argwhere(misses > FEASIBLE)
             ]
         return tuple(found)
-
-    def _droppable(self, rows: Rows, misses: Array) -> Mask:
-        missed: Mask = misses > FEASIBLE
-        if rows is self.disturbances:
-            missed[:, : rows.bounds] &= ~np.isin(rows.components, self.noise_free)
-        return missed
 
     def _replaced(self, **rows: Rows) -> Constraints:
         other = object.__new__(Constraints)
         for name in Constraints.__slots__:
             setattr(other, name, rows.get(name, getattr(self, name)))
         return other
+
+
+class Directions:
+    """Noise-free directions: N' d = c for all d = x+ - f(x) of an estimate.
+
+    They are those of the cost, with c = 0, and the components of W that have no width.
+
+    Attributes
+    ----------
+    projection, offset : (n, n) and (n,) array
+        d becomes noise-free as ``projection @ d + offset``, in the metric of the `LiftedCost`.
+    candidate_projection : (n, n) array
+        The same for the directions of the cost alone.
+    repeated : bool array
+        Which of W's rows the cost implies.
+    basis : (n, n - k) array
+        The directions in which there are disturbances.
+    """
+
+    def __init__(self, rows: Rows, space: Subspace) -> None:
+        scale, matrix, normal = space.scale, rows.matrix, space.normal
+        if space.to_disturbances is not None:
+            matrix = matrix @ space.to_disturbances
+        constant = np.zeros(normal.shape[1])
+        self.repeated: Mask = np.zeros(len(matrix), np.bool_)
+        self.candidate_projection = _off(normal, scale)
+        for j in np.flatnonzero(rows.fixed):
+            row = matrix[j] * scale
+            shares = normal.T @ row
+            rest = row - normal @ shares
+            size, value = float(np.linalg.norm(rest)), float(rows.lower[j] - shares @ constant)
+            if size > _DEPENDENT * float(np.linalg.norm(row)):
+                normal = np.column_stack((normal, rest / size))
+                constant = np.append(constant, value / size)
+                continue
+            self.repeated[j] = True
+            if abs(value) > _DEPENDENT * abs(rows.lower[j]):
+                raise SetError(
+                    f"the set of disturbances fixes component {rows.numbers[j]} at "
+                    f"{rows.lower[j]:.6g}, but the covariance of the disturbance says that it is "
+                    f"{rows.lower[j] - value:.6g}; leave it out of the set, or give it a variance."
+                )
+        self.projection = _off(normal, scale)
+        self.offset = scale * (normal @ constant)
+        k = normal.shape[1]
+        self.basis = scale[:, None] * np.linalg.qr(normal, mode="complete")[0][:, k:]
+        self._shown, self._sizes = space.noise_free, np.abs(space.noise_free)
+
+    def roll_out(self, of_candidate: bool) -> tuple[Array, Array]:
+        """Projection and offset of a trial, or of the candidate."""
+        if of_candidate:
+            return self.candidate_projection, np.zeros_like(self.offset)
+        return self.projection, self.offset
+
+    def has(self, differences: Array) -> bool:
+        """Whether the cost's directions of all d (K, n) are noise-free, up to rounding."""
+        missed = np.abs(differences @ self._shown)
+        return bool((missed <= _IN_RANGE * (np.abs(differences) @ self._sizes)).all())
+
+
+def _off(normal: Array, scale: Array) -> Array:
+    """The projection I - E N' along orthonormal directions, in scaled numbers."""
+    projection: Array = np.eye(scale.size) - scale[:, None] * (normal @ normal.T) / scale
+    return projection
 
 
 def _rows(name: str, convex_set: ConvexSet | None, covariance: Array) -> Rows | None:

@@ -18,13 +18,13 @@ def window_covariances(
     inputs: Array,
     weights: Array,
     prior_weight: Array,
-    noise_free: NDArray[np.intp],
+    basis: Array,
 ) -> Array:
     """Covariances (K + 1, n, n) of the states of a trajectory, given its window.
 
     Diagonal blocks of the inverse of the Gauss-Newton Hessian of J/2, by the Kalman filter
     and the Bryson-Frazier smoother of the linearised model. These invert no covariance of a
-    state, so that components of w may have zero covariance (noise-free ones).
+    state, so that disturbances may have zero covariance in some directions (noise-free ones).
 
     Parameters
     ----------
@@ -35,8 +35,8 @@ def window_covariances(
     weights, prior_weight : array
         Of the quadratic forms of the stages, (q, q) or (K, q, q) with q = n + p, and of the
         initial error (n, n).
-    noise_free : (k,) array
-        Components without a disturbance.
+    basis : (n, k) array
+        The directions in which there are disturbances.
 
     References
     ----------
@@ -61,9 +61,9 @@ def window_covariances(
     weights = np.broadcast_to(
         np.ldexp(weights, -whole - unit[:, None] - unit), (count, q, q)
     )
-    noisy = np.ones(n, dtype=np.bool_)
-    noisy[noise_free] = False
-    block = np.ix_(noisy, noisy)
+    # Columns of order one, and those of the identity as they are.
+    basis = np.ldexp(basis, units[:, None])
+    basis = np.ldexp(basis, 1 - np.frexp(np.abs(basis).max(axis=0, initial=0.0))[1])
     prior = np.linalg.inv(prior_weight)
     covariance = np.empty((count + 1, n, n))  # first predicted, then smoothed
     covariance[0] = 0.5 * (prior + prior.T)
@@ -75,7 +75,7 @@ def window_covariances(
         closed[i] = np.linalg.inv(eye + covariance[i] @ information)
         gained[i] = information @ closed[i]
         predicted = a[i] @ closed[i] @ covariance[i] @ a[i].T
-        predicted[block] += np.linalg.inv(weights[i, :n, :n][block])
+        predicted += basis @ np.linalg.inv(basis.T @ weights[i, :n, :n] @ basis) @ basis.T
         covariance[i + 1] = 0.5 * (predicted + predicted.T)
     later = np.zeros((n, n))  # information of this and later outputs on the state
     for i in range(count - 1, -1, -1):

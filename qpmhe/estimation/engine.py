@@ -15,7 +15,7 @@ from qpmhe_solvers import Solver, create
 from qpmhe_solvers.solver import ContainedSolver
 
 from .._checks import check_problem
-from ..costs import Cost
+from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
 from ..model.residuals import difference
 from ..model.system import System
@@ -79,7 +79,10 @@ class PythonEngine:
         settings: Settings,
         initial_state: Array,
     ) -> None:
-        self._system, self._observer, self._cost = system, observer, cost
+        self._system, self._observer, self._given_cost = system, observer, cost
+        self._cost = cost = lifted(cost, system.disturbance_matrix, observer.initial_covariance())
+        self._to_disturbances = None if cost.space is None else cost.space.to_disturbances
+        self._disturbances = system.r
         self._settings = settings
         given = settings.backend
         self._solver = solver = ContainedSolver(
@@ -90,7 +93,7 @@ class PythonEngine:
             solver.prepare((settings.horizon + 1) * system.n)
         if system.kernel is not None:
             system.kernel.prepare(settings.horizon)
-        self._reader = ConditionReader(system, cost)
+        self._reader = ConditionReader(system, self._given_cost)
         self._tools = self._tools_for(usual_conditions(settings))
         self._with_terms = settings.qp_limit > 0
         self._reinitialized = settings.candidate == "reinitialized"
@@ -203,6 +206,10 @@ class PythonEngine:
             message = f"{window.failure} {message}".strip()
         if not math.isfinite(candidate.cost):
             status &= ~Status.NO_DECREASE  # the model failed, not the solver
+            if problem.rolled_out is not None:
+                status |= Status.MODEL_FAILED
+                reason = problem.failure(problem.rolled_out)
+                message = f"the candidate's roll-out has no finite cost. {reason} {message}".strip()
             if Status.MODEL_FAILED not in status:
                 status |= Status.FAILED_STAGE
         trajectory, residuals, filtered = trial.trajectory, trial.residuals, None
@@ -212,7 +219,7 @@ class PythonEngine:
                 offset = difference(
                     self._system.state_residual, trajectory[-1], candidate.trajectory[-1]
                 )
-            if self._watch.note(offset, problem.prior_weight, bool(outcome.dropped)):
+            if self._watch.note(offset, problem.distance_weight, bool(outcome.dropped)):
                 status |= Status.OBSERVER_FAR
         else:
             self._watch.counts = 0, 0
@@ -221,6 +228,9 @@ class PythonEngine:
             filtered = window.filtered()
         if problem.observed is not None:
             residuals[:, self._system.n :][~problem.observed] = np.nan
+        if self._to_disturbances is not None:
+            n = self._system.n
+            residuals = np.hstack((residuals[:, :n] @ self._to_disturbances.T, residuals[:, n:]))
         estimate = Estimate(
             window.time - 1,
             trajectory,
@@ -238,6 +248,7 @@ class PythonEngine:
             settings.delay,
             outcome.nearest_points,
             filtered,
+            self._disturbances,
         )
         if window.newest_failed and outcome.improved:
             window.restart(estimate.state)
@@ -356,7 +367,7 @@ class PythonEngine:
             return window_covariances(
                 problem.model, trial.trajectory, problem.inputs, trial.weights,
                 problem.prior_weight_at(problem.offset(trial.trajectory)),
-                problem.constraints.noise_free,
+                problem.constraints.basis,
             )
 
     def state_dict(self) -> dict[str, Any]:
@@ -379,7 +390,7 @@ class PythonEngine:
         }
 
     def _description(self) -> dict[str, Any]:
-        return described(self._system, self._observer, self._cost, self._settings)
+        return described(self._system, self._observer, self._given_cost, self._settings)
 
     def _size(self) -> tuple[int, ...]:
         system = self._system

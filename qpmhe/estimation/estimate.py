@@ -141,8 +141,9 @@ class Estimate:
         observer's own measurement update, and z(t) for an observer without one.
     trajectory : (N_t + 1, n) array
         Estimates of all states in the window.
-    disturbances : (N_t, n) array
-        w(i) = x(i+1) - f(x(i)) along the trajectory.
+    disturbances : (N_t, r) array
+        w(i) = x(i+1) - f(x(i)) along the trajectory; with a ``disturbance_matrix`` G, the w(i)
+        for which G w(i) is nearest to this difference.
     noises : (N_t, p) array
         v(i) = y(i) - h(x(i)) along the trajectory; NaN where y is missing.
     cost, candidate_cost : float
@@ -169,9 +170,9 @@ class Estimate:
     """
 
     __slots__ = (
-        "_filtered", "_residuals", "candidate", "candidate_cost", "corrections", "cost", "delayed",
-        "dropped", "message", "nearest_points", "qps", "solve_time", "solver_iterations", "state",
-        "status", "step_time", "time", "trajectory",
+        "_filtered", "_residuals", "_width", "candidate", "candidate_cost", "corrections", "cost",
+        "delayed", "dropped", "message", "nearest_points", "qps", "solve_time",
+        "solver_iterations", "state", "status", "step_time", "time", "trajectory",
     )
 
     def __init__(
@@ -192,8 +193,10 @@ class Estimate:
         delay: int = 0,
         nearest_points: int = 0,
         filtered: Array | None = None,
+        disturbances: int | None = None,
     ) -> None:
         self.time = time
+        self._width = trajectory.shape[1] if disturbances is None else disturbances
         self.trajectory = trajectory
         self.state: Array = trajectory[-1]
         self._residuals = residuals
@@ -217,12 +220,12 @@ class Estimate:
     @property
     def disturbances(self) -> Array:
         """w(i) along the trajectory."""
-        return self._residuals[:, : self.trajectory.shape[1]]
+        return self._residuals[:, : self._width]
 
     @property
     def noises(self) -> Array:
         """v(i) along the trajectory, NaN where y is missing."""
-        return self._residuals[:, self.trajectory.shape[1] :]
+        return self._residuals[:, self._width :]
 
     def explain(self) -> str:
         """What happened, and what can be done about it, in sentences; with any dropped rows."""

@@ -168,11 +168,7 @@ class MovingHorizonEstimator:
         _require(system, System, "system", "qpmhe.System")
         _require(observer, Observer, "observer", "qpmhe.Luenberger or another observer")
         _require(cost, Cost, "cost", "qpmhe.QuadraticCost or qpmhe.RobustCost")
-        if (cost.n, cost.p) != (system.n, system.p):
-            raise ShapeError(
-                f"the cost is for {cost.n} states and {cost.p} outputs; expected {system.n} "
-                f"and {system.p}, the system's."
-            )
+        check_cost(system, cost)
         if cost.observer_prior is not None and observer.initial_covariance() is None:
             raise InvalidInputError(
                 f"the prior weight is to come from the observer, but {type(observer).__name__} "
@@ -180,7 +176,9 @@ class MovingHorizonEstimator:
                 "or give a constant weight."
             )
         # A copy: this estimator may change how f and h are called (batched, or one by one).
-        self._own_system = system.copy(cost.prior_deviations(observer.initial_covariance()))
+        self._own_system = system.copy(
+            cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix)
+        )
         nominal = self.settings.parameters
         if len(nominal) > system.m:
             raise ShapeError(
@@ -285,7 +283,7 @@ class MovingHorizonEstimator:
         dt : float, optional
             Length of the step from t to t+1 if not the sampling time; for a system made by
             `System.from_ode`.
-        noise_weight, disturbance_weight : (p, p) and (n, n) array_like, optional
+        noise_weight, disturbance_weight : (p, p) and (r, r) array_like, optional
             Weights of this sample's v(t) and w(t), in place of the cost's. Kalman-type observers
             take their inverses as covariances.
         bounds : dict, optional
@@ -623,6 +621,23 @@ def _nominal(parameters: ArrayLike | None) -> tuple[float, ...]:
 def _require(value: object, kind: type, name: str, expected: str) -> None:
     if not isinstance(value, kind):
         raise InvalidInputError(f"{name} is {shown(value)}; expected a {expected}.")
+
+
+def check_cost(system: System, cost: Cost) -> None:
+    """Check that a cost is for the system's states, disturbances and outputs."""
+    n = system.n if cost.observer_prior is not None and cost.r == system.r else cost.n
+    if (n, cost.p) != (system.n, system.p):
+        raise ShapeError(
+            f"the cost is for {n} states and {cost.p} outputs; expected {system.n} and "
+            f"{system.p}, the system's."
+        )
+    if cost.r != system.r:
+        raise ShapeError(
+            f"the cost is for {cost.r} disturbances; expected {system.r}, "
+            + ("one for each state. Give the system a disturbance_matrix if there are fewer."
+               if system.disturbance_matrix is None
+               else "one for each column of the system's disturbance_matrix.")
+        )
 
 
 def check_start(

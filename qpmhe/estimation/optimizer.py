@@ -138,10 +138,25 @@ class Optimizer:
         start = shifted() if self._warm_start else None
         if feasible:
             self._search(problem, outcome, start, self._limit)
+            if outcome.trial is candidate and problem.rolled_out is not None:
+                self._search_from_rolled_out(problem, outcome)
             outcome.improved = outcome.trial is not candidate
         else:
             self._restore(problem, outcome, start, shifted)
         return outcome
+
+    def _search_from_rolled_out(self, problem: Problem, outcome: Outcome) -> None:
+        """Search on from the trajectory of which the candidate's cost is, after a search in vain.
+
+        No step from the candidate itself need lower this cost, however short.
+        """
+        candidate, rolled_out = outcome.trial, problem.evaluate(problem.candidate.trajectory)
+        if rolled_out.cost < math.inf and outcome.qps < self._limit:
+            outcome.trial = rolled_out
+            outcome.events &= ~(Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED)
+            self._search(problem, outcome, None, self._limit - outcome.qps)
+            if outcome.trial is rolled_out:
+                outcome.trial = candidate
 
     def _restore(
         self,

@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 # Rounding of a residual, as a share of the numbers that it is computed from.
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
+# A variance below this share of the typical one is none; it counts as the second.
+_NO_VARIANCE, _KNOWN = 1e-30, 1e-16
+
 
 @dataclass(slots=True)
 class Trial:
@@ -66,11 +69,38 @@ class Formulation:
         self.observer_prior = cost.observer_prior
         self.discounted = cost.discount < 1.0
         self.wraps = not (system.output_residual is None and system.state_residual is None)
+        covariance = observer.initial_covariance()
+        # Typical variances of the states, where an observer's may be zero.
+        self._typical: Array | None = None
+        if covariance is not None and (cost.space is not None or not covariance.diagonal().all()):
+            scales = system.scales
+            self._typical = (
+                cost.prior_variances(covariance) if scales is None else scales * scales
+            )
         #: Weight of the initial error of the first window.
-        self.prior_weight: Array = cost.initial_weight(observer.initial_covariance())
+        self.prior_weight: Array
+        self.prior_weight, regular = self.prior_weights(covariance)
         self.prior_band = band_of(self.prior_weight)
-        self.constraints = Constraints(system, cost, inverse(self.prior_weight))
+        self.constraints = Constraints(system, cost, inverse(regular))
         self.constrained = bool(self.constraints)
+
+    def prior_weights(self, covariance: Array | None) -> tuple[Array, Array]:
+        """The prior's weight for an observer's covariance, and one to judge its distance by.
+
+        A state that is known exactly has a large weight in the first, and that of its typical
+        magnitude in the second.
+        """
+        typical = self._typical
+        if typical is not None and covariance is not None and self.observer_prior is not None:
+            known = covariance.diagonal() <= _NO_VARIANCE * typical
+            if known.any():
+                nearly, regular = (
+                    covariance + np.diag(np.where(known, one, 0.0))
+                    for one in (_KNOWN * typical, typical)
+                )
+                return self.cost.initial_weight(nearly), self.cost.initial_weight(regular)
+        weight = self.cost.initial_weight(covariance)
+        return weight, weight
 
     def problem(self, window: Window) -> Problem:
         """The problem of the present window."""
@@ -99,6 +129,8 @@ class Problem:
     ----------
     candidate : Trial
         The observer's trajectory (eq:warmstart), with its true J even if it is infeasible.
+    rolled_out : Trial or None
+        What its J is taken of, where a correction is outside of the range of the disturbances.
     constraints : Constraints
         The rows that a trial must satisfy.
     prior, inputs, measurements : array
@@ -109,6 +141,8 @@ class Problem:
         Which components of y are not missing; None if none is missing.
     prior_weight : (n, n) array
         Weight of the initial error, before discount and majorisation.
+    distance_weight : (n, n) array
+        Weight of a distance from the observer, regular where a state was known exactly.
     discounts : (K + 1,) array or None
         Factors of the prior's cost and of the stages'; None without a discount.
     stage_weights : array
@@ -126,10 +160,10 @@ class Problem:
     """
 
     __slots__ = (
-        "_clip", "_formulation", "_has_noise_free", "_prior_band", "candidate", "constrained",
-        "constraints", "discounts", "inputs", "measurements", "model", "observed", "prior",
-        "prior_moved", "prior_weight", "span", "stage_weights", "time", "usual_disturbances",
-        "wraps",
+        "_candidate_residuals", "_clip", "_formulation", "_has_noise_free", "_prior_band",
+        "candidate", "constrained", "constraints", "discounts", "distance_weight", "inputs",
+        "measurements", "model", "observed", "prior", "prior_moved", "prior_weight", "rolled_out",
+        "span", "stage_weights", "time", "usual_disturbances", "wraps",
     )
 
     _clip: tuple[Array, Array] | None
@@ -151,8 +185,11 @@ class Problem:
         self.discounts = window.discounts if formulation.discounted else None
         self.usual_disturbances = not (window.has_disturbance_weights or formulation.discounted)
         self.prior_weight, self._prior_band = formulation.prior_weight, formulation.prior_band
+        self.distance_weight = self.prior_weight
         if formulation.observer_prior is not None and window.prior_covariance is not None:
-            self.prior_weight = formulation.observer_prior.weight(window.prior_covariance)
+            self.prior_weight, self.distance_weight = formulation.prior_weights(
+                window.prior_covariance
+            )
             self._prior_band = band_of(self.prior_weight)
         weights = self.stage_weights if formulation.quadratic else window.majorising_weights
         if self.discounts is not None:
@@ -165,6 +202,7 @@ class Problem:
             self._move_prior(window.smoothed_prior)
         self.constraints, self.constrained = formulation.constraints, formulation.constrained
         self._has_noise_free, self._clip = False, None
+        self.rolled_out: Trial | None = None
         if self.constrained:
             constraints = formulation.constraints
             if window.has_own_bounds:
@@ -172,7 +210,30 @@ class Problem:
             if self.observed is not None:
                 constraints = constraints.observed(self.observed)
             self._constrain(constraints)
-            self.candidate.violation = self._violation(self.candidate)
+            self._judge_candidate()
+
+    def _judge_candidate(self) -> None:
+        """Set the candidate's violation and, where its noise-free part has no cost, its J.
+
+        Corrections outside of the range of the disturbances have no weight: J(candidate) is then
+        that of the roll-out of the candidate, with the part of each correction in the range.
+        """
+        candidate, directions = self.candidate, self.constraints.directions
+        self._candidate_residuals = candidate.residuals
+        if directions is not None:
+            n = self.prior.size
+            self._candidate_residuals = candidate.residuals.copy()
+            self._candidate_residuals[:, :n] @= directions.candidate_projection.T
+            if math.isfinite(candidate.cost) and not directions.has(candidate.residuals[:, :n]):
+                self.rolled_out = self.evaluate(candidate.trajectory, of_candidate=True)
+                candidate.cost = self.rolled_out.cost
+        candidate.violation = self._candidate_violation()
+
+    def _candidate_violation(self) -> float:
+        candidate = self.candidate
+        return self.constraints.violation(
+            candidate.trajectory, self._candidate_residuals, self.measurements
+        )
 
     def _move_prior(self, prior: Array) -> None:
         """Take another prior mean, unless the candidate has no finite prior cost there."""
@@ -189,7 +250,9 @@ class Problem:
 
     def _constrain(self, constraints: Constraints) -> None:
         self.constraints = constraints
-        self._has_noise_free = bool(constraints.noise_free.size)
+        self._has_noise_free = bool(constraints.noise_free.size) or (
+            constraints.directions is not None
+        )
         self._clip = None
         states = constraints.states
         if states is not None and states.bounds:
@@ -204,10 +267,10 @@ class Problem:
         other, candidate = copy(self), self.candidate
         other._constrain(
             self.constraints.without_violated(
-                candidate.trajectory, candidate.residuals, self.measurements
+                candidate.trajectory, self._candidate_residuals, self.measurements
             )
         )
-        other.candidate = replace(candidate, violation=other._violation(candidate))
+        other.candidate = replace(candidate, violation=other._candidate_violation())
         return other
 
     def missed_rows(self, trial: Trial) -> tuple[DroppedRow, ...]:
@@ -224,12 +287,15 @@ class Problem:
             np.clip(trajectory, *self._clip, out=trajectory)
         return trajectory
 
-    def evaluate(self, trajectory: Array) -> Trial:
-        """Evaluate a trajectory (K + 1, n); never raises, whatever the model does."""
+    def evaluate(self, trajectory: Array, of_candidate: bool = False) -> Trial:
+        """Evaluate a trajectory (K + 1, n); never raises, whatever the model does.
+
+        The candidate's is rolled out along the directions of the cost alone, and no set judges it.
+        """
         formulation, prior_weight = self._formulation, self.prior_weight
         try:
             if self._has_noise_free:
-                trajectory = self._rolled_out(trajectory)
+                trajectory = self._rolled_out(trajectory, of_candidate)
             residuals = self._residuals(trajectory)
             offset = trajectory[0] - self.prior
             if self.wraps:
@@ -247,7 +313,7 @@ class Problem:
         trial = Trial(trajectory, residuals, weights, cost)
         if not math.isfinite(cost):
             trial.cost = trial.violation = math.inf
-        elif self.constrained:
+        elif self.constrained and not of_candidate:
             trial.violation = self._violation(trial)
             if trial.violation > FEASIBLE:
                 trial.cost = math.inf
@@ -263,13 +329,22 @@ class Problem:
     def _violation(self, trial: Trial) -> float:
         return self.constraints.violation(trial.trajectory, trial.residuals, self.measurements)
 
-    def _rolled_out(self, trajectory: Array) -> Array:
-        """Set each noise-free component j, with W_j = {c}, to f_j(x_i) + c, stage by stage."""
-        free, shift = self.constraints.noise_free, self.constraints.constant
-        rolled_out = trajectory.copy()
+    def _rolled_out(self, trajectory: Array, of_candidate: bool) -> Array:
+        """Follow the model where there is no disturbance, stage by stage.
+
+        Components j with W_j = {c} become f_j(x_i) + c; for directions see `Directions`.
+        """
+        constraints, rolled_out = self.constraints, trajectory.copy()
+        free, shift, directions = constraints.noise_free, constraints.constant, None
+        if constraints.directions is not None:
+            directions, shift = constraints.directions.roll_out(of_candidate)
         for i in range(trajectory.shape[0] - 1):
             predicted = np.asarray(self.model.f(rolled_out[i], self.inputs[i]))
-            rolled_out[i + 1, free] = predicted[free] + shift
+            if directions is None:
+                rolled_out[i + 1, free] = predicted[free] + shift
+            else:
+                ahead = difference(self.model.state_residual, rolled_out[i + 1], predicted)
+                rolled_out[i + 1] = predicted + directions.dot(ahead) + shift
         return rolled_out if self.model.turns is None else self.model.turns(rolled_out)
 
     def offset(self, trajectory: Array) -> Array:

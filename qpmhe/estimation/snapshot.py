@@ -37,6 +37,7 @@ def described(
     found: dict[str, Any] = {
         "candidate": settings.candidate, "arrival": settings.arrival, "sampling time": system.dt,
     }
+    _describe("disturbance_matrix", system.disturbance_matrix, found)
     if settings.parameters:
         found["number of parameters"] = len(settings.parameters)
     for name in SET_NAMES:

@@ -153,6 +153,17 @@ def product(
     )
 
 
+def extended_matrix(system: System, k: int) -> Array | None:
+    """The system's ``disturbance_matrix`` with k states behind that have a disturbance each."""
+    matrix = system.disturbance_matrix
+    if matrix is None:
+        return None
+    n, r = matrix.shape
+    joint = np.zeros((n + k, r + k))
+    joint[:n, :r], joint[n:, r:] = matrix, np.eye(k)
+    return joint
+
+
 def _or_everything(one: ConvexSet | None, dimension: int) -> ConvexSet:
     if one is not None:
         return one

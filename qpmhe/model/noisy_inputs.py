@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InvalidInputError
-from .augmentation import Augmentation, augmented, chosen, product
+from .augmentation import Augmentation, augmented, chosen, extended_matrix, product
 from .functions import Trusted
 from .residuals import extended
 from .system import System, SystemOptions, checked_system
@@ -73,8 +73,8 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
         raise InvalidInputError("inputs is empty; expected at least one input, or leave it out.")
     options: SystemOptions = {
         "states": product(system.states, n, None, noisy.size),
-        "disturbances": product(system.disturbances, n, None, noisy.size),
-        "noises": system.noises,
+        "disturbances": product(system.disturbances, system.r, None, noisy.size),
+        "noises": system.noises, "disturbance_matrix": extended_matrix(system, noisy.size),
         "output_residual": system.output_residual,
         "state_residual": extended(system.state_residual, n, n + noisy.size),
     }

@@ -13,7 +13,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import dimension, flag, numbers
 from ..errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
-from .augmentation import Augmentation, augmented, chosen, product
+from .augmentation import Augmentation, augmented, chosen, extended_matrix, product
 from .functions import BatchedFunction, Parametric, Probes
 from .residuals import extended
 from .sets import Box, ConvexSet
@@ -135,9 +135,11 @@ def augment_parameters(
     if isinstance(f, System):
         n, p, m = f.n, f.p, _other_inputs(arguments, values.size)
         states, disturbances, noises = f.states, f.disturbances, f.noises
+        r, matrix = f.r, extended_matrix(f, moved.size)
     else:
         n, p = dimension("n", n, 1), dimension("p", p, 1)
         m = dimension("m", 0 if m is None else m, 0)
+        r, matrix = n, None
         alone = ", the dimension of x alone: the parameters are added here"
         checked_set("states", states, n, alone)
         checked_set("disturbances", disturbances, n, alone)
@@ -148,8 +150,8 @@ def augment_parameters(
     still = None if flag("drifting", drifting) or not k else Box(np.zeros(k), np.zeros(k))
     options: Any = {
         "states": product(states, n, parameter_bounds, k),
-        "disturbances": product(disturbances, n, still, k),
-        "noises": noises,
+        "disturbances": product(disturbances, r, still, k),
+        "noises": noises, "disturbance_matrix": matrix,
     }
     if isinstance(f, System):
         options["output_residual"] = f.output_residual

@@ -132,7 +132,7 @@ class ConvexSet:
 
         # A linear program without objective, in numbers of order one: its solver drops small
         # coefficients, and takes large bounds for none. milp takes two-sided rows as they are.
-        rows, columns = _equilibrated(self.matrix)
+        rows, columns = equilibrated(self.matrix)
         sides = [
             self.lower / columns, self.upper / columns, self.row_lower * rows,
             self.row_upper * rows,
@@ -239,7 +239,7 @@ class Polytope(ConvexSet):
         self._check_not_empty()
 
 
-def _equilibrated(matrix: Array) -> tuple[Array, Array]:
+def equilibrated(matrix: Array) -> tuple[Array, Array]:
     """Factors of rows and columns that bring the geometric mean of each one's entries to 1."""
     there = matrix != 0.0
     exponents = np.log2(np.abs(matrix), where=there, out=np.zeros(matrix.shape))

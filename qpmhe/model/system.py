@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import shown
 
-from .._checks import dimension, positive, vector
-from ..errors import InvalidInputError, ModelError, OptionError, SetError
+from .._checks import SINGULAR, dimension, numbers, positive, vector
+from ..errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
 from .derivatives import Jacobian
 from .discretize import discretize
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .residuals import Residual, Turns, checked_residual
-from .sets import ConvexSet
+from .sets import ConvexSet, equilibrated
 
 if TYPE_CHECKING:
     from .augmentation import Augmentation
@@ -49,6 +49,7 @@ class SystemOptions(TypedDict, total=False):
     scales: ArrayLike | None
     output_residual: Residual | Function | None
     state_residual: Residual | Function | None
+    disturbance_matrix: ArrayLike | None
 
 
 class _Moved:
@@ -68,10 +69,10 @@ class System:
     r"""A nonlinear discrete-time system with additive disturbance and noise.
 
     .. math::
-        x(t+1) = f(x(t), u(t)) + w(t), \qquad y(t) = h(x(t), u(t)) + v(t),
+        x(t+1) = f(x(t), u(t)) + G w(t), \qquad y(t) = h(x(t), u(t)) + v(t),
         \qquad x \in \mathbb X,\ w \in \mathbb W,\ v \in \mathbb V
 
-    as in (eq:system) of the paper, with known inputs u beside.
+    as in (eq:system) of the paper, where G is the identity; with known inputs u beside.
 
     Parameters
     ----------
@@ -104,18 +105,29 @@ class System:
         constants, such as whole turns, everywhere. Then :math:`v = y \ominus h` and
         :math:`w = x(t+1) \ominus f`, which W and V bound. Bounds of X on an angle hold for the
         state moved by whole turns to between them, if they can.
+    disturbance_matrix : (n, r) array_like, optional
+        G, of full column rank with r <= n; the identity if left out. Disturbances w, their set W,
+        and their weights and covariances in costs and observers then have the dimension r.
+
+    Attributes
+    ----------
+    r : int
+        Dimension of the disturbances.
+    disturbance_matrix : (n, r) array or None
+        G; None for the identity.
 
     Raises
     ------
     ModelError
         If a function returns the wrong shape, changes its argument, or a given Jacobian is
-        not the derivative, or a residual function not a difference.
+        not the derivative, or a residual function not a difference; if the columns of G are
+        linearly dependent.
     InvalidInputError
         If a component that does not exist is declared an angle.
     SetError
         If a set has the wrong dimension, or X an angle in a general row or with one bound only.
     OptionError, ShapeError
-        If a scale is not above zero, or there is not one for each state.
+        If a scale is not above zero, or there is not one for each state; if G has the wrong shape.
 
     Examples
     --------
@@ -142,14 +154,16 @@ class System:
         scales: ArrayLike | None = None,
         output_residual: Residual | Function | None = None,
         state_residual: Residual | Function | None = None,
+        disturbance_matrix: ArrayLike | None = None,
     ) -> None:
         self.n, self.p, self.m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m, 0)
+        self.disturbance_matrix = _checked_matrix(disturbance_matrix, self.n)
         #: Typical magnitudes of the states, (n,); None if they are not known.
         self.scales: Array | None = None
         self._scales_given = False
         self._is_timed = False
         self.states = checked_set("states", states, self.n)
-        self.disturbances = checked_set("disturbances", disturbances, self.n)
+        self.disturbances = checked_set("disturbances", disturbances, self.r)
         self.noises = checked_set("noises", noises, self.p)
         #: How outputs and states are subtracted; None for plain differences.
         self.output_residual = checked_residual("output_residual", output_residual, self.p)
@@ -192,10 +206,22 @@ class System:
                 "f": f, "h": h, "n": n, "p": p, "m": m,
                 "f_jacobian": f_jacobian, "h_jacobian": h_jacobian,
                 "states": states, "disturbances": disturbances, "noises": noises,
-                "scales": scales,
+                "scales": scales, "disturbance_matrix": disturbance_matrix,
                 "output_residual": output_residual, "state_residual": state_residual,
             },
         )
+
+    @property
+    def r(self) -> int:
+        """Dimension of the disturbances w."""
+        return self.n if self.disturbance_matrix is None else self.disturbance_matrix.shape[1]
+
+    def state_covariance(self, disturbance: Array) -> Array:
+        """The covariance (n, n) of G w, for a covariance (r, r) of w."""
+        if self.disturbance_matrix is None:
+            return disturbance
+        covariance: Array = self.disturbance_matrix @ disturbance @ self.disturbance_matrix.T
+        return 0.5 * (covariance + covariance.T)
 
     @classmethod
     def from_ode(
@@ -470,6 +496,27 @@ def checked_system(value: Any) -> System:
     if not isinstance(value, System):
         raise ModelError(f"system is {shown(value)}; expected a qpmhe.System.")
     return value
+
+
+def _checked_matrix(given: ArrayLike | None, n: int) -> Array | None:
+    """G, if it has full column rank; None for the identity."""
+    if given is None:
+        return None
+    matrix = numbers("disturbance_matrix", given)
+    if matrix.ndim != 2 or matrix.shape[0] != n or not 1 <= matrix.shape[1] <= n:
+        raise ShapeError(
+            f"disturbance_matrix has shape {matrix.shape}; expected (n, r) = ({n}, r) with r from "
+            f"1 to {n}: a column for each disturbance. Leave it out if each state has its own."
+        )
+    # In numbers of order one, so that no unit makes a column look small.
+    rows, columns = equilibrated(matrix)
+    values = np.linalg.svd(rows[:, None] * matrix * columns, compute_uv=False)
+    if values[-1] <= SINGULAR * values[0]:
+        raise ModelError(
+            f"disturbance_matrix is {matrix.tolist()}, whose columns are linearly dependent; "
+            f"expected rank {matrix.shape[1]}. Merge the disturbances that act alike."
+        )
+    return None if np.array_equal(matrix, np.eye(n)) else matrix
 
 
 def _checked_scales(given: ArrayLike, n: int) -> Array:

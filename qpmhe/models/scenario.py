@@ -10,7 +10,16 @@ import numpy as np
 
 from qpmhe_solvers.values import finite, shown
 
-from .._checks import Array, count, dimension, positive, positive_definite, vector
+from .._checks import (
+    Array,
+    count,
+    dimension,
+    positive,
+    positive_definite,
+    positive_semidefinite,
+    vector,
+)
+from .._linalg import cholesky
 from ..errors import InvalidInputError, ModelError, OptionError
 from ..model.residuals import difference
 from ..model.sets import ConvexSet
@@ -50,7 +59,7 @@ class Scenario:
     r"""How a system is simulated and how its estimation starts.
 
     Disturbance and noise are normal and white. Where the system has sets, they are truncated:
-    w(t) to those with :math:`w \in \mathbb W` and :math:`f(x, u) + w \in \mathbb X`, v(t) to
+    w(t) to those with :math:`w \in \mathbb W` and :math:`f(x, u) + G w \in \mathbb X`, v(t) to
     :math:`\mathbb V`, by drawing again. Components of a set that have zero width are set.
     Angles are recorded between minus and plus half a period, or in the turn about their bounds.
 
@@ -60,7 +69,8 @@ class Scenario:
     initial_state, initial_estimate : (n,) array
         Where the simulation starts, and the estimation.
     disturbance_covariance, noise_covariance : array
-        Covariances of w (n, n) and v (p, p), before any truncation.
+        Covariances of w (r, r) and v (p, p), before any truncation. That of w may be singular;
+        r is n, or the number of columns of the system's ``disturbance_matrix`` G.
     dt, time_unit : float and str
         Sampling time and its unit.
     horizon : int
@@ -110,9 +120,12 @@ class Scenario:
             state = _within_turn(self.system, vector(name, getattr(self, name), n))
             _check_member(name, state, self.system.states)
             object.__setattr__(self, name, state)
-        for name, size in (("disturbance_covariance", n), ("noise_covariance", p)):
-            matrix = positive_definite(name.replace("_", " "), getattr(self, name), size)
-            object.__setattr__(self, name, matrix)
+        w, _ = positive_semidefinite(
+            "disturbance covariance", self.disturbance_covariance, self.system.r
+        )
+        v = positive_definite("noise covariance", self.noise_covariance, p)
+        object.__setattr__(self, "disturbance_covariance", w)
+        object.__setattr__(self, "noise_covariance", v)
         positive("dt", self.dt)
         dimension("horizon", self.horizon, 1)
         dimension("steps", self.steps, 1)
@@ -135,7 +148,7 @@ class Scenario:
             object.__setattr__(self, "resolution", step)
 
     def simulate(self, seed: int, steps: int | None = None) -> Record:
-        """Simulate x(t+1) = f(x(t), u(t)) + w(t), y(t) = h(x(t), u(t)) + v(t).
+        """Simulate x(t+1) = f(x(t), u(t)) + G w(t), y(t) = h(x(t), u(t)) + v(t).
 
         Parameters
         ----------
@@ -154,9 +167,10 @@ class Scenario:
         generator = np.random.default_rng(count("seed", seed, 0))
         total = self.steps if steps is None else dimension("steps", steps, 0)
         system = self.system
-        spread_w = _factor(self.disturbance_covariance)
-        spread_v = _factor(self.noise_covariance)
-        w = generator.standard_normal((total, system.n)) @ spread_w
+        spread_w = cholesky(self.disturbance_covariance).T
+        spread_v = cholesky(self.noise_covariance).T
+        matrix = system.disturbance_matrix
+        w = generator.standard_normal((total, system.r)) @ spread_w
         v = generator.standard_normal((total, system.p)) @ spread_v
         states, measurements = np.empty((total + 1, system.n)), np.empty((total, system.p))
         inputs = np.empty((total, system.m))
@@ -165,20 +179,23 @@ class Scenario:
             x, u = states[t], inputs[t]
             if self.inputs is not None:
                 u[:] = vector("inputs(t, x)", self.inputs(t, x.copy()), system.m)
-            noise = _inside(v[t], spread_v, generator, (system.noises, 0.0))
+            noise = _inside(v[t], spread_v, generator, (system.noises, 0.0, None))
             if noise is None:
                 raise ModelError(f"no noise of sample {t} lies in {system.noises!r}; widen it.")
             measured = self._measured(system.h(x, u), noise)
             measurements[t] = difference(system.output_residual, measured, np.zeros(system.p))
             reached = _within_turn(system, system.f(x, u))
             disturbance = _inside(
-                w[t], spread_w, generator, (system.disturbances, 0.0), (system.states, reached)
+                w[t], spread_w, generator, (system.disturbances, 0.0, None),
+                (system.states, reached, matrix),
             )
             if disturbance is None or not np.isfinite(reached).all():
                 raise ModelError(
                     f"the simulated state cannot go on inside of the sets at sample {t}: it is "
                     f"{reached.tolist()} without disturbance. Widen the sets, or simulate less."
                 )
+            if matrix is not None:
+                disturbance = matrix @ disturbance
             states[t + 1] = _within_turn(system, reached + disturbance)
         return Record(states, measurements, inputs if system.m else None)
 
@@ -188,10 +205,6 @@ class Scenario:
             return output + noise
         digital = step * np.round(output / np.where(step > 0.0, step, 1.0))
         return np.where(step > 0.0, digital, output + noise)
-
-
-def _factor(covariance: Array) -> Array:
-    return np.asarray(np.linalg.cholesky(covariance).T, np.float64)
 
 
 def _within_turn(system: System, state: Array) -> Array:
@@ -210,17 +223,20 @@ def _check_member(name: str, state: Array, states: ConvexSet | None) -> None:
 
 def _inside(
     drawn: Array, spread: Array, generator: np.random.Generator,
-    *sets: tuple[ConvexSet | None, Any],
+    *sets: tuple[ConvexSet | None, Any, Array | None],
 ) -> Array | None:
-    """What was drawn, or drawn again until what each set bounds, s + offset, lies in it."""
-    bounded = [(each, offset) for each, offset in sets if each is not None]
+    """What was drawn, or drawn again until what each set bounds, G s + offset, lies in it."""
+    bounded = [(each, offset, matrix) for each, offset, matrix in sets if each is not None]
     for _ in range(_DRAWS):
-        for each, offset in bounded:
+        for each, offset, matrix in bounded:
             fixed = each.fixed_components
-            if fixed.size:
+            if fixed.size and matrix is None:
                 drawn = drawn.copy()
                 drawn[fixed] = (each.lower - offset)[fixed]
-        if all(each.violation(drawn + offset) == 0.0 for each, offset in bounded):
+        if all(
+            each.violation((drawn if matrix is None else matrix @ drawn) + offset) == 0.0
+            for each, offset, matrix in bounded
+        ):
             return drawn
         drawn = generator.standard_normal(drawn.size) @ spread
     return None

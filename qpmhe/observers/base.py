@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import Array, positive_definite
+from .._checks import Array, positive_definite, positive_semidefinite
 from .._linalg import inverse
 from ..errors import ShapeError
 from ..model.sets import ConvexSet
@@ -33,7 +33,7 @@ class Sample:
         are there, or it has none.
     covariance : (n, n) array or None
         Covariance of x(t) - z(t), if the observer has one.
-    disturbance_weight : (n, n) array or None
+    disturbance_weight : (r, r) array or None
         This sample's own weight of the disturbance; None if it has none.
     states : ConvexSet or None
         The X that this sample came with; None for the system's.
@@ -130,18 +130,22 @@ class Observer(ABC):
 
 
 class KalmanType(Observer):
-    """An observer with covariances of initial error (n, n), disturbance and noise (p, p)."""
+    """An observer with covariances of initial error (n, n), disturbance (r, r) and noise (p, p).
+
+    The first two may be singular. r is n, or the number of columns of the system's
+    ``disturbance_matrix``.
+    """
 
     def __init__(self, *, prior: ArrayLike, disturbance: ArrayLike, noise: ArrayLike) -> None:
-        self._prior = positive_definite("prior covariance", prior)
-        self._disturbance = positive_definite("disturbance covariance", disturbance)
+        self._prior, _ = positive_semidefinite("prior covariance", prior)
+        self._disturbance, _ = positive_semidefinite("disturbance covariance", disturbance)
         self._noise = positive_definite("noise covariance", noise)
 
     def check(self, system: System, initial_state: Array) -> None:
         """Check the covariances' dimensions; see `Observer.check`."""
         for name, matrix, size in (
             ("prior", self._prior, system.n),
-            ("disturbance", self._disturbance, system.n),
+            ("disturbance", self._disturbance, system.r),
             ("noise", self._noise, system.p),
         ):
             if matrix.shape[0] != size:
@@ -158,8 +162,9 @@ class KalmanType(Observer):
         return covariance_of(sample.noise_weight, self._noise)
 
     def _disturbance_of(self, sample: Sample) -> Array:
-        """The covariance of this sample's disturbance."""
-        return covariance_of(sample.disturbance_weight, self._disturbance)
+        """The covariance (n, n) of what this sample's disturbance adds to the state."""
+        own = covariance_of(sample.disturbance_weight, self._disturbance)
+        return sample.system.state_covariance(own)
 
 
 def covariance_of(weight: Array | None, usual: Array) -> Array:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers.values import shown
 
-from .._checks import Array, positive_definite, vector
+from .._checks import SINGULAR, Array, positive_definite, positive_semidefinite, vector
 from .._linalg import solve, unit_diagonal
 from ..errors import InvalidInputError, ModelError, OptionError, ShapeError
 from ..model.system import System, checked_system
@@ -56,9 +56,10 @@ def design_luenberger(
         With several outputs, none more often than the rank of C. For a continuous-time
         pole s and a sampling time dt, give exp(s dt). Where the states' units differ by orders
         of magnitude, give the system its `scales`.
-    disturbance, noise : (n, n) and (p, p) array_like, optional
-        Instead of poles: covariances Q of w and R of v (squared units), symmetric positive
-        definite.
+    disturbance, noise : (r, r) and (p, p) array_like, optional
+        Instead of poles: covariances Q of w and R of v (squared units), symmetric; R is
+        positive definite, Q may be singular. With the system's ``disturbance_matrix`` G,
+        G Q G' takes the place of Q above.
 
     Returns
     -------
@@ -99,7 +100,8 @@ def design_luenberger(
             _placed(a, c, _checked_poles(poles, system.n), point, system.scales)
         )
     if poles is None and disturbance is not None and noise is not None:
-        q = positive_definite("disturbance covariance", disturbance, system.n)
+        covariance, _ = positive_semidefinite("disturbance covariance", disturbance, system.r)
+        q = system.state_covariance(covariance)
         a, c, point = linearize(system, at, u, q)
         r = positive_definite("noise covariance", noise, system.p)
         return Luenberger(stationary(a, c, q, r, point)[0])
@@ -125,7 +127,9 @@ def linearize(
         )
     inputs = np.zeros(0) if u is None else vector("u", u, system.m)
     if disturbance is not None:
-        system = system.copy(_STEPS * np.sqrt(disturbance.diagonal()))
+        deviations = np.sqrt(disturbance.diagonal())
+        sizes = np.where(point != 0.0, np.abs(point), 1.0)  # of states without disturbance
+        system = system.copy(np.where(deviations > 0.0, _STEPS * deviations, sizes))
         for jacobian in (system.f_jacobian, system.h_jacobian):
             jacobian.check(point, inputs)
     found = []
@@ -153,13 +157,31 @@ def stationary(a: Array, c: Array, q: Array, r: Array, point: Array) -> tuple[Ar
     """Gain (n, p) and covariance (n, n) of the stationary Kalman predictor."""
     # In standard deviations of disturbance and noise, rounded to powers of two: the result
     # then depends on no unit.
-    (q, states, whole), (r, outputs, other) = unit_diagonal(q), unit_diagonal(r)
+    _, states, whole = unit_diagonal(_positive_diagonal(a, c, q, r))
+    q = np.ldexp(q, -whole - states[:, None] - states)
+    r, outputs, other = unit_diagonal(r)
     r = np.ldexp(r, other - whole)
     a = np.ldexp(a, states - states[:, None])
     c = np.ldexp(c, states - outputs[:, None])
     gain, covariance = _stationary(a, c, q, r, point)
     covariance = np.ldexp(covariance, whole + states[:, None] + states)
     return np.ldexp(gain, states[:, None] - outputs), covariance
+
+
+def _positive_diagonal(a: Array, c: Array, q: Array, r: Array) -> Array:
+    """Q, with a variance of the size of the state where it has none."""
+    if q.diagonal().all():
+        return q
+    reached = term = q
+    for _ in range(len(q) - 1):
+        term = a @ term @ a.T
+        reached = reached + term
+    # What no disturbance reaches is as large as the noise of the outputs that show it.
+    shown = ((c / np.sqrt(r.diagonal())[:, None]) ** 2).max(axis=0)
+    size = np.where(shown > 0.0, 1.0 / np.where(shown > 0.0, shown, 1.0), 1.0)
+    size = np.where(reached.diagonal() > 0.0, reached.diagonal(), size)
+    filled: Array = q + np.diag(np.where(q.diagonal() > 0.0, 0.0, size))
+    return filled
 
 
 def _stationary(a: Array, c: Array, q: Array, r: Array, point: Array) -> tuple[Array, Array]:
@@ -173,6 +195,15 @@ def _stationary(a: Array, c: Array, q: Array, r: Array, point: Array) -> tuple[A
             f"the linearisation at x = {point.tolist()} is not detectable: the outputs do not "
             f"show the mode with eigenvalue {_text(lasting)}, which does not decay by itself. "
             "Choose another point, measure more, or take that part out of the state."
+        )
+    singular = float(np.linalg.eigvalsh(q)[0]) <= SINGULAR
+    still = _unobservable_modes(a.T, q) if singular else hidden
+    still = still[np.abs(np.abs(still) - 1.0) < _UNSEEN]
+    if still.size:
+        raise ModelError(
+            f"no disturbance reaches the mode with eigenvalue {_text(still)} of the linearisation "
+            f"at x = {point.tolist()}, which neither decays nor grows: the stationary gain does "
+            "not correct it. Give it a small variance, or take qpmhe.ExtendedKalman."
         )
     try:
         covariance = np.asarray(solve_discrete_are(a.T, c.T, q, r), dtype=np.float64)

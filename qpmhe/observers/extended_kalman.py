@@ -25,13 +25,15 @@ class ExtendedKalman(KalmanType):
 
     Parameters
     ----------
-    prior, disturbance, noise : (n, n), (n, n) and (p, p) array_like
-        Covariances P(0) of the initial error x(0) - z(0), Q of w and R of v.
+    prior, disturbance, noise : (n, n), (r, r) and (p, p) array_like
+        Covariances P(0) of the initial error x(0) - z(0), Q of w and R of v. P(0) and Q may be
+        singular. r is n, or the number of columns of the system's ``disturbance_matrix`` G, in
+        whose place :math:`G Q G^\top` then stands above.
 
     Raises
     ------
     WeightError, ShapeError
-        If a covariance is not square, symmetric and positive definite.
+        If a covariance is not square, symmetric and positive semidefinite, R definite.
 
     References
     ----------
@@ -49,7 +51,7 @@ class ExtendedKalman(KalmanType):
         # Joseph's form: symmetric, and positive semidefinite by construction.
         closed = a - gain @ c
         following = closed @ covariance @ closed.T + gain @ r @ gain.T
-        following = following + self._disturbance_of(sample)
+        following += self._disturbance_of(sample)
         return gain @ v, 0.5 * (following + following.T)
 
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array, positive_definite
+from .._checks import Array, positive_definite, positive_semidefinite
 from .._linalg import solve
 from ..errors import ShapeError
 from ..model.system import System, checked_system
@@ -42,8 +42,9 @@ class SteadyStateKalman(Observer):
         The state about which to linearise; it should be typical of the operation.
     u : (m,) array_like, optional
         The input there; needed exactly if the system has inputs.
-    disturbance, noise : (n, n) and (p, p) array_like
-        Covariances Q of w and R of v (squared units), symmetric positive definite.
+    disturbance, noise : (r, r) and (p, p) array_like
+        Covariances Q of w and R of v (squared units), symmetric; R is positive definite, Q may be
+        singular. With the system's ``disturbance_matrix`` G, G Q G' takes the place of Q above.
     prior : (n, n) array_like, optional
         Covariance P(0) of the initial error x(0) - z(0); the stationary one if left out,
         which suits an observer that has run for long and is too sure of itself otherwise.
@@ -80,7 +81,8 @@ class SteadyStateKalman(Observer):
         noise: ArrayLike, prior: ArrayLike | None = None,
     ) -> None:
         checked_system(system)
-        self._disturbance = positive_definite("disturbance covariance", disturbance, system.n)
+        self._own, _ = positive_semidefinite("disturbance covariance", disturbance, system.r)
+        self._disturbance = system.state_covariance(self._own)
         self._a, self._c, point = linearize(system, at, u, self._disturbance)
         self._noise = positive_definite("noise covariance", noise, system.p)
         self.gain, self.covariance = stationary(
@@ -90,7 +92,7 @@ class SteadyStateKalman(Observer):
         self._filter_gain = solve(self._c @ cross + self._noise, cross.T).T
         self._prior = self.covariance
         if prior is not None:
-            self._prior = positive_definite("prior covariance", prior, system.n)
+            self._prior, _ = positive_semidefinite("prior covariance", prior, system.n)
         self._closed = self._a - self.gain @ self._c
         self._entering = self._disturbance + self.gain @ self._noise @ self.gain.T
 
@@ -101,6 +103,11 @@ class SteadyStateKalman(Observer):
             raise ShapeError(
                 f"the observer is for {n} states and {p} outputs; expected {system.n} and "
                 f"{system.p}, the system's."
+            )
+        if len(self._own) != system.r:
+            raise ShapeError(
+                f"disturbance covariance has shape {self._own.shape}; expected ({system.r}, "
+                f"{system.r}). Make the observer with the estimator's system."
             )
 
     @property
@@ -130,7 +137,10 @@ class SteadyStateKalman(Observer):
             closed, entering = self._closed, self._entering
         else:
             gain, r = self._given(self.gain, sample)
-            q = covariance_of(sample.disturbance_weight, self._disturbance)
+            entered = covariance_of(sample.disturbance_weight, self._own)
+            q = self._disturbance
+            if entered is not self._own:
+                q = sample.system.state_covariance(entered)
             closed, entering = self._a - gain @ self._c, q + gain @ r @ gain.T
         following = closed @ self._before(sample) @ closed.T + entering
         return self.gain @ v, 0.5 * (following + following.T)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array, positive
-from .._linalg import solve
+from .._linalg import cholesky, solve
 from ..model.residuals import difference
 from ..model.sets import ConvexSet
 from .base import KalmanType, Sample
@@ -52,8 +52,9 @@ class UnscentedKalman(KalmanType):
 
     Parameters
     ----------
-    prior, disturbance, noise : (n, n), (n, n) and (p, p) array_like
-        Covariances P(0) of the initial error x(0) - z(0), Q of w and R of v, in squared units.
+    prior, disturbance, noise : (n, n), (r, r) and (p, p) array_like
+        Covariances P(0) of the initial error x(0) - z(0), Q of w and R of v, in squared units,
+        as for `ExtendedKalman`: P(0) and Q may be singular.
     spread : float
         c, the distance of the sigma points from z in standard deviations, above 0:
         :math:`\sqrt{n + \lambda}` or :math:`\alpha \sqrt{n + \kappa}` of the textbooks.
@@ -62,7 +63,7 @@ class UnscentedKalman(KalmanType):
     Raises
     ------
     WeightError, ShapeError
-        If a covariance is not square, symmetric and positive definite.
+        If a covariance is not square, symmetric and positive semidefinite, R definite.
     OptionError
         If the spread is not positive.
 
@@ -108,7 +109,7 @@ class UnscentedKalman(KalmanType):
         covariance = sample.covariance
         if covariance is None:
             raise ValueError("the unscented Kalman observer needs a covariance")
-        ahead = self._spread * np.linalg.cholesky(covariance).T
+        ahead = self._spread * cholesky(covariance).T
         moves, share = np.concatenate((ahead, -ahead)), np.ones(2 * z.size)
         states = sample.system.states if sample.states is None else sample.states
         if states is not None:

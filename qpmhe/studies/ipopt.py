@@ -38,6 +38,11 @@ class IpoptEstimator:
             raise InvalidInputError(
                 "the comparison with Ipopt takes systems without inputs and constant prior weights."
             )
+        if cost.directions(system.disturbance_matrix) is not None:
+            raise InvalidInputError(
+                "the comparison with Ipopt takes no disturbance_matrix and no singular covariance "
+                "of the disturbance; give each state a disturbance of its own."
+            )
         self._system, self._cost, self._f, self._h = system, cost, f, h
         self._prior = cost.prior
         self._window = Window(system, observer, cost, horizon, initial_state, False, True)

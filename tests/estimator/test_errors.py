@@ -199,15 +199,28 @@ def test_weights(name, value, kind, fragments):
 @pytest.mark.parametrize("build", [qpmhe.QuadraticCost.from_covariances, qpmhe.ExtendedKalman])
 def test_covariances(build, name, value, kind, fragments):
     covariances = {"prior": np.eye(2), "disturbance": np.eye(2), "noise": np.eye(2), name: value}
+    if name == "disturbance" or (name == "prior" and build is qpmhe.ExtendedKalman):
+        fragments = [text.replace("definite", "semidefinite") for text in fragments]
+        if kind is WeightError and np.linalg.eigvalsh(value)[0] > -1e-15:
+            build(**covariances)
+            return
     check(kind, [f"{name} covariance ", *fragments], lambda: build(**covariances))
 
 
-@pytest.mark.parametrize("size", [1, 3])
 @pytest.mark.parametrize("build", [qpmhe.QuadraticCost, qpmhe.QuadraticCost.from_covariances])
-def test_a_prior_of_another_size(build, size):
+def test_a_prior_of_another_size(build):
     check(
-        ShapeError, [f"prior has shape ({size}, {size})", "expected (2, 2)"],
-        lambda: build(prior=np.eye(size), disturbance=np.eye(2), noise=np.eye(1)),
+        ShapeError, ["prior has shape (1, 1)", "expected (2, 2)"],
+        lambda: build(prior=np.eye(1), disturbance=np.eye(2), noise=np.eye(1)),
+    )
+    system = qpmhe.System(lambda x: x, lambda x: x[..., 0], n=3, p=1)
+    check(
+        ShapeError, ["for 2 disturbances; expected 3", "disturbance_matrix"],
+        lambda: qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger(np.zeros((3, 1))),
+            build(prior=np.eye(3), disturbance=np.eye(2), noise=np.eye(1)),
+            horizon=2, initial_state=np.zeros(3),
+        ),
     )
 
 

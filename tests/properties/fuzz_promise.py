@@ -50,15 +50,19 @@ def case(draw):
     def h(x):
         return x @ c.T + 0.02 * (x @ c.T) ** 2
 
+    r = int(draw.integers(1, n)) if n > 1 and draw.random() < 0.25 else n
     system = qpmhe.System(
-        f, h, n=n, p=p, states=box(draw, n, edge), disturbances=box(draw, n, 0.3),
+        f, h, n=n, p=p, states=box(draw, n, edge), disturbances=box(draw, r, 0.3),
         noises=box(draw, p, 0.5), state_residual=some_angles(draw, n),
         output_residual=some_angles(draw, p),
+        disturbance_matrix=draw.normal(size=(n, r)) if r < n else None,
     )
     covariances = {
-        "prior": np.diag(draw.uniform(0.1, 2, n)), "disturbance": np.diag(draw.uniform(0.01, 1, n)),
+        "prior": np.diag(draw.uniform(0.1, 2, n)), "disturbance": np.diag(draw.uniform(0.01, 1, r)),
         "noise": np.diag(draw.uniform(0.01, 1, p)),
     }
+    if draw.random() < 0.15 and system.disturbances is None:
+        covariances["disturbance"][-1, -1] = 0.0
     gain = draw.normal(size=(n, p)) if draw.random() < 0.3 else a @ np.linalg.pinv(c)
     observer = qpmhe.Luenberger(draw.uniform(0, 1.2) * gain)
     if draw.random() < 0.3:
@@ -103,13 +107,26 @@ def broken(mhe, system, cost, estimate, y):
     if system.states is not None:
         points = np.vstack((estimate.trajectory, estimate.filtered, estimate.candidate))
         low, high = system.states.lower, system.states.upper
+        # Where trials are rolled out, none of them can be clipped.
+        if system.r < system.n or cost.disturbance_factor is not None:
+            slack = FEASIBLE * (high - low)
+            low, high = low - slack, high + slack
         if not ((points >= low) & (points <= high)).all():
             faults.append("outside of X")
+    if estimate.improved and system.disturbance_matrix is not None:
+        x, subtract = estimate.trajectory, system.state_residual or np.subtract
+        missed = subtract(x[1:], system.f.batch(x[:-1], np.empty((len(x) - 1, 0))))
+        missed = missed - estimate.disturbances @ system.disturbance_matrix.T
+        if np.abs(missed).max() > 1e-12 * (1.0 + np.abs(x).max()):
+            faults.append("a disturbance in a direction that has none")
     if estimate.improved and not estimate.dropped:
-        w, v = estimate.disturbances, estimate.noises
-        if scaled_misses(
-            system.disturbances, cost.disturbance, w, estimate.trajectory[1:]
-        ) > FEASIBLE or scaled_misses(system.noises, cost.noise, v, np.abs(y).max()) > FEASIBLE:
+        w, v, sizes = estimate.disturbances, estimate.noises, np.abs(estimate.trajectory[1:])
+        if system.disturbance_matrix is not None:
+            sizes = sizes @ np.abs(np.linalg.pinv(system.disturbance_matrix)).T
+        if max(
+            scaled_misses(system.disturbances, cost.disturbance, w, sizes),
+            scaled_misses(system.noises, cost.noise, v, np.abs(y).max()),
+        ) > FEASIBLE:
             faults.append("a set violated and no row dropped")
     return faults
 
