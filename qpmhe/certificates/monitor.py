@@ -65,9 +65,7 @@ class Hypotheses:
     def held(self) -> bool:
         """Whether the certificate's bound follows at this step, if it did at those before.
 
-        The last two are no part of that: what is certified holds for any w and v, so that
-        the theorem may be applied with the whole space in place of W and V, and with the
-        region in place of X, which is the paper's remedy after Assumption ass:observer.
+        The last two are no part of that: what is certified holds for any w and v.
         """
         return not self.failed
 
