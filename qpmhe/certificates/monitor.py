@@ -108,14 +108,12 @@ class MonitorSummary:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows."""
-        return {
-            "steps": self.steps, "applied": self.applied, "held": self.held,
-            "first_failure": self.first_failure, "failed": list(self.failed),
-            "hypotheses": {
-                name: {"needed": name in NEEDED, "failed": count, "held": self.steps - count}
-                for name, count in self.missed.items()
-            },
-        }
+        content = vars(self) | {"failed": list(self.failed), "hypotheses": {
+            name: {"needed": name in NEEDED, "failed": count, "held": self.steps - count}
+            for name, count in self.missed.items()
+        }}
+        del content["missed"]
+        return content
 
     def __str__(self) -> str:
         text = f"The certificate applied at {self.applied} of {self.steps} steps"
