@@ -111,18 +111,20 @@ def cover(
 
 
 def _shown(form: Form, enclosure: Enclosure) -> tuple[NDArray[np.bool_], Array]:
+    matrices, cells = _at_corners(enclosure)
+    with np.errstate(all="ignore"):
+        proved, least = definite(form.matrices(matrices))
+    every: NDArray[np.bool_] = np.all(proved.reshape(cells, -1), axis=1)
+    smallest: Array = least.reshape(cells, -1).min(axis=1)
+    return every, smallest
+
+
+def _at_corners(enclosure: Enclosure) -> tuple[Matrices, int]:
+    """The matrices at all corners of each cell, one after another, and how many cells there are."""
     corners, error = enclosure.corners()
     cells, count = corners.shape[:2]
-    with np.errstate(all="ignore"):
-        matrices = form.matrices(
-            Matrices(
-                corners.reshape(cells * count, *corners.shape[2:]), np.repeat(error, count, axis=0)
-            )
-        )
-        proved, least = definite(matrices)
-    every: NDArray[np.bool_] = np.all(proved.reshape(cells, count), axis=1)
-    smallest: Array = least.reshape(cells, count).min(axis=1)
-    return every, smallest
+    middle = corners.reshape(cells * count, *corners.shape[2:])
+    return Matrices(middle, np.repeat(error, count, axis=0)), cells
 
 
 def _broken(form: Form, jacobians: Array) -> NDArray[np.bool_]:
@@ -216,10 +218,7 @@ def _largest(jacobians: Array, points: Array, unknown: float) -> tuple[float, Ar
 
 def _norm_bounds(enclosure: Enclosure) -> Array:
     """Upper bounds on the norm of the Jacobian of h on each cell, infinite where unknown."""
-    corners, error = enclosure.corners()
-    count = corners.shape[1]
-    C = corners.reshape(-1, *corners.shape[2:])
+    matrices, cells = _at_corners(enclosure)
     with np.errstate(all="ignore"):
-        bounds = norm_bound(Matrices(C, np.repeat(error, count, axis=0)))
-    each: Array = bounds.reshape(-1, count).max(axis=1)
+        each: Array = norm_bound(matrices).reshape(cells, -1).max(axis=1)
     return np.where(np.isnan(each), np.inf, each)

@@ -232,8 +232,11 @@ def _stability(search: Search, rho: float | None) -> ObserverStability:
     found = search.answer("rho", rho, others, _unstable)
     form = found.form
     assert isinstance(form, ErrorContraction)
-    V, allowance = _noise_weight(form.P, form.gain)
-    V = V + allowance * np.eye(V.shape[0])
+    gain = Matrices.exact(form.gain)
+    product = gain.T @ Matrices.exact(form.P) @ gain
+    # V is L^T P L, with what rounding may have made of it on the diagonal.
+    V = 0.5 * (product.middle + product.middle.T)
+    V += 2.0 * float(product.radius.sum()) * np.eye(V.shape[0])
     kappa = float(norm_bound(Matrices.exact(form.gain[None]))[0])
     return sealed(
         ObserverStability(
@@ -243,14 +246,6 @@ def _stability(search: Search, rho: float | None) -> ObserverStability:
         ),
         search.system, found.evidence,
     )
-
-
-def _noise_weight(P: Array, gain: Array) -> tuple[Array, float]:
-    """The product L^T P L, and what must be added to its diagonal for rounding."""
-    exact = Matrices.exact(gain)
-    product = exact.T @ Matrices.exact(P) @ exact
-    symmetric = 0.5 * (product.middle + product.middle.T)
-    return symmetric, float(2.0 * product.radius.sum())
 
 
 def _radii(search: Search) -> Array:

@@ -194,23 +194,20 @@ class SmoothModel:
         return found
 
     def _enclosed(self, lower: Array, upper: Array, output_only: bool) -> Enclosure:
-        cells, N = lower.shape
-        q, n = self.p if output_only else self.n + self.p, self.n
         centre = 0.5 * lower + 0.5 * upper
         half = np.nextafter(np.maximum(upper - centre, centre - lower), np.inf)
         half = np.where(upper == lower, 0.0, half)
         centre = np.where(upper == lower, lower, centre)
-        at_centre = self._derivatives(centre, centre, output_only)[0]
-        second = self._derivatives(lower, upper, output_only)[1]
-        slopes = np.zeros((cells, N, q, n))
-        middle, radius = np.moveaxis(second.middle, -1, 0), np.moveaxis(second.radius, -1, 0)
-        slopes[...] = np.moveaxis(middle, -1, 1) * half[:, :, None, None]
-        spread = np.moveaxis(radius, -1, 1) * half[:, :, None, None]
+        at_centre = Interval(*self._derivatives(centre, centre, output_only)[0])
+        second = Interval(*self._derivatives(lower, upper, output_only)[1])
+        # Cells first, then coordinates; rows and columns of the Jacobian last.
+        slopes = second.middle.transpose(3, 2, 0, 1) * half[:, :, None, None]
+        spread = second.radius.transpose(3, 2, 0, 1) * half[:, :, None, None]
         jacobian, rounding = (
-            np.moveaxis(part, -1, 0) for part in (at_centre.middle, at_centre.radius)
+            part.transpose(2, 0, 1) for part in (at_centre.middle, at_centre.radius)
         )
         error = (spread.sum(axis=1) + rounding + 1e-15 * np.abs(slopes).sum(axis=1)) * (
-            1.0 + 1e-14 * (N + 4)
+            1.0 + 1e-14 * (half.shape[1] + 4)
         )
         unknown = ~(
             np.isfinite(jacobian).all(axis=(1, 2)) & np.isfinite(error).all(axis=(1, 2))
@@ -221,32 +218,26 @@ class SmoothModel:
         jacobian = np.where(np.isfinite(jacobian).all(axis=(1, 2), keepdims=True), jacobian, np.nan)
         return Enclosure(jacobian, slopes, error, spread.sum(axis=(2, 3)))
 
-    def _derivatives(
-        self, lower: Array, upper: Array, output_only: bool
-    ) -> tuple[Interval, Interval]:
-        """Gradients (q, n, B) and their derivatives (q, n, N, B); NaN where undefined."""
+    def _derivatives(self, lower: Array, upper: Array, output_only: bool) -> tuple[Array, Array]:
+        """Ends of gradients (2, q, n, B) and of their derivatives (2, q, n, N, B).
+
+        NaN where undefined.
+        """
         cells, N = lower.shape
         q, n = self.p if output_only else self.n + self.p, self.n
+        gradient, hessian = np.zeros((2, q, n, cells)), np.zeros((2, q, n, N, cells))
         try:
             jets = self._jets(lower, upper, output_only=output_only)
         except Exception:  # outside the domain, or whatever a user's function makes of it
             if cells == 1:
-                first, second = np.full((q, n, 1), np.nan), np.full((q, n, N, 1), np.nan)
-                return Interval(first, first), Interval(second, second)
+                return np.full_like(gradient, np.nan), np.full_like(hessian, np.nan)
             half = cells // 2
-            parts = (
-                self._derivatives(lower[:half], upper[:half], output_only),
-                self._derivatives(lower[half:], upper[half:], output_only),
+            first = self._derivatives(lower[:half], upper[:half], output_only)
+            second = self._derivatives(lower[half:], upper[half:], output_only)
+            return (
+                np.concatenate((first[0], second[0]), axis=-1),
+                np.concatenate((first[1], second[1]), axis=-1),
             )
-            joined = [
-                Interval(
-                    np.concatenate([part[k].low for part in parts], axis=-1),
-                    np.concatenate([part[k].high for part in parts], axis=-1),
-                )
-                for k in range(2)
-            ]
-            return joined[0], joined[1]
-        gradient, hessian = np.zeros((2, q, n, cells)), np.zeros((2, q, n, N, cells))
         for row, jet in enumerate(jets):
             if isinstance(jet, Jet):
                 gradient[0, row], gradient[1, row] = jet.gradient.low[:n], jet.gradient.high[:n]
@@ -254,4 +245,4 @@ class SmoothModel:
                 # What is not finite has no derivative, whatever its parts had.
                 lost = ~(np.isfinite(jet.value.low) & np.isfinite(jet.value.high))
                 gradient[:, row, :, lost] = hessian[:, row, :, :, lost] = np.nan
-        return Interval(*gradient), Interval(*hessian)
+        return gradient, hessian

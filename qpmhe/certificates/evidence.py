@@ -26,12 +26,9 @@ class Evidence(Enum):
         return self.value
 
 
-_ORDER = (Evidence.PROVED, Evidence.SAMPLED, Evidence.ASSUMED)
-
-
 def weakest(evidence: Iterable[Evidence]) -> Evidence:
     """What a number rests on that is computed from others: the weakest of theirs."""
-    return max(evidence, key=_ORDER.index, default=Evidence.PROVED)
+    return max(evidence, key=list(Evidence).index, default=Evidence.PROVED)
 
 
 class CertificateError(InvalidInputError):

@@ -65,9 +65,7 @@ class Hypotheses:
     def held(self) -> bool:
         """Whether the certificate's bound follows at this step, if it did at those before.
 
-        The last two are no part of that: what is certified holds for any w and v, so that
-        the theorem may be applied with the whole space in place of W and V, and with the
-        region in place of X, which is the paper's remedy after Assumption ass:observer.
+        The last two are no part of that: what is certified holds for any w and v.
         """
         return not self.failed
 
@@ -110,14 +108,12 @@ class MonitorSummary:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows."""
-        return {
-            "steps": self.steps, "applied": self.applied, "held": self.held,
-            "first_failure": self.first_failure, "failed": list(self.failed),
-            "hypotheses": {
-                name: {"needed": name in NEEDED, "failed": count, "held": self.steps - count}
-                for name, count in self.missed.items()
-            },
-        }
+        content = vars(self) | {"failed": list(self.failed), "hypotheses": {
+            name: {"needed": name in NEEDED, "failed": count, "held": self.steps - count}
+            for name, count in self.missed.items()
+        }}
+        del content["missed"]
+        return content
 
     def __str__(self) -> str:
         text = f"The certificate applied at {self.applied} of {self.steps} steps"

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import Array, positive
-from ..errors import OptionError
+from .._checks import Array, positive, vector
 from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
@@ -67,7 +66,8 @@ class Search:
     ) -> None:
         self._deadline = Deadline.of(seconds)
         self.system, self.region, self.gain = system, region, gain
-        self._weights = _checked_weights(weights)
+        first, second = vector("weights", weights, 2).tolist()
+        self._weights = positive("weights[0]", first), positive("weights[1]", second)
         self.model = SmoothModel(system, region)
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
         self.jacobians = joint_jacobians(system, self.points)
@@ -295,15 +295,6 @@ class Search:
         self._chosen = np.append(self._chosen, np.arange(count, count + len(chosen)))
         self._program = None
         return True
-
-
-def _checked_weights(value: tuple[float, float]) -> tuple[float, float]:
-    """Two positive numbers, checked."""
-    try:
-        first, second = value
-    except (TypeError, ValueError) as error:
-        raise OptionError(f"weights is {value!r}; expected two numbers > 0.") from error
-    return positive("weights[0]", first), positive("weights[1]", second)
 
 
 def _far_apart(jacobians: Array, count: int = _MOST_POINTS) -> NDArray[np.intp]:

@@ -273,21 +273,6 @@ class TheoremConstants:
         return max(self.detectability.rate, self.observer.rate)
 
     @cached_property
-    def factors(self) -> Triple:
-        r"""Factors from the bounds of the estimate's parts to bounds of its error.
-
-        :math:`c_p \underline c_p^{-1/a}` (without :math:`\eta^N`),
-        :math:`c_w \bar\eta\, \underline c_w^{-1/a}` and
-        :math:`c_v \bar\eta\, \underline c_v^{-1/a}`.
-        """
-        c_p, c_w, c_v = self.detectability.constants
-        inverse = [
-            each[0] ** (-1.0 / self.cost.exponent)
-            for each in (self.cost.prior, self.cost.disturbance, self.cost.noise)
-        ]
-        return (c_p * inverse[0], c_w * self.eta_bar * inverse[1], c_v * self.eta_bar * inverse[2])
-
-    @cached_property
     def C_prime(self) -> Triple:  # noqa: N802
         """The constants C_1'(N), C_2'(N), C_3'(N), for t >= N."""
         c_p, c_w, c_v = self.detectability.constants
@@ -302,8 +287,13 @@ class TheoremConstants:
 
     def _sums(self, decay: float, own: Triple) -> Triple:
         """What the bounds of the estimate's parts come to, and what else there is."""
-        prior, disturbance, noise = self.factors
-        factor = prior * decay + disturbance + noise
+        c_p, c_w, c_v = self.detectability.constants
+        # From the bounds of the estimate's parts to bounds of its error.
+        prior, disturbance, noise = (
+            each[0] ** (-1.0 / self.cost.exponent)
+            for each in (self.cost.prior, self.cost.disturbance, self.cost.noise)
+        )
+        factor = c_p * prior * decay + self.eta_bar * (c_w * disturbance + c_v * noise)
         first, second, third = (
             _product(factor, C) + each for C, each in zip(self.C_bar, own, strict=True)
         )
