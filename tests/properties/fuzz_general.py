@@ -52,7 +52,7 @@ class Case:
     g: object  # of x and w; None without
     g_penalty: tuple | None  # linear and quadratic; None where g is hard
     matrix: np.ndarray  # G
-    metric: np.ndarray  # variances of the prior
+    metric: np.ndarray  # typical squares of the states: the larger ones of prior and disturbance
     prior: np.ndarray
     usual: Sample
     soft: dict  # linear and quadratic penalty of each soft set
@@ -172,9 +172,11 @@ def case(draw):
         np.zeros(p), np.append(0.0, nominal), inverses["disturbance"], inverses["noise"],
         {name: (one.lower, one.upper) for name, one in sets.items()},
     )
+    spread = matrix @ covariances["disturbance"] @ matrix.T
+    metric = np.maximum(covariances["prior"].diagonal(), spread.diagonal())
     return Case(
-        mhe, f, h, g, g_penalty, matrix, covariances["prior"].diagonal(), inverses["prior"], usual,
-        soft, states, outputs, discount,
+        mhe, f, h, g, g_penalty, matrix, metric, inverses["prior"], usual, soft, states, outputs,
+        discount,
     )
 
 
