@@ -12,7 +12,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import positive_definite, vector
 from ..costs import Cost
-from ..errors import InvalidInputError, OptionError, SetError, ShapeError
+from ..errors import InvalidInputError, OptionError, ShapeError
 from ..model.sets import ConvexSet
 from ..model.system import System, checked_set
 from .settings import Settings
@@ -145,7 +145,6 @@ class ConditionReader:
             found = self._last[name][1]
         else:
             self._check_rows(name, given, built)
-            self._check_turns(name, given, built)
             # A set without bounds of components, or without other rows, leaves these as they are.
             bounds = given if given.bounded_components.size or not given.matrix.size else usual
             rows = given if given.matrix.size else usual
@@ -184,25 +183,6 @@ class ConditionReader:
                     + ("frees component" if fixed[j] else "leaves no width to component")
                     + f" {j}; the components without a disturbance are those of the system. Make "
                     "another estimator, or leave this component as it is."
-                )
-
-    def _check_turns(self, name: str, given: ConvexSet, built: ConvexSet) -> None:
-        """Check that angles are bounded in the turn in which the system's set has them."""
-        turns = self._system.turns if name == "states" else None
-        if turns is None:
-            return
-        bounded = np.isfinite(built.lower) & np.isfinite(built.upper)
-        lower, upper = np.where(bounded, (built.lower, built.upper), 0.0)
-        for side in (given.lower, given.upper):
-            finite = np.isfinite(side) & bounded
-            ends = np.where(finite, side, 0.5 * lower + 0.5 * upper)
-            moved = finite & (turns(ends) != ends)
-            if moved.any():
-                j = int(np.argmax(moved))
-                raise SetError(
-                    f"bounds['states'] bounds component {j}, an angle, by {side[j]}; the system's "
-                    f"set has it from {built.lower[j]} to {built.upper[j]}, and it is kept in the "
-                    "turn around their middle. Subtract whole turns."
                 )
 
     def sensors(self, sensors: Any) -> tuple[NDArray[np.intp], Conditions | None]:

@@ -706,3 +706,22 @@ def test_bounds_that_leave_the_turn_are_refused(lower, upper):
     assert mhe.time == 1
     assert np.array_equal(mhe.state, before.state)
     mhe.update([-179.0], bounds={"states": qpmhe.Box([-np.inf, -9.0], [np.inf, 9.0])})
+
+
+@each_candidate
+@pytest.mark.parametrize("observer", ["luenberger", "extended"])
+def test_disturbances_of_lower_dimension_wrap_before_they_are_sized(observer, candidate):
+    """With G, also where the observer corrects outside of its range."""
+    matrix = np.array([[1.0, 0.0], [0.5, 0.0], [0.0, 1.0]])
+    covariances = {**COVARIANCES, "disturbance": COVARIANCES["disturbance"][:2, :2]}
+    _, y, u = record(2.0, 120)
+    seen, runs = np.column_stack((y[:, :2], wrapped(y[:, 2:]))), []
+    for make, data in ((plain, y), (wrapping, seen)):
+        made = qpmhe.ExtendedKalman(**covariances) if observer == "extended" else OBSERVERS[
+            observer]()
+        mhe = qpmhe.MovingHorizonEstimator(
+            make(disturbance_matrix=matrix, **SLOPES), made,
+            qpmhe.QuadraticCost.from_covariances(**covariances), horizon=8, max_qps=2,
+            initial_state=[0.7, 0.0, 0.9], candidate=candidate)
+        runs.append(mhe.run(data, u))
+    assert_same_errors(runs[1], runs[0], 1e-8)
