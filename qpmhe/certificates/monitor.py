@@ -185,6 +185,11 @@ class Monitor:
                 "the estimator's prior is a smoothed estimate, which the theorem does not cover; "
                 "make it with arrival='observer'."
             )
+        if estimator.has_changed or estimator.settings.parameters:
+            raise OptionError(
+                "the estimator has parameters, or its weights or bounds were changed by set(...); "
+                "the theorem is about what stays: make the estimator with constant ones."
+            )
         return cls(certificate, estimator.horizon)
 
     def check(self, estimate: Estimate, u: ArrayLike | None = None) -> Hypotheses:

@@ -74,6 +74,11 @@ def write(
         raise InvalidInputError(
             f"estimator is {estimator!r}; expected a qpmhe.MovingHorizonEstimator."
         )
+    if estimator.has_changed:
+        raise OptionError(
+            "the estimator's weights or bounds were changed by set(...); make one with these "
+            "values to write it."
+        )
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise OptionError(
             f"name is {name!r}; expected a C identifier: letters, digits and underscores."

@@ -252,6 +252,18 @@ class MovingHorizonEstimator:
         """N."""
         return self.settings.horizon
 
+    @property
+    def inputs(self) -> int:
+        """Number of inputs in the ``u`` of `update`: the system's without the parameters."""
+        return self._inputs
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether `set` has changed weights or bounds from those of ``cost`` and ``system``."""
+        usual = self._engine.usual
+        weights = usual.noise_weight, usual.disturbance_weight
+        return usual.has_bounds or any(one is not None for one in weights)
+
     def update(
         self,
         y: ArrayLike | None,

@@ -59,11 +59,11 @@ def load_record_model(text: str, **options: Any) -> RecordModel:
         "engine at work": estimator.engine,
         "initial_state": estimator.initial_state.tolist(),
         **vars(estimator.settings),
+        "parameters": list(estimator.settings.parameters),  # as JSON has them
     }
-    names = {
-        kind: _names(name, kind, signals[kind], getattr(estimator.system, size))
-        for kind, size in _SIZES.items()
-    }
+    system = estimator.system
+    sizes = {"states": system.n, "outputs": system.p, "inputs": estimator.inputs}
+    names = {kind: _names(name, kind, signals[kind], size) for kind, size in sizes.items()}
     return RecordModel(estimator, **names, dt=dt, identity=identity)
 
 

@@ -323,7 +323,7 @@ class _Session:
         try:
             self._mhe.load_state_dict(found.state)
             time = FieldReader(".").time(found.time)
-            inputs = np.array(found.inputs, np.float64).reshape(self._mhe.system.m)
+            inputs = np.array(found.inputs, np.float64).reshape(self._mhe.inputs)
         except (InvalidInputError, TypeError, ValueError) as error:
             raise CheckpointError(
                 f"the checkpoint {self._output.checkpoint} does not fit: {error}"

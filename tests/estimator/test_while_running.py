@@ -634,3 +634,18 @@ def test_a_batch_has_no_parameters():
             mhe.system, mhe.observer, mhe.cost, members=2, horizon=3,
             initial_states=[0.5, 0.0], parameters=[1.0],
         )
+
+
+def test_what_is_made_for_constant_weights_refuses_changed_ones(tmp_path):
+    ca = pytest.importorskip("casadi")
+    system = qpmhe.from_casadi(
+        lambda x: 0.9 * x + 0.1 * ca.sin(x), lambda x: x, n=1, p=1, noises=qpmhe.Box(-1.0, 1.0)
+    )
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
+    for changes in ({"noise_weight": 2.0}, {"bounds": {"noises": qpmhe.Box(-0.5, 0.5)}}):
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([0.2]), cost, horizon=3, initial_state=[0.0]
+        )
+        qpmhe.codegen.write(mhe, tmp_path)
+        mhe.set(**changes)
+        check(OptionError, ["set(...)"], lambda mhe=mhe: qpmhe.codegen.write(mhe, tmp_path))
