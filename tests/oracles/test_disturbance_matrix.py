@@ -312,6 +312,7 @@ def test_a_disturbance_of_python_control_takes_as_many_lines_as_there():
     np.testing.assert_allclose(estimate.disturbances[:-1], theirs.inputs.T[:-1], atol=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 @pytest.mark.parametrize("seed", [3, 15, 16, 17, 26, 37])
 def test_where_no_step_from_the_observer_helps_the_search_goes_on_from_its_roll_out(seed):
     case = Curved(seed, False)
