@@ -310,3 +310,19 @@ def test_a_disturbance_of_python_control_takes_as_many_lines_as_there():
         estimate = mhe.update(y, u)
     np.testing.assert_allclose(estimate.trajectory[:-1], theirs.states.T, atol=1e-4)
     np.testing.assert_allclose(estimate.disturbances[:-1], theirs.inputs.T[:-1], atol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
+@pytest.mark.parametrize("seed", [3, 15, 16, 17, 26, 37])
+def test_where_no_step_from_the_observer_helps_the_search_goes_on_from_its_roll_out(seed):
+    case = Curved(seed, False)
+    case.bent *= 6.0
+    gain = 0.5 * np.random.default_rng(seed).standard_normal((case.n, case.p))
+    mhe = qpmhe.MovingHorizonEstimator(
+        case.system(), qpmhe.Luenberger(gain), case.cost(), horizon=8, initial_state=case.start,
+        max_qps=None,
+    )
+    for y in case.Y:
+        estimate = mhe.update(y)
+        assert estimate.improved
+        assert estimate.cost < estimate.candidate_cost
