@@ -25,10 +25,11 @@ from .estimation.engines import Engine, register_engine
 from .estimation.estimate import DroppedRow, Estimate, Status
 from .estimation.estimator import MovingHorizonEstimator
 from .estimation.run import Run
+from .model.constraints import Constraint
 from .model.noisy_inputs import noisy_inputs
 from .model.parameters import augment_parameters
 from .model.residuals import angles
-from .model.sets import Box, ConvexSet, Polytope
+from .model.sets import Box, ConvexSet, Polytope, SoftSet
 from .model.system import System
 from .observers import (
     ExtendedKalman,
@@ -55,6 +56,7 @@ register_engine("compiled", _compiled_engine)
 __all__ = [
     "BatchEstimator",
     "Box",
+    "Constraint",
     "ConvexSet",
     "Cost",
     "CostConstants",
@@ -78,6 +80,7 @@ __all__ = [
     "RobustCost",
     "Run",
     "Sample",
+    "SoftSet",
     "Status",
     "SteadyStateKalman",
     "System",

@@ -21,7 +21,7 @@ from ..errors import CompilationError, EngineWarning, OptionError
 from ..model.augmentation import Augmentation
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
-from ..model.system import System, SystemOptions
+from ..model.system import System, SystemOptions, checked_set, timed_options
 
 Array = NDArray[np.float64]
 # Makes buffers for a number of states and the wanted results.
@@ -86,7 +86,9 @@ def from_casadi(
     model = casadi_model(f, h, n=n, p=p, m=m, dt=dt, method=method)
     library: ctypes.PyDLL | None = None
     if compiled or (compiled is None and find_compiler() is not None):
-        library = _library(model, options.get("states"), compiled is True)
+        library = _library(
+            model, checked_set("states", options.get("states"), model.n), compiled is True
+        )
 
     def made(timed: bool) -> System:
         maker = (
@@ -97,7 +99,8 @@ def from_casadi(
         one = {name: Trusted(partial(evaluator.one, name)) for name in _NAMES}
         system = System(
             one["f"], one["h"], n=model.n, p=model.p, m=model.m + timed,
-            f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"], **options,
+            f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"],
+            **(timed_options(options) if timed else options),
         )
         system.f_jacobian.method = system.h_jacobian.method = "casadi"
         system.kernel = evaluator

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .._checks import dimension, need, positive
 from ..model.augmentation import Augmentation
 from ..model.functions import Trusted, takes_input
-from ..model.system import System, SystemOptions, checked_set, probe_points
+from ..model.system import System, SystemOptions, checked_set, probe_points, timed_options
 from .jax_programs import Programs
 
 Array = NDArray[np.float64]
@@ -118,7 +118,9 @@ def from_jax(
     system = _assembled(_Model(programs, length), m, options)
     if length is not None:
         system.dt = length
-        system.make_timed = partial(_assembled, _Model(programs, None), m + 1, options)
+        system.make_timed = partial(
+            _assembled, _Model(programs, None), m + 1, timed_options(options)
+        )
     system.make_augmented = partial(_augmented, f, h, p, m, dt, method)
     system.recipe = (
         from_jax,

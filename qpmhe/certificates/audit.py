@@ -277,6 +277,11 @@ def audit(
 def checked_ingredients(system: Any, observer: Any, cost: Any) -> None:
     """Check that system, observer and cost go together."""
     checked_system(system)
+    if system.extensions:
+        raise CertificateError(
+            f"the system has {' and '.join(system.extensions)}, which the theorem's cost and sets "
+            "do not; certify the system without them."
+        )
     if not isinstance(observer, Observer):
         raise InvalidInputError(
             f"observer is {observer!r}; expected an observer, such as qpmhe.Luenberger(gain)."

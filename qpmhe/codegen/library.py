@@ -49,6 +49,11 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
                 f"engine='compiled' does not yet take a residual function; take engine='python', "
                 f"or leave {name} out."
             )
+    if system.extensions:
+        return (
+            f"engine='compiled' does not have {' and '.join(system.extensions)}; take "
+            "engine='python'."
+        )
     if observer.constant_gain is None or observer.filter_gain is None:
         return (
             f"{type(observer).__name__} has no C form; take an observer with constant gain "

@@ -131,6 +131,11 @@ class ConditionReader:
     def _with_sides(self, name: str, given: Any, usual: Any) -> ConvexSet:
         """The rows of the system's set with the sides of another."""
         built: ConvexSet | None = getattr(self._system, name)
+        if name in self._system.soft:
+            raise OptionError(
+                f"bounds has {name!r}, but the set of {name} is soft, and its sides cannot change; "
+                "leave it out, or make the set a hard one."
+            )
         if built is None:
             raise OptionError(
                 f"bounds has {name!r}, but the system has no set of {name}; make it with "

@@ -1,4 +1,4 @@
-"""The sets X, W and V as rows: one inequality at one stage each (eq:constraints)."""
+"""The sets X, W, V and the nonlinear constraints as rows: one inequality at one stage each."""
 
 from __future__ import annotations
 
@@ -167,12 +167,14 @@ class Rows:
 
 
 class Constraints:
-    """The rows of X, W and V, and the directions without disturbance; immutable.
+    """The rows of X, W, V and hard nonlinear constraints, and noise-free directions; immutable.
 
     Attributes
     ----------
     states, disturbances, noises : Rows or None
         The inequalities on x, on d = x+ - f(x) and on v.
+    constraints : Rows or None
+        Those on the values of the nonlinear constraints.
     noise_free : (k,) array
         Components whose disturbance is a constant, so that their states follow the model.
     constant : (k,) array
@@ -184,12 +186,17 @@ class Constraints:
     """
 
     __slots__ = (
-        "basis", "constant", "directions", "disturbances", "noise_free", "noises", "states",
+        "basis", "constant", "constraints", "directions", "disturbances", "noise_free", "noises",
+        "states",
     )
 
     def __init__(self, system: System, cost: Cost, prior_covariance: Array) -> None:
         self.states = _rows("states", system.states, prior_covariance)
         self.noises = _rows("noises", system.noises, inverse(cost.noise))
+        self.constraints: Rows | None = None
+        nonlinear = system.constraints
+        if nonlinear is not None and not nonlinear.soft.all():
+            self.constraints = function_rows(~nonlinear.soft, nonlinear.scale)
         disturbances, spread = system.disturbances, inverse(cost.disturbance)
         self.noise_free: NDArray[np.intp] = np.empty(0, np.intp)
         self.constant: Array = np.empty(0)
@@ -220,10 +227,10 @@ class Constraints:
         self.disturbances = mapped if len(mapped.matrix) else None
 
     def __bool__(self) -> bool:
-        return any((self.states, self.disturbances, self.noises))
+        return any((self.states, self.disturbances, self.noises, self.constraints))
 
     def _parts(
-        self, trajectory: Array, residuals: Array, measurements: Array
+        self, trajectory: Array, residuals: Array, measurements: Array, values: Array | None
     ) -> Iterator[tuple[Rows, Array, Array]]:
         """Each set's rows, the points to test, and the ``sizes`` of `Rows.misses`."""
         n = trajectory.shape[1]
@@ -233,11 +240,20 @@ class Constraints:
             yield self.disturbances, residuals[:, :n], trajectory[1:]
         if self.noises is not None:
             yield self.noises, residuals[:, n:], measurements
+        if self.constraints is not None and values is not None:
+            # Nothing is known about the rounding within a user's function.
+            yield self.constraints, values, np.zeros(values.shape)
 
-    def violation(self, trajectory: Array, residuals: Array, measurements: Array) -> float:
-        """The largest miss of a row in its scale; infinity where a number is not finite."""
+    def violation(
+        self, trajectory: Array, residuals: Array, measurements: Array,
+        values: Array | None = None,
+    ) -> float:
+        """The largest miss of a row in its scale; infinity where a number is not finite.
+
+        ``values`` are those of the nonlinear constraints, if there are any.
+        """
         worst = 0.0
-        for rows, points, sizes in self._parts(trajectory, residuals, measurements):
+        for rows, points, sizes in self._parts(trajectory, residuals, measurements, values):
             misses = rows.misses(points, sizes)
             if misses is not None:
                 largest = float(misses.max())
@@ -255,29 +271,37 @@ class Constraints:
                 rows[name] = mine.with_sides([*sets, sets[-1]] if name == "states" else sets)
         return self._replaced(**rows)
 
-    def observed(self, observed: Mask) -> Constraints:
-        """The constraints without the rows of V on missing outputs; ``observed`` is (K, p) bool."""
-        if self.noises is None:
-            return self
-        return self._replaced(noises=self.noises.without(self.noises.touching(~observed)))
+    def observed(self, observed: Mask, counting: Mask | None) -> Constraints:
+        """The constraints without the rows on missing outputs; ``observed`` is (K, p) bool.
+
+        ``counting`` (K + 1, T) says which rows of the nonlinear constraints hold.
+        """
+        rows = {}
+        if self.noises is not None:
+            rows["noises"] = self.noises.without(self.noises.touching(~observed))
+        if self.constraints is not None and counting is not None:
+            left_out = ~counting[:, self.constraints.components]
+            rows["constraints"] = self.constraints.without(left_out)
+        return self._replaced(**rows) if rows else self
 
     def without_violated(
-        self, trajectory: Array, residuals: Array, measurements: Array
+        self, trajectory: Array, residuals: Array, measurements: Array, values: Array | None
     ) -> Constraints:
         """The constraints without the rows that a trajectory misses; noise-free ones stay."""
         left = {
             rows.name: rows.without((misses > FEASIBLE) & ~rows.fixed, points)
-            for rows, points, sizes in self._parts(trajectory, residuals, measurements)
+            for rows, points, sizes in self._parts(trajectory, residuals, measurements, values)
             if (misses := rows.misses(points, sizes)) is not None
         }
         return self._replaced(**left)
 
     def missed_rows(
-        self, trajectory: Array, residuals: Array, measurements: Array, first: int
+        self, trajectory: Array, residuals: Array, measurements: Array, values: Array | None,
+        first: int,
     ) -> tuple[DroppedRow, ...]:
         """The rows that a trajectory misses; its first state has the time ``first``."""
         found = []
-        for rows, points, sizes in self._parts(trajectory, residuals, measurements):
+        for rows, points, sizes in self._parts(trajectory, residuals, measurements, values):
             misses = rows.misses(points, sizes)
             if misses is None:
                 continue
@@ -360,6 +384,10 @@ def _off(normal: Array, scale: Array) -> Array:
     """The projection I - E N' along orthonormal directions, in scaled numbers."""
     projection: Array = np.eye(scale.size) - scale[:, None] * (normal @ normal.T) / scale
     return projection
+def function_rows(chosen: Mask, scale: Array) -> Rows:
+    """The rows g <= 0 of the chosen ones among all rows of g; a point is all of their values."""
+    upper = np.where(chosen, 0.0, np.inf)
+    return Rows("constraints", Box(np.full(upper.size, -np.inf), upper), np.diag(scale**2))
 
 
 def _rows(name: str, convex_set: ConvexSet | None, covariance: Array) -> Rows | None:

@@ -15,6 +15,7 @@ from qpmhe_solvers import Solver, create
 from qpmhe_solvers.solver import ContainedSolver
 
 from .._checks import check_problem
+from .._linalg import inverse
 from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
 from ..model.residuals import difference
@@ -93,8 +94,13 @@ class PythonEngine:
             solver.prepare((settings.horizon + 1) * system.n)
         if system.kernel is not None:
             system.kernel.prepare(settings.horizon)
+        if system.constraints is not None:
+            self._scale_constraints(initial_state)
         self._reader = ConditionReader(system, self._given_cost)
         self._tools = self._tools_for(usual_conditions(settings))
+        penalties = self._tools.formulation.penalties
+        if settings.qp_limit and penalties is not None:
+            solver.prepare((settings.horizon + 1) * (system.n + penalties.size))
         self._with_terms = settings.qp_limit > 0
         self._reinitialized = settings.candidate == "reinitialized"
         self._smoothed = settings.arrival == "smoothed"
@@ -109,6 +115,18 @@ class PythonEngine:
             [initial_state.copy()], maxlen=settings.horizon + 1 if self._reinitialized else 1
         )
 
+    def _scale_constraints(self, initial_state: Array) -> None:
+        """Give the nonlinear constraints the standard deviations of what they are functions of."""
+        cost, functions = self._cost, self._system.constraints
+        assert functions is not None
+        deviations = self._given_cost.prior_deviations(
+            self._observer.initial_covariance(), self._system.disturbance_matrix
+        )
+        functions.use_scales(
+            initial_state, deviations, inverse(cost.disturbance), inverse(cost.noise),
+            self._to_disturbances,
+        )
+
     def _tools_for(self, usual: Conditions) -> Tools:
         """What a step uses under these usual conditions."""
         system, cost, settings = self._system, self._cost, self._settings
@@ -118,7 +136,9 @@ class PythonEngine:
         if usual.noise_weight is not None or usual.disturbance_weight is not None:
             cost = cost.with_weights(usual.noise_weight, usual.disturbance_weight)
         formulation = Formulation(system, self._observer, cost)
-        subproblem = Subproblem(system, cost, formulation.constraints, settings.horizon)
+        subproblem = Subproblem(
+            system, cost, formulation.constraints, settings.horizon, formulation.penalties
+        )
         return Tools(
             usual, system, cost, formulation, subproblem,
             Optimizer(subproblem, self._solver, settings),
@@ -204,6 +224,9 @@ class PythonEngine:
             status |= Status(window.events)
         if window.failure:
             message = f"{window.failure} {message}".strip()
+        if candidate.values is not None and (text := problem.constraint_failure(candidate)):
+            status |= Status.MODEL_FAILED
+            message = f"{text} {message}".strip()
         if not math.isfinite(candidate.cost):
             status &= ~Status.NO_DECREASE  # the model failed, not the solver
             if problem.rolled_out is not None:

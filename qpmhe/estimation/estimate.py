@@ -71,8 +71,8 @@ _TEXTS = {
         "out and the observer predicted without it."
     ),
     Status.CANDIDATE_OUTSIDE: (
-        "The observer's candidate violates the sets of disturbances or noises (or of states, with "
-        "project_observer=False)."
+        "The observer's candidate violates the sets of disturbances or noises or a hard nonlinear "
+        "constraint (or the set of states, with project_observer=False)."
     ),
     Status.ROWS_DROPPED: (
         "No trajectory was found that satisfies all sets at a cost not above the candidate's; the "
@@ -102,13 +102,14 @@ class DroppedRow(NamedTuple):
     Attributes
     ----------
     set : str
-        ``states``, ``disturbances`` or ``noises``.
+        ``states``, ``disturbances``, ``noises`` or ``constraints``.
     row : int
-        The component that it bounds, or the dimension of the set plus the row of its matrix.
+        The component that it bounds, or the dimension of the set plus the row of its matrix; for
+        ``constraints`` the row among those of all constraints.
     side : str
         ``lower`` or ``upper``.
     time : int
-        The time i of x(i), w(i) or v(i).
+        The time i of x(i), w(i) or v(i), or of the sample.
     """
 
     set: str
@@ -147,7 +148,8 @@ class Estimate:
     noises : (N_t, p) array
         v(i) = y(i) - h(x(i)) along the trajectory; NaN where y is missing.
     cost, candidate_cost : float
-        True cost J of the estimate and of the observer's candidate; cost <= candidate_cost.
+        True cost J of the estimate and of the observer's candidate, penalties of what is soft
+        included; cost <= candidate_cost.
     candidate : (N_t + 1, n) array
         The observer's trajectory.
     delayed : (n,) array or None

@@ -135,6 +135,7 @@ class Optimizer:
         if self._limit == 0:
             outcome.events |= Status.NO_QPS
             return outcome
+        self._subproblem.start()
         start = shifted() if self._warm_start else None
         if feasible:
             self._search(problem, outcome, start, self._limit)
@@ -236,7 +237,7 @@ class Optimizer:
 
     def _step(self, problem: Problem, qp: QP, outcome: Outcome) -> bool:
         """Solve one QP and take its step; whether another QP is worth solving."""
-        solution = self._solve(qp, outcome)
+        solution = self._solution(qp, outcome)
         if solution is None:
             return False
         outcome.qps += 1
@@ -250,8 +251,7 @@ class Optimizer:
         best = outcome.trial
         # Where J is infinite, no decrease is negligible.
         negligible = self._tolerance * best.cost if best.cost < math.inf else -1.0
-        # The decrease of J that the QP predicts: its objective is J/2.
-        predicted = abs(float(np.vdot(qp.gradient, solution.d)))
+        predicted = self._subproblem.predicted(qp, best, solution.d)
         useless = solved and predicted <= negligible
         trial = self._line_search(problem, qp, outcome, solution.d, useless)
         if trial.cost < _target(best):
@@ -291,6 +291,11 @@ class Optimizer:
                 trial = self._feasible_near(problem, outcome, trial)
             if trial.cost < target:
                 return trial
+        elif best.penalty < trial.penalty < math.inf and not useless:
+            # A full step along a soft row that is curved: the penalty grows where J would not.
+            corrected = self._correct(problem, qp, outcome, trial)
+            if corrected.cost < target:
+                return corrected
         # From outside, a full step ends as a rule on the boundary of the linearised sets: shorter
         # ones stay outside.
         if useless or best.violation > FEASIBLE:
@@ -323,7 +328,7 @@ class Optimizer:
             if outcome.time_is_up():
                 break
             self._subproblem.correct_rows(qp, problem, best, trial)
-            solution = self._solve(qp, outcome)
+            solution = self._solution(qp, outcome)
             if solution is None:
                 break
             outcome.corrections += 1
@@ -333,6 +338,21 @@ class Optimizer:
             if trial.cost < math.inf or not math.isfinite(trial.violation):
                 break
         return trial
+
+    def _solution(self, qp: QP, outcome: Outcome) -> Solution | None:
+        """The solution of a QP with its soft rows, if there are any; None if no time is left.
+
+        Where the solution without them violates none, it is the solution with them, too.
+        """
+        solution = self._solve(qp, outcome)
+        if solution is None:
+            return None
+        softened = self._subproblem.softened(qp, solution)
+        if softened is None:
+            self._subproblem.note(qp, solution)
+            return solution
+        solution = self._solve(softened, outcome)
+        return None if solution is None else self._subproblem.lowered(qp, solution)
 
     def _solve(self, qp: QP, outcome: Outcome) -> Solution | None:
         """Solve a QP within the time left; None if no time is left."""

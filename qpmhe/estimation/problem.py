@@ -20,6 +20,7 @@ from ..observers import Observer
 from .constraints import Constraints
 from .estimate import DroppedRow
 from .limits import FEASIBLE
+from .softened import Penalties, WindowPenalties
 from .stages import read_only
 from .window import Window
 
@@ -49,6 +50,10 @@ class Trial:
         The largest violation of a row in its scale (see `Rows`), infinity if the model fails.
     error : Exception or None
         What the model or the cost raised.
+    values : (K + 1, T) array or None
+        Values of the nonlinear constraints, if there are any; see `ConstraintFunctions.values`.
+    penalty : float
+        The part of the cost that soft sets and soft constraints add.
     """
 
     trajectory: Array
@@ -57,6 +62,8 @@ class Trial:
     cost: float
     violation: float = 0.0
     error: Exception | None = None
+    values: Array | None = None
+    penalty: float = 0.0
 
 
 class Formulation:
@@ -81,8 +88,15 @@ class Formulation:
         self.prior_weight: Array
         self.prior_weight, regular = self.prior_weights(covariance)
         self.prior_band = band_of(self.prior_weight)
-        self.constraints = Constraints(system, cost, inverse(regular))
+        covariance = inverse(regular)
+        self.functions = system.constraints
+        self.constraints = Constraints(system, cost, covariance)
         self.constrained = bool(self.constraints)
+        penalties = Penalties(system, cost, covariance)
+        #: The soft sets and soft constraints; None without any.
+        self.penalties: Penalties | None = penalties if penalties else None
+        #: Whether trials have values of nonlinear constraints, or penalties.
+        self.extended = self.functions is not None or self.penalties is not None
 
     def prior_weights(self, covariance: Array | None) -> tuple[Array, Array]:
         """The prior's weight for an observer's covariance, and one to judge its distance by.
@@ -153,6 +167,8 @@ class Problem:
         The model that takes these inputs, whose last column may be the length of the step.
     span : Span
         The candidate's linearised stages.
+    penalties : WindowPenalties or None
+        The rows of soft sets and soft constraints, with their penalties.
     time : int
         Time of the first state.
     wraps : bool
@@ -160,10 +176,11 @@ class Problem:
     """
 
     __slots__ = (
-        "_candidate_residuals", "_clip", "_formulation", "_has_noise_free", "_prior_band",
-        "candidate", "constrained", "constraints", "discounts", "distance_weight", "inputs",
-        "measurements", "model", "observed", "prior", "prior_moved", "prior_weight", "rolled_out",
-        "span", "stage_weights", "time", "usual_disturbances", "wraps",
+        "_candidate_residuals", "_clip", "_counting", "_formulation", "_has_noise_free",
+        "_prior_band", "candidate", "constrained", "constraints", "discounts", "distance_weight",
+        "inputs", "measurements", "model", "observed", "penalties", "prior", "prior_moved",
+        "prior_weight", "rolled_out", "span", "stage_weights", "time", "usual_disturbances",
+        "wraps",
     )
 
     _clip: tuple[Array, Array] | None
@@ -203,12 +220,22 @@ class Problem:
         self.constraints, self.constrained = formulation.constraints, formulation.constrained
         self._has_noise_free, self._clip = False, None
         self.rolled_out: Trial | None = None
+        self._counting: NDArray[np.bool_] | None = None
+        if formulation.functions is not None and self.observed is not None:
+            self._counting = formulation.functions.counting(window.length, self.observed)
+        self.penalties: WindowPenalties | None = None
+        if formulation.penalties is not None:
+            self.penalties = formulation.penalties.of_window(
+                window.length, self.observed, self.discounts
+            )
+        if formulation.extended:
+            self._add_penalty(self.candidate)
         if self.constrained:
             constraints = formulation.constraints
             if window.has_own_bounds:
                 constraints = constraints.at(window.conditions)
             if self.observed is not None:
-                constraints = constraints.observed(self.observed)
+                constraints = constraints.observed(self.observed, self._counting)
             self._constrain(constraints)
             self._judge_candidate()
 
@@ -232,7 +259,7 @@ class Problem:
     def _candidate_violation(self) -> float:
         candidate = self.candidate
         return self.constraints.violation(
-            candidate.trajectory, self._candidate_residuals, self.measurements
+            candidate.trajectory, self._candidate_residuals, self.measurements, candidate.values
         )
 
     def _move_prior(self, prior: Array) -> None:
@@ -267,16 +294,56 @@ class Problem:
         other, candidate = copy(self), self.candidate
         other._constrain(
             self.constraints.without_violated(
-                candidate.trajectory, self._candidate_residuals, self.measurements
+                candidate.trajectory, self._candidate_residuals, self.measurements,
+                candidate.values,
             )
         )
         other.candidate = replace(candidate, violation=other._candidate_violation())
         return other
 
+    def _add_penalty(self, trial: Trial) -> None:
+        """Evaluate the nonlinear constraints, and add the penalty of what is soft to the cost."""
+        functions, penalties = self._formulation.functions, self._formulation.penalties
+        if functions is not None:
+            trial.values = functions.values(trial.trajectory, self.inputs, trial.residuals)
+            if self._counting is not None:
+                trial.values[~self._counting] = 0.0
+        if penalties is not None and self.penalties is not None:
+            values = penalties.values(trial.trajectory, trial.residuals, trial.values)
+            trial.penalty = self.penalties.cost(self.penalties.misses(values))
+            trial.cost += trial.penalty
+
+    def linearised(
+        self, trial: Trial, minus_jacobian: Array
+    ) -> tuple[Array, Array] | None:
+        """Derivatives of the nonlinear constraints; see `ConstraintFunctions.linearised`."""
+        functions = self._formulation.functions
+        if functions is None:
+            return None
+        return functions.linearised(
+            trial.trajectory, self.inputs, trial.residuals, minus_jacobian
+        )
+
+    def curvature(
+        self, trial: Trial, minus_jacobian: Array, forces: Array
+    ) -> tuple[Array, Array, Array]:
+        """What active nonlinear constraints add to the Hessian; see `ConstraintFunctions`."""
+        functions = self._formulation.functions
+        assert functions is not None
+        return functions.curvature(
+            trial.trajectory, self.inputs, trial.residuals, minus_jacobian, forces
+        )
+
+    def soft_rows(self, trial: Trial) -> Array:
+        """Values (K + 1, R) of all soft rows at a trial."""
+        penalties = self._formulation.penalties
+        assert penalties is not None
+        return penalties.values(trial.trajectory, trial.residuals, trial.values)
+
     def missed_rows(self, trial: Trial) -> tuple[DroppedRow, ...]:
         """The rows of this problem that a trial violates."""
         return self.constraints.missed_rows(
-            trial.trajectory, trial.residuals, self.measurements, self.time
+            trial.trajectory, trial.residuals, self.measurements, trial.values, self.time
         )
 
     def clipped(self, trajectory: Array) -> Array:
@@ -311,6 +378,9 @@ class Problem:
             residuals = np.full_like(self.candidate.residuals, np.nan)
             return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf, error)
         trial = Trial(trajectory, residuals, weights, cost)
+        if self._formulation.extended:
+            self._add_penalty(trial)
+            cost = trial.cost
         if not math.isfinite(cost):
             trial.cost = trial.violation = math.inf
         elif self.constrained and not of_candidate:
@@ -322,12 +392,21 @@ class Problem:
     def failure(self, trial: Trial) -> str:
         """What the model or the cost raised at a trial, as a message; blank if nothing."""
         if trial.error is None:
-            return ""
+            return "" if trial.values is None else self.constraint_failure(trial)
         functions = {"f": self.model.f, "h": self.model.h}
         return raised_along(trial.error, functions, trial.trajectory[:-1], self.inputs)
 
+    def constraint_failure(self, trial: Trial) -> str:
+        """What a nonlinear constraint raised at a trial, as a message; blank if nothing."""
+        functions = self._formulation.functions
+        if functions is None or trial.values is None or np.isfinite(trial.values).all():
+            return ""
+        return functions.failure(trial.trajectory, self.inputs, trial.residuals)
+
     def _violation(self, trial: Trial) -> float:
-        return self.constraints.violation(trial.trajectory, trial.residuals, self.measurements)
+        return self.constraints.violation(
+            trial.trajectory, trial.residuals, self.measurements, trial.values
+        )
 
     def _rolled_out(self, trajectory: Array, of_candidate: bool) -> Array:
         """Follow the model where there is no disturbance, stage by stage.

@@ -41,7 +41,9 @@ def described(
     if settings.parameters:
         found["number of parameters"] = len(settings.parameters)
     for name in SET_NAMES:
-        _describe(f"set of {name}", getattr(system, name), found)
+        _describe(f"set of {name}", system.soft.get(name, getattr(system, name)), found)
+    if system.constraints is not None:
+        found["constraints"] = system.constraints.described()
     for name, size in (("output_residual", system.p), ("state_residual", system.n)):
         residual = getattr(system, name)
         if residual is not None:

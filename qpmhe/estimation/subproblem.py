@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from qpmhe_solvers import QP
+from qpmhe_solvers import QP, Solution
 from qpmhe_solvers.qp import band_of
 
 from ..costs import Cost
@@ -18,6 +18,7 @@ from .constraints import Constraints, Rows
 from .limits import BEYOND
 from .linearization import Span, StageTerms
 from .problem import Problem, Trial
+from .softened import Penalties, Softened
 
 Array = NDArray[np.float64]
 
@@ -32,13 +33,18 @@ class Subproblem:
 
     - bounds on d, and rows on ``x_i + d_i``, from X;
     - rows on ``w_i + d_{i+1} - A_i d_i`` from W and on ``v_i - C_i d_i`` from V; a component
-      of W of zero width gives an equality row.
+      of W of zero width gives an equality row;
+    - rows on the linearised nonlinear constraints.
+
+    Soft rows are not among them: `softened` adds these, with slack variables, where a solution
+    without them violates one.
 
     There is one QP, of the present window length; each use overwrites it.
     """
 
     def __init__(
-        self, system: System, cost: Cost, constraints: Constraints, horizon: int
+        self, system: System, cost: Cost, constraints: Constraints, horizon: int,
+        penalties: Penalties | None = None,
     ) -> None:
         n, p = system.n, system.p
         self._n, self._p = n, p
@@ -51,9 +57,17 @@ class Subproblem:
         self._x_rows = states.matrix[states.bounds :] if states else np.empty((0, n))
         self._w_rows = w.matrix if w else np.empty((0, n))
         self._v_rows = v.matrix if v else np.empty((0, p))
-        ends = np.cumsum([0, *(len(rows) for rows in (self._w_rows, self._v_rows, self._x_rows))])
+        g = constraints.constraints
+        self._g_rows = np.empty(0, np.intp) if g is None else g.components
+        sizes = (len(one) for one in (self._w_rows, self._v_rows, self._x_rows, self._g_rows))
+        ends = np.cumsum([0, *sizes])
         self._rows = int(ends[-1])
-        self._w, self._v, self._x = (slice(a, b) for a, b in pairwise(ends))
+        self._w, self._v, self._x, self._g = (slice(a, b) for a, b in pairwise(ends))
+        self._penalties = penalties
+        self._softened = None if penalties is None else Softened(penalties, n)
+        self._functions = system.constraints
+        # Multipliers of the nonlinear constraints in the last QP of the sequence, (K + 1, T).
+        self._forces: Array | None = None
         self._qp: QP | None = None
         #: Why `at` returned None the last time.
         self.failure = ""
@@ -119,15 +133,65 @@ class Subproblem:
         curvature = trial.residuals - linearised
         if problem.wraps:
             problem.wrap(curvature, trial.trajectory)
+        bent = None if trial.values is None else self._bent(qp, around, trial, step)
+        if self._softened is not None:
+            self._softened.bend(problem.soft_rows(trial), step, curvature)
         values = qp.rows_times(step)
         missed = np.maximum(qp.row_lower - values, values - qp.row_upper)
         margin = 2.0 * np.maximum(missed, 0.0)
         margin[:-1, self._w] += BEYOND * np.abs(curvature[:, :n] @ self._w_rows.T)
         margin[:-1, self._v] += BEYOND * np.abs(curvature[:, n:] @ self._v_rows.T)
-        self._set_rows(qp, problem, around.residuals + curvature, around.trajectory)
+        if bent is not None and around.values is not None:
+            margin[:, self._g] += BEYOND * np.abs(bent[:, self._g_rows])
+            bent += around.values
+        self._set_rows(qp, problem, around.residuals + curvature, around.trajectory, bent)
         inwards = np.where(qp.row_upper - qp.row_lower > 4.0 * margin, margin, 0.0)
         qp.row_lower += inwards
         qp.row_upper -= inwards
+
+    def _bent(self, qp: QP, around: Trial, trial: Trial, step: Array) -> Array:
+        """The linearisation error (K + 1, T) of the nonlinear constraints at a trial."""
+        assert trial.values is not None
+        assert around.values is not None
+        bent = np.zeros(trial.values.shape)
+        change = trial.values - around.values
+        bent[:, self._g_rows] = change[:, self._g_rows] - qp.rows_times(step)[:, self._g]
+        return np.where(np.isfinite(bent), bent, 0.0)
+
+    def softened(self, qp: QP, solution: Solution) -> QP | None:
+        """The QP with slack variables; None where the solution without violates no soft row."""
+        soft = self._softened
+        if soft is None or solution.d is None or not soft.misses(solution.d).any():
+            return None
+        return soft.lifted(qp)
+
+    def lowered(self, qp: QP, solution: Solution) -> Solution:
+        """A solution of the QP with slack variables, as one of the QP without."""
+        assert self._softened is not None
+        self._note(qp, solution, self._softened.forces(qp, solution))
+        return self._softened.lowered(qp, solution)
+
+    def start(self) -> None:
+        """Say that a new sequence of QPs begins: nothing is known of its multipliers."""
+        self._forces = None
+
+    def note(self, qp: QP, solution: Solution) -> None:
+        """Take a solution's multipliers: the next QP has the curvature of active constraints."""
+        if self._functions is not None:
+            self._note(qp, solution, np.zeros((qp.stages, self._functions.size)))
+
+    def _note(self, qp: QP, solution: Solution, forces: Array | None) -> None:
+        if forces is not None and solution.row_duals is not None:
+            hard = solution.row_duals.reshape(qp.stages, -1)[:, self._g]
+            forces[:, self._g_rows] = np.maximum(hard, 0.0)
+            self._forces = forces if forces.any() and np.isfinite(forces).all() else None
+
+    def predicted(self, qp: QP, best: Trial, step: Array) -> float:
+        """The decrease of J that the QP predicts for its step: its objective is J/2."""
+        if self._softened is None:
+            return abs(float(np.vdot(qp.gradient, step)))
+        decrease = best.penalty - 2.0 * qp.objective(step) - self._softened.penalty(step)
+        return max(decrease, 0.0)
 
     def forget(self) -> None:
         """Build the QP anew at its next use: an interrupt may have left it half written."""
@@ -162,9 +226,27 @@ class Subproblem:
             gradient_first += problem.prior_weight_at(offset).dot(offset)
         gradient_last[...] = span.next_gradient_last
         self._minus_jacobian = span.minus_jacobian
+        if self._forces is not None and len(self._forces) == count + 1:
+            self._add_curvature(
+                qp, *problem.curvature(trial, span.minus_jacobian, self._forces)
+            )
+        slopes = problem.linearised(trial, span.minus_jacobian)
         if problem.constrained:
-            self._set_inequalities(qp, problem, trial)
+            self._set_inequalities(qp, problem, trial, slopes)
+        if self._softened is not None and problem.penalties is not None:
+            assert self._penalties is not None
+            self._softened.around(
+                problem.penalties, problem.soft_rows(trial),
+                self._penalties.linearised(span.minus_jacobian, slopes),
+            )
         return qp
+
+    def _add_curvature(self, qp: QP, own: Array, below: Array, following: Array) -> None:
+        n, band = self._n, qp.band
+        own[1:] += following
+        for c in range(n):
+            band[:, c, : n - c] += own[:, c:, c]
+            band[:-1, c, n - c : 2 * n - c] += below[:, :, c]
 
     def _new_qp(self, stages: int) -> QP:
         """A QP of another length in place of the present one."""
@@ -178,7 +260,9 @@ class Subproblem:
         self._uniform, self._prior_band = False, _NO_BAND
         return qp
 
-    def _set_inequalities(self, qp: QP, problem: Problem, trial: Trial) -> None:
+    def _set_inequalities(
+        self, qp: QP, problem: Problem, trial: Trial, slopes: tuple[Array, Array] | None
+    ) -> None:
         n, states = self._n, problem.constraints.states
         qp.bounded = states is not None and bool(states.bounds)
         if states is not None and qp.bounded:
@@ -191,9 +275,19 @@ class Subproblem:
             minus = self._minus_jacobian
             np.matmul(self._w_rows, minus[:, :n], out=qp.row_own[:-1, self._w])
             np.matmul(self._v_rows, minus[:, n:], out=qp.row_own[:-1, self._v])
-            self._set_rows(qp, problem, trial.residuals, trial.trajectory)
+            if slopes is not None and trial.values is not None:
+                own, following = (one[:, self._g_rows] for one in slopes)
+                usable = np.isfinite(own).all(axis=2) & np.isfinite(trial.values[:, self._g_rows])
+                usable[:-1] &= np.isfinite(following).all(axis=2)
+                # A row that cannot be linearised here is left out; the true problem has it.
+                self._left_out = ~usable
+                qp.row_own[:, self._g] = np.where(usable[:, :, None], own, 0.0)
+                qp.row_next[:-1, self._g] = np.where(usable[:-1, :, None], following, 0.0)
+            self._set_rows(qp, problem, trial.residuals, trial.trajectory, trial.values)
 
-    def _set_rows(self, qp: QP, problem: Problem, residuals: Array, trajectory: Array) -> None:
+    def _set_rows(
+        self, qp: QP, problem: Problem, residuals: Array, trajectory: Array, values: Array | None
+    ) -> None:
         n, constraints = self._n, problem.constraints
         for place, rows, points in (
             (self._w, constraints.disturbances, residuals[:, :n]),
@@ -202,6 +296,9 @@ class Subproblem:
         ):
             if rows is not None and place.start < place.stop:
                 _set_sides(qp, place, rows, points)
+        if constraints.constraints is not None and values is not None:
+            _set_sides(qp, self._g, constraints.constraints, values)
+            qp.row_upper[:, self._g][self._left_out] = np.inf
 
 
 def _set_sides(qp: QP, place: slice, rows: Rows, points: Array) -> None:

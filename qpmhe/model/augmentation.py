@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers.values import shown
 
-from ..errors import InvalidInputError, ShapeError
+from ..errors import InvalidInputError, SetError, ShapeError
 from .functions import BatchedFunction, Trusted
-from .sets import Box, ConvexSet
+from .sets import Box, ConvexSet, SoftSet
 from .system import System, SystemOptions
 
 Array = NDArray[Any]
@@ -89,6 +89,11 @@ class Augmentation:
 
 def augmented(system: System, change: Augmentation, **options: Unpack[SystemOptions]) -> System:
     """The augmented system, made by the adapter that made the system, with exact derivatives."""
+    if system.extensions:
+        raise InvalidInputError(
+            f"the system has {' and '.join(system.extensions)}, which an augmented model does not "
+            "take over; leave them out, or write the augmented model as functions of a System."
+        )
     if system.make_augmented is not None:
         return system.make_augmented(change, options)
     return System(
@@ -132,9 +137,14 @@ def chosen(name: str, given: ArrayLike | None, size: int, kind: str) -> Index:
 
 
 def product(
-    first: ConvexSet | None, n: int, second: ConvexSet | None, k: int
+    first: ConvexSet | SoftSet | None, n: int, second: ConvexSet | None, k: int
 ) -> ConvexSet | None:
     """All (x, s) with x (n,) in the first set and s (k,) in the second; None is everything."""
+    if isinstance(first, SoftSet):
+        raise SetError(
+            f"the set {first!r} is soft; an augmented model takes hard ones only: leave it out, or "
+            "write the augmented model as functions of a System."
+        )
     if first is None and second is None:
         return None
     if k == 0:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from copy import copy
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from qpmhe_solvers.values import shown
 
 from .._checks import numbers
 from ..errors import SetError
@@ -109,6 +112,36 @@ class ConvexSet:
             other._check_not_empty()
         return other
 
+    def soften(
+        self, *, linear: ArrayLike | None = None, quadratic: ArrayLike | None = None
+    ) -> SoftSet:
+        r"""The set as a soft one: its inequalities may be violated, at a price.
+
+        The cost J then has in addition :math:`\rho_j s_j + \sigma_j s_j^2` for each inequality j
+        that is violated by :math:`s_j`, at each sample.
+
+        Parameters
+        ----------
+        linear, quadratic : float or array_like, optional
+            The penalties :math:`\rho` and :math:`\sigma` of each inequality, in units of cost per
+            unit of the inequality and per its square; at least 0, and one of them above 0.
+            Numbers for all, or arrays: (d,) for the components of a box, (r,) for the rows of a
+            polytope, (d + r,), components first, for a set with both.
+
+        Raises
+        ------
+        SetError
+            If a penalty is not a finite number >= 0, or an inequality has none.
+        """
+        bounded = np.isfinite(self.lower) | np.isfinite(self.upper)
+        rows = self.matrix.shape[0]
+        if rows and not bounded.any():
+            made = penalties(linear, quadratic, np.ones(rows, np.bool_), "set")
+            none = np.zeros(self.dimension)
+            return SoftSet(self, np.append(none, made[0]), np.append(none, made[1]))
+        counts = np.append(bounded, np.ones(rows, np.bool_))
+        return SoftSet(self, *penalties(linear, quadratic, counts, "set"))
+
     def __and__(self, other: ConvexSet) -> ConvexSet:
         if not isinstance(other, ConvexSet):
             return NotImplemented
@@ -158,6 +191,64 @@ class ConvexSet:
         box = f"lower={self.lower.tolist()}, upper={self.upper.tolist()}"
         rows = f", {self.matrix.shape[0]} rows" if self.matrix.shape[0] else ""
         return f"{type(self).__name__}({box}{rows})"
+
+
+class SoftSet:
+    """A set whose inequalities may be violated at a price; made by `ConvexSet.soften`.
+
+    Attributes
+    ----------
+    convex : ConvexSet
+        The set without a violation.
+    linear, quadratic : (d + r,) array
+        Penalties of the d components and the r general inequalities.
+    """
+
+    __slots__ = ("convex", "linear", "quadratic")
+
+    def __init__(self, convex: ConvexSet, linear: Array, quadratic: Array) -> None:
+        self.convex, self.linear, self.quadratic = convex, linear, quadratic
+
+    @property
+    def dimension(self) -> int:
+        """Length of a point."""
+        return self.convex.dimension
+
+    def __and__(self, other: object) -> NoReturn:
+        raise SetError(
+            f"{self!r} cannot be intersected; intersect sets first and soften the result, or pass "
+            "the soft inequalities as a qpmhe.Constraint."
+        )
+
+    __rand__ = __and__
+
+    def __repr__(self) -> str:
+        return f"{self.convex!r}.soften(...)"
+
+
+def penalties(
+    linear: ArrayLike | None, quadratic: ArrayLike | None, counts: NDArray[np.bool_], what: str
+) -> tuple[Array, Array]:
+    """The checked penalties of rows, of which those that count need one."""
+    made = []
+    for name, given in (("linear", linear), ("quadratic", quadratic)):
+        value = np.zeros(()) if given is None else numbers(name, given, finite=False)
+        if value.shape not in ((), counts.shape):
+            raise SetError(
+                f"{name} has shape {value.shape}; expected a number, or {counts.size} of them: one "
+                f"for each row of the {what}."
+            )
+        if not (np.isfinite(value) & (value >= 0.0)).all():
+            raise SetError(f"{name} is {value.tolist()}; expected finite numbers >= 0.")
+        made.append(np.broadcast_to(value, counts.shape).copy())
+    free = counts & (made[0] == 0.0) & (made[1] == 0.0)
+    if free.any():
+        raise SetError(
+            f"row {int(np.argmax(free))} of the soft {what} has no penalty (linear = "
+            f"{shown(linear)}, quadratic = {shown(quadratic)}), so that it would do nothing; pass "
+            f"linear > 0 or quadratic > 0, or leave the {what} hard."
+        )
+    return made[0], made[1]
 
 
 class Box(ConvexSet):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypedDict, Unpack
 
@@ -14,11 +14,12 @@ from qpmhe_solvers.values import shown
 
 from .._checks import SINGULAR, dimension, numbers, positive, vector
 from ..errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
+from .constraints import Constraint, ConstraintFunctions, checked_constraints
 from .derivatives import Jacobian
 from .discretize import discretize
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .residuals import Residual, Turns, checked_residual
-from .sets import ConvexSet, equilibrated
+from .sets import ConvexSet, SoftSet, equilibrated
 
 if TYPE_CHECKING:
     from .augmentation import Augmentation
@@ -43,13 +44,19 @@ class ModelKernel(Protocol):
 class SystemOptions(TypedDict, total=False):
     """The options of `System` that every function that makes a system hands on to it."""
 
-    states: ConvexSet | None
-    disturbances: ConvexSet | None
-    noises: ConvexSet | None
+    states: ConvexSet | SoftSet | None
+    disturbances: ConvexSet | SoftSet | None
+    noises: ConvexSet | SoftSet | None
     scales: ArrayLike | None
     output_residual: Residual | Function | None
     state_residual: Residual | Function | None
     disturbance_matrix: ArrayLike | None
+    constraints: Sequence[Constraint] | None
+
+
+def timed_options(options: SystemOptions) -> SystemOptions:
+    """The options of a timed system: its constraints are those of the usual one."""
+    return {**options, "constraints": None}
 
 
 class _Moved:
@@ -93,7 +100,8 @@ class System:
         they are computed: by the complex step where the function allows it, else by
         differences, central ones or, at a bound of X, inward ones; see ``derivatives``.
     states, disturbances, noises : Box or Polytope, optional
-        The sets X, W and V; the whole space if left out.
+        The sets X, W and V; the whole space if left out. Soft ones are made by
+        `ConvexSet.soften`; the observer is not projected onto a soft X.
     scales : (n,) array_like, optional
         Typical magnitudes of the states, above zero, in their units: difference steps are
         shares of them, and a given Jacobian is compared with differences where they are known.
@@ -115,6 +123,8 @@ class System:
         Dimension of the disturbances.
     disturbance_matrix : (n, r) array or None
         G; None for the identity.
+    constraints : list of Constraint, optional
+        Nonlinear inequalities g(x, u, w, v) <= 0 at every sample, hard or soft.
 
     Raises
     ------
@@ -125,7 +135,8 @@ class System:
     InvalidInputError
         If a component that does not exist is declared an angle.
     SetError
-        If a set has the wrong dimension, or X an angle in a general row or with one bound only.
+        If a set has the wrong dimension, X an angle in a general row or with one bound only, or
+        ``constraints`` is no list of constraints.
     OptionError, ShapeError
         If a scale is not above zero, or there is not one for each state; if G has the wrong shape.
 
@@ -148,13 +159,14 @@ class System:
         m: int = 0,
         f_jacobian: Function | Trusted | None = None,
         h_jacobian: Function | Trusted | None = None,
-        states: ConvexSet | None = None,
-        disturbances: ConvexSet | None = None,
-        noises: ConvexSet | None = None,
+        states: ConvexSet | SoftSet | None = None,
+        disturbances: ConvexSet | SoftSet | None = None,
+        noises: ConvexSet | SoftSet | None = None,
         scales: ArrayLike | None = None,
         output_residual: Residual | Function | None = None,
         state_residual: Residual | Function | None = None,
         disturbance_matrix: ArrayLike | None = None,
+        constraints: Sequence[Constraint] | None = None,
     ) -> None:
         self.n, self.p, self.m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m, 0)
         self.disturbance_matrix = _checked_matrix(disturbance_matrix, self.n)
@@ -165,6 +177,11 @@ class System:
         self.states = checked_set("states", states, self.n)
         self.disturbances = checked_set("disturbances", disturbances, self.r)
         self.noises = checked_set("noises", noises, self.p)
+        given = {"states": states, "disturbances": disturbances, "noises": noises}
+        #: Those of X, W and V that are soft, by name; `states` and the others are None then.
+        self.soft: dict[str, SoftSet] = {
+            name: one for name, one in given.items() if isinstance(one, SoftSet)
+        }
         #: How outputs and states are subtracted; None for plain differences.
         self.output_residual = checked_residual("output_residual", output_residual, self.p)
         self.state_residual = checked_residual("state_residual", state_residual, self.n)
@@ -173,6 +190,7 @@ class System:
         if self.states is not None and self.state_residual is not None:
             turns = Turns(self.state_residual, self.states)
             self.states, self.turns = turns.states, turns or None
+        self._check_soft_angles()
         probes = probe_points(self.states, self.n, self.m)
         self.f = BatchedFunction("f", f, (self.n,), self.m, probes)
         self.h = BatchedFunction("h", h, (self.p,), self.m, probes)
@@ -183,6 +201,14 @@ class System:
         self.h_jacobian = Jacobian(
             self.h, h_jacobian, self.m, probes, self.states, self.output_residual
         )
+        listed = checked_constraints(constraints)
+        #: The nonlinear constraints; None without any.
+        self.constraints: ConstraintFunctions | None = None
+        if listed:
+            self.constraints = ConstraintFunctions(
+                listed, {"x": self.n, "u": self.m, "w": self.r, "v": self.p},
+                {"x": self.states, "w": self.disturbances, "v": self.noises}, probe_points,
+            )
         #: The Jacobian of the rate of a discretised ODE, where the user gave it.
         self.rate_jacobian: Jacobian | None = None
         if scales is not None:
@@ -208,6 +234,7 @@ class System:
                 "states": states, "disturbances": disturbances, "noises": noises,
                 "scales": scales, "disturbance_matrix": disturbance_matrix,
                 "output_residual": output_residual, "state_residual": state_residual,
+                "constraints": constraints,
             },
         )
 
@@ -299,7 +326,7 @@ class System:
                 n=n, p=p, m=m + 1,
                 f_jacobian=step_jacobian and Trusted(_timed_by_input(step_jacobian, m)),
                 h_jacobian=h_jacobian and Trusted(_without_last(system.h_jacobian.batch, m)),
-                **options,
+                **timed_options(options),
             )
 
         def augmented(change: Augmentation, options: SystemOptions) -> System:
@@ -351,6 +378,8 @@ class System:
         other.f, other.h = self.f.copy(), self.h.copy()
         other.f_jacobian = self.f_jacobian.copy(other.f)
         other.h_jacobian = self.h_jacobian.copy(other.h)
+        if self.constraints is not None:
+            other.constraints = self.constraints.copy()
         if self.rate_jacobian is not None:
             other.rate_jacobian = self.rate_jacobian.copy(self.rate_jacobian.function)
         other.__dict__.pop("timed", None)
@@ -438,6 +467,26 @@ class System:
             system.f_jacobian.use(methods[2 * k])
             system.h_jacobian.use(methods[2 * k + 1])
 
+    def _check_soft_angles(self) -> None:
+        soft, residual = self.soft.get("states"), self.state_residual
+        if soft is None or residual is None:
+            return
+        angles = np.zeros(self.n, np.bool_)
+        angles[residual.components] = True
+        bounded = np.isin(soft.convex.bounded_components, residual.components)
+        if bounded.any() or soft.convex.touched(angles).any():
+            raise SetError(
+                f"the soft set of states, {soft.convex!r}, bounds an angle (components "
+                f"{residual.components.tolist()}), which is known up to whole turns; leave it out, "
+                "or write a qpmhe.Constraint of its sine and cosine."
+            )
+
+    @property
+    def extensions(self) -> tuple[str, ...]:
+        """What it has beyond hard convex sets: soft sets and nonlinear constraints, in words."""
+        found = [f"a soft set of {name}" for name in self.soft]
+        return (*found, "nonlinear constraints") if self.constraints else tuple(found)
+
     @property
     def derivatives(self) -> dict[str, str]:
         """How the Jacobians of f and h are computed."""
@@ -459,7 +508,8 @@ class System:
             If one is not.
         """
         rate = () if self.rate_jacobian is None else (self.rate_jacobian,)
-        for function in (self.f, self.h, *rate, self.f_jacobian, self.h_jacobian):
+        own = () if self.constraints is None else (self.constraints,)
+        for function in (self.f, self.h, *rate, self.f_jacobian, self.h_jacobian, *own):
             try:
                 function.check(x, u)
             except ModelError:
@@ -477,18 +527,21 @@ def _made(maker: Function, arguments: dict[str, Any]) -> Any:
 
 
 def checked_set(
-    name: str, value: ConvexSet | None, dimension: int, meaning: str = ""
+    name: str, value: ConvexSet | SoftSet | None, dimension: int, meaning: str = ""
 ) -> ConvexSet | None:
-    """The set, or None, after a check of its type and dimension, which may have a meaning."""
+    """The set if it is a hard one, else None, after a check of its type and dimension.
+
+    The dimension may have a meaning.
+    """
     if value is None:
         return None
-    if not isinstance(value, ConvexSet):
+    if not isinstance(value, (ConvexSet, SoftSet)):
         raise SetError(
             f"{name} is {shown(value)}; expected a qpmhe.Box, a qpmhe.Polytope or None."
         )
     if value.dimension != dimension:
         raise SetError(f"{name} has dimension {value.dimension}; expected {dimension}{meaning}.")
-    return value
+    return value if isinstance(value, ConvexSet) else None
 
 
 def checked_system(value: Any) -> System:

@@ -43,6 +43,11 @@ class IpoptEstimator:
                 "the comparison with Ipopt takes no disturbance_matrix and no singular covariance "
                 "of the disturbance; give each state a disturbance of its own."
             )
+        if system.extensions:
+            raise InvalidInputError(
+                f"the comparison with Ipopt does not have {' and '.join(system.extensions)}; leave "
+                "them out."
+            )
         self._system, self._cost, self._f, self._h = system, cost, f, h
         self._prior = cost.prior
         self._window = Window(system, observer, cost, horizon, initial_state, False, True)

@@ -1,0 +1,397 @@
+"""Soft sets and soft constraints: their penalty in J, and QPs with slack variables."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qpmhe_solvers import QP, Solution, SolveStatus
+
+from .._linalg import inverse, solve
+from ..costs import Cost
+from ..model.system import System
+from .constraints import Rows, function_rows
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# As in the banded solver: a root is exact for powers of four alone.
+_COST_UNITS = 0.5, 1.0
+
+# Most Newton steps on the optimality conditions: each may change which rows are active.
+_NEWTON_STEPS = 10
+
+# Curvature that a slack has at least, as a share of its linear penalty per scale of its row. It
+# holds the slack near its present value, so that it vanishes where the sequence converges.
+_CURVATURE = 1e-2
+
+
+class _Part(NamedTuple):
+    """The soft rows of one set: of ``states``, ``disturbances``, ``noises`` or ``constraints``."""
+
+    rows: Rows
+    place: slice  # among all soft rows
+    penalties: tuple[Array, Array]
+
+
+class Penalties:
+    """All soft rows of an estimator: of X, W, V and of the nonlinear constraints.
+
+    At each of the K + 1 states of a window there are R rows; those on w, v and on whole samples
+    do not count at the newest state.
+    """
+
+    def __init__(self, system: System, cost: Cost, prior_covariance: Array) -> None:
+        self.parts: list[_Part] = []
+        self.size, self._n = 0, system.n
+        for name, covariance in (
+            ("states", prior_covariance), ("disturbances", inverse(cost.disturbance)),
+            ("noises", inverse(cost.noise)),
+        ):
+            soft = system.soft.get(name)
+            if soft is None:
+                continue
+            through = cost.space.to_disturbances if cost.space and name == "disturbances" else None
+            if through is not None:
+                covariance = through @ covariance @ through.T
+            rows = Rows(name, soft.convex, covariance)
+            linear, quadratic = soft.linear[rows.numbers], soft.quadratic[rows.numbers]
+            if through is not None:
+                none = np.zeros((system.n, 0))
+                rows = rows.mapped(through, none, np.zeros(len(rows.matrix), np.bool_))
+            self._add(rows, linear, quadratic)
+        functions = self.functions = system.constraints
+        if functions is not None and functions.soft.any():
+            rows = function_rows(functions.soft, functions.scale)
+            self._add(rows, functions.linear[rows.numbers], functions.quadratic[rows.numbers])
+        self._windows: dict[int, WindowPenalties] = {}
+
+    def _add(self, rows: Rows, linear: Array, quadratic: Array) -> None:
+        place = slice(self.size, self.size + len(rows.matrix))
+        self.parts.append(_Part(rows, place, (linear, quadratic)))
+        self.size = place.stop
+
+    def __bool__(self) -> bool:
+        return self.size > 0
+
+    def of_window(
+        self, count: int, observed: Mask | None, discounts: Array | None
+    ) -> WindowPenalties:
+        """The penalties of a window of ``count`` stages; rows on missing outputs do not count."""
+        if observed is None and count in self._windows:
+            return self._windows[count]
+        lower, upper = np.full((2, count + 1, self.size), np.inf)
+        np.negative(lower, out=lower)
+        linear, quadratic = np.zeros((2, count + 1, self.size))
+        for rows, place, penalties in self.parts:
+            counts = np.ones((count + 1, len(rows.matrix)), np.bool_)
+            if rows.name == "constraints" and self.functions is not None:
+                counts = self.functions.counting(count, observed)[:, rows.components]
+            elif rows.name != "states":
+                counts[-1] = False
+                if rows.name == "noises" and observed is not None:
+                    counts[:-1] = ~rows.touching(~observed)
+            lower[:, place] = np.where(counts, rows.lower, -np.inf)
+            upper[:, place] = np.where(counts, rows.upper, np.inf)
+            linear[:, place], quadratic[:, place] = penalties
+        if discounts is not None:
+            factors = np.append(discounts[1:], 1.0)[:, None]
+            linear, quadratic = factors * linear, factors * quadratic
+        made = WindowPenalties(lower, upper, linear, quadratic)
+        if observed is None:
+            self._windows[count] = made
+        return made
+
+    def values(self, trajectory: Array, residuals: Array, functions: Array | None) -> Array:
+        """The rows' values along a trajectory, (K + 1, R); 0 where they do not count."""
+        values, n = np.zeros((len(trajectory), self.size)), self._n
+        for rows, place, _ in self.parts:
+            if rows.name == "states":
+                values[:, place] = rows.values(trajectory)
+            elif rows.name == "disturbances":
+                values[:-1, place] = rows.values(residuals[:, :n])
+            elif rows.name == "noises":
+                values[:-1, place] = rows.values(residuals[:, n:])
+            elif functions is not None:
+                values[:, place] = rows.values(functions)
+        return values
+
+    def linearised(
+        self, minus_jacobian: Array, functions: tuple[Array, Array] | None
+    ) -> tuple[Array, Array]:
+        """Derivatives of the rows with respect to each state and the next, both (K + 1, R, n)."""
+        count, n = len(minus_jacobian), self._n
+        own, following = np.zeros((2, count + 1, self.size, n))
+        for rows, place, _ in self.parts:
+            if rows.name == "states":
+                own[:, place] = rows.matrix
+            elif rows.name == "disturbances":
+                own[:-1, place] = rows.matrix @ minus_jacobian[:, :n]
+                following[:-1, place] = rows.matrix
+            elif rows.name == "noises":
+                own[:-1, place] = rows.matrix @ minus_jacobian[:, n:]
+            elif functions is not None:
+                own[:, place] = functions[0][:, rows.components]
+                following[:-1, place] = functions[1][:, rows.components]
+        return own, following
+
+    @property
+    def scale(self) -> Array:
+        """The unit (R,) of each row."""
+        return np.concatenate([part.rows.scale for part in self.parts])
+
+
+class WindowPenalties(NamedTuple):
+    """The soft rows of one window: sides and penalties (K + 1, R), discount included."""
+
+    lower: Array
+    upper: Array
+    linear: Array
+    quadratic: Array
+
+    def misses(self, values: Array) -> Array:
+        """By how much values (K + 1, R) of the rows miss their sides."""
+        return np.asarray(np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0))
+
+    def cost(self, misses: Array) -> float:
+        """The penalty of these misses; infinity where one is not finite."""
+        cost = float((misses * (self.linear + self.quadratic * misses)).sum())
+        return math.inf if math.isnan(cost) else cost
+
+
+class Softened:
+    """QPs with a slack variable for each soft row, made from QPs without these rows.
+
+    The unknowns of stage k are d_k and the misses s_k >= 0 of the R rows; each soft row gives two
+    rows, one for each side: ``lower <= row + s`` and ``row - s <= upper``.
+    """
+
+    def __init__(self, penalties: Penalties, n: int) -> None:
+        from scipy.linalg.lapack import dpbsv  # late: most estimators have nothing soft
+
+        self._dpbsv = dpbsv
+        self._n, self._penalties = n, penalties
+        self._least = _CURVATURE / penalties.scale
+        self._qp: QP | None = None
+        #: Values of the rows at d = 0, (K + 1, R), and their derivatives, as in `Penalties`.
+        self.values: Array
+        self._own: Array
+        self._following: Array
+        self._window: WindowPenalties
+
+    def around(
+        self, window: WindowPenalties, values: Array, derivatives: tuple[Array, Array]
+    ) -> None:
+        """Take the soft rows around a trajectory."""
+        self._window, self.values = window, values
+        self._own, self._following = derivatives
+
+    def at(self, step: Array) -> Array:
+        """The linearised rows (K + 1, R) at a step (K + 1, n)."""
+        value: Array = self.values + np.matmul(self._own, step[:, :, None])[:, :, 0]
+        value[:-1] += np.matmul(self._following[:-1], step[1:, :, None])[:, :, 0]
+        return value
+
+    def misses(self, step: Array) -> Array:
+        """The misses of the linearised rows; rows that cannot be linearised have none."""
+        return np.nan_to_num(self._window.misses(self.at(step)), nan=0.0, posinf=0.0)
+
+    def penalty(self, step: Array) -> float:
+        """The penalty of the linearised rows at a step."""
+        return self._window.cost(self.misses(step))
+
+    def bend(self, values: Array, step: Array, curvature: Array) -> None:
+        """Shift the rows by what their linearisation misses at a step that leads to these values.
+
+        ``curvature`` (K, n + p) is what it misses of the residuals, less whole turns of angles.
+        """
+        shift, n = values - self.at(step), self._n
+        for rows, place, _ in self._penalties.parts:
+            if rows.name in ("disturbances", "noises"):
+                part = curvature[:, :n] if rows.name == "disturbances" else curvature[:, n:]
+                shift[:-1, place] = rows.values(part)
+        self.values = self.values + shift
+
+    def lifted(self, base: QP) -> QP:
+        """The QP with slack variables, its objective half of J as the base's is."""
+        n, rows, size, window = self._n, base.rows, self._penalties.size, self._window
+        qp = self._qp
+        if qp is None or qp.stages != base.stages or qp.rows != rows + 2 * size:
+            qp = self._qp = self._new(base)
+        panel = np.append(base.band.reshape(base.stages, -1), np.zeros((base.stages, 1)), axis=1)
+        panel.take(self._index, axis=1, out=qp.band, mode="clip")
+        half = 0.5 * window.linear
+        curvature = np.maximum(window.quadratic, half * self._least)
+        qp.band[:, n:, 0] = curvature
+        present = np.nan_to_num(window.misses(self.values), nan=0.0, posinf=0.0)
+        usable = np.isfinite(self.values) & np.isfinite(self._own).all(axis=2) & (
+            np.isfinite(self._following).all(axis=2)
+        )
+        own = np.where(usable[:, :, None], self._own, 0.0)
+        following = np.where(usable[:, :, None], self._following, 0.0)
+        values = np.where(usable, self.values, 0.0)
+        qp.gradient[:, :n] = base.gradient
+        # What the curvature exceeds the quadratic penalty by acts on the slack's change alone.
+        needed = usable & (np.isfinite(window.lower) | np.isfinite(window.upper))
+        qp.gradient[:, n:] = np.where(needed, half - (curvature - window.quadratic) * present, 0.0)
+        if base.bounded:
+            qp.lower[:, :n], qp.upper[:, :n] = base.lower, base.upper
+        else:
+            qp.lower[:, :n], qp.upper[:, :n] = -np.inf, np.inf
+        qp.row_own[:, :rows, :n], qp.row_next[:, :rows, :n] = base.row_own, base.row_next
+        qp.row_lower[:, :rows], qp.row_upper[:, :rows] = base.row_lower, base.row_upper
+        for first in (rows, rows + size):
+            place = slice(first, first + size)
+            qp.row_own[:, place, :n], qp.row_next[:, place, :n] = own, following
+        qp.row_lower[:, rows : rows + size] = np.where(needed, window.lower - values, -np.inf)
+        qp.row_upper[:, rows + size :] = np.where(needed, window.upper - values, np.inf)
+        return qp
+
+    def _new(self, base: QP) -> QP:
+        n, rows, size = self._n, base.rows, self._penalties.size
+        wide = n + size
+        qp = QP(base.stages, wide, rows + 2 * size)
+        qp.lower[:, n:] = 0.0
+        slacks = np.arange(size)
+        qp.row_own[:, rows + slacks, n + slacks] = 1.0
+        qp.row_own[:, rows + size + slacks, n + slacks] = -1.0
+        # Entry [c, o] of a panel is H[c + o, c]: the next stage's rows are `size` further on.
+        zero = 2 * n * n
+        index = np.full((wide, 2 * wide), zero)
+        for c in range(n):
+            index[c, : n - c] = c * 2 * n + np.arange(n - c)
+            index[c, wide - c : wide - c + n] = c * 2 * n + n - c + np.arange(n)
+        self._index = index
+        return qp
+
+    def forces(self, base: QP, solution: Solution) -> Array | None:
+        """Multipliers (K + 1, T) of soft nonlinear constraints in a solution of the lifted QP."""
+        functions, duals = self._penalties.functions, solution.row_duals
+        if functions is None or duals is None:
+            return None
+        forces = np.zeros((base.stages, functions.size))
+        upper = duals.reshape(base.stages, -1)[:, base.rows + self._penalties.size :]
+        for rows, place, _ in self._penalties.parts:
+            if rows.name == "constraints":
+                forces[:, rows.components] = np.maximum(upper[:, place], 0.0)
+        return forces
+
+    def lowered(self, base: QP, solution: Solution) -> Solution:
+        """A solution of the lifted QP without its slack variables; exact where that succeeds."""
+        status = solution.status
+        d = None if solution.d is None else solution.d[:, : self._n].copy()
+        if d is not None and status in (SolveStatus.SOLVED, SolveStatus.INACCURATE):
+            exact = self._exact(base, d, solution)
+            if exact is not None:
+                d, status = exact, SolveStatus.SOLVED
+        return Solution(d, status, solution.iterations, message=solution.message)
+
+    def _exact(self, base: QP, d: Array, solution: Solution) -> Array | None:
+        """The minimiser on the rows that a solution says are active; None if they are not.
+
+        What a solver misses a soft row by costs its linear penalty times as much, which may be
+        more than J itself. So its solution only says which rows are active, or violated; a few
+        Newton steps on the optimality conditions then give the exact one.
+        """
+        if solution.bound_duals is None or solution.row_duals is None:
+            return None
+        rows, sides, most, curvature, forces = self._sides(
+            base, solution.bound_duals.reshape(base.stages, -1),
+            solution.row_duals.reshape(base.stages, -1),
+        )
+        # A power of two, so that the root in a Cholesky factor is exact for units that are, too.
+        unit = _COST_UNITS[math.frexp(base.band.item(0))[1] % 2]
+        right = unit * np.vstack((base.gradient.reshape(1, -1), rows)).T
+        _, found, info = self._dpbsv(unit * base.lapack_band, right, lower=1)
+        if info != 0 or not np.isfinite(found).all():
+            return None
+        free, moved = -found[:, 0], found[:, 1:]
+        reach = np.einsum("ij,ji->i", rows, moved)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            stiff, soft = 1.0 / reach, np.where(curvature > 0.0, 1.0 / curvature, 0.0)
+        step: Array = d.ravel()
+        test = forces + stiff * (rows @ step - sides)
+        before: tuple[Mask, Mask] | None = None
+        for _ in range(_NEWTON_STEPS):
+            active, violated = test > 0.0, test > most
+            if before is not None and all(map(np.array_equal, before, (active, violated))):
+                return np.reshape(step, d.shape)
+            before = active, violated
+            pushed = violated & (curvature == 0.0)
+            solved = active & ~pushed
+            bent = np.where(violated, soft, 0.0)[solved]
+            step = free - moved[:, pushed] @ most[pushed]
+            forces = np.where(pushed, most, 0.0)
+            if solved.any():
+                gap = rows[solved] @ step - sides[solved]
+                gap += np.where(violated, most * soft, 0.0)[solved]
+                try:
+                    forces[solved] = solve(
+                        rows[solved] @ moved[:, solved] + np.diag(bent), gap[:, None]
+                    )[:, 0]
+                except np.linalg.LinAlgError:  # active rows that depend on each other
+                    return None
+                step = step - moved[:, solved] @ forces[solved]
+            if not (np.isfinite(step).all() and np.isfinite(forces).all()):
+                return None
+            test = forces + np.where(active, 0.0, stiff) * (rows @ step - sides)
+            test[pushed] += (stiff * (rows @ step - sides))[pushed]
+        return None
+
+    def _sides(
+        self, base: QP, bound_duals: Array, row_duals: Array
+    ) -> tuple[Array, Array, Array, Array, Array]:
+        """All inequalities as ``rows d <= sides``, where some side is finite.
+
+        With, for each, the largest force of an active row that is not violated, the curvature of
+        the penalty beyond, and the force that a solver found.
+        """
+        n, count, window, size = self._n, base.rows, self._window, self._penalties.size
+        usable = np.isfinite(self._own).all(axis=2) & np.isfinite(self._following).all(axis=2)
+        usable &= np.isfinite(self.values)
+        soft = (
+            np.where(usable[:, :, None], self._own, 0.0),
+            np.where(usable[:, :, None], self._following, 0.0),
+            np.where(usable, window.lower - self.values, -np.inf),
+            np.where(usable, window.upper - self.values, np.inf),
+            0.5 * window.linear, window.quadratic,
+            row_duals[:, count : count + size], row_duals[:, count + size :],
+        )
+        hard, none = np.full((base.stages, count), np.inf), np.zeros((base.stages, count))
+        parts = [soft]
+        if count:
+            duals = row_duals[:, :count]
+            parts.append((
+                base.row_own, base.row_next, base.row_lower, base.row_upper, hard, none, duals,
+                duals,
+            ))
+        if base.bounded:
+            eye = np.broadcast_to(np.eye(n), (base.stages, n, n))
+            wide = np.full((base.stages, n), np.inf)
+            parts.append((
+                eye, np.zeros(eye.shape), base.lower, base.upper, wide, np.zeros(wide.shape),
+                bound_duals[:, :n], bound_duals[:, :n],
+            ))
+        collected: list[list[Array]] = [[] for _ in range(5)]
+        for own, following, lower, upper, most, curvature, below, above in parts:
+            matrix = _dense(own, following)
+            for sign, side, duals in ((1.0, upper, above), (-1.0, -lower, -below)):
+                chosen = np.isfinite(side).ravel()
+                given = sign * matrix, side, most, curvature, np.maximum(duals, 0.0)
+                for into, one in zip(collected, given, strict=True):
+                    into.append(one.reshape(chosen.size, -1)[chosen])
+        rows, *others = (np.concatenate(one) for one in collected)
+        sides, most, curvature, forces = (one.ravel() for one in others)
+        return rows, sides, most, curvature, forces
+
+
+def _dense(own: Array, following: Array) -> Array:
+    """Rows on each state and the next, ((K + 1) R, (K + 1) n)."""
+    stages, rows, n = own.shape
+    matrix, k = np.zeros((stages, rows, stages, n)), np.arange(stages)
+    matrix[k, :, k] = own
+    matrix[k[:-1], :, k[1:]] = following[:-1]
+    return matrix.reshape(stages * rows, stages * n)

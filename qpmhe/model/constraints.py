@@ -1,0 +1,524 @@
+"""Nonlinear constraints g(x, u, w, v) <= 0, evaluated and differentiated along a trajectory."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from copy import copy
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qpmhe_solvers.errors import report_unknown_options
+from qpmhe_solvers.values import integer, shown
+
+from ..errors import ModelError, SetError, ShapeError
+from .derivatives import Jacobian
+from .functions import BatchedFunction, Probes, raised
+from .sets import Box, ConvexSet, penalties
+from .tracing import trace
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_NAMES = ("x", "u", "w", "v")
+# Multiples of the standard deviations within which the scale of a row is looked for.
+_REACHES = (1.0, 10.0, 100.0, 1000.0)
+# Step of second derivatives, as a share of the standard deviations.
+_MOVE = 2.0**-12
+# Points at which constraints are compared with another system's.
+_POINTS = 5
+# Labels of a trace are the bits of 64-bit integers.
+_MOST_LABELS = 62
+
+
+@report_unknown_options
+class Constraint:
+    r"""Nonlinear inequalities :math:`g(x, u, w, v) \le 0` at every sample, hard or soft.
+
+    Without penalties they are hard: the estimator treats them as it does the sets W and V.
+    With penalties the cost J has in addition, for each row j of g and each sample,
+
+    .. math::
+        \rho_j s + \sigma_j s^2, \qquad s = \max(0, g_j(x, u, w, v))
+
+    discounted as the cost of the sample's stage is.
+
+    Parameters
+    ----------
+    g : callable
+        A function of any of x (n,), u (m,), w (r,) and v (p,), named so, that returns ``size``
+        numbers, or a number if ``size`` is 1. One of x alone holds for the newest state x(t+1),
+        too; any other one for the samples of the window.
+    size : int
+        Number of rows.
+    linear, quadratic : float or (size,) array_like, optional
+        The penalties :math:`\rho`, in units of cost per unit of the row, and :math:`\sigma`, per
+        its square; at least 0, and one of them above 0 for each row.
+
+    Raises
+    ------
+    ModelError
+        If g is no function, or has other parameters.
+    ShapeError
+        If the size is no positive integer.
+    SetError
+        If a penalty is not a finite number >= 0, or a row of a soft constraint has none.
+
+    Examples
+    --------
+    >>> import qpmhe
+    >>> inside_circle = qpmhe.Constraint(lambda x: x[0] ** 2 + x[1] ** 2 - 4.0)
+    >>> preferred = qpmhe.Constraint(lambda x, u: x[0] - u[0], linear=10.0)
+    """
+
+    def __init__(
+        self, g: Callable[..., Any], size: int = 1, *, linear: ArrayLike | None = None,
+        quadratic: ArrayLike | None = None,
+    ) -> None:
+        if not callable(g):
+            raise ModelError(
+                f"g is {shown(g)}; expected a function of x, u, w or v that is to be <= 0."
+            )
+        rows = integer(size)
+        if rows is None or rows < 1:
+            raise ShapeError(f"size is {shown(size)}; expected an integer >= 1, the rows of g.")
+        self.g, self.size, self.names = g, rows, _parameters(g)
+        #: Penalties of each row, two arrays (size,); None for a hard constraint.
+        self.penalty: tuple[Array, Array] | None = None
+        if linear is not None or quadratic is not None:
+            self.penalty = penalties(linear, quadratic, np.ones(rows, np.bool_), "constraint")
+
+    def __repr__(self) -> str:
+        kind = "hard" if self.penalty is None else "soft"
+        return f"Constraint(g({', '.join(self.names)}), size={self.size}, {kind})"
+
+
+def _parameters(g: Callable[..., Any]) -> tuple[str, ...]:
+    """The names among x, u, w and v that g takes."""
+    remedy = "write it with parameters named x, u, w and v, such as lambda x, v: ..."
+    try:
+        parameters = inspect.signature(g).parameters.values()
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"the parameters of g, {shown(g)}, have no names; {remedy}") from error
+    for one in parameters:
+        by_name = one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)
+        known = by_name and (one.name in _NAMES or one.default is not one.empty)
+        if not known:
+            raise ModelError(
+                f"g has the parameter {one}; expected only x, u, w and v, which can be passed by "
+                f"name: {remedy} Bind others with functools.partial or a default value."
+            )
+    names = tuple(one.name for one in parameters if one.name in _NAMES)
+    if not set(names) - {"u"}:
+        raise ModelError(
+            f"g takes {' and '.join(names) or 'no argument'}, so that no estimate can change it; "
+            f"{remedy}"
+        )
+    return names
+
+
+class _Bound:
+    """A constraint of a system, as a function of the joint argument s of x, w and v.
+
+    Attributes
+    ----------
+    function, jacobian : BatchedFunction, Jacobian
+        g(s) or g(s, u), (size,), and its derivative with respect to s.
+    parts : dict
+        The slice of s for each of x, w and v that g takes.
+    on_state : bool
+        Whether g is a function of x alone.
+    """
+
+    def __init__(
+        self, index: int, constraint: Constraint, sizes: dict[str, int],
+        bounds: dict[str, ConvexSet | None], probes_of: Callable[..., Probes],
+    ) -> None:
+        self.size, self._names, self._written = constraint.size, constraint.names, constraint.g
+        name, m = f"constraints[{index}]", sizes["u"]
+        if "u" in self._names and not m:
+            raise ModelError(
+                f"{name} takes u, but the system has no inputs; leave u out, or pass m."
+            )
+        self.on_state = self._names == ("x",)
+        self.parts: dict[str, slice] = {}
+        self._d = 0
+        lower, upper = [], []
+        for part in ("x", "w", "v"):
+            if part in self._names:
+                self.parts[part] = slice(self._d, self._d + sizes[part])
+                self._d += sizes[part]
+                one, free = bounds[part], np.full(sizes[part], np.inf)
+                lower.append(-free if one is None else one.lower)
+                upper.append(free if one is None else one.upper)
+        self._box = Box(np.concatenate(lower), np.concatenate(upper))
+        self._inputs, self._probes_of = m, probes_of
+        self._takes_input = "u" in self._names
+        self._found: BatchedFunction | None = None
+        probes = probes_of(self._box, self._d, m)
+        try:
+            self.function = BatchedFunction(
+                name, self._with_input if self._takes_input else self._without_input,
+                (self.size,), m, probes,
+            )
+        except ModelError as error:
+            raise ModelError(f"{error} A constraint's size is the number of its rows.") from error
+        self._found = self.function
+        self.jacobian = Jacobian(self.function, None, m, probes, self._box)
+
+    def _without_input(self, s: Array) -> Any:
+        return self._written(**self._split(s))
+
+    def _with_input(self, s: Array, u: Array) -> Any:
+        return self._written(**self._split(s), u=u)
+
+    def _split(self, s: Array) -> dict[str, Array]:
+        if len(self.parts) == 1:
+            return dict.fromkeys(self.parts, s)
+        if s.ndim == 2 and self._by_columns(s):
+            return {name: s[part] for name, part in self.parts.items()}
+        return {name: s[..., part] for name, part in self.parts.items()}
+
+    def _by_columns(self, s: Array) -> bool:
+        """Whether the points are the columns of s; shapes do not say so where it is square."""
+        if self._found is None:
+            return bool(s.shape[-1] != self._d)
+        return self._found.mode == "columns"
+
+    def copy(self) -> _Bound:
+        """The same, whose functions may come to be called in other ways."""
+        other = copy(self)
+        other.function = self.function.copy()
+        other.jacobian = self.jacobian.copy(other.function)
+        return other
+
+    def joined(self, values: dict[str, Array]) -> Array:
+        """s, of values of x, w and v along the same stages."""
+        if len(self.parts) == 1:
+            return values[next(iter(self.parts))]
+        return np.concatenate([values[name] for name in self.parts], axis=-1)
+
+    def use_scales(self, deviations: Array) -> None:
+        """Take the typical magnitudes of s."""
+        self._deviations = deviations
+        probes = self._probes_of(self._box, self._d, self._inputs, deviations)
+        self.function.try_again(probes)
+        self.jacobian.use_scales(deviations, None, probes)
+
+    def scale(self, start: Array, deviations: Array, u: Array) -> Array:
+        """The largest change (size,) of each row within a standard deviation around a start."""
+        moves = np.vstack((np.eye(self._d), -np.eye(self._d), np.ones(self._d), -np.ones(self._d)))
+        for inputs in (u, np.full_like(u, 0.5)):
+            for reach in _REACHES:
+                points = np.vstack((start, start + reach * deviations * moves))
+                values = self.values(points, np.tile(inputs, (len(points), 1)))
+                change = np.abs(values[1:] - values[0])
+                change = np.where(np.isfinite(change), change, 0.0).max(axis=0) / reach
+                if (change > 0.0).all():
+                    return np.asarray(change)
+        size = np.abs(values[0])
+        # A constant row holds everywhere or nowhere: any scale will do.
+        other = np.where(np.isfinite(size) & (size > 0.0), size, 1.0)
+        return np.where(change > 0.0, change, other)
+
+    def values(self, s: Array, u: Array) -> Array:
+        """Values along points s (K, d), (K, size); infinity where it raises or is not finite."""
+        try:
+            found = np.array(self.function.batch(s, u), np.float64)
+            if found.shape != (len(s), self.size):
+                raise ValueError(found.shape)
+        except Exception:  # outside of its domain at some point
+            found = _one_by_one(self.function, (self.size,), s, u)
+        return np.where(np.isfinite(found), found, np.inf)
+
+    def derivatives(self, s: Array, u: Array) -> Array:
+        """The derivative along points s (K, d), (K, size, d); NaN where it raises."""
+        shape = (self.size, self._d)
+        try:
+            found = np.array(self.jacobian.batch(s, u), np.float64)
+            if found.shape != (len(s), *shape):
+                raise ValueError(found.shape)
+        except Exception:
+            found = _one_by_one(self.jacobian, shape, s, u)
+        return found
+
+    def curvature(self, s: Array, u: Array, forces: Array) -> Array:
+        """The convex part of the second derivative of ``forces g`` (K, d, d) along points s."""
+        pushed, d = forces.any(axis=1), self._d
+        curvature = np.zeros((len(s), d, d))
+        if not pushed.any():
+            return curvature
+        moves = np.diag(_MOVE * self._deviations)
+        points = s[pushed][:, None] + np.concatenate((moves, -moves))
+        inputs = np.repeat(u[pushed], 2 * d, axis=0)
+        slopes = self.derivatives(points.reshape(-1, d), inputs).reshape(-1, 2, d, self.size, d)
+        change = np.einsum("kj,kejd->ked", forces[pushed], slopes[:, 0] - slopes[:, 1])
+        # In units of the deviations, so that what is convex does not depend on units.
+        change *= self._deviations / (2.0 * _MOVE)
+        change = 0.5 * (change + change.transpose(0, 2, 1))
+        change[~np.isfinite(change).all(axis=(1, 2))] = 0.0
+        values, vectors = np.linalg.eigh(change)
+        convex = (vectors * np.maximum(values, 0.0)[:, None]) @ vectors.transpose(0, 2, 1)
+        curvature[pushed] = convex / np.outer(self._deviations, self._deviations)
+        return curvature
+
+    def failure(self, s: Array, u: Array) -> str:
+        """What g raised at the first point at which it has no finite value."""
+        for one, known in zip(s, u, strict=True):
+            try:
+                found = np.asarray(self.function(one, known), np.float64)
+            except Exception as error:
+                return raised(self.function.name, error, one)
+            if not np.isfinite(found).all():
+                return f"{self.function.name} is {found.tolist()} at {one.tolist()}."
+        return ""
+
+    def probed(self, k: int) -> Array:
+        """Values (size,) at a fixed point; infinity where it raises or is not finite."""
+        s, u = self._probes_of(None, self._d, self._inputs)[k]
+        with np.errstate(all="ignore"):
+            values: Array = self.values(s[None], u[None])[0]
+        return values
+
+    def touched(self, p: int) -> Mask:
+        """Which rows depend on each component of v (size, p); all where that is not known."""
+        if "v" not in self.parts:
+            return np.zeros((self.size, p), np.bool_)
+        labels = None
+        bits = np.left_shift(np.uint64(1), np.arange(1, p + 1, dtype=np.uint64))
+        if p <= _MOST_LABELS:
+            s = np.ones(self._d, np.uint64)
+            s[self.parts["v"]] = bits
+            arguments = [s, np.ones(self._inputs, np.uint64)][: 1 + self._takes_input]
+            labels = trace(self.function.function, arguments)
+        if labels is None or labels.size != self.size:
+            return np.ones((self.size, p), np.bool_)
+        touched: Mask = (labels.reshape(-1, 1) & bits) != 0
+        return touched
+
+
+class ConstraintFunctions:
+    """All nonlinear constraints of a system, as rows one below the other.
+
+    Attributes
+    ----------
+    size : int
+        Number T of rows of all constraints.
+    soft : (T,) bool array
+        Which rows are soft.
+    linear, quadratic : (T,) array
+        Their penalties; 0 for hard rows.
+    on_state : (T,) bool array
+        Which rows are functions of x alone, and hold at the newest state as well.
+    """
+
+    def __init__(
+        self, constraints: Sequence[Constraint], sizes: dict[str, int],
+        bounds: dict[str, ConvexSet | None], probes_of: Callable[..., Probes],
+    ) -> None:
+        self._n, self._r, self._p, self._m = (sizes[name] for name in ("x", "w", "v", "u"))
+        # Maps d = x+ - f(x) to w; None for the identity.
+        self._through: Array | None = None
+        self._bound = [
+            _Bound(k, one, sizes, bounds, probes_of) for k, one in enumerate(constraints)
+        ]
+        ends = np.cumsum([0, *(one.size for one in constraints)]).tolist()
+        self._places = [slice(a, b) for a, b in pairwise(ends)]
+        self.size: int = ends[-1]
+        counts = [one.size for one in constraints]
+        chosen = [one.penalty or (np.zeros(one.size), np.zeros(one.size)) for one in constraints]
+        self.linear: Array = np.concatenate([one[0] for one in chosen])
+        self.quadratic: Array = np.concatenate([one[1] for one in chosen])
+        self.soft: Mask = np.repeat([one.penalty is not None for one in constraints], counts)
+        self.on_state: Mask = np.repeat([one.on_state for one in self._bound], counts)
+        self._touched = np.vstack([one.touched(self._p) for one in self._bound])
+        #: The unit (T,) in which a miss of a row is measured; see `use_scales`.
+        self.scale: Array = np.ones(self.size)
+
+    def copy(self) -> ConstraintFunctions:
+        """The same, whose functions may come to be called in other ways."""
+        other = copy(self)
+        other._bound = [one.copy() for one in self._bound]
+        return other
+
+    def _split(self, trajectory: Array, residuals: Array) -> dict[str, Array]:
+        """x, w and v of the stages."""
+        d, v = residuals[:, : self._n], residuals[:, self._n :]
+        w = d if self._through is None else d @ self._through.T
+        return {"x": trajectory[:-1], "w": w, "v": v}
+
+    def _start(self, state: Array) -> dict[str, Array]:
+        return {"x": state, "w": np.zeros(self._r), "v": np.zeros(self._p)}
+
+    def _slopes(self, minus_jacobian: Array) -> tuple[dict[str, Array], Array]:
+        """Derivatives of x, w and v of each stage by its state, and of w by the next one."""
+        n = self._n
+        by_state, through = minus_jacobian[:, :n], np.eye(n)
+        if self._through is not None:
+            by_state, through = self._through @ by_state, self._through
+        return {"x": np.eye(n), "w": by_state, "v": minus_jacobian[:, n:]}, through
+
+    def check(self, x: Array, u: Array) -> None:
+        """Check that all are finite at a state and input, with no disturbance and no noise."""
+        for one in self._bound:
+            s = one.joined(self._start(x))
+            one.function.check(s, u)
+            one.jacobian.check(s, u)
+
+    def use_scales(
+        self, start: Array, x: Array, d: Array, v: Array, through: Array | None
+    ) -> None:
+        """Take the rows' scale around a start, by deviations x (n,) and covariances of d and v.
+
+        ``through`` (r, n) maps d = x+ - f(x) to w; None for the identity.
+        """
+        self._through = through
+        w = np.sqrt((d if through is None else through @ d @ through.T).diagonal())
+        v = np.sqrt(v.diagonal())
+        found, u = [], np.zeros(self._m)
+        for one in self._bound:
+            deviations = one.joined({"x": x, "w": w, "v": v})
+            one.use_scales(deviations)
+            s = one.joined(self._start(start))
+            one.jacobian.check(s, u)
+            found.append(one.scale(s, deviations, u))
+        self.scale = np.concatenate(found)
+
+    def counting(self, count: int, observed: Mask | None) -> Mask:
+        """Which rows hold at each stage (K + 1, T): none on missing outputs.
+
+        Parameters
+        ----------
+        count : int
+            Number K of stages; the newest state is one more point.
+        observed : (K, p) bool array or None
+            Which components of y are there; None for all.
+        """
+        counts = np.ones((count + 1, self.size), np.bool_)
+        counts[-1] = self.on_state
+        if observed is not None:
+            counts[:-1] &= ~((~observed).astype(np.intp) @ self._touched.T.astype(np.intp) > 0)
+        return counts
+
+    def values(self, trajectory: Array, inputs: Array, residuals: Array) -> Array:
+        """Values along a trajectory (K + 1, n), (K + 1, T); never raises.
+
+        Infinity stands where a function raises or is not finite, and 0 at the newest state for
+        rows that do not hold there.
+        """
+        parts, u = self._split(trajectory, residuals), inputs[:, : self._m]
+        found = np.zeros((len(trajectory), self.size))
+        for one, place in zip(self._bound, self._places, strict=True):
+            if one.on_state:
+                found[:, place] = one.values(trajectory, _extended(u))
+            else:
+                found[:-1, place] = one.values(one.joined(parts), u)
+        return found
+
+    def linearised(
+        self, trajectory: Array, inputs: Array, residuals: Array, minus_jacobian: Array
+    ) -> tuple[Array, Array]:
+        """Derivatives with respect to each state and the next one, (K + 1, T, n) and (K, T, n).
+
+        ``minus_jacobian`` (K, n + p, n) is the derivative of the residuals (w, v) with respect
+        to x. Rows that cannot be differentiated are not finite.
+        """
+        count, n = len(residuals), self._n
+        own, following = np.zeros((count + 1, self.size, n)), np.zeros((count, self.size, n))
+        parts, u = self._split(trajectory, residuals), inputs[:, : self._m]
+        slopes, through = self._slopes(minus_jacobian)
+        for one, place in zip(self._bound, self._places, strict=True):
+            if one.on_state:
+                own[:, place] = one.derivatives(trajectory, _extended(u))
+                continue
+            slope = one.derivatives(one.joined(parts), u)
+            for name, columns in one.parts.items():
+                own[:-1, place] += slope[:, :, columns] @ slopes[name]
+            if "w" in one.parts:
+                following[:, place] = slope[:, :, one.parts["w"]] @ through
+        return own, following
+
+    def curvature(
+        self, trajectory: Array, inputs: Array, residuals: Array, minus_jacobian: Array,
+        forces: Array,
+    ) -> tuple[Array, Array, Array]:
+        """What the curvature of ``forces g`` adds to a Hessian in the increments of the states.
+
+        ``forces`` (K + 1, T) are multipliers >= 0 of the rows. The blocks are those of each state
+        (K + 1, n, n), those below them, (K, n, n), and those of each next state, (K, n, n).
+        """
+        count, n = len(residuals), self._n
+        own, below, following = (np.zeros((count + k, n, n)) for k in (1, 0, 0))
+        parts, u = self._split(trajectory, residuals), inputs[:, : self._m]
+        slopes, through = self._slopes(minus_jacobian)
+        for one, place in zip(self._bound, self._places, strict=True):
+            if one.on_state:
+                own += one.curvature(trajectory, _extended(u), forces[:, place])
+                continue
+            bent = one.curvature(one.joined(parts), u, forces[:-1, place])
+            moved = np.zeros((count, bent.shape[1], n))  # s by the state
+            for name, columns in one.parts.items():
+                moved[:, columns] = slopes[name]
+            half = bent @ moved
+            own[:-1] += moved.transpose(0, 2, 1) @ half
+            if "w" in one.parts:
+                columns = one.parts["w"]
+                below += through.T @ half[:, columns]
+                following += through.T @ bent[:, columns, columns] @ through
+        return own, below, following
+
+    def described(self) -> Array:
+        """Penalties and values at some points, one row each, to compare with another's."""
+        found = [self.soft.astype(np.float64), self.linear, self.quadratic]
+        for k in range(_POINTS):
+            values = [one.probed(k) for one in self._bound]
+            found.append(np.concatenate(values))
+        return np.array(found)
+
+    def failure(self, trajectory: Array, inputs: Array, residuals: Array) -> str:
+        """What a constraint raised along a trajectory, as a message; blank if nothing."""
+        parts, u = self._split(trajectory, residuals), inputs[:, : self._m]
+        for one in self._bound:
+            s, known = (trajectory, _extended(u)) if one.on_state else (one.joined(parts), u)
+            text = one.failure(s, known)
+            if text:
+                return text
+        return ""
+
+
+def _one_by_one(
+    function: Callable[..., Any], shape: tuple[int, ...], s: Array, u: Array
+) -> Array:
+    """Values at each point; NaN where the function raises."""
+    found = np.full((len(s), *shape), np.nan)
+    for k in range(len(s)):
+        with suppress(Exception):
+            found[k] = np.asarray(function(s[k], u[k]), np.float64).reshape(shape)
+    return found
+
+
+def _extended(u: Array) -> Array:
+    """Inputs of the stages with any one for the newest state, which no function of it reads."""
+    return np.concatenate((u, np.zeros((1, u.shape[1]))))
+
+
+def checked_constraints(value: Any) -> tuple[Constraint, ...]:
+    """The nonlinear constraints that a system was given."""
+    if value is None:
+        return ()
+    if isinstance(value, Constraint):
+        return (value,)
+    listed = tuple(value) if isinstance(value, (list, tuple)) else None
+    wrong = value if listed is None else next(
+        (one for one in listed if not isinstance(one, Constraint)), None
+    )
+    if wrong is not None or listed is None:
+        raise SetError(
+            f"constraints holds {shown(wrong)}; expected a list of qpmhe.Constraint, such as "
+            "[qpmhe.Constraint(lambda x: x[0] - 1.0)]."
+        )
+    return listed
