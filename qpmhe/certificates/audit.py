@@ -18,7 +18,7 @@ from ..observers import Observer, Sample
 from .branch_and_bound import output_lipschitz
 from .contraction import gain_if_constant
 from .deadline import PART_SECONDS, Deadline
-from .enclosures import evaluated
+from .enclosures import evaluated, place
 from .evidence import CertificateError, Evidence, json_ready
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
 from .regions import Region, bounded_region
@@ -163,9 +163,7 @@ def _invariance_finding(system: System, region: Region) -> Finding:
         k = int(np.argmax(lost))
         return found(
             False, Evidence.PROVED,
-            f"f is not finite: {following[k].tolist()} at x = {x[k].tolist()}"
-            + (f", u = {u[k].tolist()}" if system.m else ""),
-            None, where(k),
+            f"f is not finite: {following[k].tolist()} at {place(x[k], u[k])}", None, where(k),
         )
     if system.states is None:
         return found(True, Evidence.PROVED, "X is the whole space")
@@ -217,11 +215,6 @@ class Audit:
         return value
 
     @property
-    def kappa(self) -> float | None:
-        """The constant of (eq:kappa)."""
-        return self["correction bound"].value
-
-    @property
     def violated(self) -> tuple[Finding, ...]:
         """The findings with a counterexample, or without constants."""
         return tuple(finding for finding in self.findings if finding.holds is False)
@@ -251,8 +244,8 @@ def audit(
         assumption that does not hold raises nothing.
     """
     checked_ingredients(system, observer, cost)
-    place = bounded_region(system, region, inputs)
-    slope = output_lipschitz(system, place, seconds=Deadline.of(seconds))
+    where = bounded_region(system, region, inputs)
+    slope = output_lipschitz(system, where, seconds=Deadline.of(seconds))
     constants, about_cost = _cost_finding(cost)
     candidate: tuple[bool | None, Evidence | None, str] = (
         True, Evidence.PROVED, "X, W and V are the whole space"
@@ -266,12 +259,12 @@ def audit(
             f"{slope.attained:.6g} at {np.round(slope.at, 4).tolist()}",
             slope.value,
         ),
-        *_correction_findings(system, observer, place),
+        *_correction_findings(system, observer, where),
         about_cost,
-        _invariance_finding(system, place),
+        _invariance_finding(system, where),
         Finding("candidate in the sets", "ass:observer", *candidate),
     )
-    return Audit(findings, constants, place)
+    return Audit(findings, constants, where)
 
 
 def checked_ingredients(system: Any, observer: Any, cost: Any) -> None:

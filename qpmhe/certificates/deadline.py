@@ -17,14 +17,9 @@ _LEAST = 1e-9
 class Deadline:
     """A moment on the monotonic clock, after which searches stop and return what they have."""
 
-    __slots__ = ("_end", "seconds")
-
     def __init__(self, seconds: float) -> None:
-        if (
-            isinstance(seconds, bool)
-            or not isinstance(seconds, (int, float))
-            or not seconds > 0.0
-        ):
+        number = isinstance(seconds, (int, float)) and not isinstance(seconds, bool)
+        if not number or not seconds > 0.0:
             raise OptionError(
                 f"seconds is {seconds!r}; expected a number > 0, or math.inf for no limit."
             )

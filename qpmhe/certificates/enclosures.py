@@ -34,7 +34,7 @@ def _raised(name: str, function: Any, x: Array, u: Array, first: Exception) -> s
             np.array(function.batch(x[k : k + 1], u[k : k + 1]), np.float64)
         except Exception as error:
             return (
-                f"{name} raises {type(error).__name__} at {_place(x[k], u[k])}, within the region: "
+                f"{name} raises {type(error).__name__} at {place(x[k], u[k])}, within the region: "
                 f"{error}. {_REMEDY}"
             )
     return (
@@ -43,7 +43,8 @@ def _raised(name: str, function: Any, x: Array, u: Array, first: Exception) -> s
     )
 
 
-def _place(x: Array, u: Array) -> str:
+def place(x: Array, u: Array) -> str:
+    """A state and its input in words."""
     return f"x = {x.tolist()}" + (f", u = {u.tolist()}" if u.size else "")
 
 
@@ -56,7 +57,7 @@ def check_values(system: System, points: Array, *, output_only: bool = False) ->
         if broken.any():
             k = int(np.argmax(broken))
             raise ModelError(
-                f"{name} is not finite at {_place(x[k], u[k])}, within the region: it returned "
+                f"{name} is not finite at {place(x[k], u[k])}, within the region: it returned "
                 f"{values[k].tolist()}. {_REMEDY}"
             )
 

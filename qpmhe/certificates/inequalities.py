@@ -61,12 +61,9 @@ def norms(values: Array, weight: Array) -> Array:
 
 
 def _square(P: Array, rate: float) -> Matrices:
-    exact = Matrices.exact(np.array([[rate]]))
-    factor = exact @ exact
-    return Matrices(
-        factor.middle * P,
-        (factor.radius + 1e-15 * factor.middle) * np.abs(P) * (1.0 + 1e-15) + 1e-290,
-    )
+    """rate^2 P, with more than the error of two products."""
+    middle = rate * rate * P
+    return Matrices(middle, 4.0 * _UNIT * np.abs(middle) + _TINY)
 
 
 def _assemble(rows: list[list[Matrices]]) -> Matrices:

@@ -60,11 +60,6 @@ class Interval:
         """The interval itself, or a number as one."""
         return value if isinstance(value, Interval) else cls(value, value)
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The shape of low and of high."""
-        return np.broadcast_shapes(self.low.shape, self.high.shape)
-
     def __getitem__(self, index: Any) -> Interval:
         return Interval(self.low[index], self.high[index])
 
@@ -156,7 +151,7 @@ class Interval:
         if exponent < 0:
             return self.power(-exponent).reciprocal()
         if exponent == 0:
-            return Interval(np.ones(self.shape), np.ones(self.shape))
+            return Interval(np.ones_like(self.low), np.ones_like(self.low))
         if exponent % 2 == 0:
             return self.power(exponent // 2).square()
         if exponent == 1:
@@ -452,7 +447,7 @@ def _outer(a: Interval, b: Interval) -> Interval:
     if a is b:
         # The diagonal as squares, which are not negative.
         product = a[:, None] * b[None]
-        squares, which = a.square(), np.arange(a.shape[0])
+        squares, which = a.square(), np.arange(len(a.low))
         low, high = product.low.copy(), product.high.copy()
         low[which, which], high[which, which] = squares.low, squares.high
         return Interval(low, high)

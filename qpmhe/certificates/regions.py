@@ -76,11 +76,12 @@ class Region:
 
     def outside(self, lower: Array, upper: Array) -> NDArray[np.bool_]:
         """Which cells, given by corners (B, n + m), certainly have no state of the region."""
-        away = np.zeros(lower.shape[0], dtype=np.bool_)
         if self.is_box:
-            return away
+            return np.zeros(len(lower), np.bool_)
         least, most = _row_bounds(self.states.matrix, lower[:, : self.n], upper[:, : self.n])
-        away |= np.any((least > self.states.row_upper) | (most < self.states.row_lower), axis=1)
+        away: NDArray[np.bool_] = np.any(
+            (least > self.states.row_upper) | (most < self.states.row_lower), axis=1
+        )
         return away
 
     def sample(self, count: int, generator: np.random.Generator) -> Array:

@@ -159,8 +159,8 @@ def summed_bound(constants: TheoremConstants, n: int = 1, p: int = 1) -> WindowB
 
 
 def weighted_bound(
-    cost: Cost, horizon: int, detectability: Detectability, stability: ObserverStability,
-    slope: float,
+    cost: Cost, horizon: int, *, eta: float, P: Array, V: Array, rho: float, O: Array,  # noqa: E741
+    K: Array, slope: float,
 ) -> WindowBound:
     r"""The quadratic cost's own weights, and the norms of the Lyapunov functions.
 
@@ -172,19 +172,14 @@ def weighted_bound(
 
     The slope is the largest :math:`|\Delta h|_M / |\Delta x|_O`, M that of `fit_weight`.
     """
-    P, V, O, K = detectability.P, detectability.V, stability.P, stability.gain  # noqa: E741
-    assert P is not None
-    assert V is not None
-    assert O is not None
-    assert K is not None
     squares, bought = [largest(P, cost.least_prior)], largest(P, cost.disturbance)
     noise = largest(V, cost.noise)
     for _ in range(horizon):
-        squares.append(max(detectability.eta**2 * squares[-1], noise) + bought)
+        squares.append(max(eta**2 * squares[-1], noise) + bought)
     inverse = np.linalg.inv(P)
     scales = np.append(np.linalg.eigvalsh(inverse)[-1], np.diag(inverse))
     return WindowBound(
-        "weighted", horizon, stability.rho, detectability.eta, 2.0, slope,
+        "weighted", horizon, rho, eta, 2.0, slope,
         math.sqrt(largest(P, O)), np.sqrt(squares), _rounding(P) * np.sqrt(scales),
         Norms(O, P, O, K.T @ O @ K, fit_weight(cost, K), P, V, K),
     )
@@ -273,28 +268,22 @@ def bounds_for(
     if lipschitz > 0.0:  # a larger C_v holds as well, and from 1 / L_h on L_bar is L_h
         larger = max(plain.observer.noise, 1.0 / lipschitz)
         paper = replace(plain, observer=replace(plain.observer, noise=larger))
-    certified = (detectability.P, detectability.V, stability.P, stability.gain)
-    if all(each is not None for each in certified) and cost.quadratic and cost.discount == 1.0:
-        slope = _slope(cost, stability, lipschitz, output)
-        return HorizonBounds(
-            paper, weighted_bound(cost, horizon, detectability, stability, slope)
-        )
+    P, V, O, K = detectability.P, detectability.V, stability.P, stability.gain  # noqa: E741
+    plain_cost = cost.quadratic and cost.discount == 1.0
+    if plain_cost and P is not None and V is not None and O is not None and K is not None:
+        return HorizonBounds(paper, weighted_bound(
+            cost, horizon, eta=detectability.eta, P=P, V=V, rho=stability.rho, O=O, K=K,
+            slope=_slope(fit_weight(cost, K), O, lipschitz, output),
+        ))
     summed = constants.exponent >= 1.0
     return HorizonBounds(paper, summed_bound(plain, cost.n, cost.p) if summed else None)
 
 
-def _slope(
-    cost: Cost, stability: ObserverStability, lipschitz: float, output: Matrices | None
-) -> float:
+def _slope(fit: Array, O: Array, lipschitz: float, output: Matrices | None) -> float:  # noqa: E741
     """The largest |h(x) - h(z)|_M / |x - z|_O, from L_h or from a constant Jacobian of h."""
-    assert stability.P is not None
-    assert stability.gain is not None
-    fit = fit_weight(cost, stability.gain)
-    plain = math.sqrt(
-        float(np.linalg.eigvalsh(fit)[-1]) * largest(np.eye(cost.n), stability.P)
-    )
+    plain = math.sqrt(float(np.linalg.eigvalsh(fit)[-1]) * largest(np.eye(len(O)), O))
     slope = plain * lipschitz
     if output is not None:
         C, radius = output.middle[0], float(np.linalg.norm(output.radius[0]))
-        slope = min(slope, math.sqrt(largest(C.T @ fit @ C, stability.P)) + plain * radius)
+        slope = min(slope, math.sqrt(largest(C.T @ fit @ C, O)) + plain * radius)
     return slope * _OUTWARD

@@ -11,10 +11,12 @@ import qpmhe
 from qpmhe.certificates import search as search_module
 from qpmhe.certificates.contraction import certify_detectability
 from qpmhe.certificates.evidence import Evidence, NotCertifiedError, weakest
-from qpmhe.certificates.inequalities import Matrices, OutputWeight, definite
+from qpmhe.certificates.inequalities import Matrices, OutputWeight, definite, norms
 from qpmhe.certificates.properties import Detectability
 from qpmhe.certificates.sdp import Answer, Program
 from qpmhe.errors import OptionError
+
+from .attacks import attack_detectability
 
 REACTOR = qpmhe.Box([0.1, 0.0], [9.0, 9.0])
 
@@ -70,24 +72,6 @@ def test_reactor_is_refused_at_a_rate_that_is_too_fast():
     assert "a larger eta" in str(caught.value)
 
 
-def simulate_pairs(system, box, steps, count, generator, u=None):
-    """Pairs of trajectories that disturbances keep within a box, and their differences."""
-    low, high = box.lower, box.upper
-    x = generator.uniform(low, high, (2, count, system.n))
-    states, moved, outputs = [x], [], []
-    for _ in range(steps):
-        inputs = np.zeros((count, 0)) if u is None else generator.uniform(*u, (count, system.m))
-        f = np.stack([system.f.batch(one, inputs) for one in x])
-        h = np.stack([system.h.batch(one, inputs) for one in x])
-        w = 0.02 * (high - low) * generator.standard_normal(f.shape)
-        following = np.clip(f + w, low, high)
-        moved.append(np.diff(following - f, axis=0)[0])
-        outputs.append(np.diff(h, axis=0)[0])
-        x = following
-        states.append(x)
-    return np.diff(np.array(states), axis=1)[:, 0], np.array(moved), np.array(outputs)
-
-
 SYSTEMS = {
     "batch_reactor": (REACTOR, None),
     "pendulum": (qpmhe.Box([-3.0, -10.0], [3.0, 10.0]), None),
@@ -103,17 +87,21 @@ def test_pairs_of_trajectories_keep_to_the_bound(name):
     inputs = u and qpmhe.Box([u[0]], [u[1]])
     found = certify_detectability(system, box, eta=0.9, inputs=inputs)
     assert found.evidence is Evidence.PROVED
-    dx, dw, dh = simulate_pairs(system, box, 15, 400, np.random.default_rng(8), u)
-    bound = found.bound(dx[0], dw, dh)
-    assert np.all(np.linalg.norm(dx, axis=2) <= bound)
-
-    def norm(values, weight):
-        return np.sqrt(np.einsum("...i,ij,...j->...", values, weight, values))
-
+    attack = attack_detectability(
+        system, found.region, found.sums, trials=100, steps=15, polish=4
+    )
+    assert not attack.refuted
     # The contraction behind it, in one step.
-    following, now = norm(dx[1:], found.P), norm(dx[:-1], found.P)
-    right = found.eta * now + norm(dw, found.P) + norm(dh, found.V)
-    assert np.all(following <= right * (1 + 1e-9))
+    n, rng = system.n, np.random.default_rng(8)
+    points = found.region.sample(400, rng)
+    one, other = points[rng.integers(len(points), size=(2, 400))]
+    other[:, n:] = one[:, n:]
+    df, dh = (
+        function.batch(one[:, :n], one[:, n:]) - function.batch(other[:, :n], other[:, n:])
+        for function in (system.f, system.h)
+    )
+    right = found.eta * norms((one - other)[:, :n], found.P) + norms(dh, found.V)
+    assert np.all(norms(df, found.P) <= right * (1 + 1e-9))
 
 
 def test_default_rate_lies_between_the_smallest_and_one():
@@ -133,10 +121,7 @@ def test_nonlinear_output_takes_output_injection():
     assert any("not affine" in note for note in found.notes)
     sharp = 0.8 / 0.7 / 0.6
     assert sharp < found.c_v < 1.05 * sharp
-    dx, dw, dh = simulate_pairs(
-        system, qpmhe.Box([-5.0], [5.0]), 12, 500, np.random.default_rng(9)
-    )
-    assert np.all(np.linalg.norm(dx, axis=2) <= found.bound(dx[0], dw, dh))
+    assert not attack_detectability(system, found.region, found.sums, trials=500).refuted
 
 
 def test_what_holds_at_every_state_need_not_hold_for_averages():

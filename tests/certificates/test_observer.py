@@ -11,6 +11,7 @@ from qpmhe.certificates.evidence import CertificateError, Evidence, NotCertified
 from qpmhe.certificates.properties import ObserverStability
 from qpmhe.errors import OptionError
 
+from .attacks import attack_observer
 from .test_detectability import REACTOR, linear, unit_box
 
 TANK_AREA, TANK_DT = 0.5, 0.1
@@ -68,27 +69,11 @@ def test_errors_keep_to_the_bound(name):
         (system, observer, _, _), box = qpmhe.models.pendulum(), qpmhe.Box([-3, -10], [3, 10])
     found = certify_observer(system, observer, box)
     assert found.evidence is Evidence.PROVED
-    generator = np.random.default_rng(10)
-    count, steps = 400, 20
-    centre, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
-    x, z = (centre + 0.9 * half * generator.uniform(-1, 1, (count, 2)) for _ in range(2))
-    none, errors, ws, vs = np.zeros((count, 0)), [x - z], [], []
-    inside = np.ones(count, dtype=bool)
-    for _ in range(steps):
-        v = 0.02 * half.min() * generator.standard_normal((count, system.p))
-        w = 0.01 * half * generator.standard_normal((count, 2))
-        misfit = system.h.batch(x, none) + v - system.h.batch(z, none)
-        x, z = system.f.batch(x, none) + w, system.f.batch(z, none) + misfit @ observer.gain.T
-        # The constants hold as long as both stay in the box; runs are kept until they leave.
-        for one in (x, z):
-            inside &= np.all((one >= box.lower) & (one <= box.upper), 1)
-        x, z = (np.where(inside[:, None], one, centre) for one in (x, z))
-        errors.append(np.where(inside[:, None], x - z, 0.0))
-        ws.append(w)
-        vs.append(v)
-    bound = found.bound(errors[0], np.array(ws), np.array(vs))
-    assert inside.sum() > 50
-    assert np.all(np.linalg.norm(np.array(errors), axis=2) <= bound)
+    attack = attack_observer(
+        system, found.region, observer.gain, found.sums, trials=200, polish=10
+    )
+    assert not attack.refuted
+    assert attack.compared > 1000
 
 
 def test_linear_observer_reaches_its_spectral_radius():

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.certificates.theorem import DecayingSums, TheoremConstants
 from qpmhe.certificates.window_bounds import largest, summed_bound, weighted_bound
 from qpmhe.costs import CostConstants
@@ -89,14 +88,12 @@ def weighted(**changes):
         "P": 1.0, "eta": 0.9, "noise_weight": 1.0, "observer_norm": 1.0, "rho": 0.8, "gain": 0.2,
         "slope": 1.0,
     } | changes
-    P, V, norm, gain = (
+    P, V, O, K = (  # noqa: E741
         np.atleast_2d(given[name]) for name in ("P", "noise_weight", "observer_norm", "gain")
     )
     return weighted_bound(
-        given["cost"], given["horizon"],
-        Detectability(given["eta"], 1.0, 1.0, 1.0, P=P, V=V),
-        ObserverStability(given["rho"], 1.0, 1.0, 1.0, 1.0, P=norm, gain=gain),
-        given["slope"],
+        given["cost"], given["horizon"], eta=given["eta"], P=P, V=V, rho=given["rho"], O=O, K=K,
+        slope=given["slope"],
     )
 
 
