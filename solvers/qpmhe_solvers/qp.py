@@ -35,12 +35,12 @@ def band_index(n: int) -> NDArray[np.intp]:
     return index
 
 
-def band_of(block: Array) -> Array:
-    """The band panels (..., n, 2n) of symmetric diagonal blocks that couple to nothing."""
-    n = block.shape[-1]
-    panel = np.zeros((*block.shape[:-2], n, 2 * n))
-    for column in range(n):
-        panel[..., column, : n - column] = block[..., column:, column]
+def band_of(columns: Array) -> Array:
+    """The band panels (..., n, 2n) of stages: of their columns (..., 2n, n), or diagonal blocks."""
+    *stages, height, n = columns.shape
+    flat = np.zeros((*stages, 2 * n * n + 1))
+    flat[..., : height * n] = columns.reshape(*stages, height * n)
+    panel: Array = flat[..., band_index(n)]
     return panel
 
 
