@@ -307,7 +307,12 @@ class Drawn:
         }
 
 
-@pytest.mark.parametrize("seed", range(60))
+def seeds(few, many):
+    """Some seeds for the sample, and the others for all cases."""
+    return [*range(few), *(pytest.param(k, marks=pytest.mark.slow) for k in range(few, many))]
+
+
+@pytest.mark.parametrize("seed", seeds(24, 60))
 def test_powers_of_two_change_not_a_bit(seed):
     drawn = Drawn(seed)
     units = drawn.units(2.0, 30)
@@ -324,7 +329,7 @@ def test_powers_of_two_change_not_a_bit(seed):
             np.testing.assert_array_equal(value, expected[name], err_msg=f"{name} at {one.time}")
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", seeds(12, 30))
 def test_powers_of_ten_change_no_estimate(seed):
     drawn = Drawn(seed)
     units = drawn.units(10.0, 9)
