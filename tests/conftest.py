@@ -16,7 +16,7 @@ SEED = 1
 # The share of the cases beyond the first that a test keeps.
 SHARE = 0.05
 # Examples of each property whose test names no number: in the sample, and in all.
-FEW, MANY = 8, 25
+FEW, MANY = 6, 25
 # Begun first, so that no long test is the last one: most of these tests start processes.
 FIRST = {"studies", "tests", "examples", "records"}
 WHOLE = {"oracles", "properties"}  # folders that keep every value of every parameter

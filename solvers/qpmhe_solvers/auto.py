@@ -29,6 +29,7 @@ class AutoSolver(Solver):
         super().__init__(options)
         self._banded = BandedSolver(options)
         self._others: dict[bool, list[ContainedSolver]] = {}
+        self._shifts = 0  # of which the others do not know yet
 
     def __reduce__(self) -> tuple[type[AutoSolver], tuple[SolverOptions]]:
         return type(self), (self.options,)
@@ -42,6 +43,8 @@ class AutoSolver(Solver):
         small = qp.size <= _SMALL
         if small not in self._others:
             self._others[small] = self._choose(small)
+        if self._shifts:
+            self._pass_shifts_on(qp.stages)
         for other in self._others[small]:
             if limit is not None:
                 remaining = limit - (perf_counter() - began)
@@ -54,13 +57,20 @@ class AutoSolver(Solver):
 
     def forget(self) -> None:
         """Let the QP solvers drop what they keep; see `Solver.forget`."""
+        self._shifts = 0
         for other in chain.from_iterable(self._others.values()):
             other.forget()
 
     def shift(self) -> None:
-        """Pass it on to the QP solvers; see `Solver.shift`."""
+        """Count, for the QP solvers, which most steps do not need; see `Solver.shift`."""
+        self._shifts += 1
+
+    def _pass_shifts_on(self, stages: int) -> None:
         for other in chain.from_iterable(self._others.values()):
-            other.shift()
+            # After as many as there are stages, nothing that was kept belongs to any.
+            for _ in range(min(self._shifts, stages)):
+                other.shift()
+        self._shifts = 0
 
     def prepare(self, size: int) -> None:
         """Make the QP solvers: theirs is a long import."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .options import SolverOptions
-from .qp import QP, Array, Places, hessian_pattern, rows_pattern
+from .qp import QP, Array, Places, hessian_entries, rows_entries
 from .solution import Residuals, Solution, SolveStatus
 from .solver import Solver
 
@@ -126,10 +126,13 @@ def _optimality_conditions(
     size, level = stages * n, np.flatnonzero(np.frombuffer(equal, np.bool_))
     order = np.argsort(np.append(np.arange(size) // n, level // rows), kind="stable")
     at = np.argsort(order)
-    H, A = hessian_pattern(stages, n).tocoo(), rows_pattern(*sizes).tocsr()[level].tocoo()
-    own = Places.of(*sizes).own + A.data
-    row = at[np.concatenate((H.row, size + A.row, A.col))]
-    column = at[np.concatenate((H.col, A.col, size + A.row))]
+    own, rows_of, columns_of = rows_entries(*sizes)
+    kept = np.isin(rows_of, level)
+    own, columns_of = Places.of(*sizes).own + own[kept], columns_of[kept]
+    rows_of = size + np.searchsorted(level, rows_of[kept])
+    source, row, column = hessian_entries(stages, n)
+    row = at[np.concatenate((row, rows_of, columns_of))]
+    column = at[np.concatenate((column, columns_of, rows_of))]
     width = int(np.abs(row - column).max())
     target = (2 * width + row - column) * order.size + column
-    return width, level, order, np.concatenate((H.data, own, own)), target
+    return width, level, order, np.concatenate((source, own, own)), target

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
 Array = NDArray[np.float64]
+Entries = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]
 
 #: Names of the arrays that hold a QP's numbers.
 ARRAYS = ("band", "gradient", "lower", "upper", "row_own", "row_next", "row_lower", "row_upper")
@@ -35,47 +36,54 @@ def band_index(n: int) -> NDArray[np.intp]:
     return index
 
 
-def band_of(block: Array) -> Array:
-    """The band panels (..., n, 2n) of symmetric diagonal blocks that couple to nothing."""
-    n = block.shape[-1]
-    panel = np.zeros((*block.shape[:-2], n, 2 * n))
-    for column in range(n):
-        panel[..., column, : n - column] = block[..., column:, column]
+def band_of(columns: Array) -> Array:
+    """The band panels (..., n, 2n) of stages: of their columns (..., 2n, n), or diagonal blocks."""
+    *stages, height, n = columns.shape
+    flat = np.zeros((*stages, 2 * n * n + 1))
+    flat[..., : height * n] = columns.reshape(*stages, height * n)
+    panel: Array = flat[..., band_index(n)]
     return panel
 
 
-@lru_cache(maxsize=256)
-def hessian_pattern(stages: int, n: int) -> csc_matrix:
-    """H in full; its entries are the places of the numbers in the flat band panels."""
+def hessian_entries(stages: int, n: int) -> Entries:
+    """All of H: places of its numbers in the flat band panels, rows, and columns."""
     k, c, o = np.indices((stages, n, 2 * n))
     column = k * n + c
     row = column + o
     source = np.flatnonzero((c + o < 2 * n) & (row < stages * n))
     row, column = row.ravel()[source], column.ravel()[source]
     below = row > column
-    return _csc(
+    return (
         np.append(source, source[below]), np.append(row, column[below]),
-        np.append(column, row[below]), (stages * n, stages * n),
+        np.append(column, row[below]),
     )
 
 
-@lru_cache(maxsize=256)
-def rows_pattern(stages: int, n: int, rows: int) -> csc_matrix:
-    """The general rows [F, G]; entries are places in the flat own rows, then the next rows."""
+def rows_entries(stages: int, n: int, rows: int) -> Entries:
+    """All of [F, G]: places in the flat own rows, then the next rows; rows, and columns."""
     k, j, c = np.indices((stages, rows, n)).reshape(3, -1)
     row, column = k * rows + j, k * n + c
     source = np.arange(2 * row.size)
     next_too = np.append(np.ones(row.size, np.bool_), k + 1 < stages)
-    return _csc(
-        source[next_too], np.append(row, row)[next_too],
-        np.append(column, column + n)[next_too], (stages * rows, stages * n),
+    return (
+        source[next_too], np.append(row, row)[next_too], np.append(column, column + n)[next_too]
     )
 
 
-def _csc(
-    source: NDArray[np.intp], row: NDArray[np.intp], column: NDArray[np.intp],
-    shape: tuple[int, int],
-) -> csc_matrix:
+@lru_cache(maxsize=256)
+def hessian_pattern(stages: int, n: int) -> csc_matrix:
+    """H in full; its entries are the places of its numbers."""
+    return _csc(hessian_entries(stages, n), (stages * n, stages * n))
+
+
+@lru_cache(maxsize=256)
+def rows_pattern(stages: int, n: int, rows: int) -> csc_matrix:
+    """The general rows [F, G]; entries are the places of their numbers."""
+    return _csc(rows_entries(stages, n, rows), (stages * rows, stages * n))
+
+
+def _csc(entries: Entries, shape: tuple[int, int]) -> csc_matrix:
+    source, row, column = entries
     from scipy.sparse import csc_matrix  # late: the banded solver does without
 
     matrix = csc_matrix((source, (row, column)), shape)

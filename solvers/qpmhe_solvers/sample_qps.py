@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from .qp import QP, band_index
+from .qp import QP, band_of
 
 Bounds = Literal["none", "all", "part"]
 Sides = Literal["none", "two", "equal", "mixed"]
@@ -34,7 +34,9 @@ def sample(
         block = (factor.T * weights) @ factor + 0.5 * np.diag(weights)
         if k + 1 == stages:
             block[n:], block[:, n:] = 0.0, 0.0
-        _add(qp, k, block)
+        qp.band[k] += band_of(block[:, :n])
+        if k + 1 < stages:
+            qp.band[k + 1] += band_of(block[n:, n:])
     qp.gradient[...] = push * rng.standard_normal((stages, n))
     qp.row_own[...], qp.row_next[...] = rng.standard_normal((2, stages, rows, n))
     inside = around * rng.standard_normal((stages, n))
@@ -64,14 +66,3 @@ def contradiction(stages: int = 6, n: int = 2) -> QP:
     qp.row_own[middle], qp.row_next[middle] = 1.0, 0.0
     qp.row_lower[middle], qp.row_upper[middle] = [5.0, -6.0], [6.0, -5.0]
     return qp
-
-
-def _add(qp: QP, k: int, block: np.ndarray) -> None:
-    """Add a symmetric (2 n, 2 n) block over the stages k and k + 1 to the Hessian."""
-    n = qp.n
-    flat = np.append(block[:, :n].reshape(-1), 0.0)
-    qp.band[k] += flat[band_index(n)]
-    if k + 1 < qp.stages:
-        following = np.zeros((2 * n, n))
-        following[:n] = block[n:, n:]
-        qp.band[k + 1] += np.append(following.reshape(-1), 0.0)[band_index(n)]

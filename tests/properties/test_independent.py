@@ -17,7 +17,7 @@ from .fuzz_independent import WRITINGS, Case, WrongStepError, fuzz, table
 
 SEED = 1
 # Steps of each by default, and in the sample: whatever is compiled takes its time to be made.
-FEW = {"numpy": (120, 60), "casadi": (180, 90), "jax": (90, 45)}
+FEW = {"numpy": (120, 40), "casadi": (180, 90), "jax": (90, 45)}
 WAYS = [(source, writing) for source, writings in WRITINGS.items() for writing in writings]
 
 

@@ -241,12 +241,14 @@ def test_auto_passes_on_how_far_the_trajectory_moved(monkeypatch):
         monkeypatch.setitem(qpmhe_solvers.native.NATIVE, name, entry)
     solver, qp = create("auto"), make(6, 2, bounds="all")[0]
     solver.solve(qp)
-    for shifts in (0, 2, 0, 10):
+    for shifts, told in ((0, 0), (2, 2), (0, 0), (100, 6)):
         for _ in range(shifts):
             solver.shift()
-        assert calls == ["shift", "shift"] * shifts  # there are two solvers
+        assert calls == []
         solver.solve(qp)
+        assert calls == ["shift"] * 2 * told  # there are two solvers
         calls.clear()
+    solver.shift()
     solver.forget()
     solver.solve(qp)
     assert calls == ["forget", "forget"]

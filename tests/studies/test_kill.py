@@ -28,7 +28,7 @@ print(reads)
 def test_a_study_killed_at_random_loses_and_repeats_nothing(tmp_path):
     options = {"backends": ["banded"], "qps": [0, 1], "seeds": 60, "steps": 20}
     cells = Study(**options).cells()
-    killed = kill_and_finish(options, len(cells), 3, tmp_path / "store.sqlite", seed=1)
+    killed = kill_and_finish(options, len(cells), 2, tmp_path / "store.sqlite", seed=1)
     assert len(cells) == 120
     assert sorted(killed.frame["key"]) == sorted(cell.key for cell in cells)
     assert set(killed.frame["outcome"]) == {"done"}

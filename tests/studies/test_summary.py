@@ -1,7 +1,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy.stats import ttest_1samp, ttest_rel
@@ -157,6 +157,7 @@ points = arrays.arrays(
 )
 
 
+@settings(max_examples=100, derandomize=True, deadline=None)
 @given(points)
 def test_front_against_its_definition(rows):
     finite = np.isfinite(rows).all(axis=1)
