@@ -107,11 +107,14 @@ class ObserverPrior:
             return None
         return self.minimum, self.maximum
 
-    def weight(self, covariance: Array) -> Array:
-        """The inverse of a covariance (n, n), clipped if bounds were given."""
+    def weight(self, covariance: Array, least: float = SINGULAR) -> Array:
+        """The inverse of a covariance (n, n), clipped if bounds were given.
+
+        Otherwise eigenvalues of its correlations that are rounding count as ``least``.
+        """
         bounds = self.bounds
         if bounds is None:
-            return _relative_inverse(covariance)
+            return _relative_inverse(covariance, least)
         values, vectors = np.linalg.eigh(covariance)
         with np.errstate(divide="ignore"):
             clipped = np.clip(np.where(values > 0.0, 1.0 / values, bounds[1]), *bounds)
@@ -119,13 +122,13 @@ class ObserverPrior:
         return weight
 
 
-def _relative_inverse(covariance: Array) -> Array:
+def _relative_inverse(covariance: Array, least: float) -> Array:
     """The inverse by standard deviations and correlations, whatever the units."""
     variances = covariance.diagonal()
     deviations = np.sqrt(np.maximum(variances, _NO_VARIANCE))
     products = np.multiply.outer(deviations, deviations)
     values, vectors = np.linalg.eigh(covariance / products)
-    weight: Array = (vectors / np.maximum(values, SINGULAR)) @ vectors.T
+    weight: Array = (vectors / np.where(values > SINGULAR, values, least)) @ vectors.T
     return weight / products
 
 
