@@ -73,7 +73,8 @@ class ObserverPrior:
     .. math::
         D^{-1} C^{-1} D^{-1}, \qquad P = D\, C\, D
 
-    where eigenvalues of C below 1e-12, which are rounding, count as 1e-12.
+    where eigenvalues of C below 1e-12, which are rounding, count as 1e-12; as 3e-9 where the
+    disturbance has fewer directions than the state, so that C may be singular for ever.
 
     Parameters
     ----------

@@ -8,7 +8,6 @@ from .._checks import Array
 from .base import Cost, CostConstants, quadratic_form
 from .subspace import Subspace
 
-
 # Rounding of 1 / s in a prior's weight is as large as the error of s in place of an eigenvalue 0.
 _LEAST = 3e-9
 
