@@ -73,7 +73,8 @@ class ObserverPrior:
     .. math::
         D^{-1} C^{-1} D^{-1}, \qquad P = D\, C\, D
 
-    where eigenvalues of C below 1e-12, which are rounding, count as 1e-12.
+    where eigenvalues of C below 1e-12, which are rounding, count as 1e-12; as 3e-9 where the
+    disturbance has fewer directions than the state, so that C may be singular for ever.
 
     Parameters
     ----------
@@ -107,11 +108,14 @@ class ObserverPrior:
             return None
         return self.minimum, self.maximum
 
-    def weight(self, covariance: Array) -> Array:
-        """The inverse of a covariance (n, n), clipped if bounds were given."""
+    def weight(self, covariance: Array, least: float = SINGULAR) -> Array:
+        """The inverse of a covariance (n, n), clipped if bounds were given.
+
+        Otherwise eigenvalues of its correlations that are rounding count as ``least``.
+        """
         bounds = self.bounds
         if bounds is None:
-            return _relative_inverse(covariance)
+            return _relative_inverse(covariance, least)
         values, vectors = np.linalg.eigh(covariance)
         with np.errstate(divide="ignore"):
             clipped = np.clip(np.where(values > 0.0, 1.0 / values, bounds[1]), *bounds)
@@ -119,13 +123,13 @@ class ObserverPrior:
         return weight
 
 
-def _relative_inverse(covariance: Array) -> Array:
+def _relative_inverse(covariance: Array, least: float) -> Array:
     """The inverse by standard deviations and correlations, whatever the units."""
     variances = covariance.diagonal()
     deviations = np.sqrt(np.maximum(variances, _NO_VARIANCE))
     products = np.multiply.outer(deviations, deviations)
     values, vectors = np.linalg.eigh(covariance / products)
-    weight: Array = (vectors / np.maximum(values, SINGULAR)) @ vectors.T
+    weight: Array = (vectors / np.where(values > SINGULAR, values, least)) @ vectors.T
     return weight / products
 
 

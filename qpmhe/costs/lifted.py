@@ -8,6 +8,9 @@ from .._checks import Array
 from .base import Cost, CostConstants, quadratic_form
 from .subspace import Subspace
 
+# Rounding of 1 / s in a prior's weight is as large as the error of s in place of an eigenvalue 0.
+_LEAST = 3e-9
+
 
 class LiftedCost(Cost):
     r"""The user's cost of w, as a cost of :math:`d = x^+ - f(x)`.
@@ -59,6 +62,12 @@ class LiftedCost(Cost):
         """The user's weights (..., s + p, s + p), from those of d and v."""
         lowered: Array = self._range.T @ weights @ self._range
         return lowered
+
+    def initial_weight(self, covariance: Array | None) -> Array:
+        """As any cost's, more exact where a covariance is singular; see `Cost.initial_weight`."""
+        if self.observer_prior is None or covariance is None:
+            return super().initial_weight(covariance)
+        return self.observer_prior.weight(covariance, _LEAST)
 
     def prior_cost(self, offset: Array, weight: Array) -> float:
         """The user's; see `Cost.prior_cost`."""

@@ -132,6 +132,27 @@ def test_with_a_constant_prior_it_is_least_squares_in_the_disturbances(n, r, p, 
             assert np.abs(estimate.disturbances - w).max() <= 1e-8 * (1.0 + np.abs(w).max())
 
 
+@pytest.mark.parametrize("horizon", [1, 4])
+@pytest.mark.parametrize("seed", range(4))
+def test_singular_covariances_of_the_state_cost_few_digits(seed, horizon):
+    """A model that forgets all but one direction has covariances of rank 2 in 3 dimensions."""
+    plant, rng = Linear(seed, 3, 1, 2), np.random.default_rng(seed + 5)
+    plant.A = np.outer(rng.standard_normal(3), rng.standard_normal(3))
+    plant.A /= np.abs(np.linalg.eigvals(plant.A)).max()
+    mhe = plant.estimator(
+        "matrix",
+        lambda _, Q: qpmhe.ExtendedKalman(prior=plant.P, disturbance=Q, noise=plant.R),
+        lambda Q: qpmhe.QuadraticCost.from_covariances(
+            prior=qpmhe.ObserverPrior(), disturbance=Q, noise=plant.R
+        ),
+        horizon=horizon,
+    )
+    means, covariances = plant.kalman()
+    assert np.linalg.cond(covariances[-1]) > 1e15
+    found = mhe.run(plant.Y).states
+    assert np.abs(found - means).max() <= 1e-7 * (1.0 + np.abs(means).max())
+
+
 def test_a_state_that_only_delays_another_has_singular_covariances_throughout():
     """x2+ = x1 and x1 a random walk that starts at a known value."""
     A, Q, R = np.array([[1.0, 0.0], [1.0, 0.0]]), np.diag([0.04, 0.0]), np.eye(2)
