@@ -55,7 +55,8 @@ class SoftDrawn(Drawn):
             flat = s @ self.slopes.T
             return (flat + 0.2 * s[..., :1] ** 2 - self.level) * rows
 
-        penalty = {} if self.hard else self.penalties(self.prices["states"][:, :2], rows, units.cost)
+        prices = self.prices["states"][:, :2]
+        penalty = {} if self.hard else self.penalties(prices, rows, units.cost)
         made["constraints"] = [qpmhe.Constraint(g, 2, **penalty)]
         return made
 
