@@ -107,6 +107,9 @@ class Optimizer:
         self._limit, self._tolerance = settings.qp_limit, settings.tolerance
         self._warm_start = settings.warm_start
         self._may_drop = settings.infeasible == "drop_rows"
+        # Most estimators have no soft rows and no nonlinear constraints.
+        self._extended = subproblem.extended
+        self._solution = self._softened_solution if self._extended else self._solve
 
     def improve(
         self,
@@ -135,7 +138,8 @@ class Optimizer:
         if self._limit == 0:
             outcome.events |= Status.NO_QPS
             return outcome
-        self._subproblem.start()
+        if self._extended:
+            self._subproblem.start()
         start = shifted() if self._warm_start else None
         if feasible:
             self._search(problem, outcome, start, self._limit)
@@ -251,7 +255,11 @@ class Optimizer:
         best = outcome.trial
         # Where J is infinite, no decrease is negligible.
         negligible = self._tolerance * best.cost if best.cost < math.inf else -1.0
-        predicted = self._subproblem.predicted(qp, best, solution.d)
+        # The decrease of J that the QP predicts: its objective is J/2.
+        if self._extended:
+            predicted = self._subproblem.predicted(qp, best, solution.d)
+        else:
+            predicted = abs(float(np.vdot(qp.gradient, solution.d)))
         useless = solved and predicted <= negligible
         trial = self._line_search(problem, qp, outcome, solution.d, useless)
         if trial.cost < _target(best):
@@ -339,7 +347,7 @@ class Optimizer:
                 break
         return trial
 
-    def _solution(self, qp: QP, outcome: Outcome) -> Solution | None:
+    def _softened_solution(self, qp: QP, outcome: Outcome) -> Solution | None:
         """The solution of a QP with its soft rows, if there are any; None if no time is left.
 
         Where the solution without them violates none, it is the solution with them, too.

@@ -313,13 +313,10 @@ class Problem:
             trial.penalty = self.penalties.cost(self.penalties.misses(values))
             trial.cost += trial.penalty
 
-    def linearised(
-        self, trial: Trial, minus_jacobian: Array
-    ) -> tuple[Array, Array] | None:
+    def linearised(self, trial: Trial, minus_jacobian: Array) -> tuple[Array, Array]:
         """Derivatives of the nonlinear constraints; see `ConstraintFunctions.linearised`."""
         functions = self._formulation.functions
-        if functions is None:
-            return None
+        assert functions is not None
         return functions.linearised(
             trial.trajectory, self.inputs, trial.residuals, minus_jacobian
         )

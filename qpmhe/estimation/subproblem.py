@@ -66,6 +66,8 @@ class Subproblem:
         self._penalties = penalties
         self._softened = None if penalties is None else Softened(penalties, n)
         self._functions = system.constraints
+        #: Whether there are soft rows or nonlinear constraints.
+        self.extended: bool = self._functions is not None or penalties is not None
         # Multipliers of the nonlinear constraints in the last QP of the sequence, (K + 1, T).
         self._forces: Array | None = None
         self._qp: QP | None = None
@@ -187,7 +189,7 @@ class Subproblem:
             self._forces = forces if forces.any() and np.isfinite(forces).all() else None
 
     def predicted(self, qp: QP, best: Trial, step: Array) -> float:
-        """The decrease of J that the QP predicts for its step: its objective is J/2."""
+        """The decrease of J that the QP predicts for its step."""
         if self._softened is None:
             return abs(float(np.vdot(qp.gradient, step)))
         decrease = best.penalty - 2.0 * qp.objective(step) - self._softened.penalty(step)
@@ -230,7 +232,9 @@ class Subproblem:
             self._add_curvature(
                 qp, *problem.curvature(trial, span.minus_jacobian, self._forces)
             )
-        slopes = problem.linearised(trial, span.minus_jacobian)
+        slopes = None
+        if self._functions is not None:
+            slopes = problem.linearised(trial, span.minus_jacobian)
         if problem.constrained:
             self._set_inequalities(qp, problem, trial, slopes)
         if self._softened is not None and problem.penalties is not None:

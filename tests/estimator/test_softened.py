@@ -471,3 +471,88 @@ def test_functions_are_evaluated_however_they_are_written(write):
                 own[i], by_x + by_w @ minus[i, :2] + minus[i, 2:], rtol=1e-6, atol=1e-8
             )
             np.testing.assert_allclose(following[i], by_w, rtol=1e-6, atol=1e-8)
+
+
+def test_disturbances_of_lower_dimension():
+    ys = record()
+    observer = qpmhe.Luenberger(GAIN)
+
+    def costs(disturbance, **options):
+        cost = qpmhe.QuadraticCost(prior=COST.prior, disturbance=disturbance, noise=COST.noise)
+        mhe = qpmhe.MovingHorizonEstimator(
+            qpmhe.System(f, h, n=2, p=2, **options), observer, cost, horizon=N,
+            initial_state=[1.5, 0.8], max_qps=None,
+        )
+        found = [mhe.update(y) for y in ys]
+        assert all(one.cost <= one.candidate_cost for one in found)
+        return np.array([one.cost for one in found]), found
+
+    matrix = [[0.0], [1.0]]
+    bounds = {"linear": 5.0, "quadratic": 40.0}
+    by_set, _ = costs(
+        [[100.0]], disturbance_matrix=matrix,
+        disturbances=qpmhe.Box([-0.02], [0.03]).soften(**bounds),
+    )
+    by_function, _ = costs([[100.0]], disturbance_matrix=matrix, constraints=[
+        qpmhe.Constraint(lambda w: np.array([w[0] - 0.03, -0.02 - w[0]]), 2, **bounds)
+    ])
+    fixed, _ = costs(100.0 * np.eye(2), disturbances=qpmhe.Box([0, -np.inf], [0, np.inf]),
+                     constraints=[qpmhe.Constraint(
+                         lambda w: np.array([w[1] - 0.03, -0.02 - w[1]]), 2, **bounds)])
+    none, _ = costs([[100.0]], disturbance_matrix=matrix)
+    assert (by_set > none + 1e-6).sum() > 5
+    np.testing.assert_allclose(by_function, by_set, rtol=1e-6)
+    np.testing.assert_allclose(fixed, by_set, rtol=1e-6)
+    _, hard = costs([[100.0]], disturbance_matrix=matrix, constraints=[
+        qpmhe.Constraint(lambda x, w: w[0] ** 2 - 0.03**2 + 0.0 * x[0])
+    ])
+    held = [one for one in hard if one.improved and not one.dropped]
+    assert len(held) > 10
+    assert all(np.abs(one.disturbances).max() <= 0.03 + 1e-6 for one in held)
+
+
+def test_residuals_that_wrap():
+    # Measurements with whole turns added are the same measurements.
+    ys, turns = record(), np.random.default_rng(0).integers(-2, 3, (24, 2))
+    options = {
+        "output_residual": qpmhe.angles([0, 1], period=2.0), "noises": SOFT["noises"],
+        "constraints": [qpmhe.Constraint(lambda x, v: x[0] + v[0] ** 2 - 1.1, linear=6.0)],
+    }
+    for one, other in zip(
+        estimates(options, ys), estimates(options, ys + 2.0 * turns), strict=True
+    ):
+        assert one.cost == pytest.approx(other.cost, rel=1e-7)
+    with pytest.raises(SetError, match="bounds an angle"):
+        qpmhe.System(
+            f, h, n=2, p=2, state_residual=qpmhe.angles([0]), states=SOFT["states"]
+        )
+
+
+def test_what_changes_while_running():
+    hard = qpmhe.Box([-0.2, -0.2], [0.2, 0.3])
+    options = {"noises": hard, "constraints": CONSTRAINTS["soft"], "states": SOFT["states"]}
+    mhe = make(options, max_qps=3)
+    with pytest.raises(qpmhe.errors.OptionError, match="the set of states is soft"):
+        mhe.update([1.0, 0.5], bounds={"states": qpmhe.Box([-1.0, -1.0], [1.0, 1.0])})
+    for t, y in enumerate(record(12)):
+        given = {"bounds": {"noises": qpmhe.Box([-0.3, -0.3], [0.3, 0.3])}} if t == 4 else {}
+        if t == 6:
+            given = {"noise_weight": 9.0 * np.eye(2), "disturbance_weight": 50.0 * np.eye(2)}
+        estimate = mhe.update(y, **given)
+        assert estimate.cost <= estimate.candidate_cost
+    mhe.set(disturbance_weight=80.0 * np.eye(2))
+    estimate = mhe.update([1.0, 0.5])
+    assert estimate.cost <= estimate.candidate_cost
+
+
+def test_augmented_models_refuse_them_by_name():
+    system = qpmhe.System.from_ode(
+        rate, output, dt=0.1, n=2, p=2, m=1, constraints=CONSTRAINTS["hard"]
+    )
+    with pytest.raises(qpmhe.errors.InvalidInputError, match="nonlinear constraints"):
+        qpmhe.noisy_inputs(system)
+    with pytest.raises(SetError, match="is soft; an augmented model takes hard ones only"):
+        qpmhe.augment_parameters(
+            lambda x, theta: f(x) * theta, lambda x, theta: h(x), n=2, p=2, nominal=[1.0],
+            states=SOFT["states"],
+        )
