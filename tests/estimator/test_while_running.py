@@ -649,3 +649,45 @@ def test_what_is_made_for_constant_weights_refuses_changed_ones(tmp_path):
         qpmhe.codegen.write(mhe, tmp_path)
         mhe.set(**changes)
         check(OptionError, ["set(...)"], lambda mhe=mhe: qpmhe.codegen.write(mhe, tmp_path))
+
+
+@pytest.mark.parametrize("kalman", [False, True])
+def test_with_a_disturbance_matrix(kalman):
+    """The disturbance's weight then has the size of its columns."""
+    def made(weight, start=(0.4, 0.0)):
+        system = qpmhe.System(
+            lambda x: x + 0.1 * np.stack((x[..., 1], -np.sin(x[..., 0])), axis=-1),
+            lambda x: x[..., :1], n=2, p=1, disturbance_matrix=[[0.1], [1.0]],
+        )
+        observer, first = qpmhe.Luenberger([[0.3], [0.2]]), np.eye(2)
+        if kalman:
+            observer = qpmhe.ExtendedKalman(prior=first, disturbance=1.0 / weight, noise=1.0)
+            first = qpmhe.ObserverPrior()
+        cost = qpmhe.QuadraticCost(prior=first, disturbance=weight, noise=1.0)
+        return qpmhe.MovingHorizonEstimator(
+            system, observer, cost, horizon=4, initial_state=start, max_qps=2
+        )
+
+    mhe, twin, rng = made(9.0), made(9.0), np.random.default_rng(14)
+    Y = rng.normal(0.0, 0.5, 12)
+    wrong = {"disturbance_weight": np.eye(2)}
+    unharmed(mhe, ShapeError, ["(2, 2)", "(1, 1)"], lambda one: one.set(**wrong))
+    for t, y in enumerate(Y[:8]):
+        own = {"disturbance_weight": 9.0} if t % 2 else {}
+        found, expected = mhe.update(y, **own), twin.update(y)
+        assert_same(numbers(found), numbers(expected))
+    assert_same(numbers(mhe.set(disturbance_weight=9.0)), numbers(found))
+    other = made(4.0, found.candidate[0])
+    for y in Y[4:8]:
+        expected = other.update(y)
+    found = mhe.set(disturbance_weight=[[4.0]])
+    if not kalman:  # the other one's covariance would have to be another from the start
+        assert_close(found, expected)
+    restored = made(9.0)
+    restored.load_state_dict(mhe.state_dict())
+    for t, y in enumerate(Y[8:]):
+        own = {"disturbance_weight": 20.0} if t == 1 else {}
+        found, expected = mhe.update(y, **own), other.update(y, **own)
+        if not kalman:
+            assert_close(found, expected)
+        assert_same(numbers(restored.update(y, **own)), numbers(found))
