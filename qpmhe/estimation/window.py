@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,8 @@ from ..observers.projection import ErrorMetric, NearestPoint
 from .conditions import USUAL, Conditions
 from .estimate import Status
 from .limits import LARGEST
-from .linearization import Stage, StageTerms
+from .linearization import Stage
 from .running import RunningObservers
-from .snapshot import mismatch, near
 from .stages import Stages, StageView, WindowView, read_only
 
 Array = NDArray[np.float64]
@@ -607,66 +606,3 @@ class Window(Stages):
         if self._cost.quadratic:
             return self.stage_weights
         return self._majorising_weights[self.start : self.end]
-
-    def check_stages(self, loaded: Window, terms: bool) -> None:
-        """Compute the stages of a loaded window again, and raise if the loaded ones differ.
-
-        This window, loaded from the same state, then holds the computed ones.
-        """
-        n, count, first = self._n, self.end, self.time - self.end
-        with np.errstate(all="ignore"):
-            for k in range(count):
-                self._set_weight(k, first + k)
-                self._compute_stage(k, first + k)
-                succeeded = math.isfinite(loaded._stage_costs[k])
-                if succeeded != math.isfinite(self._stage_costs[k]):
-                    raise mismatch("model")
-                if succeeded:
-                    self._check_stage(k, loaded, terms)
-                elif loaded.terms.residuals[k, :n].any():  # no correction at a failed stage
-                    raise mismatch("model")
-                # After a failed stage, `restart` may have set it; elsewhere it has been compared.
-                self._z[k + 1] = loaded._z[k + 1]
-                if self._covariances is not None and loaded._covariances is not None:
-                    self._covariances[k + 1] = loaded._covariances[k + 1]
-
-    def _check_stage(self, k: int, loaded: Window, terms: bool) -> None:
-        for what, found, expected, size in self._comparisons(k, loaded, terms):
-            if not near(found, expected, size):
-                raise mismatch(what)
-
-    def _comparisons(
-        self, k: int, loaded: Window, terms: bool
-    ) -> Iterator[tuple[str, Array, Array, Array | float]]:
-        """What must agree, the loaded and the computed numbers, and the size of their terms."""
-        n, mine, saved, weight = self._n, self.terms, loaded.terms, self._weights[k]
-        flags = [np.append(one._observed[k], one._special[k]) * 1.0 for one in (loaded, self)]
-        yield "weight of the stages' cost", flags[0], flags[1], 0.0
-        yield "weight of the stages' cost", loaded._weights[k], weight, np.abs(weight).max()
-        correction, v = mine.residuals[k, :n], mine.residuals[k, n:]
-        yield "model (h)", saved.residuals[k, n:], v, np.abs(self._y[k]) + np.abs(v)
-        reached = np.maximum(np.abs(loaded._z[: self.end + 1]).max(axis=0), np.abs(correction))
-        yield "observer", saved.residuals[k, :n], correction, reached
-        yield "model (f)", loaded._z[k + 1], self._z[k + 1], reached
-        if self._covariances is not None and loaded._covariances is not None:
-            expected = self._covariances[k + 1]
-            spread = np.sqrt(np.abs(expected.diagonal()))
-            yield "observer", loaded._covariances[k + 1], expected, np.outer(spread, spread)
-        r, weight = saved.residuals[k], loaded._weights[k]
-        cost = self._evaluate_costs(r[None], weight)[0]
-        size = np.abs(r).dot(np.abs(weight)).dot(np.abs(r)) if self._quadratic else cost
-        yield "cost", loaded._stage_costs[k], cost, size
-        if not (terms and (self._with_terms or self._quadratic)):
-            return
-        jacobian, weight = mine.linear[k, :, 1:], self._majorising_weights[k]
-        size = np.nan_to_num(np.abs(jacobian)).max(axis=1, keepdims=True)
-        yield "model (its Jacobians)", saved.linear[k, :, 1:], jacobian, size
-        yield "cost", loaded._majorising_weights[k], weight, np.abs(weight).max()
-        exact, bound = StageTerms(1, n, r.size - n), StageTerms(1, n, r.size - n)
-        exact.linear[0], weight = saved.linear[k], loaded._majorising_weights[k]
-        bound.linear[0] = np.abs(exact.linear[0])
-        exact.set_all(1, weight)
-        bound.set_all(1, np.abs(weight))
-        sizes = bound.arrays()
-        for name, expected in exact.arrays().items():
-            yield "weight of the stages' cost", saved.arrays()[name][k], expected[0], sizes[name][0]
