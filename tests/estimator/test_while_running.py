@@ -606,27 +606,6 @@ def test_the_compiled_step_refuses_by_name():
     np.testing.assert_allclose(mhe.run(Y, U).states, python.run(Y, U).states, atol=1e-9)
 
 
-def test_bounds_of_an_angle_lie_in_its_turn():
-    system = qpmhe.System(
-        lambda x: x + np.array([0.3, 0.0]), lambda x: x, n=2, p=2, state_residual=qpmhe.angles([0]),
-        output_residual=qpmhe.angles([0]), states=qpmhe.Box([2.0, -np.inf], [6.0, np.inf]),
-    )
-    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(2))
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(0.3 * np.eye(2)), cost, horizon=3, initial_state=[3.0, 0.0]
-    )
-    for t in range(12):
-        for low, high, fragment in ((-4.0, 3.0, "-4.0"), (3.0, 9.0, "9.0")):
-            wrong = {"bounds": {"states": qpmhe.Box([low, -np.inf], [high, np.inf])}}
-            unharmed(
-                mhe, SetError, [fragment, "whole turns"],
-                lambda one, wrong=wrong: one.update([0.0, 0.0], **wrong),
-            )
-        box = qpmhe.Box([3.1, -np.inf], [3.5 + 0.1 * t, np.inf])
-        estimate = mhe.update([3.0 + 0.3 * t - 2.0 * np.pi, 0.0], bounds={"states": box})
-        assert box.violation(estimate.trajectory[-1]) <= 1e-9
-
-
 def test_a_batch_has_no_parameters():
     mhe = estimator()
     with pytest.raises(qpmhe.errors.UnknownOptionError, match=r"'parameters'.*inputs"):
