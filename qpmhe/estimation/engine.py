@@ -184,7 +184,7 @@ class PythonEngine:
         window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
             window.make_room()  # before the undo point: `undo` cannot reverse it
-        self._set_undo_point(reinitialized or window.moves_state(own))
+        self._set_undo_point(reinitialized or (window.projects and window.moves_state(own)))
         try:
             with np.errstate(all="ignore"):
                 if window.length == self._settings.horizon:

@@ -83,6 +83,8 @@ class Window(Stages):
                 self.metric = ErrorMetric(
                     observer, cost.initial_weight(observer.initial_covariance()), noise
                 )
+        #: Whether the observer is projected onto X.
+        self.projects: bool = self._usual_nearest is not None
         self._nearest = self._usual_nearest
         # For the re-initialised candidate; None where `replay` has to make it.
         self._observers: RunningObservers | None = None
@@ -129,8 +131,6 @@ class Window(Stages):
 
     def moves_state(self, own: Conditions | None) -> bool:
         """Whether a sample with these conditions may project z(t) onto another X."""
-        if self._nearest is None or (own is None and not self._own):
-            return False
         states = None if own is None else own.states
         return states is not self._own.get(self.time - 1, USUAL).states
 
@@ -140,7 +140,8 @@ class Window(Stages):
         """Store the sample y(t), u(t), and advance the observer to z(t+1)."""
         if self.end == self.room:
             self.make_room()
-        moves, failed = self.moves_state(own), self.time > 0 and self.newest_failed
+        moves = self.projects and self.moves_state(own)
+        failed = moves and self.time > 0 and self.newest_failed
         k, m, time = self.end, self._m, self.time
         self.end, self.time = k + 1, time + 1
         view = self._stage_views[k]
@@ -264,7 +265,8 @@ class Window(Stages):
             observers.trajectory(first, now)
         )
         self.failure = ""
-        if self._is_missing(now - 1, self._sample.observed):
+        observed = self._sample.observed
+        if observed is not None and self._is_missing(now - 1, observed):
             self.events |= _MISSING
         return not observers.failed[first % self.horizon] and self._set_all_stages()
 
@@ -292,7 +294,9 @@ class Window(Stages):
     def _compute_stage(self, k: int, time: int) -> None:
         """Compute stage k, of this time, from its sample and the observer's state."""
         y, observed = self._stage_views[k].y, self._find_observed(k, time)
-        self.failure, self._nearest = "", self._projection(time + 1)
+        self.failure = ""
+        if self.projects:
+            self._nearest = self._projection(time + 1)
         cost = self._evaluate_stage(k, time, observed)
         if not math.isfinite(cost) and observed is None:
             small = np.abs(y) < LARGEST
@@ -309,7 +313,7 @@ class Window(Stages):
         if (model_failed or jacobian_failed) and not self.failure:
             what = "the model, the observer or the cost" if model_failed else "a Jacobian"
             self.failure = f"{what} is not finite at x = {self._stage_views[k].z.tolist()}."
-        if self._is_missing(time, observed):
+        if observed is not None and self._is_missing(time, observed):
             self.events |= _MISSING
         if model_failed or jacobian_failed:
             self.events |= _MODEL_FAILED
@@ -325,10 +329,8 @@ class Window(Stages):
         observed: NDArray[np.bool_] = self._observed[k]
         return observed
 
-    def _is_missing(self, time: int, observed: NDArray[np.bool_] | None) -> bool:
+    def _is_missing(self, time: int, observed: NDArray[np.bool_]) -> bool:
         """Whether a component was sampled that is not there."""
-        if observed is None:
-            return False
         sampled = self._own.get(time, USUAL).sampled
         if sampled is None:
             return True
@@ -413,7 +415,7 @@ class Window(Stages):
     ) -> tuple[System, Array]:
         """Fill the `Sample` that the observer gets for stage k; return its model and input."""
         model, u, sample = self._system, self._stage_views[k].u, self._sample
-        own = self._own.get(time, USUAL)
+        own = self._own.get(time, USUAL) if self._own else USUAL
         if own is not self._filled:
             self._filled = None  # an interrupt may leave half of it
             whole = own if self._usual is USUAL else own.over(self._usual)
