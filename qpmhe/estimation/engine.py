@@ -26,6 +26,7 @@ from .covariance import window_covariances
 from .estimate import Estimate, Status
 from .optimizer import Optimizer
 from .problem import Formulation
+from .recheck import check_stages
 from .settings import Settings
 from .snapshot import (
     SET_NAMES,
@@ -183,7 +184,7 @@ class PythonEngine:
         window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
             window.make_room()  # before the undo point: `undo` cannot reverse it
-        self._set_undo_point(reinitialized or window.moves_state(own))
+        self._set_undo_point(reinitialized or (window.projects and window.moves_state(own)))
         try:
             with np.errstate(all="ignore"):
                 if window.length == self._settings.horizon:
@@ -466,7 +467,7 @@ class PythonEngine:
             if not np.array_equal(trajectory[-1], history[-1]):
                 raise ValueError("history does not end where the trajectory does")
         same_terms = with_terms == self._with_terms
-        recomputed.check_stages(loaded, same_terms)
+        check_stages(recomputed, loaded, same_terms)
         far, dropped = (
             check_size("watched", found, lambda count: 0 <= count <= loaded.time)
             for found in state["watched"]

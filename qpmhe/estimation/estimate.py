@@ -146,7 +146,7 @@ class Estimate:
         w(i) = x(i+1) - f(x(i)) along the trajectory; with a ``disturbance_matrix`` G, the w(i)
         for which G w(i) is nearest to this difference.
     noises : (N_t, p) array
-        v(i) = y(i) - h(x(i)) along the trajectory; NaN where y is missing.
+        v(i) = y(i) - h(x(i)) along the trajectory; NaN where y is missing or was not sampled.
     cost, candidate_cost : float
         True cost J of the estimate and of the observer's candidate, penalties of what is soft
         included; cost <= candidate_cost.

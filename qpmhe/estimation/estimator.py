@@ -330,7 +330,8 @@ class MovingHorizonEstimator:
             y_array = self._measurement(y)
         else:
             y_array, own = self._sampled(y, sensors)
-        u_array = self._input(u, parameters)
+        needed = u is not None or parameters is not None or self._full_input.size
+        u_array = self._input(u, parameters) if needed else self._full_input
         if dt is not None:
             dt = positive("dt", dt)
             self._check_step_length(dt)

@@ -239,7 +239,8 @@ class Stages:
     def mark(self, whole: bool) -> Mark:
         """What `roll_back` needs; all stages if ``whole``."""
         return Mark(
-            self.start, self.end, self.time, self.unusual, self._own.copy(), self.smoothed_prior,
+            self.start, self.end, self.time, self.unusual,
+            self._own.copy() if self._own else {}, self.smoothed_prior,
             None if self.metric is None else self.metric.state,
             self._copies() if whole else None,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,8 @@ from ..observers.projection import ErrorMetric, NearestPoint
 from .conditions import USUAL, Conditions
 from .estimate import Status
 from .limits import LARGEST
-from .linearization import Stage, StageTerms
+from .linearization import Stage
 from .running import RunningObservers
-from .snapshot import mismatch, near
 from .stages import Stages, StageView, WindowView, read_only
 
 Array = NDArray[np.float64]
@@ -84,6 +83,8 @@ class Window(Stages):
                 self.metric = ErrorMetric(
                     observer, cost.initial_weight(observer.initial_covariance()), noise
                 )
+        #: Whether the observer is projected onto X.
+        self.projects: bool = self._usual_nearest is not None
         self._nearest = self._usual_nearest
         # For the re-initialised candidate; None where `replay` has to make it.
         self._observers: RunningObservers | None = None
@@ -130,8 +131,6 @@ class Window(Stages):
 
     def moves_state(self, own: Conditions | None) -> bool:
         """Whether a sample with these conditions may project z(t) onto another X."""
-        if self._nearest is None or (own is None and not self._own):
-            return False
         states = None if own is None else own.states
         return states is not self._own.get(self.time - 1, USUAL).states
 
@@ -141,7 +140,8 @@ class Window(Stages):
         """Store the sample y(t), u(t), and advance the observer to z(t+1)."""
         if self.end == self.room:
             self.make_room()
-        moves, failed = self.moves_state(own), self.time > 0 and self.newest_failed
+        moves = self.projects and self.moves_state(own)
+        failed = moves and self.time > 0 and self.newest_failed
         k, m, time = self.end, self._m, self.time
         self.end, self.time = k + 1, time + 1
         view = self._stage_views[k]
@@ -265,7 +265,8 @@ class Window(Stages):
             observers.trajectory(first, now)
         )
         self.failure = ""
-        if self._is_missing(now - 1, self._sample.observed):
+        observed = self._sample.observed
+        if observed is not None and self._is_missing(now - 1, observed):
             self.events |= _MISSING
         return not observers.failed[first % self.horizon] and self._set_all_stages()
 
@@ -293,7 +294,9 @@ class Window(Stages):
     def _compute_stage(self, k: int, time: int) -> None:
         """Compute stage k, of this time, from its sample and the observer's state."""
         y, observed = self._stage_views[k].y, self._find_observed(k, time)
-        self.failure, self._nearest = "", self._projection(time + 1)
+        self.failure = ""
+        if self.projects:
+            self._nearest = self._projection(time + 1)
         cost = self._evaluate_stage(k, time, observed)
         if not math.isfinite(cost) and observed is None:
             small = np.abs(y) < LARGEST
@@ -310,7 +313,7 @@ class Window(Stages):
         if (model_failed or jacobian_failed) and not self.failure:
             what = "the model, the observer or the cost" if model_failed else "a Jacobian"
             self.failure = f"{what} is not finite at x = {self._stage_views[k].z.tolist()}."
-        if self._is_missing(time, observed):
+        if observed is not None and self._is_missing(time, observed):
             self.events |= _MISSING
         if model_failed or jacobian_failed:
             self.events |= _MODEL_FAILED
@@ -326,10 +329,8 @@ class Window(Stages):
         observed: NDArray[np.bool_] = self._observed[k]
         return observed
 
-    def _is_missing(self, time: int, observed: NDArray[np.bool_] | None) -> bool:
+    def _is_missing(self, time: int, observed: NDArray[np.bool_]) -> bool:
         """Whether a component was sampled that is not there."""
-        if observed is None:
-            return False
         sampled = self._own.get(time, USUAL).sampled
         if sampled is None:
             return True
@@ -414,7 +415,7 @@ class Window(Stages):
     ) -> tuple[System, Array]:
         """Fill the `Sample` that the observer gets for stage k; return its model and input."""
         model, u, sample = self._system, self._stage_views[k].u, self._sample
-        own = self._own.get(time, USUAL)
+        own = self._own.get(time, USUAL) if self._own else USUAL
         if own is not self._filled:
             self._filled = None  # an interrupt may leave half of it
             whole = own if self._usual is USUAL else own.over(self._usual)
@@ -607,66 +608,3 @@ class Window(Stages):
         if self._cost.quadratic:
             return self.stage_weights
         return self._majorising_weights[self.start : self.end]
-
-    def check_stages(self, loaded: Window, terms: bool) -> None:
-        """Compute the stages of a loaded window again, and raise if the loaded ones differ.
-
-        This window, loaded from the same state, then holds the computed ones.
-        """
-        n, count, first = self._n, self.end, self.time - self.end
-        with np.errstate(all="ignore"):
-            for k in range(count):
-                self._set_weight(k, first + k)
-                self._compute_stage(k, first + k)
-                succeeded = math.isfinite(loaded._stage_costs[k])
-                if succeeded != math.isfinite(self._stage_costs[k]):
-                    raise mismatch("model")
-                if succeeded:
-                    self._check_stage(k, loaded, terms)
-                elif loaded.terms.residuals[k, :n].any():  # no correction at a failed stage
-                    raise mismatch("model")
-                # After a failed stage, `restart` may have set it; elsewhere it has been compared.
-                self._z[k + 1] = loaded._z[k + 1]
-                if self._covariances is not None and loaded._covariances is not None:
-                    self._covariances[k + 1] = loaded._covariances[k + 1]
-
-    def _check_stage(self, k: int, loaded: Window, terms: bool) -> None:
-        for what, found, expected, size in self._comparisons(k, loaded, terms):
-            if not near(found, expected, size):
-                raise mismatch(what)
-
-    def _comparisons(
-        self, k: int, loaded: Window, terms: bool
-    ) -> Iterator[tuple[str, Array, Array, Array | float]]:
-        """What must agree, the loaded and the computed numbers, and the size of their terms."""
-        n, mine, saved, weight = self._n, self.terms, loaded.terms, self._weights[k]
-        flags = [np.append(one._observed[k], one._special[k]) * 1.0 for one in (loaded, self)]
-        yield "weight of the stages' cost", flags[0], flags[1], 0.0
-        yield "weight of the stages' cost", loaded._weights[k], weight, np.abs(weight).max()
-        correction, v = mine.residuals[k, :n], mine.residuals[k, n:]
-        yield "model (h)", saved.residuals[k, n:], v, np.abs(self._y[k]) + np.abs(v)
-        reached = np.maximum(np.abs(loaded._z[: self.end + 1]).max(axis=0), np.abs(correction))
-        yield "observer", saved.residuals[k, :n], correction, reached
-        yield "model (f)", loaded._z[k + 1], self._z[k + 1], reached
-        if self._covariances is not None and loaded._covariances is not None:
-            expected = self._covariances[k + 1]
-            spread = np.sqrt(np.abs(expected.diagonal()))
-            yield "observer", loaded._covariances[k + 1], expected, np.outer(spread, spread)
-        r, weight = saved.residuals[k], loaded._weights[k]
-        cost = self._evaluate_costs(r[None], weight)[0]
-        size = np.abs(r).dot(np.abs(weight)).dot(np.abs(r)) if self._quadratic else cost
-        yield "cost", loaded._stage_costs[k], cost, size
-        if not (terms and (self._with_terms or self._quadratic)):
-            return
-        jacobian, weight = mine.linear[k, :, 1:], self._majorising_weights[k]
-        size = np.nan_to_num(np.abs(jacobian)).max(axis=1, keepdims=True)
-        yield "model (its Jacobians)", saved.linear[k, :, 1:], jacobian, size
-        yield "cost", loaded._majorising_weights[k], weight, np.abs(weight).max()
-        exact, bound = StageTerms(1, n, r.size - n), StageTerms(1, n, r.size - n)
-        exact.linear[0], weight = saved.linear[k], loaded._majorising_weights[k]
-        bound.linear[0] = np.abs(exact.linear[0])
-        exact.set_all(1, weight)
-        bound.set_all(1, np.abs(weight))
-        sizes = bound.arrays()
-        for name, expected in exact.arrays().items():
-            yield "weight of the stages' cost", saved.arrays()[name][k], expected[0], sizes[name][0]

@@ -606,27 +606,6 @@ def test_the_compiled_step_refuses_by_name():
     np.testing.assert_allclose(mhe.run(Y, U).states, python.run(Y, U).states, atol=1e-9)
 
 
-def test_bounds_of_an_angle_lie_in_its_turn():
-    system = qpmhe.System(
-        lambda x: x + np.array([0.3, 0.0]), lambda x: x, n=2, p=2, state_residual=qpmhe.angles([0]),
-        output_residual=qpmhe.angles([0]), states=qpmhe.Box([2.0, -np.inf], [6.0, np.inf]),
-    )
-    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(2))
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(0.3 * np.eye(2)), cost, horizon=3, initial_state=[3.0, 0.0]
-    )
-    for t in range(12):
-        for low, high, fragment in ((-4.0, 3.0, "-4.0"), (3.0, 9.0, "9.0")):
-            wrong = {"bounds": {"states": qpmhe.Box([low, -np.inf], [high, np.inf])}}
-            unharmed(
-                mhe, SetError, [fragment, "whole turns"],
-                lambda one, wrong=wrong: one.update([0.0, 0.0], **wrong),
-            )
-        box = qpmhe.Box([3.1, -np.inf], [3.5 + 0.1 * t, np.inf])
-        estimate = mhe.update([3.0 + 0.3 * t - 2.0 * np.pi, 0.0], bounds={"states": box})
-        assert box.violation(estimate.trajectory[-1]) <= 1e-9
-
-
 def test_a_batch_has_no_parameters():
     mhe = estimator()
     with pytest.raises(qpmhe.errors.UnknownOptionError, match=r"'parameters'.*inputs"):
@@ -649,3 +628,45 @@ def test_what_is_made_for_constant_weights_refuses_changed_ones(tmp_path):
         qpmhe.codegen.write(mhe, tmp_path)
         mhe.set(**changes)
         check(OptionError, ["set(...)"], lambda mhe=mhe: qpmhe.codegen.write(mhe, tmp_path))
+
+
+@pytest.mark.parametrize("kalman", [False, True])
+def test_with_a_disturbance_matrix(kalman):
+    """The disturbance's weight then has the size of its columns."""
+    def made(weight, start=(0.4, 0.0)):
+        system = qpmhe.System(
+            lambda x: x + 0.1 * np.stack((x[..., 1], -np.sin(x[..., 0])), axis=-1),
+            lambda x: x[..., :1], n=2, p=1, disturbance_matrix=[[0.1], [1.0]],
+        )
+        observer, first = qpmhe.Luenberger([[0.3], [0.2]]), np.eye(2)
+        if kalman:
+            observer = qpmhe.ExtendedKalman(prior=first, disturbance=1.0 / weight, noise=1.0)
+            first = qpmhe.ObserverPrior()
+        cost = qpmhe.QuadraticCost(prior=first, disturbance=weight, noise=1.0)
+        return qpmhe.MovingHorizonEstimator(
+            system, observer, cost, horizon=4, initial_state=start, max_qps=2
+        )
+
+    mhe, twin, rng = made(9.0), made(9.0), np.random.default_rng(14)
+    Y = rng.normal(0.0, 0.5, 12)
+    wrong = {"disturbance_weight": np.eye(2)}
+    unharmed(mhe, ShapeError, ["(2, 2)", "(1, 1)"], lambda one: one.set(**wrong))
+    for t, y in enumerate(Y[:8]):
+        own = {"disturbance_weight": 9.0} if t % 2 else {}
+        found, expected = mhe.update(y, **own), twin.update(y)
+        assert_same(numbers(found), numbers(expected))
+    assert_same(numbers(mhe.set(disturbance_weight=9.0)), numbers(found))
+    other = made(4.0, found.candidate[0])
+    for y in Y[4:8]:
+        expected = other.update(y)
+    found = mhe.set(disturbance_weight=[[4.0]])
+    if not kalman:  # the other one's covariance would have to be another from the start
+        assert_close(found, expected)
+    restored = made(9.0)
+    restored.load_state_dict(mhe.state_dict())
+    for t, y in enumerate(Y[8:]):
+        own = {"disturbance_weight": 20.0} if t == 1 else {}
+        found, expected = mhe.update(y, **own), other.update(y, **own)
+        if not kalman:
+            assert_close(found, expected)
+        assert_same(numbers(restored.update(y, **own)), numbers(found))

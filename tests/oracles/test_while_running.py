@@ -175,11 +175,12 @@ def test_the_observer_is_in_the_set_of_each_sample():
 class Drifting:
     """A linear system whose covariances drift, and its Kalman filter."""
 
-    def __init__(self, seed, missing):
+    def __init__(self, seed, missing, directions):
         rng = np.random.default_rng(seed)
         self.A, self.C = rng.standard_normal((3, 3)) / 2.0, rng.standard_normal((2, 3))
         self.P = weight(rng, 3, 1.0)
-        self.Q = [weight(rng, 3, 0.2) for _ in range(50)]
+        self.G = rng.standard_normal((3, directions)) if directions < 3 else np.eye(3)
+        self.Q = [weight(rng, directions, 0.2) for _ in range(50)]
         self.R = [weight(rng, 2, 0.3) for _ in range(50)]
         self.Y = rng.standard_normal((50, 2))
         self.Y[rng.random((50, 2)) < missing] = np.nan
@@ -191,18 +192,20 @@ class Drifting:
             C = self.C[there]
             K = P @ C.T @ np.linalg.inv(C @ P @ C.T + R[there][:, there])
             filtered, P = z + K @ (y[there] - C @ z), P - K @ C @ P
-            z, P = A @ filtered, A @ P @ A.T + Q
+            z, P = A @ filtered, A @ P @ A.T + self.G @ Q @ self.G.T
             yield filtered, z, P
 
 
 @pytest.mark.parametrize("candidate", ["observer", "reinitialized"])
 @pytest.mark.parametrize("missing", [0.0, 0.3])
 @pytest.mark.parametrize("observer", ["ExtendedKalman", "UnscentedKalman"])
-def test_drifting_covariances_give_the_kalman_filter(observer, missing, candidate):
-    one = Drifting(4, missing)
-    A, C, usual = one.A, one.C, {"disturbance": 0.1 * np.eye(3), "noise": np.eye(2)}
+@pytest.mark.parametrize("directions", [3, 2, 1])
+def test_drifting_covariances_give_the_kalman_filter(directions, observer, missing, candidate):
+    one = Drifting(4, missing, directions)
+    A, C, usual = one.A, one.C, {"disturbance": 0.1 * np.eye(directions), "noise": np.eye(2)}
+    given = {} if directions == 3 else {"disturbance_matrix": one.G}
     mhe = qpmhe.MovingHorizonEstimator(
-        qpmhe.System(lambda x: x @ A.T, lambda x: x @ C.T, n=3, p=2),
+        qpmhe.System(lambda x: x @ A.T, lambda x: x @ C.T, n=3, p=2, **given),
         getattr(qpmhe, observer)(prior=one.P, **usual),
         qpmhe.QuadraticCost.from_covariances(prior=qpmhe.ObserverPrior(), **usual),
         horizon=4, initial_state=np.zeros(3), candidate=candidate,

@@ -1,0 +1,78 @@
+"""Validation of a window from a snapshot: its stages, computed again, must agree."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .linearization import StageTerms
+from .snapshot import mismatch, near
+from .window import Window
+
+Array = NDArray[np.float64]
+
+
+def check_stages(window: Window, loaded: Window, terms: bool) -> None:
+    """Compute the stages of a loaded window again, and raise if the loaded ones differ.
+
+    The first window, loaded from the same state, then holds the computed ones; ``terms`` says
+    whether both are to have the terms of QPs.
+    """
+    n, count, first = window._n, window.end, window.time - window.end
+    with np.errstate(all="ignore"):
+        for k in range(count):
+            window._set_weight(k, first + k)
+            window._compute_stage(k, first + k)
+            succeeded = math.isfinite(loaded._stage_costs[k])
+            if succeeded != math.isfinite(window._stage_costs[k]):
+                raise mismatch("model")
+            if succeeded:
+                for what, found, expected, size in _comparisons(window, k, loaded, terms):
+                    if not near(found, expected, size):
+                        raise mismatch(what)
+            elif loaded.terms.residuals[k, :n].any():  # no correction at a failed stage
+                raise mismatch("model")
+            # After a failed stage, `restart` may have set it; elsewhere it has been compared.
+            window._z[k + 1] = loaded._z[k + 1]
+            if window._covariances is not None and loaded._covariances is not None:
+                window._covariances[k + 1] = loaded._covariances[k + 1]
+
+
+def _comparisons(
+    window: Window, k: int, loaded: Window, terms: bool
+) -> Iterator[tuple[str, Array, Array, Array | float]]:
+    """What must agree, the loaded and the computed numbers, and the size of their terms."""
+    n, mine, saved, weight = window._n, window.terms, loaded.terms, window._weights[k]
+    flags = [np.append(one._observed[k], one._special[k]) * 1.0 for one in (loaded, window)]
+    yield "weight of the stages' cost", flags[0], flags[1], 0.0
+    yield "weight of the stages' cost", loaded._weights[k], weight, np.abs(weight).max()
+    correction, v = mine.residuals[k, :n], mine.residuals[k, n:]
+    yield "model (h)", saved.residuals[k, n:], v, np.abs(window._y[k]) + np.abs(v)
+    reached = np.maximum(np.abs(loaded._z[: window.end + 1]).max(axis=0), np.abs(correction))
+    yield "observer", saved.residuals[k, :n], correction, reached
+    yield "model (f)", loaded._z[k + 1], window._z[k + 1], reached
+    if window._covariances is not None and loaded._covariances is not None:
+        expected = window._covariances[k + 1]
+        spread = np.sqrt(np.abs(expected.diagonal()))
+        yield "observer", loaded._covariances[k + 1], expected, np.outer(spread, spread)
+    r, weight = saved.residuals[k], loaded._weights[k]
+    cost = window._evaluate_costs(r[None], weight)[0]
+    size = np.abs(r).dot(np.abs(weight)).dot(np.abs(r)) if window._quadratic else cost
+    yield "cost", loaded._stage_costs[k], cost, size
+    if not (terms and (window._with_terms or window._quadratic)):
+        return
+    jacobian, weight = mine.linear[k, :, 1:], window._majorising_weights[k]
+    size = np.nan_to_num(np.abs(jacobian)).max(axis=1, keepdims=True)
+    yield "model (its Jacobians)", saved.linear[k, :, 1:], jacobian, size
+    yield "cost", loaded._majorising_weights[k], weight, np.abs(weight).max()
+    exact, bound = StageTerms(1, n, r.size - n), StageTerms(1, n, r.size - n)
+    exact.linear[0], weight = saved.linear[k], loaded._majorising_weights[k]
+    bound.linear[0] = np.abs(exact.linear[0])
+    exact.set_all(1, weight)
+    bound.set_all(1, np.abs(weight))
+    sizes = bound.arrays()
+    for name, expected in exact.arrays().items():
+        yield "weight of the stages' cost", saved.arrays()[name][k], expected[0], sizes[name][0]
