@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from .._checks import Array, choice
+from .._checks import Array
 from ..costs import Cost, CostConstants
 from ..errors import OptionError
 from .inequalities import Matrices, norms
@@ -225,7 +225,6 @@ class HorizonBounds:
 
     def beyond(self, kind: Kind) -> WindowBound:
         """The bound beyond the paper that a kind asks for."""
-        choice("kind", kind, get_args(Kind))
         if self.window is None or kind not in self.kinds:
             raise OptionError(
                 f"kind is {kind!r}, for which there is no bound here; expected one of "
