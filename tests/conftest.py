@@ -2,8 +2,8 @@
 
 The sample holds every test but those marked ``slow``. Of a test with several cases it holds one
 and a share of the others: first those that bring new values of the parameters, and in `oracles`
-and `properties` all of these. The choice depends on the names of the cases only, so that the
-processes of pytest-xdist agree on it.
+and `properties` all of these, up to a number that seeds alone exceed. The choice depends on the
+names of the cases only, so that the processes of pytest-xdist agree on it.
 """
 
 import hashlib
@@ -19,7 +19,8 @@ SHARE = 0.05
 FEW, MANY = 6, 25
 # Begun first, so that no long test is the last one: most of these tests start processes.
 FIRST = {"studies", "tests", "examples", "records"}
-WHOLE = {"oracles", "properties"}  # folders that keep every value of every parameter
+# Folders that keep every value of every parameter, and most cases that a test keeps for that.
+WHOLE, MOST = {"oracles", "properties"}, 24
 LEFT_OUT = pytest.StashKey[int]()
 COLLECTED = pytest.StashKey[int]()
 
@@ -55,7 +56,7 @@ def sample(cases):
         seen |= values
     wanted = 1 + round(SHARE * (len(cases) - 1))
     if cases[0].path.parent.name in WHOLE:
-        wanted = max(wanted, len(kept))
+        wanted = max(wanted, min(len(kept), MOST))
     return (kept + others)[:wanted]
 
 

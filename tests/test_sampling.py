@@ -19,6 +19,10 @@ def test_product(a, b):
 def test_few(a):
     pass
 
+@pytest.mark.parametrize("seed", range(50))
+def test_seeds(seed):
+    pass
+
 def test_one():
     pass
 
@@ -52,12 +56,13 @@ def test_a_sample_has_some_cases_of_every_test(run):
     assert len({name for name in ran if "test_cases.py::test_few" in name}) == 1
     assert "test_cases.py::test_one" in ran
     assert not any("test_slow" in name for name in ran)
-    # Oracles keep every value of every parameter.
+    # Oracles keep every value of every parameter, but for many seeds.
     values = {v for name in ran if "same_cases.py::test_product" in name
               for v in name.partition("[")[2].strip("]").split("-")}  # fmt: skip
     assert values == set("uvwxyz012345")
-    left_out = 2 * 42 - len(ran)
-    assert f"{left_out} of 84 cases left out; --all (make test-all) runs them too" in output
+    assert len({name for name in ran if "same_cases.py::test_seeds" in name}) == 24
+    left_out = 2 * 92 - len(ran)
+    assert f"{left_out} of 184 cases left out; --all (make test-all) runs them too" in output
 
 
 def test_processes_agree_on_the_sample(run):
@@ -66,7 +71,7 @@ def test_processes_agree_on_the_sample(run):
 
 def test_all_runs_all(run):
     ran, output = run("--all")
-    assert len(ran) == 84
+    assert len(ran) == 184
     assert "left out" not in output
 
 
