@@ -170,9 +170,9 @@ class Softened:
     """
 
     def __init__(self, penalties: Penalties, n: int) -> None:
-        from scipy.linalg.lapack import dpbsv  # late: most estimators have nothing soft
+        from scipy.linalg.lapack import dpbtrf, dpbtrs  # late: most estimators have nothing soft
 
-        self._dpbsv = dpbsv
+        self._dpbtrf, self._dpbtrs = dpbtrf, dpbtrs
         self._n, self._penalties = n, penalties
         self._least = _CURVATURE / penalties.scale
         self._qp: QP | None = None
@@ -304,41 +304,45 @@ class Softened:
         )
         # A power of two, so that the root in a Cholesky factor is exact for units that are, too.
         unit = _COST_UNITS[math.frexp(base.band.item(0))[1] % 2]
-        right = unit * np.vstack((base.gradient.reshape(1, -1), rows)).T
-        _, found, info = self._dpbsv(unit * base.lapack_band, right, lower=1)
-        if info != 0 or not np.isfinite(found).all():
+        factor, info = self._dpbtrf(unit * base.lapack_band, lower=1)
+        if info != 0:
             return None
-        free, moved = -found[:, 0], found[:, 1:]
-        reach = np.einsum("ij,ji->i", rows, moved)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            stiff, soft = 1.0 / reach, np.where(curvature > 0.0, 1.0 / curvature, 0.0)
+        free = -self._dpbtrs(factor, unit * base.gradient.reshape(-1, 1), lower=1)[0][:, 0]
+        # H^-1 of the rows that have been active at some time, and how stiff H is against them.
+        known, moved = np.zeros(len(rows), np.bool_), np.zeros(rows.shape[::-1])
+        stiff, soft = np.zeros(len(rows)), np.zeros(len(rows))
+        np.divide(1.0, curvature, out=soft, where=curvature > 0.0)
         step: Array = d.ravel()
-        test = forces + stiff * (rows @ step - sides)
-        before: tuple[Mask, Mask] | None = None
+        gap, before = rows @ step - sides, None
         for _ in range(_NEWTON_STEPS):
-            active, violated = test > 0.0, test > most
+            new = ~known & ((forces > 0.0) | (gap > 0.0))
+            if new.any():
+                moved[:, new] = self._dpbtrs(factor, unit * rows[new].T, lower=1)[0]
+                stiff[new] = 1.0 / np.einsum("ij,ji->i", rows[new], moved[:, new])
+                known |= new
+            held = forces + stiff * gap
+            active, violated = held > 0.0, held > most
             if before is not None and all(map(np.array_equal, before, (active, violated))):
                 return np.reshape(step, d.shape)
             before = active, violated
             pushed = violated & (curvature == 0.0)
             solved = active & ~pushed
-            bent = np.where(violated, soft, 0.0)[solved]
-            step = free - moved[:, pushed] @ most[pushed]
             forces = np.where(pushed, most, 0.0)
+            step = free - moved[:, pushed] @ most[pushed]
             if solved.any():
-                gap = rows[solved] @ step - sides[solved]
-                gap += np.where(violated, most * soft, 0.0)[solved]
+                bent = np.where(violated, soft, 0.0)
+                missed = (rows[solved] @ step - sides[solved]) + (bent * most)[solved]
                 try:
                     forces[solved] = solve(
-                        rows[solved] @ moved[:, solved] + np.diag(bent), gap[:, None]
+                        rows[solved] @ moved[:, solved] + np.diag(bent[solved]), missed[:, None]
                     )[:, 0]
                 except np.linalg.LinAlgError:  # active rows that depend on each other
                     return None
                 step = step - moved[:, solved] @ forces[solved]
             if not (np.isfinite(step).all() and np.isfinite(forces).all()):
                 return None
-            test = forces + np.where(active, 0.0, stiff) * (rows @ step - sides)
-            test[pushed] += (stiff * (rows @ step - sides))[pushed]
+            gap = rows @ step - sides
+            gap[solved] = 0.0  # on the row, or beyond it by what its force says
         return None
 
     def _sides(
