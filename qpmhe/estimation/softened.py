@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers import QP, Solution, SolveStatus
 
-from .._linalg import inverse, solve
+from .._linalg import inverse, solve, unit_diagonal
 from ..costs import Cost
 from ..model.system import System
 from .constraints import Rows, function_rows
@@ -20,6 +20,9 @@ Mask = NDArray[np.bool_]
 
 # As in the banded solver: a root is exact for powers of four alone.
 _COST_UNITS = 0.5, 1.0
+
+# Rounding of a row, as a share of its terms, and how many times that a solved one may be off.
+_ROUNDING, _ACCURACY = 16.0 * float(np.finfo(np.float64).eps), 2.0**20
 
 # Most Newton steps on the optimality conditions: each may change which rows are active.
 _NEWTON_STEPS = 10
@@ -332,17 +335,18 @@ class Softened:
             if solved.any():
                 bent = np.where(violated, soft, 0.0)
                 missed = (rows[solved] @ step - sides[solved]) + (bent * most)[solved]
-                try:
-                    forces[solved] = solve(
-                        rows[solved] @ moved[:, solved] + np.diag(bent[solved]), missed[:, None]
-                    )[:, 0]
-                except np.linalg.LinAlgError:  # active rows that depend on each other
-                    return None
+                reaction = rows[solved] @ moved[:, solved] + np.diag(bent[solved])
+                forces[solved] = _least_squares(reaction, missed)
                 step = step - moved[:, solved] @ forces[solved]
             if not (np.isfinite(step).all() and np.isfinite(forces).all()):
                 return None
             gap = rows @ step - sides
-            gap[solved] = 0.0  # on the row, or beyond it by what its force says
+            rounding = _ROUNDING * (np.abs(rows) @ np.abs(step) + np.abs(sides))
+            # Solved rows are met, or missed by what their force says.
+            off = gap - np.where(violated, soft * (forces - most), 0.0)
+            if (np.abs(off) > _ACCURACY * rounding)[solved].any():
+                return None
+            gap[solved | (np.abs(gap) <= rounding)] = 0.0
         return None
 
     def _sides(
@@ -390,6 +394,16 @@ class Softened:
         rows, *others = (np.concatenate(one) for one in collected)
         sides, most, curvature, forces = (one.ravel() for one in others)
         return rows, sides, most, curvature, forces
+
+
+def _least_squares(matrix: Array, side: Array) -> Array:
+    """The solution of ``matrix x = side``, the least one where rows depend on each other."""
+    try:
+        return solve(matrix, side[:, None])[:, 0]
+    except np.linalg.LinAlgError:
+        scaled, units, whole = unit_diagonal(matrix)
+        found = np.linalg.lstsq(scaled, np.ldexp(side, -whole - units), rcond=1e-10)[0]
+        return np.asarray(np.ldexp(found, -units))
 
 
 def _dense(own: Array, following: Array) -> Array:
