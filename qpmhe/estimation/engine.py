@@ -336,25 +336,25 @@ class PythonEngine:
         usual = changes.over(before.tools.usual)
         if parameters is not None:
             usual = usual._replace(parameters=parameters)
-        with np.errstate(all="ignore"):
-            tools = self._tools_for(usual)
-            window = self._fresh_window(before.window.initial_state, tools)
-            window.take_over(before.window, changes, parameters)
-            if self._reinitialized and window.length:
-                estimates = before.history[:-1]
-                estimates[-window.length] = window.initial_state  # in the new X
-                window.reinitialize(estimates)
-            try:
+        try:
+            with np.errstate(all="ignore"):
+                tools = self._tools_for(usual)
+                window = self._fresh_window(before.window.initial_state, tools)
+                window.take_over(before.window, changes, parameters)
+                if self._reinitialized and window.length:
+                    estimates = before.history[:-1]
+                    estimates[-window.length] = window.initial_state  # in the new X
+                    window.reinitialize(estimates)
                 self._solver.forget()
                 self._tools, self._window, self._trajectory = tools, window, None
                 estimate = self._estimate(began) if window.length else None
                 state = window.initial_state if estimate is None else estimate.state.copy()
                 self._history[-1] = state
                 self._watch.counts = before.watched  # no sample more
-                return estimate
-            except BaseException:
-                self.replace(before)
-                raise
+            return estimate
+        except BaseException:
+            self.replace(before)
+            raise
 
     @property
     def memory(self) -> Memory:
