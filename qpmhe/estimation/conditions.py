@@ -122,20 +122,15 @@ class ConditionReader:
                     f"{', '.join(map(repr, SET_NAMES))}."
                 )
         for name, given in bounds.items():
-            before = getattr(usual, name) or getattr(self._system, name)
+            before = getattr(usual, name) or self._system.set_of(name)
             one = self._with_sides(name, given, before)
-            if not (drop_usual and _alike(one, before)):
+            if not (drop_usual and before is not None and _alike(one, before)):
                 found[name] = one
         return Conditions(**found)
 
     def _with_sides(self, name: str, given: Any, usual: Any) -> ConvexSet:
         """The rows of the system's set with the sides of another."""
-        built: ConvexSet | None = getattr(self._system, name)
-        if name in self._system.soft:
-            raise OptionError(
-                f"bounds has {name!r}, but the set of {name} is soft, and its sides cannot change; "
-                "leave it out, or make the set a hard one."
-            )
+        built = self._system.set_of(name)
         if built is None:
             raise OptionError(
                 f"bounds has {name!r}, but the system has no set of {name}; make it with "
@@ -160,8 +155,7 @@ class ConditionReader:
         self._last[name] = key, found
         return found
 
-    @staticmethod
-    def _check_rows(name: str, given: ConvexSet, built: ConvexSet) -> None:
+    def _check_rows(self, name: str, given: ConvexSet, built: ConvexSet) -> None:
         """Check that only sides differ from those of the system's set."""
         what = f"bounds[{name!r}] is {given!r}"
         new = np.setdiff1d(given.bounded_components, built.bounded_components)
@@ -176,7 +170,7 @@ class ConditionReader:
                 f"{what}, whose general inequalities are not those of the system's set of {name}; "
                 "only their sides may change. Take the same matrix in the same order of rows."
             )
-        if name == "disturbances":
+        if name == "disturbances" and name not in self._system.soft:
             fixed = np.zeros(built.dimension, np.bool_)
             fixed[built.fixed_components] = True
             same = (given.lower == built.lower) & (given.upper == built.upper)
@@ -251,10 +245,10 @@ class ConditionReader:
         """The conditions that `Conditions.state_dict` described; raises anything if damaged."""
         if not isinstance(saved, dict):
             raise TypeError(f"conditions are {saved!r}")
-        p, values, found = self._system.p, dict(saved), {}
+        p, values, found = self._system.p, dict(saved), dict[str, Any]()
         for name in SET_NAMES:
             if name in values:
-                built = getattr(self._system, name)
+                built = self._system.set_of(name)
                 if built is None:
                     raise mismatch(f"set of {name}")
                 given, shapes = values.pop(name), [getattr(built, side).shape for side in _SIDES]

@@ -132,8 +132,8 @@ class PythonEngine:
         """What a step uses under these usual conditions."""
         system, cost, settings = self._system, self._cost, self._settings
         if usual.has_bounds:
-            sets = (getattr(usual, name) or getattr(system, name) for name in SET_NAMES)
-            system = system.with_sets(*sets)
+            sets = {name: getattr(usual, name) for name in SET_NAMES}
+            system = system.with_sets({n: one for n, one in sets.items() if one is not None})
         if usual.noise_weight is not None or usual.disturbance_weight is not None:
             cost = cost.with_weights(usual.noise_weight, usual.disturbance_weight)
         formulation = Formulation(system, self._observer, cost)

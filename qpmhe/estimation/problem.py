@@ -226,7 +226,8 @@ class Problem:
         self.penalties: WindowPenalties | None = None
         if formulation.penalties is not None:
             self.penalties = formulation.penalties.of_window(
-                window.length, self.observed, self.discounts
+                window.length, self.observed, self.discounts,
+                window.conditions if window.has_own_bounds else None,
             )
         if formulation.extended:
             self._add_penalty(self.candidate)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from qpmhe_solvers import QP, Solution, SolveStatus
 from .._linalg import inverse, solve, unit_diagonal
 from ..costs import Cost
 from ..model.system import System
+from .conditions import Conditions
 from .constraints import Rows, function_rows
 
 Array = NDArray[np.float64]
@@ -81,15 +83,24 @@ class Penalties:
         return self.size > 0
 
     def of_window(
-        self, count: int, observed: Mask | None, discounts: Array | None
+        self, count: int, observed: Mask | None, discounts: Array | None,
+        conditions: Sequence[Conditions] | None = None,
     ) -> WindowPenalties:
-        """The penalties of a window of ``count`` stages; rows on missing outputs do not count."""
-        if observed is None and count in self._windows:
+        """The penalties of a window of ``count`` stages; rows on missing outputs do not count.
+
+        ``conditions`` are those of the stages where some have sets with other sides; the newest
+        state has those of the last stage.
+        """
+        usual = observed is None and conditions is None
+        if usual and count in self._windows:
             return self._windows[count]
         lower, upper = np.full((2, count + 1, self.size), np.inf)
         np.negative(lower, out=lower)
         linear, quadratic = np.zeros((2, count + 1, self.size))
         for rows, place, penalties in self.parts:
+            if conditions is not None and rows.name != "constraints":
+                sets = [getattr(own, rows.name) for own in conditions]
+                rows = rows.with_sides([*sets, sets[-1]])
             counts = np.ones((count + 1, len(rows.matrix)), np.bool_)
             if rows.name == "constraints" and self.functions is not None:
                 counts = self.functions.counting(count, observed)[:, rows.components]
@@ -104,7 +115,7 @@ class Penalties:
             factors = np.append(discounts[1:], 1.0)[:, None]
             linear, quadratic = factors * linear, factors * quadratic
         made = WindowPenalties(lower, upper, linear, quadratic)
-        if observed is None:
+        if usual:
             self._windows[count] = made
         return made
 

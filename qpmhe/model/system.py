@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypedDict, Unpack
 
@@ -396,13 +396,21 @@ class System:
             other.use_scales(scales)
         return other
 
-    def with_sets(
-        self, states: ConvexSet | None, disturbances: ConvexSet | None, noises: ConvexSet | None
-    ) -> System:
-        """The same system, its functions shared, with other sides of its sets."""
+    def set_of(self, name: str) -> ConvexSet | None:
+        """The set of ``states``, ``disturbances`` or ``noises``, hard or soft."""
+        soft = self.soft.get(name)
+        return getattr(self, name) if soft is None else soft.convex
+
+    def with_sets(self, sets: Mapping[str, ConvexSet]) -> System:
+        """The same system, its functions shared, with other sides of its sets, by name."""
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__)
-        other.states, other.disturbances, other.noises = states, disturbances, noises
+        for name, one in sets.items():
+            soft = self.soft.get(name)
+            if soft is None:
+                setattr(other, name, one)
+            else:
+                other.soft = other.soft | {name: SoftSet(one, soft.linear, soft.quadratic)}
         other.__dict__.pop("timed", None)
         if self.make_timed is not None:
             other.make_timed = lambda: self.timed

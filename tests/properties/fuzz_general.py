@@ -186,10 +186,10 @@ def spd(draw, size):
 
 
 def moved(draw, one):
-    """Other sides for some of the hard sets."""
+    """Other sides for some of the sets."""
     other = {}
     for name, (low, high) in one.usual.bounds.items():
-        if name not in one.soft and draw.random() < 0.5:
+        if draw.random() < 0.5:
             width = np.where(np.isfinite(high), high - low, 1.0)
             shift = 0.2 * width * draw.normal(size=low.size)
             other[name] = (low + shift, high + shift + 0.2 * width * draw.random())
