@@ -57,10 +57,10 @@ def wrapped_sight(x):
     return value
 
 
-def record(turn, steps, length=0.5, seed=0):
+def record(turn, steps, length=0.5, seed=0, heading=0.4):
     rng = np.random.default_rng(seed)
     u = np.column_stack((np.full(steps, length), np.full(steps, turn)))
-    x, y = [np.array([1.0, -0.5, 0.4])], []
+    x, y = [np.array([1.0, -0.5, heading])], []
     for one in u:
         y.append(sight(x[-1]) + rng.normal(0.0, DEVIATIONS["noise"]))
         x.append(step(x[-1], one) + rng.normal(0.0, DEVIATIONS["disturbance"]))
@@ -115,6 +115,7 @@ def assert_same_errors(found, reference, tolerance=1e-10):
     np.testing.assert_allclose(found.costs, reference.costs, rtol=1e-6)
     np.testing.assert_allclose(found.candidate_costs, reference.candidate_costs, rtol=1e-6)
     assert np.array_equal(found.qps, reference.qps)
+    assert np.array_equal(found.flags, reference.flags)
     return turns
 
 
@@ -133,6 +134,34 @@ def test_a_robot_that_turns_a_hundred_times_loses_nothing(observer, candidate):
     assert (np.abs(np.diff(run.states[:, 2])) > PI).sum() >= 100
     late = (reference.states - x)[100:]
     assert np.sqrt((late**2).mean(axis=0))[2] < 0.05  # and the reference estimates well
+
+
+@pytest.mark.parametrize("options", [
+    {}, {"warm_start": True}, {"arrival": "smoothed"}, {"candidate": "reinitialized"},
+    {"max_qps": None, "warm_start": True}, {"max_qps": 1, "warm_start": True}, {"horizon": 1},
+])
+@pytest.mark.parametrize("sets", [
+    {}, {"states": qpmhe.Box([-9.0, -9.0, PI - 0.5], [9.0, 9.0, PI + 0.5])},
+    {"disturbances": qpmhe.Box([-0.05, -0.05, 0.0], [0.05, 0.05, 0.0])},
+    {"disturbances": qpmhe.Box([-0.05] * 3, [0.05] * 3),
+     "noises": qpmhe.Box([-0.4, -0.4, -0.06, -0.06], [0.4, 0.4, 0.06, 0.06])},
+])
+@pytest.mark.parametrize("observer", ["luenberger", "extended"])
+@pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
+def test_a_heading_that_stays_at_the_seam(observer, sets, options):
+    """Prior, candidate, estimate and measurement are on different turns at most samples."""
+    _, y, u = record(0.0, 50, 0.05, heading=PI)
+    seen = np.column_stack((y[:, :2], wrapped(y[:, 2:])))
+    runs = [
+        estimator(made, observer, (0.7, 0.0, start), **options).run(data, u)
+        for made, data, start in (
+            (plain(**sets, **SLOPES), y, PI + 0.2), (wrapping(**sets, **SLOPES), seen, 0.2 - PI),
+        )
+    ]
+    signs = np.sign(runs[1].states[:, 2])
+    assert "states" in sets or (signs[1:] != signs[:-1]).sum() >= 2
+    converged = "disturbances" in sets or options.get("max_qps", 2) is None
+    assert_same_errors(runs[1], runs[0], 1e-6 if converged else 1e-9)
 
 
 def test_without_residual_functions_each_crossing_costs():
@@ -270,7 +299,9 @@ def needle_record(steps=80, seed=1):
 KALMAN = {"prior": np.diag([25.0, 1.0]), "disturbance": np.diag([1.0, 0.1]), "noise": [[4.0]]}
 
 
-@each_candidate
+@pytest.mark.parametrize("options", [
+    {}, {"candidate": "reinitialized"}, {"warm_start": True, "max_qps": 1},
+])
 @pytest.mark.parametrize("observer", [
     qpmhe.Luenberger([0.5, 0.05]), qpmhe.OutputInjection(lambda z, v: [0.5 * v[0], 0.05 * v[0]]),
     qpmhe.ExtendedKalman(**KALMAN), qpmhe.UnscentedKalman(**KALMAN),
@@ -280,20 +311,23 @@ KALMAN = {"prior": np.diag([25.0, 1.0]), "disturbance": np.diag([1.0, 0.1]), "no
     {"states": qpmhe.Box([170.0, -9.0], [190.0, 9.0]) & qpmhe.Polytope([[0.0, 1.0]], [2.0])},
     {"disturbances": qpmhe.Box([-0.6, -1.0], [0.6, 1.0]), "noises": qpmhe.Box([-2.5], [2.5])},
     {"disturbances": qpmhe.Box([0.0, -1.0], [0.0, 1.0])},
+    {"disturbances": qpmhe.Box([0.0, -1.0], [0.0, 1.0]),
+     "states": qpmhe.Box([170.0, -9.0], [190.0, 9.0])},
     {"disturbances": qpmhe.Polytope([[1.0, 1.0], [-1.0, 1.0]], [0.7, 0.7]),
      "states": qpmhe.Box([170.0, -9.0], [190.0, 9.0])},
 ])
-def test_sets_hold_as_they_do_without_a_seam(sets, observer, candidate):
-    y = needle_record()
-    # Bounds on a model that turns with the sign of zero: no start on them.
-    reference = needle(compass(wraps=False, **sets), observer, candidate=candidate).run(y)
-    run = needle(compass(**sets), observer, candidate=candidate).run(_degrees(y))
+@pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
+def test_sets_hold_as_they_do_without_a_seam(sets, observer, options):
+    y = needle_record(60)
+    reference = needle(compass(wraps=False, **sets), observer, **options).run(y)
+    run = needle(compass(**sets), observer, **options).run(_degrees(y))
     error = run.states - reference.states
     if "states" not in sets:
         error[:, 0] = _degrees(error[:, 0])
     assert np.abs(error).max() < 1e-6
     np.testing.assert_allclose(run.costs, reference.costs, rtol=1e-6)
-    free = needle(compass(wraps=False), observer, candidate=candidate).run(y)
+    assert np.array_equal(run.flags, reference.flags)
+    free = needle(compass(wraps=False), observer, **options).run(y)
     assert not np.allclose(reference.states, free.states, atol=1e-3)  # the sets bind
 
 
@@ -317,6 +351,36 @@ def test_a_state_written_in_another_turn_is_in_its_bounds():
     assert mhe.initial_state[0] == 170.0  # the nearer bound
 
 
+@each_candidate
+def test_projections_onto_bounds_across_the_seam(candidate):
+    covariances = {"prior": 1e6 * np.eye(2), "disturbance": np.eye(2), "noise": [[1.0]]}
+
+    def needle_at(start, turn, observer):
+        system = qpmhe.System(
+            lambda x: np.array([_degrees(x[0] + turn), x[1]]), lambda x: x[:1], n=2, p=1,
+            states=qpmhe.Box([170.0, -np.inf], [190.0, np.inf]),
+            output_residual=qpmhe.angles(0, 360.0), state_residual=qpmhe.angles(0, 360.0))
+        cost = qpmhe.QuadraticCost.from_covariances(**covariances)
+        return qpmhe.MovingHorizonEstimator(
+            system, observer, cost, horizon=3, initial_state=[start, 0.0], max_qps=0,
+            candidate=candidate)
+
+    # The prediction, -175 degrees, is inside; with the correction by 10 degrees it is not.
+    half = qpmhe.Luenberger([0.5, 0.0])
+    projected = needle_at(185.0, 0.0, half).update([-155.0])
+    assert qpmhe.Status.OBSERVER_PROJECTED in projected.status
+    assert qpmhe.Status.PREDICTION_OUTSIDE not in projected.status
+    assert projected.state[0] == 190.0
+    assert projected.disturbances[0, 0] == 5.0
+    # From 5 degrees over -9 to the bound at 190 the shorter way is backwards.
+    far = needle_at(185.0, 180.0, half).update([157.0])
+    assert far.state[0] == 190.0
+    assert far.disturbances[0, 0] == -175.0
+    # What has used y is beyond the turn, nearer to the other bound.
+    kalman = qpmhe.ExtendedKalman(**covariances)
+    assert needle_at(189.0, 0.0, kalman).update([8.0]).filtered[0] == 170.0
+
+
 def test_bounds_a_period_apart_bound_nothing():
     y = _degrees(needle_record())
     free = needle(compass()).run(y)
@@ -330,14 +394,16 @@ def test_bounds_a_period_apart_bound_nothing():
     assert compass(qpmhe.Box([0.0, -9.0], [359.0, 9.0])).turns is not None
 
 
-def test_a_prediction_far_from_the_measurement_turns_the_short_way():
+@each_candidate
+def test_a_prediction_far_from_the_measurement_turns_the_short_way(candidate):
     """Half a turn off, corrections and their cost are those of the shorter way round."""
-    mhe = needle(compass(), qpmhe.Luenberger([1.0, 0.0]), start=(-170.0, 0.0), max_qps=0)
+    options = {"max_qps": 0, "candidate": candidate}
+    mhe = needle(compass(), qpmhe.Luenberger([1.0, 0.0]), start=(-170.0, 0.0), **options)
     estimate = mhe.update([150.0])
     assert estimate.noises[0].tolist() == [-40.0]
     assert estimate.disturbances[0, 0] == -40.0
     assert estimate.state[0] % 360.0 == pytest.approx(150.0)
-    mhe = needle(compass(), qpmhe.Luenberger([7.0, 0.0]), start=(0.0, 0.0), max_qps=0)
+    mhe = needle(compass(), qpmhe.Luenberger([7.0, 0.0]), start=(0.0, 0.0), **options)
     estimate = mhe.update([30.0])  # a correction by 210 degrees is one by -150
     assert estimate.disturbances[0, 0] == -150.0
     assert estimate.cost == pytest.approx(150.0**2 + 30.0**2 / 4.0)
