@@ -51,6 +51,7 @@ class Case:
     h: object
     g: object  # of x and w; None without
     g_penalty: tuple | None  # linear and quadratic; None where g is hard
+    along: np.ndarray | None  # the slope of g with respect to x
     matrix: np.ndarray  # G
     metric: np.ndarray  # typical squares of the states: the larger ones of prior and disturbance
     prior: np.ndarray
@@ -134,7 +135,7 @@ def case(draw):
         options[name] = one
         if name in soft:
             options[name] = one.soften(linear=soft[name][0], quadratic=soft[name][1])
-    g = g_penalty = None
+    g = g_penalty = along = None
     if draw.random() < 0.3:
         along, limit = draw.normal(size=n), draw.uniform(0.5, 4.0)
         if states:
@@ -175,8 +176,8 @@ def case(draw):
     spread = matrix @ covariances["disturbance"] @ matrix.T
     metric = np.maximum(covariances["prior"].diagonal(), spread.diagonal())
     return Case(
-        mhe, f, h, g, g_penalty, matrix, metric, inverses["prior"], usual, soft, states, outputs,
-        discount,
+        mhe, f, h, g, g_penalty, along, matrix, metric, inverses["prior"], usual, soft, states,
+        outputs, discount,
     )
 
 
@@ -315,7 +316,10 @@ def judged(one, trajectory, start):
             if one.g_penalty is not None:
                 stage += penalty(value, -np.inf, 0.0, one.g_penalty)
             else:
-                worst = max(worst, float(value))
+                # Its largest change within a standard deviation of x and w.
+                scale = np.abs(one.along) @ deviations["states"]
+                scale = scale + 0.1 * np.sum(deviations["disturbances"] ** 2)
+                worst = max(worst, float(value / scale))
         cost += one.discount ** (count - 1 - i) * stage
     if "states" in one.usual.bounds:
         low, high = samples[-1].bounds["states"]
