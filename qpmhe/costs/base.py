@@ -73,8 +73,8 @@ class ObserverPrior:
     .. math::
         D^{-1} C^{-1} D^{-1}, \qquad P = D\, C\, D
 
-    where eigenvalues of C below 1e-12, which are rounding, count as 1e-12; as 3e-9 where the
-    disturbance has fewer directions than the state, so that C may be singular for ever.
+    where eigenvalues of C below 1e-12, which are rounding, count as 1e-12; those below 3e-9 as
+    3e-9 where the disturbance has fewer directions than the state, so that C may be singular.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ class ObserverPrior:
     def weight(self, covariance: Array, least: float = SINGULAR) -> Array:
         """The inverse of a covariance (n, n), clipped if bounds were given.
 
-        Otherwise eigenvalues of its correlations that are rounding count as ``least``.
+        Otherwise eigenvalues of its correlations below ``least`` count as that.
         """
         bounds = self.bounds
         if bounds is None:
@@ -129,7 +129,7 @@ def _relative_inverse(covariance: Array, least: float) -> Array:
     deviations = np.sqrt(np.maximum(variances, _NO_VARIANCE))
     products = np.multiply.outer(deviations, deviations)
     values, vectors = np.linalg.eigh(covariance / products)
-    weight: Array = (vectors / np.where(values > SINGULAR, values, least)) @ vectors.T
+    weight: Array = (vectors / np.maximum(values, least)) @ vectors.T
     return weight / products
 
 

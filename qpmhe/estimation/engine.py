@@ -302,7 +302,9 @@ class PythonEngine:
             with np.errstate(all="ignore"):
                 self._window.amend(time, y)
                 self._trajectory = None  # of this window already: no warm start from it
+                counts = self._watch.counts
                 estimate = self._estimate(began)
+                self._watch.counts = counts  # no sample more
             self._history[-1] = estimate.state.copy()
             return estimate
         except BaseException:

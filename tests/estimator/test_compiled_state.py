@@ -64,6 +64,26 @@ def test_a_snapshot_goes_on_bit_for_bit(name, cut):
         np.testing.assert_array_equal(other.covariances(), mhe.covariances())
 
 
+@engines
+def test_late_measurements_are_no_samples_with_a_far_observer(engine):
+    system = qpmhe.from_casadi(lambda x: 0.9 * x, lambda x: x, n=1)
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
+
+    def build():
+        return qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([0.0]), cost, horizon=3, initial_state=[0.0], engine=engine
+        )
+
+    mhe = build()
+    mhe.update([1e3])
+    for _ in range(4):
+        estimate = mhe.amend(0, [1e3])
+        assert Status.OBSERVER_FAR not in estimate.status
+    build().load_state_dict(saved(mhe))
+    assert Status.OBSERVER_FAR not in mhe.update([1e3]).status
+    assert Status.OBSERVER_FAR in mhe.update([1e3]).status
+
+
 @pytest.mark.parametrize("horizon", [1, 2])
 @engines
 def test_a_snapshot_of_stages_where_the_model_fails(engine, horizon):

@@ -153,6 +153,24 @@ def test_singular_covariances_of_the_state_cost_few_digits(seed, horizon):
     assert np.abs(found - means).max() <= 1e-7 * (1.0 + np.abs(means).max())
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_covariance_on_its_way_to_a_singular_one_costs_few_digits(seed):
+    """A decaying model without disturbance: some eigenvalues are small, but not rounding yet."""
+    plant = Linear(seed, 3, 1, 2)
+    plant.A, plant.Q = 0.95 * plant.A, np.zeros((1, 1))
+    mhe = plant.estimator(
+        "matrix",
+        lambda _, Q: qpmhe.ExtendedKalman(prior=plant.P, disturbance=Q, noise=plant.R),
+        lambda Q: qpmhe.QuadraticCost.from_covariances(
+            prior=qpmhe.ObserverPrior(), disturbance=Q, noise=plant.R
+        ),
+        horizon=4,
+    )
+    means, _ = plant.kalman()
+    found = mhe.run(plant.Y).states
+    assert np.abs(found - means).max() <= 2e-7 * (1.0 + np.abs(means).max())
+
+
 def test_a_state_that_only_delays_another_has_singular_covariances_throughout():
     """x2+ = x1 and x1 a random walk that starts at a known value."""
     A, Q, R = np.array([[1.0, 0.0], [1.0, 0.0]]), np.diag([0.04, 0.0]), np.eye(2)

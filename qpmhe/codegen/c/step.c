@@ -153,8 +153,10 @@ int mhe_amend(mhe_estimator *e, mhe_workspace *k, int64_t time, const real *y,
         }
     mhe_set_noise_weight(e->settings, stage);
     const int failed = mhe_replay(e, i);
+    const int32_t far = e->far, dropped = e->dropped;
     /* The kept trajectory does not belong to the window before this one. */
     mhe_estimate_now(e, k, &outcome, failed, -1);
+    e->far = far, e->dropped = dropped; /* no sample more */
     memcpy(e->history + e->newest * NX, outcome.best->x + e->length * NX, sizeof(real) * NX);
     mhe_fill(e, k, &outcome, out);
     return 0;
