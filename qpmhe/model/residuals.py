@@ -14,7 +14,7 @@ from qpmhe_solvers.values import integer, shown
 
 from .._checks import numbers
 from ..errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
-from .functions import BatchedFunction
+from .functions import BatchedFunction, contained
 from .sets import ConvexSet
 
 Array = NDArray[np.float64]
@@ -50,10 +50,8 @@ class Residual(ABC):
 
     def aligned(self, points: Array, references: Array) -> Array:
         """Points (..., d), moved by whole turns so that their plain difference is the residual."""
-        plain = points - references
-        wrapped = plain.copy()
-        self.wrap(wrapped, points)
-        moved = wrapped != plain
+        wrapped = self(points, references)
+        moved = wrapped != points - references
         return np.where(moved, references + wrapped, points) if moved.any() else points
 
     @abstractmethod
@@ -62,8 +60,13 @@ class Residual(ABC):
 
 
 def difference(residual: Residual | None, a: Array, b: Array) -> Array:
-    """A [-] b, or a - b without a residual function."""
-    return a - b if residual is None else residual(a, b)
+    """A [-] b, or a - b without a residual function; NaN where a user's raises."""
+    if residual is None:
+        return a - b
+    try:
+        return residual(a, b)
+    except Exception:  # bad luck at run time, for which not every caller has a remedy
+        return np.full_like(a - b, np.nan)
 
 
 class Angles(Residual):
@@ -179,12 +182,14 @@ class _Given(Residual):
         pairs = [
             tuple(10.0**k * rng.uniform(-1.0, 1.0, (2, dimension))) for k in range(-12, 13)
         ]
-        self._function = BatchedFunction(name, function, (dimension,), dimension, pairs)
-        if not self._function.takes_input:
+        self._function: Callable[..., Any] = contained(function)
+        shape = self._checked(*pairs[12]).shape
+        if shape != (dimension,) and (shape or dimension > 1):
             raise ModelError(
-                f"{name} is a function of one argument; expected {name}(a, b), the difference of "
-                "two vectors."
+                f"{name} returned shape {shape} for two vectors of {dimension} numbers; expected "
+                f"({dimension},), their difference."
             )
+        self._function = BatchedFunction(name, function, (dimension,), dimension, pairs)
         self._check_zero(rng.uniform(-1.0, 1.0, dimension), 1.0)
         unit, moved = 1.0, np.zeros(dimension, np.bool_)
         for a, b in reversed(pairs):
@@ -200,7 +205,7 @@ class _Given(Residual):
     def _checked(self, a: Array, b: Array) -> Array:
         try:
             with np.errstate(all="ignore"):
-                value = np.asarray(self._function(a, b), np.float64)
+                value = np.asarray(self._function(a.copy(), b.copy()), np.float64)
         except Exception as error:
             raise ModelError(
                 f"{self._name} raised {type(error).__name__}: {error} at a = {a.tolist()}, "
@@ -371,5 +376,8 @@ class Turns:
         return np.where(given, ends[0], lower), np.where(given, ends[1], upper)
 
     def __call__(self, points: Array) -> Array:
-        """Points (..., n) in this turn; the same array where all are."""
-        return self._residual.aligned(points, np.where(self._bounded, self._middle, points))
+        """Points (..., n) in this turn; the same array where all are or a residual raises."""
+        try:
+            return self._residual.aligned(points, np.where(self._bounded, self._middle, points))
+        except Exception:
+            return points

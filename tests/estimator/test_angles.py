@@ -669,6 +669,40 @@ def test_divergence_to_infinity_is_a_failed_stage():
         assert np.isfinite(mhe.update([0.3]).state).all()
 
 
+@pytest.mark.parametrize("luck", ["raises", "stops", "shape", "nothing", "nan"])
+@pytest.mark.parametrize("kalman", [None, qpmhe.ExtendedKalman, qpmhe.UnscentedKalman])
+def test_residual_functions_that_fail_at_some_calls_are_bad_luck(kalman, luck):
+    rng, share = np.random.default_rng(2), 0.0
+
+    def residual(a, b):
+        if rng.random() < share:
+            if luck == "raises":
+                raise ValueError("here")
+            if luck == "stops":
+                raise SystemExit(1)
+            return {"shape": np.zeros(3), "nothing": None, "nan": a * np.nan}[luck]
+        return (a - b + np.pi) % (2.0 * np.pi) - np.pi
+
+    system = qpmhe.System(
+        lambda x: 0.9 * x, lambda x: x, n=1, p=1, states=qpmhe.Box([-1.5], [1.5]),
+        state_residual=residual, output_residual=residual)
+    covariances = {"prior": 1.0, "disturbance": 1.0, "noise": 1.0}
+    for candidate in ("observer", "reinitialized"):
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([0.3]) if kalman is None else kalman(**covariances),
+            qpmhe.QuadraticCost.from_covariances(**covariances),
+            horizon=3, initial_state=[0.0], max_qps=2, warm_start=True, candidate=candidate)
+        for t in range(80):
+            share = 0.2 if 3 <= t < 60 else 0.0
+            estimate = mhe.update([np.sin(t)])
+            assert mhe.time == t + 1
+            assert np.isfinite(estimate.trajectory).all()
+            if np.isfinite(estimate.candidate_cost):
+                assert estimate.cost <= estimate.candidate_cost
+        assert not estimate.status & (qpmhe.Status.MODEL_FAILED | qpmhe.Status.FAILED_STAGE)
+        share = 0.0
+
+
 INPUTS = {"n": 3, "p": 4, "m": 2}
 
 
@@ -685,7 +719,9 @@ INPUTS = {"n": 3, "p": 4, "m": 2}
     (lambda a, b: (a - b)[..., None], ModelError, r"shape .*expected"),
     (lambda a, b: 1 / 0, ModelError, "raised ZeroDivisionError"),
     (lambda a, b: np.log(a - b), ModelError, "expected finite numbers"),
-    (lambda a: a, ModelError, "function of one argument"),
+    (lambda a: a, ModelError, "takes 1 positional argument.*expected the difference a - b"),
+    (lambda a, b, c: a, ModelError, "missing 1 required.*expected the difference a - b"),
+    (lambda a, b: a[0] - b[0], ModelError, r"shape \(\) for two vectors of .*their difference"),
     (qpmhe.angles([7]), InvalidInputError, "names component 7"),
 ])
 def test_residual_functions_that_are_none(residual, error, text):
