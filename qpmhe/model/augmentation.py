@@ -137,14 +137,16 @@ def chosen(name: str, given: ArrayLike | None, size: int, kind: str) -> Index:
 
 
 def product(
-    first: ConvexSet | SoftSet | None, n: int, second: ConvexSet | None, k: int
+    first: ConvexSet | SoftSet | None, n: int, second: ConvexSet | SoftSet | None, k: int
 ) -> ConvexSet | None:
     """All (x, s) with x (n,) in the first set and s (k,) in the second; None is everything."""
-    if isinstance(first, SoftSet):
-        raise SetError(
-            f"the set {first!r} is soft; an augmented model takes hard ones only: leave it out, or "
-            "write the augmented model as functions of a System."
-        )
+    for one in (first, second):
+        if isinstance(one, SoftSet):
+            raise SetError(
+                f"the set {one!r} is soft; an augmented model takes hard ones only: leave it out, "
+                "or write the augmented model as functions of a System."
+            )
+    assert not isinstance(first, SoftSet) and not isinstance(second, SoftSet)
     if first is None and second is None:
         return None
     if k == 0:

@@ -79,19 +79,19 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
         "state_residual": extended(system.state_residual, n, n + noisy.size),
     }
     held = augmented(system, Augmentation(n, m, np.zeros(0), noisy), **options)
-    made = _without_memory(held, n, options)
+    made = _without_memory(held, slice(n, n + noisy.size), options)
     made.recipe = noisy_inputs, {"system": system, "inputs": noisy}
     return made
 
 
-def _without_memory(held: System, n: int, options: SystemOptions) -> System:
+def _without_memory(held: System, errors: slice, options: SystemOptions) -> System:
     """The system with e+ = 0, from the one with e+ = e."""
 
     def zeroed(function: Any) -> Callable[[Array, Array], Array]:
         def evaluate(z: Array, u: Array) -> Array:
             many = z.ndim > 1
             value = np.array(function.batch(z, u) if many else function(z, u))
-            value[(slice(None), slice(n, None)) if many else slice(n, None)] = 0.0
+            value[(slice(None), errors) if many else errors] = 0.0
             return value
 
         return evaluate
@@ -111,5 +111,8 @@ def _without_memory(held: System, n: int, options: SystemOptions) -> System:
     )
     made.dt = held.dt
     if held.make_timed is not None:
-        made.make_timed = lambda: _without_memory(held.timed, n, options)
+        made.make_timed = lambda: _without_memory(held.timed, errors, options)
+    made.make_augmented = lambda change, others: _without_memory(
+        augmented(held, change, **others), errors, others
+    )
     return made

@@ -215,8 +215,10 @@ def _nominal(given: ArrayLike) -> Array:
 def _check_bounds(bounds: ConvexSet | None, nominal: Array) -> None:
     if bounds is not None and nominal.size == 0:
         raise SetError("parameter_bounds was given, but no parameter is estimated; leave it out.")
-    checked_set("parameter_bounds", bounds, nominal.size, ", the number of estimated parameters")
-    if bounds is not None and bounds.violation(nominal) > 0.0:
+    hard = checked_set(
+        "parameter_bounds", bounds, nominal.size, ", the number of estimated parameters"
+    )
+    if hard is not None and hard.violation(nominal) > 0.0:
         raise SetError(
             f"nominal is {nominal.tolist()} for the estimated parameters, outside of "
             f"parameter_bounds {bounds!r}; the prior value must be within."

@@ -182,7 +182,7 @@ class _Given(Residual):
         pairs = [
             tuple(10.0**k * rng.uniform(-1.0, 1.0, (2, dimension))) for k in range(-12, 13)
         ]
-        self._function: Callable[..., Any] = contained(function)
+        self._function: Any = contained(function)
         shape = self._checked(*pairs[12]).shape
         if shape != (dimension,) and (shape or dimension > 1):
             raise ModelError(

@@ -232,3 +232,26 @@ def test_irregular_steps_and_snapshots(stop):
     x, e = expected[-1].trajectory[:, :2], expected[-1].trajectory[:, 2:]
     step = plant.timed.f(x[-2], np.append(0.1 + e[-2], 0.25))
     np.testing.assert_allclose(expected[-1].disturbances[-1, :2], x[-1] - step, atol=1e-14)
+
+
+def spring(x, u):
+    return np.stack([x[..., 1], u[..., 0] - u[..., 1] * x[..., 0]], axis=-1)
+
+
+@pytest.mark.parametrize("second", ["parameter", "noisy input"])
+def test_a_system_with_noisy_inputs_is_augmented_with_its_sampling_time(second):
+    plant = qpmhe.System.from_ode(spring, angle, dt=0.1, n=2, p=1, m=2)
+    noisy = qpmhe.noisy_inputs(plant, [0])
+    if second == "parameter":
+        system, more, known = qpmhe.augment_parameters(noisy, nominal=[3.0]), 3.0, [0.5]
+    else:
+        system, more, known = qpmhe.noisy_inputs(noisy, [1]), 0.7, [0.5, 2.3]
+    z, restored = np.array([0.3, -0.2, 0.1, more]), pickle.loads(pickle.dumps(system))
+    kept = [0.0, more if second == "parameter" else 0.0]
+    for one in (system, restored):
+        assert one.dt == 0.1
+        for step in (0.1, 0.25):
+            expected = plant.timed.f(z[:2], np.array([0.6, 3.0, step]))
+            found = one.timed.f(z, np.append(known, step))
+            np.testing.assert_allclose(found, np.append(expected, kept), rtol=1e-14)
+        np.testing.assert_allclose(one.f(z, np.array(known)), one.timed.f(z, np.append(known, 0.1)))

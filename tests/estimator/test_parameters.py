@@ -451,6 +451,8 @@ def build(**changes):
          "parameter_bounds has dimension 1; expected 2"),
         ({"parameter_bounds": Box([0.0, 1.0], [9.0, 9.0])}, "SetError",
          r"nominal is \[2.0, 0.8\].*outside of parameter_bounds"),
+        ({"parameter_bounds": Box([0.0] * 2, [9.0] * 2).soften(linear=1.0)}, "SetError",
+         "is soft; an augmented model takes hard ones only"),
         ({"parameter_bounds": Box([0.0], [9.0]), "estimated": []}, "SetError",
          "parameter_bounds was given, but no parameter is estimated"),
         ({"f": lambda x: x}, "ModelError",
