@@ -30,7 +30,10 @@ _MOST_BYTES = 2**31 - 1
 def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings) -> str:
     """Why an estimator has no C form, with the remedy; empty if it has one."""
     if system.symbolic is None:
-        return "the system has no CasADi form; make it with qpmhe.from_casadi."
+        return (
+            "the system has no CasADi form; make it with qpmhe.from_casadi. One of noisy_inputs "
+            "never has: take engine='python'."
+        )
     if system.disturbance_matrix is not None:
         return "engine='compiled' does not yet take a disturbance_matrix; take engine='python'."
     if cost.disturbance_factor is not None:
