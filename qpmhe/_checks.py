@@ -102,10 +102,15 @@ def positive_definite(name: str, value: ArrayLike, size: int | None = None) -> A
     matrix, smallest = _symmetric(name, value, size)
     if smallest <= 0.0:
         eigenvalue = float(np.linalg.eigvalsh(matrix)[0])
+        remedy = "Give every direction a value above 0, if a small one."
+        if name.startswith("disturbance"):
+            remedy = (
+                "For directions without disturbance give a singular covariance of the disturbance, "
+                "or the system a disturbance_matrix."
+            )
         raise WeightError(
             f"{name} has the eigenvalue {min(max(smallest, -1.0), eigenvalue):.3g}; expected a "
-            "positive definite matrix. For directions without disturbance give a singular "
-            "covariance of the disturbance, or the system a disturbance_matrix."
+            f"positive definite matrix. {remedy}"
         )
     return matrix
 

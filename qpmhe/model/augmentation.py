@@ -140,13 +140,7 @@ def product(
     first: ConvexSet | SoftSet | None, n: int, second: ConvexSet | SoftSet | None, k: int
 ) -> ConvexSet | None:
     """All (x, s) with x (n,) in the first set and s (k,) in the second; None is everything."""
-    for one in (first, second):
-        if isinstance(one, SoftSet):
-            raise SetError(
-                f"the set {one!r} is soft; an augmented model takes hard ones only: leave it out, "
-                "or write the augmented model as functions of a System."
-            )
-    assert not isinstance(first, SoftSet) and not isinstance(second, SoftSet)
+    first, second = _hard(first), _hard(second)
     if first is None and second is None:
         return None
     if k == 0:
@@ -174,6 +168,15 @@ def extended_matrix(system: System, k: int) -> Array | None:
     joint = np.zeros((n + k, r + k))
     joint[:n, :r], joint[n:, r:] = matrix, np.eye(k)
     return joint
+
+
+def _hard(one: ConvexSet | SoftSet | None) -> ConvexSet | None:
+    if isinstance(one, SoftSet):
+        raise SetError(
+            f"the set {one!r} is soft; an augmented model takes hard ones only: leave it out, or "
+            "write the augmented model as functions of a System."
+        )
+    return one
 
 
 def _or_everything(one: ConvexSet | None, dimension: int) -> ConvexSet:

@@ -280,7 +280,7 @@ def test_a_casadi_model_runs_in_the_compiled_step():
     # Constant parameters are noise-free components, which the step in C does not take.
     with pytest.raises(qpmhe.errors.OptionError, match="zero width"):
         estimator(qpmhe.augment_parameters(model, nominal=[0.1]), engine="compiled")
-    with pytest.raises(qpmhe.errors.OptionError, match="no CasADi form.*noisy_inputs"):
+    with pytest.raises(qpmhe.errors.OptionError, match=r"no CasADi form.*noisy_inputs"):
         estimator(qpmhe.noisy_inputs(model), engine="compiled")
 
 

@@ -356,3 +356,13 @@ def test_weights_of_rows_in_any_unit_are_weights(unit):
     negative[0] = negative[:, 0] = 3.0 * negative[:, 1] * units[0] / units[1]
     with pytest.raises(qpmhe.errors.WeightError, match="positive definite"):
         qpmhe.QuadraticCost.from_covariances(prior=negative, disturbance=matrix, noise=1.0)
+
+
+@pytest.mark.parametrize(("name", "remedy"), [
+    ("prior", "every direction"), ("disturbance", "disturbance_matrix"),
+    ("noise", "every direction"),
+])
+def test_the_remedy_for_a_singular_weight_is_one_for_this_weight(name, remedy):
+    weights = {"prior": 1.0, "disturbance": 1.0, "noise": 1.0, name: 0.0}
+    with pytest.raises(qpmhe.errors.WeightError, match=f"{name} has the eigenvalue 0.*{remedy}"):
+        qpmhe.QuadraticCost(**weights)
