@@ -87,8 +87,10 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
 def _without_memory(held: System, errors: slice, options: SystemOptions) -> System:
     """The system with e+ = 0, from the one with e+ = e."""
 
-    def zeroed(function: Any) -> Callable[[Array, Array], Array]:
-        def evaluate(z: Array, u: Array) -> Array:
+    nothing: Array = np.zeros(0)
+
+    def zeroed(function: Any) -> Callable[..., Array]:
+        def evaluate(z: Array, u: Array = nothing) -> Array:
             many = z.ndim > 1
             value = np.array(function.batch(z, u) if many else function(z, u))
             value[(slice(None), errors) if many else errors] = 0.0
@@ -96,8 +98,8 @@ def _without_memory(held: System, errors: slice, options: SystemOptions) -> Syst
 
         return evaluate
 
-    def output(function: Any) -> Callable[[Array, Array], Array]:
-        return lambda z, u: function.batch(z, u) if z.ndim > 1 else np.asarray(function(z, u))
+    def output(function: Any) -> Callable[..., Array]:
+        return lambda z, u=nothing: function.batch(z, u) if z.ndim > 1 else np.asarray(function(z, u))
 
     # What is computed by small steps is better computed of the new functions, in their scales.
     exact = [
