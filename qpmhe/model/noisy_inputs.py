@@ -86,7 +86,6 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
 
 def _without_memory(held: System, errors: slice, options: SystemOptions) -> System:
     """The system with e+ = 0, from the one with e+ = e."""
-
     nothing: Array = np.zeros(0)
 
     def zeroed(function: Any) -> Callable[..., Array]:
@@ -99,7 +98,10 @@ def _without_memory(held: System, errors: slice, options: SystemOptions) -> Syst
         return evaluate
 
     def output(function: Any) -> Callable[..., Array]:
-        return lambda z, u=nothing: function.batch(z, u) if z.ndim > 1 else np.asarray(function(z, u))
+        def evaluate(z: Array, u: Array = nothing) -> Array:
+            return function.batch(z, u) if z.ndim > 1 else np.asarray(function(z, u))
+
+        return evaluate
 
     # What is computed by small steps is better computed of the new functions, in their scales.
     exact = [
