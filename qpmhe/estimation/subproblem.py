@@ -116,7 +116,9 @@ class Subproblem:
 
         Its metric is the Gauss-Newton Hessian of J.
         """
+        self._forces, forces = None, self._forces
         qp = self.at(problem, trial)
+        self._forces = forces
         if qp is not None:
             qp.gradient[...] = 0.0
         return qp

@@ -10,6 +10,7 @@ import qpmhe
 import qpmhe.certificates
 from qpmhe import Status
 from qpmhe.errors import ModelError, SetError, ShapeError
+from qpmhe.estimation.subproblem import Subproblem
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
 
@@ -201,6 +202,23 @@ def test_hard_constraints_hold_or_are_named():
     assert named
     first = estimates({"constraints": CONSTRAINTS["hard"]}, ys, infeasible="keep_candidate")
     assert any(one.status & Status.CANDIDATE_OUTSIDE for one in first)
+
+
+def test_nearest_points_are_nearest_in_the_hessian_of_j_alone(monkeypatch):
+    found, plain = [], Subproblem.nearest_point
+
+    def compared(self, problem, trial):
+        band, forces = plain(self, problem, trial).band.copy(), self._forces
+        self.start()
+        qp = plain(self, problem, trial)
+        found.append((forces is not None, np.array_equal(qp.band, band)))
+        self._forces = forces
+        return qp
+
+    monkeypatch.setattr(Subproblem, "nearest_point", compared)
+    estimates({"constraints": CONSTRAINTS["hard"]}, max_qps=3)
+    assert any(bent for bent, _ in found)
+    assert all(equal for _, equal in found)
 
 
 def test_a_dropped_row_reads_well():
