@@ -343,7 +343,9 @@ class Optimizer:
             if solution.d is None:
                 break
             trial = self._trial(problem, best, solution.d)
-            if trial.cost < math.inf or not math.isfinite(trial.violation):
+            if not math.isfinite(trial.violation) or (
+                trial.cost < math.inf and trial.penalty <= best.penalty
+            ):
                 break
         return trial
 

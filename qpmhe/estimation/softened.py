@@ -16,6 +16,7 @@ from ..costs import Cost
 from ..model.system import System
 from .conditions import Conditions
 from .constraints import Rows, function_rows
+from .limits import BEYOND
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -220,6 +221,8 @@ class Softened:
     def bend(self, values: Array, step: Array, curvature: Array) -> None:
         """Shift the rows by what their linearisation misses at a step that leads to these values.
 
+        They are tightened by a share of that, too, as hard rows are: a step that ends outside by
+        the third order costs its linear penalty, which may be more than the step gains.
         ``curvature`` (K, n + p) is what it misses of the residuals, less whole turns of angles.
         """
         shift, n = values - self.at(step), self._n
@@ -228,6 +231,10 @@ class Softened:
                 part = curvature[:, :n] if rows.name == "disturbances" else curvature[:, n:]
                 shift[:-1, place] = rows.values(part)
         self.values = self.values + shift
+        window = self._window
+        margin = np.nan_to_num(BEYOND * np.abs(shift), nan=0.0, posinf=0.0)
+        margin = np.where(window.upper - window.lower > 4.0 * margin, margin, 0.0)
+        self._window = window._replace(lower=window.lower + margin, upper=window.upper - margin)
 
     def lifted(self, base: QP) -> QP:
         """The QP with slack variables, its objective half of J as the base's is."""

@@ -185,10 +185,13 @@ class Subproblem:
             self._note(qp, solution, np.zeros((qp.stages, self._functions.size)))
 
     def _note(self, qp: QP, solution: Solution, forces: Array | None) -> None:
-        if forces is not None and solution.row_duals is not None:
-            hard = solution.row_duals.reshape(qp.stages, -1)[:, self._g]
-            forces[:, self._g_rows] = np.maximum(hard, 0.0)
-            self._forces = forces if forces.any() and np.isfinite(forces).all() else None
+        self._forces = None  # those of an older QP may be far too large
+        if forces is not None:
+            if solution.row_duals is not None:
+                hard = solution.row_duals.reshape(qp.stages, -1)[:, self._g]
+                forces[:, self._g_rows] = np.maximum(hard, 0.0)
+            if forces.any() and np.isfinite(forces).all():
+                self._forces = forces
 
     def predicted(self, qp: QP, best: Trial, step: Array) -> float:
         """The decrease of J that the QP predicts for its step."""

@@ -183,6 +183,34 @@ def test_a_large_linear_penalty_is_exact(name):
     assert compared >= 15
 
 
+@pytest.mark.parametrize("seed", [10, 13, 19, 22])
+def test_a_large_linear_penalty_of_a_ball_is_exact_from_its_centre(seed):
+    a = np.array([[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.1, 0.9]])
+    rng = np.random.default_rng(seed)
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=0.3 * np.eye(3), disturbance=0.01 * np.eye(3), noise=0.05 * np.eye(2)
+    )
+    hard, soft = (
+        qpmhe.MovingHorizonEstimator(
+            qpmhe.System(
+                lambda x: x @ a.T + 0.1 * np.sin(x), lambda x: x[..., :2], n=3, p=2,
+                constraints=[qpmhe.Constraint(lambda x: x @ x - 0.1, **penalty)],
+            ),
+            qpmhe.Luenberger(0.2 * np.eye(3)[:, :2]), cost, horizon=6, initial_state=np.zeros(3),
+            max_qps=None, tolerance=1e-12,
+        )
+        for penalty in ({}, {"linear": 1e5})
+    )
+    x = rng.normal(size=3) * 0.3
+    for _ in range(12):
+        y = x[:2] + 0.2 * rng.normal(size=2)
+        x = x @ a.T + 0.1 * rng.normal(size=3)
+        one, other = hard.update(y), soft.update(y)
+        assert other.qps < 50
+        if one.improved and not one.dropped and np.array_equal(one.candidate, other.candidate):
+            assert other.cost <= one.cost * (1.0 + 1e-5)
+
+
 def test_hard_constraints_hold_or_are_named():
     ys = record()
     named = 0
