@@ -248,15 +248,10 @@ class Softened:
         curvature = np.maximum(window.quadratic, half * self._least)
         qp.band[:, n:, 0] = curvature
         present = np.nan_to_num(window.misses(self.values), nan=0.0, posinf=0.0)
-        usable = np.isfinite(self.values) & np.isfinite(self._own).all(axis=2) & (
-            np.isfinite(self._following).all(axis=2)
-        )
-        own = np.where(usable[:, :, None], self._own, 0.0)
-        following = np.where(usable[:, :, None], self._following, 0.0)
-        values = np.where(usable, self.values, 0.0)
+        own, following, lower, upper = self._usable()
         qp.gradient[:, :n] = base.gradient
         # What the curvature exceeds the quadratic penalty by acts on the slack's change alone.
-        needed = usable & (np.isfinite(window.lower) | np.isfinite(window.upper))
+        needed = np.isfinite(lower) | np.isfinite(upper)
         qp.gradient[:, n:] = np.where(needed, half - (curvature - window.quadratic) * present, 0.0)
         if base.bounded:
             qp.lower[:, :n], qp.upper[:, :n] = base.lower, base.upper
@@ -267,9 +262,20 @@ class Softened:
         for first in (rows, rows + size):
             place = slice(first, first + size)
             qp.row_own[:, place, :n], qp.row_next[:, place, :n] = own, following
-        qp.row_lower[:, rows : rows + size] = np.where(needed, window.lower - values, -np.inf)
-        qp.row_upper[:, rows + size :] = np.where(needed, window.upper - values, np.inf)
+        qp.row_lower[:, rows : rows + size], qp.row_upper[:, rows + size :] = lower, upper
         return qp
+
+    def _usable(self) -> tuple[Array, Array, Array, Array]:
+        """Derivatives by the state and the next, and sides, of rows that can be linearised."""
+        window, values = self._window, self.values
+        usable = np.isfinite(self._own).all(axis=2) & np.isfinite(self._following).all(axis=2)
+        usable &= np.isfinite(values)
+        return (
+            np.where(usable[:, :, None], self._own, 0.0),
+            np.where(usable[:, :, None], self._following, 0.0),
+            np.where(usable, window.lower - values, -np.inf),
+            np.where(usable, window.upper - values, np.inf),
+        )
 
     def _new(self, base: QP) -> QP:
         n, rows, size = self._n, base.rows, self._penalties.size
@@ -375,43 +381,30 @@ class Softened:
         With, for each, the largest force of an active row that is not violated, the curvature of
         the penalty beyond, and the force that a solver found.
         """
-        n, count, window, size = self._n, base.rows, self._window, self._penalties.size
-        usable = np.isfinite(self._own).all(axis=2) & np.isfinite(self._following).all(axis=2)
-        usable &= np.isfinite(self.values)
-        soft = (
-            np.where(usable[:, :, None], self._own, 0.0),
-            np.where(usable[:, :, None], self._following, 0.0),
-            np.where(usable, window.lower - self.values, -np.inf),
-            np.where(usable, window.upper - self.values, np.inf),
-            0.5 * window.linear, window.quadratic,
-            row_duals[:, count : count + size], row_duals[:, count + size :],
+        n, hard, window, size = self._n, base.rows, self._window, self._penalties.size
+        count = hard + (n if base.bounded else 0)  # of hard inequalities at each stage
+        duals = np.hstack((row_duals[:, :hard], bound_duals[:, : count - hard]))
+        eye = np.broadcast_to(np.eye(n)[: count - hard], (base.stages, count - hard, n))
+        bounds = base.lower[:, : count - hard], base.upper[:, : count - hard]
+        parts = (
+            self._usable(), (base.row_own, base.row_next, base.row_lower, base.row_upper),
+            (eye, 0.0 * eye, *bounds),
         )
-        hard, none = np.full((base.stages, count), np.inf), np.zeros((base.stages, count))
-        parts = [soft]
-        if count:
-            duals = row_duals[:, :count]
-            parts.append((
-                base.row_own, base.row_next, base.row_lower, base.row_upper, hard, none, duals,
-                duals,
-            ))
-        if base.bounded:
-            eye = np.broadcast_to(np.eye(n), (base.stages, n, n))
-            wide = np.full((base.stages, n), np.inf)
-            parts.append((
-                eye, np.zeros(eye.shape), base.lower, base.upper, wide, np.zeros(wide.shape),
-                bound_duals[:, :n], bound_duals[:, :n],
-            ))
-        collected: list[list[Array]] = [[] for _ in range(5)]
-        for own, following, lower, upper, most, curvature, below, above in parts:
-            matrix = _dense(own, following)
-            for sign, side, duals in ((1.0, upper, above), (-1.0, -lower, -below)):
-                chosen = np.isfinite(side).ravel()
-                given = sign * matrix, side, most, curvature, np.maximum(duals, 0.0)
-                for into, one in zip(collected, given, strict=True):
-                    into.append(one.reshape(chosen.size, -1)[chosen])
-        rows, *others = (np.concatenate(one) for one in collected)
-        sides, most, curvature, forces = (one.ravel() for one in others)
-        return rows, sides, most, curvature, forces
+        own, following, lower, upper = (
+            np.concatenate(one, axis=1) for one in zip(*parts, strict=True)
+        )
+        free = np.zeros((base.stages, count))
+        most, curvature, below, above = (np.hstack(one).ravel() for one in (
+            (0.5 * window.linear, free + np.inf), (window.quadratic, free),
+            (row_duals[:, hard : hard + size], duals), (row_duals[:, hard + size :], duals),
+        ))
+        uppers, lowers = (np.flatnonzero(np.isfinite(one)) for one in (upper, lower))
+        which, matrix = np.append(uppers, lowers), _dense(own, following)
+        return (
+            np.vstack((matrix[uppers], -matrix[lowers])),
+            np.append(upper.ravel()[uppers], -lower.ravel()[lowers]), most[which],
+            curvature[which], np.maximum(np.append(above[uppers], -below[lowers]), 0.0),
+        )
 
 
 def _least_squares(matrix: Array, side: Array) -> Array:
