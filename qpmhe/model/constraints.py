@@ -227,24 +227,12 @@ class _Bound:
 
     def values(self, s: Array, u: Array) -> Array:
         """Values along points s (K, d), (K, size); infinity where it raises or is not finite."""
-        try:
-            found = np.array(self.function.batch(s, u), np.float64)
-            if found.shape != (len(s), self.size):
-                raise ValueError(found.shape)
-        except Exception:  # outside of its domain at some point
-            found = _one_by_one(self.function, (self.size,), s, u)
+        found = _along(self.function, (self.size,), s, u)
         return np.where(np.isfinite(found), found, np.inf)
 
     def derivatives(self, s: Array, u: Array) -> Array:
         """The derivative along points s (K, d), (K, size, d); NaN where it raises."""
-        shape = (self.size, self._d)
-        try:
-            found = np.array(self.jacobian.batch(s, u), np.float64)
-            if found.shape != (len(s), *shape):
-                raise ValueError(found.shape)
-        except Exception:
-            found = _one_by_one(self.jacobian, shape, s, u)
-        return found
+        return _along(self.jacobian, (self.size, self._d), s, u)
 
     def curvature(self, s: Array, u: Array, forces: Array) -> Array:
         """The convex part of the second derivative of ``forces g`` (K, d, d) along points s."""
@@ -488,10 +476,14 @@ class ConstraintFunctions:
         return ""
 
 
-def _one_by_one(
-    function: Callable[..., Any], shape: tuple[int, ...], s: Array, u: Array
+def _along(
+    function: BatchedFunction | Jacobian, shape: tuple[int, ...], s: Array, u: Array
 ) -> Array:
-    """Values at each point; NaN where the function raises."""
+    """Values along points; NaN where the function raises."""
+    with suppress(Exception):  # outside of its domain at some point
+        found = np.array(function.batch(s, u), np.float64)
+        if found.shape == (len(s), *shape):
+            return found
     found = np.full((len(s), *shape), np.nan)
     for k in range(len(s)):
         with suppress(Exception):
