@@ -335,23 +335,22 @@ class Softened:
         if info != 0:
             return None
         free = -self._dpbtrs(factor, unit * base.gradient.reshape(-1, 1), lower=1)[0][:, 0]
-        # H^-1 of the rows that have been active at some time, and how stiff H is against them.
-        known, moved = np.zeros(len(rows), np.bool_), np.zeros(rows.shape[::-1])
-        stiff, soft = np.zeros(len(rows)), np.zeros(len(rows))
+        # H^-1 of the rows that have been active at some time, and how stiff H is against each row:
+        # its diagonal will do, and an interior point has a force on rows that are not active.
+        known, moved = np.zeros(len(rows), np.bool_), np.zeros(rows.shape[::-1], order="F")
+        stiff, soft = 1.0 / (rows**2 @ (1.0 / base.band[:, :, 0].ravel())), np.zeros(len(rows))
         np.divide(1.0, curvature, out=soft, where=curvature > 0.0)
         step: Array = d.ravel()
-        gap, before = rows @ step - sides, None
+        gap, before, magnitudes = rows @ step - sides, None, np.abs(rows)
         for _ in range(_NEWTON_STEPS):
-            new = ~known & ((forces > 0.0) | (gap > 0.0))
-            if new.any():
-                moved[:, new] = self._dpbtrs(factor, unit * rows[new].T, lower=1)[0]
-                stiff[new] = 1.0 / np.einsum("ij,ji->i", rows[new], moved[:, new])
-                known |= new
             held = forces + stiff * gap
             active, violated = held > 0.0, held > most
             if before is not None and all(map(np.array_equal, before, (active, violated))):
                 return np.reshape(step, d.shape)
-            before = active, violated
+            before, new = (active, violated), active & ~known
+            if new.any():
+                moved[:, new] = self._dpbtrs(factor, unit * rows[new].T, lower=1)[0]
+                known |= new
             pushed = violated & (curvature == 0.0)
             solved = active & ~pushed
             forces = np.where(pushed, most, 0.0)
@@ -365,7 +364,7 @@ class Softened:
             if not (np.isfinite(step).all() and np.isfinite(forces).all()):
                 return None
             gap = rows @ step - sides
-            rounding = _ROUNDING * (np.abs(rows) @ np.abs(step) + np.abs(sides))
+            rounding = _ROUNDING * (magnitudes @ np.abs(step) + np.abs(sides))
             # Solved rows are met, or missed by what their force says.
             off = gap - np.where(violated, soft * (forces - most), 0.0)
             if (np.abs(off) > _ACCURACY * rounding)[solved].any():
