@@ -12,7 +12,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import positive_definite, vector
 from ..costs import Cost
-from ..errors import InvalidInputError, OptionError, ShapeError
+from ..errors import InvalidInputError, OptionError, SetError, ShapeError
 from ..model.sets import ConvexSet
 from ..model.system import System, checked_set
 from .settings import Settings
@@ -135,6 +135,11 @@ class ConditionReader:
             raise OptionError(
                 f"bounds has {name!r}, but the system has no set of {name}; make it with "
                 f"System(..., {name}=...), as wide as it ever is, and narrow it here."
+            )
+        if not isinstance(given, ConvexSet):
+            raise SetError(
+                f"bounds[{name!r}] is {shown(given)}; expected a qpmhe.Box or a qpmhe.Polytope, "
+                "also for a soft set, whose penalties stay. Leave it out for the usual bounds."
             )
         checked_set(f"bounds[{name!r}]", given, built.dimension)
         key = tuple(

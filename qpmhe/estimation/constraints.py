@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ Mask = NDArray[np.bool_]
 
 # Rounding of a difference, as a share of its terms: a residual may miss a row by that much more.
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
-
 
 # A row is the combination of others if less than this share of it is not.
 _DEPENDENT = 1e-9
@@ -98,7 +98,7 @@ class Rows:
         """A copy with the sides of these sets, one a point; None for the present ones."""
         if all(one is None for one in sets):
             return self
-        other = self._copy()
+        other = copy(self)
         other.lower, other.upper = (
             np.tile(side, (len(sets), 1)) for side in (self.lower, self.upper)
         )
@@ -129,7 +129,7 @@ class Rows:
 
     def without(self, left_out: Mask, points: Array | None = None) -> Rows:
         """A copy without rows (K, r) at some stages: both sides, or those that points miss."""
-        other = self._copy()
+        other = copy(self)
         lower, upper = left_out, left_out
         if points is not None:
             values = self.values(points)
@@ -145,7 +145,7 @@ class Rows:
 
     def mapped(self, through: Array | None, noise_free: Array, left_out: Mask) -> Rows:
         """The rows on d, where s = T d, without some; and behind them N' d = 0, noise-free."""
-        other, kept, nothing = self._copy(), ~left_out, np.zeros(noise_free.shape[1])
+        other, kept, nothing = copy(self), ~left_out, np.zeros(noise_free.shape[1])
         matrix = self.matrix if through is None else self.matrix @ through
         other._kept, other.matrix = kept, np.vstack((matrix[kept], noise_free.T))
         other.lower = np.append(self.lower[kept], nothing)
@@ -157,12 +157,6 @@ class Rows:
         other.fixed = np.append(self.fixed[kept], nothing == 0.0)
         other.numbers = np.append(self.numbers[kept], np.full(nothing.size, -1))
         other._columns, other._magnitudes = None, np.abs(other.matrix).T
-        return other
-
-    def _copy(self) -> Rows:
-        other = object.__new__(Rows)
-        for name in Rows.__slots__:
-            setattr(other, name, getattr(self, name))
         return other
 
 
@@ -316,9 +310,9 @@ class Constraints:
         return tuple(found)
 
     def _replaced(self, **rows: Rows) -> Constraints:
-        other = object.__new__(Constraints)
-        for name in Constraints.__slots__:
-            setattr(other, name, rows.get(name, getattr(self, name)))
+        other = copy(self)
+        for name, mine in rows.items():
+            setattr(other, name, mine)
         return other
 
 
@@ -384,6 +378,8 @@ def _off(normal: Array, scale: Array) -> Array:
     """The projection I - E N' along orthonormal directions, in scaled numbers."""
     projection: Array = np.eye(scale.size) - scale[:, None] * (normal @ normal.T) / scale
     return projection
+
+
 def function_rows(chosen: Mask, scale: Array) -> Rows:
     """The rows g <= 0 of the chosen ones among all rows of g; a point is all of their values."""
     upper = np.where(chosen, 0.0, np.inf)

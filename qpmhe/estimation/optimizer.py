@@ -312,19 +312,27 @@ class Optimizer:
             trial = self._trial(problem, best, length * step)
             if trial.cost < target:
                 return trial
-        return self._boundary_search(problem, outcome, step) if curved else trial
+        if curved or best.penalty < trial.penalty < math.inf:
+            return self._boundary_search(problem, qp, outcome, step, curved)
+        return trial
 
-    def _boundary_search(self, problem: Problem, outcome: Outcome, step: Array) -> Trial:
+    def _boundary_search(
+        self, problem: Problem, qp: QP, outcome: Outcome, step: Array, curved: bool
+    ) -> Trial:
         """A trial along the boundary of a curved set: back into the set from a shortened step.
 
         The decrease of J is proportional to the length of a short step, the distance from the set
         to its square. So the way back costs less than a step gains, if the step is short enough.
+        Where it is no hard set that is ``curved``, a correction leads back to the soft rows.
         """
         best, target = outcome.trial, _target(outcome.trial)
         trial = best
         for length in ALONG:
             trial = self._trial(problem, best, length * step)
-            trial = self._feasible_near(problem, outcome, trial)
+            if curved:
+                trial = self._feasible_near(problem, outcome, trial)
+            else:
+                trial = self._correct(problem, qp, outcome, trial)
             if trial.cost < target:
                 break
         return trial
@@ -343,7 +351,9 @@ class Optimizer:
             if solution.d is None:
                 break
             trial = self._trial(problem, best, solution.d)
-            if trial.cost < math.inf or not math.isfinite(trial.violation):
+            if not math.isfinite(trial.violation) or (
+                trial.cost < math.inf and trial.penalty <= best.penalty
+            ):
                 break
         return trial
 

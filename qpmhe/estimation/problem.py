@@ -255,13 +255,8 @@ class Problem:
             if math.isfinite(candidate.cost) and not directions.has(candidate.residuals[:, :n]):
                 self.rolled_out = self.evaluate(candidate.trajectory, of_candidate=True)
                 candidate.cost = self.rolled_out.cost
-        candidate.violation = self._candidate_violation()
-
-    def _candidate_violation(self) -> float:
-        candidate = self.candidate
-        return self.constraints.violation(
-            candidate.trajectory, self._candidate_residuals, self.measurements, candidate.values
-        )
+        points = self._points(candidate, self._candidate_residuals)
+        candidate.violation = self.constraints.violation(*points)
 
     def _move_prior(self, prior: Array) -> None:
         """Take another prior mean, unless the candidate has no finite prior cost there."""
@@ -292,14 +287,10 @@ class Problem:
 
     def without_violated(self) -> Problem:
         """The problem without the rows that the candidate violates; noise-free ones stay."""
-        other, candidate = copy(self), self.candidate
-        other._constrain(
-            self.constraints.without_violated(
-                candidate.trajectory, self._candidate_residuals, self.measurements,
-                candidate.values,
-            )
-        )
-        other.candidate = replace(candidate, violation=other._candidate_violation())
+        other, points = copy(self), self._points(self.candidate, self._candidate_residuals)
+        other._constrain(self.constraints.without_violated(*points))
+        violation = other.constraints.violation(*points)
+        other.candidate = replace(self.candidate, violation=violation)
         return other
 
     def _add_penalty(self, trial: Trial) -> None:
@@ -314,35 +305,17 @@ class Problem:
             trial.penalty = self.penalties.cost(self.penalties.misses(values))
             trial.cost += trial.penalty
 
-    def linearised(self, trial: Trial, minus_jacobian: Array) -> tuple[Array, Array]:
-        """Derivatives of the nonlinear constraints; see `ConstraintFunctions.linearised`."""
-        functions = self._formulation.functions
-        assert functions is not None
-        return functions.linearised(
-            trial.trajectory, self.inputs, trial.residuals, minus_jacobian
-        )
-
-    def curvature(
-        self, trial: Trial, minus_jacobian: Array, forces: Array
-    ) -> tuple[Array, Array, Array]:
-        """What active nonlinear constraints add to the Hessian; see `ConstraintFunctions`."""
-        functions = self._formulation.functions
-        assert functions is not None
-        return functions.curvature(
-            trial.trajectory, self.inputs, trial.residuals, minus_jacobian, forces
-        )
-
-    def soft_rows(self, trial: Trial) -> Array:
-        """Values (K + 1, R) of all soft rows at a trial."""
-        penalties = self._formulation.penalties
-        assert penalties is not None
-        return penalties.values(trial.trajectory, trial.residuals, trial.values)
-
     def missed_rows(self, trial: Trial) -> tuple[DroppedRow, ...]:
         """The rows of this problem that a trial violates."""
-        return self.constraints.missed_rows(
-            trial.trajectory, trial.residuals, self.measurements, trial.values, self.time
-        )
+        return self.constraints.missed_rows(*self._points(trial), self.time)
+
+    def _points(
+        self, trial: Trial, residuals: Array | None = None
+    ) -> tuple[Array, Array, Array, Array | None]:
+        """What `Constraints` are functions of, with a trial's residuals or these."""
+        if residuals is None:
+            residuals = trial.residuals
+        return trial.trajectory, residuals, self.measurements, trial.values
 
     def clipped(self, trajectory: Array) -> Array:
         """Clip each state to its bounds, in place; return the trajectory."""
@@ -382,7 +355,7 @@ class Problem:
         if not math.isfinite(cost):
             trial.cost = trial.violation = math.inf
         elif self.constrained and not of_candidate:
-            trial.violation = self._violation(trial)
+            trial.violation = self.constraints.violation(*self._points(trial))
             if trial.violation > FEASIBLE:
                 trial.cost = math.inf
         return trial
@@ -400,11 +373,6 @@ class Problem:
         if functions is None or trial.values is None or np.isfinite(trial.values).all():
             return ""
         return functions.failure(trial.trajectory, self.inputs, trial.residuals)
-
-    def _violation(self, trial: Trial) -> float:
-        return self.constraints.violation(
-            trial.trajectory, trial.residuals, self.measurements, trial.values
-        )
 
     def _rolled_out(self, trajectory: Array, of_candidate: bool) -> Array:
         """Follow the model where there is no disturbance, stage by stage.

@@ -16,6 +16,7 @@ from ..costs import Cost
 from ..model.system import System
 from .conditions import Conditions
 from .constraints import Rows, function_rows
+from .limits import BEYOND
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -220,6 +221,8 @@ class Softened:
     def bend(self, values: Array, step: Array, curvature: Array) -> None:
         """Shift the rows by what their linearisation misses at a step that leads to these values.
 
+        They are tightened by a share of that, too, as hard rows are: a step that ends outside by
+        the third order costs its linear penalty, which may be more than the step gains.
         ``curvature`` (K, n + p) is what it misses of the residuals, less whole turns of angles.
         """
         shift, n = values - self.at(step), self._n
@@ -228,6 +231,10 @@ class Softened:
                 part = curvature[:, :n] if rows.name == "disturbances" else curvature[:, n:]
                 shift[:-1, place] = rows.values(part)
         self.values = self.values + shift
+        window = self._window
+        margin = np.nan_to_num(BEYOND * np.abs(shift), nan=0.0, posinf=0.0)
+        margin = np.where(window.upper - window.lower > 4.0 * margin, margin, 0.0)
+        self._window = window._replace(lower=window.lower + margin, upper=window.upper - margin)
 
     def lifted(self, base: QP) -> QP:
         """The QP with slack variables, its objective half of J as the base's is."""
@@ -241,15 +248,10 @@ class Softened:
         curvature = np.maximum(window.quadratic, half * self._least)
         qp.band[:, n:, 0] = curvature
         present = np.nan_to_num(window.misses(self.values), nan=0.0, posinf=0.0)
-        usable = np.isfinite(self.values) & np.isfinite(self._own).all(axis=2) & (
-            np.isfinite(self._following).all(axis=2)
-        )
-        own = np.where(usable[:, :, None], self._own, 0.0)
-        following = np.where(usable[:, :, None], self._following, 0.0)
-        values = np.where(usable, self.values, 0.0)
+        own, following, lower, upper = self._usable()
         qp.gradient[:, :n] = base.gradient
         # What the curvature exceeds the quadratic penalty by acts on the slack's change alone.
-        needed = usable & (np.isfinite(window.lower) | np.isfinite(window.upper))
+        needed = np.isfinite(lower) | np.isfinite(upper)
         qp.gradient[:, n:] = np.where(needed, half - (curvature - window.quadratic) * present, 0.0)
         if base.bounded:
             qp.lower[:, :n], qp.upper[:, :n] = base.lower, base.upper
@@ -260,9 +262,20 @@ class Softened:
         for first in (rows, rows + size):
             place = slice(first, first + size)
             qp.row_own[:, place, :n], qp.row_next[:, place, :n] = own, following
-        qp.row_lower[:, rows : rows + size] = np.where(needed, window.lower - values, -np.inf)
-        qp.row_upper[:, rows + size :] = np.where(needed, window.upper - values, np.inf)
+        qp.row_lower[:, rows : rows + size], qp.row_upper[:, rows + size :] = lower, upper
         return qp
+
+    def _usable(self) -> tuple[Array, Array, Array, Array]:
+        """Derivatives by the state and the next, and sides, of rows that can be linearised."""
+        window, values = self._window, self.values
+        usable = np.isfinite(self._own).all(axis=2) & np.isfinite(self._following).all(axis=2)
+        usable &= np.isfinite(values)
+        return (
+            np.where(usable[:, :, None], self._own, 0.0),
+            np.where(usable[:, :, None], self._following, 0.0),
+            np.where(usable, window.lower - values, -np.inf),
+            np.where(usable, window.upper - values, np.inf),
+        )
 
     def _new(self, base: QP) -> QP:
         n, rows, size = self._n, base.rows, self._penalties.size
@@ -322,23 +335,22 @@ class Softened:
         if info != 0:
             return None
         free = -self._dpbtrs(factor, unit * base.gradient.reshape(-1, 1), lower=1)[0][:, 0]
-        # H^-1 of the rows that have been active at some time, and how stiff H is against them.
-        known, moved = np.zeros(len(rows), np.bool_), np.zeros(rows.shape[::-1])
-        stiff, soft = np.zeros(len(rows)), np.zeros(len(rows))
+        # H^-1 of the rows that have been active at some time, and how stiff H is against each row:
+        # its diagonal will do, and an interior point has a force on rows that are not active.
+        known, moved = np.zeros(len(rows), np.bool_), np.zeros(rows.shape[::-1], order="F")
+        stiff, soft = 1.0 / (rows**2 @ (1.0 / base.band[:, :, 0].ravel())), np.zeros(len(rows))
         np.divide(1.0, curvature, out=soft, where=curvature > 0.0)
         step: Array = d.ravel()
-        gap, before = rows @ step - sides, None
+        gap, before, magnitudes = rows @ step - sides, None, np.abs(rows)
         for _ in range(_NEWTON_STEPS):
-            new = ~known & ((forces > 0.0) | (gap > 0.0))
-            if new.any():
-                moved[:, new] = self._dpbtrs(factor, unit * rows[new].T, lower=1)[0]
-                stiff[new] = 1.0 / np.einsum("ij,ji->i", rows[new], moved[:, new])
-                known |= new
             held = forces + stiff * gap
             active, violated = held > 0.0, held > most
             if before is not None and all(map(np.array_equal, before, (active, violated))):
                 return np.reshape(step, d.shape)
-            before = active, violated
+            before, new = (active, violated), active & ~known
+            if new.any():
+                moved[:, new] = self._dpbtrs(factor, unit * rows[new].T, lower=1)[0]
+                known |= new
             pushed = violated & (curvature == 0.0)
             solved = active & ~pushed
             forces = np.where(pushed, most, 0.0)
@@ -352,7 +364,7 @@ class Softened:
             if not (np.isfinite(step).all() and np.isfinite(forces).all()):
                 return None
             gap = rows @ step - sides
-            rounding = _ROUNDING * (np.abs(rows) @ np.abs(step) + np.abs(sides))
+            rounding = _ROUNDING * (magnitudes @ np.abs(step) + np.abs(sides))
             # Solved rows are met, or missed by what their force says.
             off = gap - np.where(violated, soft * (forces - most), 0.0)
             if (np.abs(off) > _ACCURACY * rounding)[solved].any():
@@ -368,43 +380,30 @@ class Softened:
         With, for each, the largest force of an active row that is not violated, the curvature of
         the penalty beyond, and the force that a solver found.
         """
-        n, count, window, size = self._n, base.rows, self._window, self._penalties.size
-        usable = np.isfinite(self._own).all(axis=2) & np.isfinite(self._following).all(axis=2)
-        usable &= np.isfinite(self.values)
-        soft = (
-            np.where(usable[:, :, None], self._own, 0.0),
-            np.where(usable[:, :, None], self._following, 0.0),
-            np.where(usable, window.lower - self.values, -np.inf),
-            np.where(usable, window.upper - self.values, np.inf),
-            0.5 * window.linear, window.quadratic,
-            row_duals[:, count : count + size], row_duals[:, count + size :],
+        n, hard, window, size = self._n, base.rows, self._window, self._penalties.size
+        count = hard + (n if base.bounded else 0)  # of hard inequalities at each stage
+        duals = np.hstack((row_duals[:, :hard], bound_duals[:, : count - hard]))
+        eye = np.broadcast_to(np.eye(n)[: count - hard], (base.stages, count - hard, n))
+        bounds = base.lower[:, : count - hard], base.upper[:, : count - hard]
+        parts = (
+            self._usable(), (base.row_own, base.row_next, base.row_lower, base.row_upper),
+            (eye, 0.0 * eye, *bounds),
         )
-        hard, none = np.full((base.stages, count), np.inf), np.zeros((base.stages, count))
-        parts = [soft]
-        if count:
-            duals = row_duals[:, :count]
-            parts.append((
-                base.row_own, base.row_next, base.row_lower, base.row_upper, hard, none, duals,
-                duals,
-            ))
-        if base.bounded:
-            eye = np.broadcast_to(np.eye(n), (base.stages, n, n))
-            wide = np.full((base.stages, n), np.inf)
-            parts.append((
-                eye, np.zeros(eye.shape), base.lower, base.upper, wide, np.zeros(wide.shape),
-                bound_duals[:, :n], bound_duals[:, :n],
-            ))
-        collected: list[list[Array]] = [[] for _ in range(5)]
-        for own, following, lower, upper, most, curvature, below, above in parts:
-            matrix = _dense(own, following)
-            for sign, side, duals in ((1.0, upper, above), (-1.0, -lower, -below)):
-                chosen = np.isfinite(side).ravel()
-                given = sign * matrix, side, most, curvature, np.maximum(duals, 0.0)
-                for into, one in zip(collected, given, strict=True):
-                    into.append(one.reshape(chosen.size, -1)[chosen])
-        rows, *others = (np.concatenate(one) for one in collected)
-        sides, most, curvature, forces = (one.ravel() for one in others)
-        return rows, sides, most, curvature, forces
+        own, following, lower, upper = (
+            np.concatenate(one, axis=1) for one in zip(*parts, strict=True)
+        )
+        free = np.zeros((base.stages, count))
+        most, curvature, below, above = (np.hstack(one).ravel() for one in (
+            (0.5 * window.linear, free + np.inf), (window.quadratic, free),
+            (row_duals[:, hard : hard + size], duals), (row_duals[:, hard + size :], duals),
+        ))
+        uppers, lowers = (np.flatnonzero(np.isfinite(one)) for one in (upper, lower))
+        which, matrix = np.append(uppers, lowers), _dense(own, following)
+        return (
+            np.vstack((matrix[uppers], -matrix[lowers])),
+            np.append(upper.ravel()[uppers], -lower.ravel()[lowers]), most[which],
+            curvature[which], np.maximum(np.append(above[uppers], -below[lowers]), 0.0),
+        )
 
 
 def _least_squares(matrix: Array, side: Array) -> Array:

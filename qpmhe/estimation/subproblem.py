@@ -116,7 +116,9 @@ class Subproblem:
 
         Its metric is the Gauss-Newton Hessian of J.
         """
+        self._forces, forces = None, self._forces
         qp = self.at(problem, trial)
+        self._forces = forces
         if qp is not None:
             qp.gradient[...] = 0.0
         return qp
@@ -136,8 +138,9 @@ class Subproblem:
         if problem.wraps:
             problem.wrap(curvature, trial.trajectory)
         bent = None if trial.values is None else self._bent(qp, around, trial, step)
-        if self._softened is not None:
-            self._softened.bend(problem.soft_rows(trial), step, curvature)
+        if self._softened is not None and self._penalties is not None:
+            values = self._penalties.values(trial.trajectory, trial.residuals, trial.values)
+            self._softened.bend(values, step, curvature)
         values = qp.rows_times(step)
         missed = np.maximum(qp.row_lower - values, values - qp.row_upper)
         margin = 2.0 * np.maximum(missed, 0.0)
@@ -183,10 +186,13 @@ class Subproblem:
             self._note(qp, solution, np.zeros((qp.stages, self._functions.size)))
 
     def _note(self, qp: QP, solution: Solution, forces: Array | None) -> None:
-        if forces is not None and solution.row_duals is not None:
-            hard = solution.row_duals.reshape(qp.stages, -1)[:, self._g]
-            forces[:, self._g_rows] = np.maximum(hard, 0.0)
-            self._forces = forces if forces.any() and np.isfinite(forces).all() else None
+        self._forces = None  # those of an older QP may be far too large
+        if forces is not None:
+            if solution.row_duals is not None:
+                hard = solution.row_duals.reshape(qp.stages, -1)[:, self._g]
+                forces[:, self._g_rows] = np.maximum(hard, 0.0)
+            if forces.any() and np.isfinite(forces).all():
+                self._forces = forces
 
     def predicted(self, qp: QP, best: Trial, step: Array) -> float:
         """The decrease of J that the QP predicts for its step."""
@@ -228,19 +234,19 @@ class Subproblem:
             gradient_first += problem.prior_weight_at(offset).dot(offset)
         gradient_last[...] = span.next_gradient_last
         self._minus_jacobian = span.minus_jacobian
-        if self._forces is not None and len(self._forces) == count + 1:
-            self._add_curvature(
-                qp, *problem.curvature(trial, span.minus_jacobian, self._forces)
-            )
         slopes = None
         if self._functions is not None:
-            slopes = problem.linearised(trial, span.minus_jacobian)
+            along = trial.trajectory, problem.inputs, trial.residuals, span.minus_jacobian
+            if self._forces is not None and len(self._forces) == count + 1:
+                self._add_curvature(qp, *self._functions.curvature(*along, self._forces))
+            slopes = self._functions.linearised(*along)
         if problem.constrained:
             self._set_inequalities(qp, problem, trial, slopes)
-        if self._softened is not None and problem.penalties is not None:
-            assert self._penalties is not None
+        if self._softened is not None and self._penalties is not None:
+            assert problem.penalties is not None
             self._softened.around(
-                problem.penalties, problem.soft_rows(trial),
+                problem.penalties,
+                self._penalties.values(trial.trajectory, trial.residuals, trial.values),
                 self._penalties.linearised(span.minus_jacobian, slopes),
             )
         return qp

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from copy import copy
 from itertools import pairwise
@@ -227,24 +227,12 @@ class _Bound:
 
     def values(self, s: Array, u: Array) -> Array:
         """Values along points s (K, d), (K, size); infinity where it raises or is not finite."""
-        try:
-            found = np.array(self.function.batch(s, u), np.float64)
-            if found.shape != (len(s), self.size):
-                raise ValueError(found.shape)
-        except Exception:  # outside of its domain at some point
-            found = _one_by_one(self.function, (self.size,), s, u)
+        found = _along(self.function, (self.size,), s, u)
         return np.where(np.isfinite(found), found, np.inf)
 
     def derivatives(self, s: Array, u: Array) -> Array:
         """The derivative along points s (K, d), (K, size, d); NaN where it raises."""
-        shape = (self.size, self._d)
-        try:
-            found = np.array(self.jacobian.batch(s, u), np.float64)
-            if found.shape != (len(s), *shape):
-                raise ValueError(found.shape)
-        except Exception:
-            found = _one_by_one(self.jacobian, shape, s, u)
-        return found
+        return _along(self.jacobian, (self.size, self._d), s, u)
 
     def curvature(self, s: Array, u: Array, forces: Array) -> Array:
         """The convex part of the second derivative of ``forces g`` (K, d, d) along points s."""
@@ -345,11 +333,18 @@ class ConstraintFunctions:
         other._bound = [one.copy() for one in self._bound]
         return other
 
-    def _split(self, trajectory: Array, residuals: Array) -> dict[str, Array]:
-        """x, w and v of the stages."""
-        d, v = residuals[:, : self._n], residuals[:, self._n :]
+    def _along(
+        self, trajectory: Array, inputs: Array, residuals: Array
+    ) -> Iterator[tuple[_Bound, slice, slice, Array, Array]]:
+        """Each constraint, its stages and its rows, and its arguments s and u at these stages."""
+        d, v, u = residuals[:, : self._n], residuals[:, self._n :], inputs[:, : self._m]
         w = d if self._through is None else d @ self._through.T
-        return {"x": trajectory[:-1], "w": w, "v": v}
+        parts = {"x": trajectory[:-1], "w": w, "v": v}
+        for one, place in zip(self._bound, self._places, strict=True):
+            if one.on_state:  # u is any at the newest state: it is not read
+                yield one, slice(None), place, trajectory, np.vstack((u, np.zeros((1, self._m))))
+            else:
+                yield one, slice(-1), place, one.joined(parts), u
 
     def _start(self, state: Array) -> dict[str, Array]:
         return {"x": state, "w": np.zeros(self._r), "v": np.zeros(self._p)}
@@ -410,13 +405,9 @@ class ConstraintFunctions:
         Infinity stands where a function raises or is not finite, and 0 at the newest state for
         rows that do not hold there.
         """
-        parts, u = self._split(trajectory, residuals), inputs[:, : self._m]
         found = np.zeros((len(trajectory), self.size))
-        for one, place in zip(self._bound, self._places, strict=True):
-            if one.on_state:
-                found[:, place] = one.values(trajectory, _extended(u))
-            else:
-                found[:-1, place] = one.values(one.joined(parts), u)
+        for one, stages, place, s, u in self._along(trajectory, inputs, residuals):
+            found[stages, place] = one.values(s, u)
         return found
 
     def linearised(
@@ -429,13 +420,12 @@ class ConstraintFunctions:
         """
         count, n = len(residuals), self._n
         own, following = np.zeros((count + 1, self.size, n)), np.zeros((count, self.size, n))
-        parts, u = self._split(trajectory, residuals), inputs[:, : self._m]
         slopes, through = self._slopes(minus_jacobian)
-        for one, place in zip(self._bound, self._places, strict=True):
+        for one, _, place, s, u in self._along(trajectory, inputs, residuals):
+            slope = one.derivatives(s, u)
             if one.on_state:
-                own[:, place] = one.derivatives(trajectory, _extended(u))
+                own[:, place] = slope
                 continue
-            slope = one.derivatives(one.joined(parts), u)
             for name, columns in one.parts.items():
                 own[:-1, place] += slope[:, :, columns] @ slopes[name]
             if "w" in one.parts:
@@ -453,13 +443,12 @@ class ConstraintFunctions:
         """
         count, n = len(residuals), self._n
         own, below, following = (np.zeros((count + k, n, n)) for k in (1, 0, 0))
-        parts, u = self._split(trajectory, residuals), inputs[:, : self._m]
         slopes, through = self._slopes(minus_jacobian)
-        for one, place in zip(self._bound, self._places, strict=True):
+        for one, stages, place, s, u in self._along(trajectory, inputs, residuals):
+            bent = one.curvature(s, u, forces[stages, place])
             if one.on_state:
-                own += one.curvature(trajectory, _extended(u), forces[:, place])
+                own += bent
                 continue
-            bent = one.curvature(one.joined(parts), u, forces[:-1, place])
             moved = np.zeros((count, bent.shape[1], n))  # s by the state
             for name, columns in one.parts.items():
                 moved[:, columns] = slopes[name]
@@ -481,29 +470,25 @@ class ConstraintFunctions:
 
     def failure(self, trajectory: Array, inputs: Array, residuals: Array) -> str:
         """What a constraint raised along a trajectory, as a message; blank if nothing."""
-        parts, u = self._split(trajectory, residuals), inputs[:, : self._m]
-        for one in self._bound:
-            s, known = (trajectory, _extended(u)) if one.on_state else (one.joined(parts), u)
-            text = one.failure(s, known)
-            if text:
+        for one, _, _, s, u in self._along(trajectory, inputs, residuals):
+            if text := one.failure(s, u):
                 return text
         return ""
 
 
-def _one_by_one(
-    function: Callable[..., Any], shape: tuple[int, ...], s: Array, u: Array
+def _along(
+    function: BatchedFunction | Jacobian, shape: tuple[int, ...], s: Array, u: Array
 ) -> Array:
-    """Values at each point; NaN where the function raises."""
+    """Values along points; NaN where the function raises."""
+    with suppress(Exception):  # outside of its domain at some point
+        found = np.array(function.batch(s, u), np.float64)
+        if found.shape == (len(s), *shape):
+            return found
     found = np.full((len(s), *shape), np.nan)
     for k in range(len(s)):
         with suppress(Exception):
             found[k] = np.asarray(function(s[k], u[k]), np.float64).reshape(shape)
     return found
-
-
-def _extended(u: Array) -> Array:
-    """Inputs of the stages with any one for the newest state, which no function of it reads."""
-    return np.concatenate((u, np.zeros((1, u.shape[1]))))
 
 
 def checked_constraints(value: Any) -> tuple[Constraint, ...]:

@@ -346,6 +346,10 @@ def wrong():
     bounds = [
         (OptionError, ["bounds is 3", "dictionary"], {"bounds": 3}),
         (OptionError, ["'outputs'", "'states'"], {"bounds": {"outputs": box}}),
+        (SetError, ["bounds['states'] is None", "qpmhe.Box", "Leave it out"],
+         {"bounds": {"states": None}}),
+        (SetError, ["bounds['states'] is Box", "soften", "penalties stay"],
+         {"bounds": {"states": box.soften(linear=1.0)}}),
         (SetError, ["bounds['states'] is [0.0, 1.0]", "qpmhe.Box"],
          {"bounds": {"states": [0.0, 1.0]}}),
         (SetError, ["dimension 3", "expected 2"],
