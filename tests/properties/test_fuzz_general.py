@@ -9,9 +9,9 @@ from tests.properties import fuzz_general
 
 
 @pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 3))])
 def test_no_step_breaks_the_promise(seed):
-    counts, faults = fuzz_general.run(600, seed)
+    counts, faults = fuzz_general.run(500, seed)
     assert faults == []
     assert counts["IMPROVED"] > 60
     assert counts["CANDIDATE_OUTSIDE"] > 20
