@@ -6,7 +6,9 @@ import pytest
 import qpmhe
 from qpmhe import Status
 
-from .test_units import Drawn, seeds
+from .test_units import Drawn
+
+SEEDS = [*range(8), *(pytest.param(k, marks=pytest.mark.slow) for k in range(8, 60))]
 
 
 class SoftDrawn(Drawn):
@@ -61,7 +63,7 @@ class SoftDrawn(Drawn):
         return made
 
 
-@pytest.mark.parametrize("seed", seeds(10, 60))
+@pytest.mark.parametrize("seed", SEEDS[:60])
 def test_powers_of_two_change_not_a_bit(seed):
     drawn = SoftDrawn(seed)
     units = drawn.units(2.0, 30)
@@ -75,7 +77,7 @@ def test_powers_of_two_change_not_a_bit(seed):
             np.testing.assert_array_equal(value, expected[name], err_msg=f"{name} at {one.time}")
 
 
-@pytest.mark.parametrize("seed", seeds(5, 30))
+@pytest.mark.parametrize("seed", SEEDS[:30])
 def test_powers_of_ten_change_no_estimate(seed):
     drawn = SoftDrawn(seed)
     units = drawn.units(10.0, 9)
