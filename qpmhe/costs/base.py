@@ -223,7 +223,7 @@ class Cost(ABC):
         return None
 
     def prior_deviations(self, covariance: Array | None, matrix: Array | None = None) -> Array:
-        """The square roots of `prior_variances`: typical magnitudes of the states."""
+        """Typical magnitudes of the states: roots of `prior_variances(covariance, matrix)`."""
         deviations: Array = np.sqrt(self.prior_variances(covariance, matrix))
         return deviations
 
@@ -279,7 +279,7 @@ class Cost(ABC):
         """The prior's counterpart of `majorise`, for offset and weight as of `prior_cost`."""
 
     def joint_weight(self, noise: Array | None, disturbance: Array | None = None) -> Array:
-        """The weight of (w, v) with these weights of v and w; None for the usual ones."""
+        """The weight of (w, v), of ``disturbance`` and ``noise``; None is the usual weight."""
         size = self.disturbance.shape[0]
         joint = np.zeros((size + self.p, size + self.p))
         joint[:size, :size] = self.disturbance if disturbance is None else disturbance
@@ -287,7 +287,7 @@ class Cost(ABC):
         return joint
 
     def with_weights(self, noise: Array | None, disturbance: Array | None) -> Cost:
-        """The step's cost with other usual weights; None keeps one."""
+        """The step's cost with other usual weights ``noise``, ``disturbance``; None keeps one."""
         other = copy(self)
         if noise is not None:
             other.noise = noise
@@ -306,7 +306,7 @@ class Cost(ABC):
     def check_weights(  # noqa: B027 - most costs take any weight
         self, noise: Array | None, disturbance: Array | None
     ) -> None:
-        """Raise a `WeightError` unless the cost can use these weights at single samples."""
+        """Raise a `WeightError` unless it can use ``noise`` and ``disturbance`` at a sample."""
 
     def partial_weight(
         self, observed: Mask, noise: Array | None = None, disturbance: Array | None = None
@@ -314,7 +314,7 @@ class Cost(ABC):
         """The stage weight where only the observed components of y are there, (p,) bool.
 
         It is zero on the others; those there weigh the inverse of their block of the covariance
-        of the noise. This sample may have weights of its own.
+        of the noise. This sample may have weights of its own, ``noise`` and ``disturbance``.
         """
         if noise is not None or disturbance is not None:
             return self._reduced(observed, self.noise if noise is None else noise, disturbance)

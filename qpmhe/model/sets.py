@@ -95,7 +95,12 @@ class ConvexSet:
     def with_sides(
         self, lower: Array, upper: Array, row_lower: Array, row_upper: Array
     ) -> ConvexSet:
-        """The same rows with other sides, shaped as this set's.
+        """The same rows with other sides.
+
+        Parameters
+        ----------
+        lower, upper, row_lower, row_upper : array
+            The sides, shaped as this set's.
 
         Raises
         ------

@@ -244,7 +244,7 @@ class System:
         return self.n if self.disturbance_matrix is None else self.disturbance_matrix.shape[1]
 
     def state_covariance(self, disturbance: Array) -> Array:
-        """The covariance (n, n) of G w, for a covariance (r, r) of w."""
+        """The covariance (n, n) of G w, for the covariance ``disturbance`` (r, r) of w."""
         if self.disturbance_matrix is None:
             return disturbance
         covariance: Array = self.disturbance_matrix @ disturbance @ self.disturbance_matrix.T
@@ -397,7 +397,7 @@ class System:
         return other
 
     def set_of(self, name: str) -> ConvexSet | None:
-        """The set of ``states``, ``disturbances`` or ``noises``, hard or soft."""
+        """The set of this name (``states``, ``disturbances`` or ``noises``), hard or soft."""
         soft = self.soft.get(name)
         return getattr(self, name) if soft is None else soft.convex
 

@@ -194,7 +194,9 @@ def test_our_part_of_a_solve_leaves_no_memory_behind(name):
     answers[0].z = answers[0].y = answers[0].z_box = np.zeros(200)
     answers[0].extras = {}
     solver._solve_problem = lambda *one, **two: answers[0]
-    assert growth(solver, qps[:5]) < 2000  # two bytes a solve
+    # Eight bytes a solve: no object is as small. NumPy and Python keep some freed ones at first.
+    growth(solver, qps[:5])
+    assert growth(solver, qps[:5]) < 8000
     # Never a pattern that is kept. NumPy keeps some freed arrays; 240 forms take megabytes.
     assert growth(solver, qps, 240) < 100_000
     assert len(solver._workspaces) < len(qps)

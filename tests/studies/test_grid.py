@@ -102,7 +102,7 @@ def test_lists_may_be_any_iterable_and_single_values_stand_for_lists():
         ({"steps": 0}, OptionError, "steps is 0"),
         ({"measure": "speed"}, OptionError, "'both', 'accuracy', 'time'"),
         ({"deadline": 0.0}, OptionError, "deadline is 0.0"),
-        ({"covariances": 1}, StudyError, "covariances is 1"),
+        ({"covariances": 1}, OptionError, "covariances is 1"),
         ({"cell_timeout": float("inf")}, OptionError, "cell_timeout is inf"),
         ({"seed": 1}, UnknownOptionError, "Did you mean seeds?"),
     ],

@@ -98,8 +98,9 @@ def test_what_does_not_fit_is_refused_with_file_and_line(tmp_path, old, new, wor
     assert str(path) in str(caught.value)
     if "TOML" not in words:
         # Of a list over several lines, the line of its key.
+        lines = GOOD.splitlines()
+        wrong = next(i for i, line in enumerate(lines) if old in line)
         lines = text.splitlines()
-        wrong = next(i for i, line in enumerate(lines) if new in line)
         while not re.match(r"\w+ =|\[", lines[wrong]):
             wrong -= 1
         assert f", line {wrong + 1}:" in str(caught.value)
