@@ -101,7 +101,7 @@ class Formulation:
     def prior_weights(self, covariance: Array | None) -> tuple[Array, Array]:
         """The prior's weight for an observer's covariance, and one to judge its distance by.
 
-        A state that is known exactly has a large weight in the first, and that of its typical
+        A state that is known exactly has a large weight in the first, and the weight of its typical
         magnitude in the second.
         """
         typical = self._typical
@@ -243,8 +243,8 @@ class Problem:
     def _judge_candidate(self) -> None:
         """Set the candidate's violation and, where its noise-free part has no cost, its J.
 
-        Corrections outside of the range of the disturbances have no weight: J(candidate) is then
-        that of the roll-out of the candidate, with the part of each correction in the range.
+        Corrections outside of the range of the disturbances have no weight: J(candidate) is then J
+        of its roll-out, which takes the part of each correction that is in the range.
         """
         candidate, directions = self.candidate, self.constraints.directions
         self._candidate_residuals = candidate.residuals

@@ -122,7 +122,7 @@ class IpoptEstimator:
         return self._programs[count]
 
     def _wrapped(self, residual: Residual | None, plain: Any) -> Any:
-        """The same branch as in `Angles.wrap`; its derivative is that of the difference."""
+        """The same branch as in `Angles.wrap`, with the derivative of the difference."""
         if residual is None:
             return plain
         if not isinstance(residual, Angles):

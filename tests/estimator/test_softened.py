@@ -286,7 +286,7 @@ def test_a_constraint_that_fails_far_from_the_data_never_escapes(bad, penalty):
 def test_rows_on_missing_outputs_do_not_count():
     ys = record()
     ys[8:11, 1] = np.nan
-    # One row on each output: that of the second does not count where it is missing.
+    # One row on each output: the second row does not count where its output is missing.
     both = [qpmhe.Constraint(lambda v: np.array([v[0] ** 2, v[1] ** 2]) - 0.05, 2)]
     first = [qpmhe.Constraint(lambda v: v[0] ** 2 - 0.05)]
     alone = np.array(record())

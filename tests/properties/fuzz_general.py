@@ -7,9 +7,7 @@ candidate and all constraints a second time, from the record that it keeps itsel
 
 from __future__ import annotations
 
-import argparse
 import math
-import warnings
 from collections import Counter
 from dataclasses import dataclass, field
 
@@ -17,6 +15,8 @@ import numpy as np
 
 import qpmhe
 from qpmhe import Status
+
+from .fuzz_promise import main
 
 # Of a row, in units of its width or of a standard deviation.
 FEASIBLE = 1e-8
@@ -280,7 +280,7 @@ def penalty(values, low, high, linear_quadratic):
 
 
 def judged(one, trajectory, start):
-    """J of a trajectory, its largest miss of a hard row, and that of a noise-free direction."""
+    """J of a trajectory, its largest misses of a hard row and of a noise-free direction."""
     samples = one.taken[-(len(trajectory) - 1) :]
     inverse, _, null = one.inverse
     offset = wrapped(trajectory[0] - start, one.state_angles)
@@ -389,18 +389,5 @@ def run(steps, seed):
     return counts, faults
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    warnings.simplefilter("ignore", qpmhe.ObserverWarning)
-    counts, faults = run(arguments.steps, arguments.seed)
-    for name, count in counts.most_common():
-        print(f"{name:20}{count:>10,}")
-    print(f"faults: {len(faults)}", *faults[:20], sep="\n")
-    return bool(faults)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main(__doc__.splitlines()[0], run))
