@@ -38,7 +38,7 @@ class Scale:
 
     ``step``, (K, n), is the unit of d, t S; ``units`` and ``duals``, (K n + K rows,), are those of
     the constraints, t S and t / R, and of their multipliers, t / (c S) and t R / c, bounds first;
-    ``cost`` is that of the objective, t squared over c.
+    ``cost`` is the value of the objective, t squared over c.
     """
 
     __slots__ = ("_factors", "_unknown", "cost", "duals", "key", "sizes", "step", "units")
