@@ -169,7 +169,10 @@ def estimator_files(
 ) -> tuple[dict[str, str], str]:
     """Header and source of a whole estimator."""
     head = header(name, {**layout.header_values(name), "version": __version__})
-    parts = ("window.c", "factor.c", "inequalities.c", "optimizer.c", "step.c")
+    parts = (
+        "algebra.c", "cost.c", "observer.c", "window.c", "sets.c", "trial.c", "factor.c",
+        "inequalities.c", "optimizer.c", "step.c",
+    )
     body = prologue() + model_source(model) + "\n".join(template(part) for part in parts)
     data = (
         "\n/* Weights, gain, sets and options of the estimator that this was made from. */\n"

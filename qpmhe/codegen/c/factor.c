@@ -14,14 +14,15 @@ static real mhe_floored(real factor) { return factor < LEAST_FACTOR ? LEAST_FACT
 
 /* Fill panels and gradient from the terms in workspace->at, around a trajectory that starts
  * at the given offset from the prior. */
-static void mhe_assemble(const mhe_estimator *e, mhe_workspace *k, const real *offset)
+static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
 {
     const mhe_settings *s = e->settings;
     const int count = e->length;
     const real *factors = k->factors;
     for (int i = 0; i <= count; i++) {
         real *panel = k->panels + i * NX * WIDTH, *g = k->gradient + i * NX;
-        const real *weight = i == 0 ? s->prior_weight : s->disturbance_weight;
+        const real *weight = i == 0 ? mhe_prior_weight(s, mhe_stage_at(e, 0))
+                                    : mhe_disturbance_weight(s, mhe_stage_at(e, i - 1));
         const real factor = mhe_floored(factors[i]);
         for (int r = 0; r < NX; r++) {
             real *row = panel + r * WIDTH;
@@ -29,7 +30,7 @@ static void mhe_assemble(const mhe_estimator *e, mhe_workspace *k, const real *o
             for (int c = NX; c < WIDTH; c++) row[c] = 0;
         }
         if (i == 0) {
-            mhe_times(NX, s->prior_weight, offset, g);
+            mhe_times(NX, weight, offset, g);
             for (int j = 0; j < NX; j++) g[j] *= factor;
         } else {
             for (int j = 0; j < NX; j++) g[j] = factor * k->at[i - 1]->following[j];
@@ -130,7 +131,7 @@ static int mhe_solve(const mhe_workspace *k, int count, real *restrict b)
 }
 
 /* The QP, or that of the nearest point that satisfies the rows, in the metric of its Hessian. */
-static void mhe_build(const mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest)
+static void mhe_build(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest)
 {
     mhe_assemble(e, k, offset);
     if (nearest) memset(k->gradient, 0, sizeof k->gradient);

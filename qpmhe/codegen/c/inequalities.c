@@ -223,7 +223,7 @@ static real mhe_product(int n, const real *a, const real *b)
  * which mostly ends after a few factorisations, with an exact solution. The equations are those of
  * an augmented Lagrangian, so that rows may depend on each other. `step` and rows.value
  * are those of the minimiser without inequalities. STOPPED where the guesses do not settle. */
-static int mhe_active_set(const mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest,
+static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest,
                           int limit, int *iterations)
 {
     const int count = e->length, size = (count + 1) * NX, rows = count * ROWS;
@@ -386,7 +386,7 @@ static real mhe_set_corrections(mhe_rows *q, int rows, real length)
  * by `missed` scales at most, and `promise` is its |g'd|. No unit matters: rows are compared with their scales,
  * products of slacks and duals with what the objective has to gain or to pay, gradients with the
  * roots of the Hessian's diagonal. */
-static int mhe_interior_point(const mhe_estimator *e, mhe_workspace *k, const real *offset,
+static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *offset,
                               int nearest, real missed, real promise, int limit, int *iterations)
 {
     const mhe_settings *s = e->settings;

@@ -67,8 +67,7 @@ static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *
         mhe_h_jacobian(around->x + i * NX, stage->u, output, t->h_jacobian);
         if (!mhe_all_finite(NX * NX, t->f_jacobian) || !mhe_all_finite(NY * NX, t->h_jacobian))
             return 0;
-        mhe_set_terms(e->settings, stage->noise_weight, around->w + i * NX,
-                      around->v + i * NY, t);
+        mhe_set_terms(e->settings, stage, around->w + i * NX, around->v + i * NY, t);
     }
 #if CONSTRAINED
     mhe_set_limits(e, k, around->w, around->v);

@@ -12,7 +12,7 @@ static void mhe_watch(mhe_estimator *e, mhe_outcome *o)
     real offset[NX];
     for (int j = 0; j < NX; j++)
         offset[j] = o->best->x[e->length * NX + j] - o->candidate->x[e->length * NX + j];
-    const int far = mhe_form(NX, e->settings->prior_weight, offset) > MHE_FAR * MHE_FAR;
+    const int far = mhe_form(NX, mhe_prior_weight(e->settings, mhe_stage_at(e, 0)), offset) > MHE_FAR * MHE_FAR;
     e->far = far ? e->far + (e->far < INT32_MAX) : 0;
     e->dropped = o->rows_dropped ? e->dropped + (e->dropped < INT32_MAX) : 0;
     if (e->far >= MHE_HORIZON) o->events |= MHE_OBSERVER_FAR;
@@ -42,10 +42,10 @@ static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 static void mhe_filtered(mhe_estimator *e, const mhe_outcome *o, real *out)
 {
     const mhe_stage *newest = mhe_stage_at(e, e->length - 1);
-    const int kept = o->best == o->candidate;
-    for (int j = 0; j < NX; j++)
-        out[j] = o->best->x[(e->length - 1) * NX + j] +
-                 (kept ? mhe_dot(NY, e->settings->filter_gain + j * NY, newest->v) : 0);
+    if (o->best == o->candidate)
+        mhe_filter(e->settings, newest, out);
+    else
+        memcpy(out, o->best->x + (e->length - 1) * NX, sizeof(real) * NX);
 }
 
 static void mhe_step(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u,

@@ -1,0 +1,98 @@
+/* The cost of the true problem, and the quadratic form by which a QP sees it: weights, values, terms. */
+
+/* The weight of the components that are there: the inverse of their block of the noise
+ * covariance is the Schur complement of the others in the weight. */
+static void mhe_set_noise_weight(const mhe_settings *s, mhe_stage *stage)
+{
+    real *R = stage->noise_weight;
+    memcpy(R, stage->has_own_noise ? stage->own_noise_weight : s->noise_weight,
+           sizeof stage->noise_weight);
+    stage->is_complete = 1;
+    for (int m = 0; m < NY; m++) {
+        if (stage->is_observed[m]) continue;
+        stage->is_complete = 0;
+        stage->y[m] = 0; /* any number: its weight is zero */
+        const real pivot = R[m * NY + m];
+        for (int i = 0; i < NY; i++) {
+            if (i == m) continue;
+            const real share = R[i * NY + m] / pivot;
+            for (int j = 0; j < NY; j++)
+                if (j != m) R[i * NY + j] -= share * R[m * NY + j];
+        }
+        for (int i = 0; i < NY; i++) {
+            R[i * NY + m] = 0;
+            R[m * NY + i] = 0;
+        }
+    }
+}
+
+/* The weight of w at a stage. */
+static const real *mhe_disturbance_weight(const mhe_settings *s, const mhe_stage *stage)
+{
+    (void)stage;
+    return s->disturbance_weight;
+}
+
+/* l(w, v) of a stage. */
+static real mhe_stage_cost(const mhe_settings *s, const mhe_stage *stage, const real *w,
+                           const real *v)
+{
+    return mhe_form(NX, mhe_disturbance_weight(s, stage), w) +
+           mhe_form(NY, stage->noise_weight, v);
+}
+
+/* The weight of the prior at the window's first stage. */
+static const real *mhe_prior_weight(const mhe_settings *s, const mhe_stage *first)
+{
+    (void)first;
+    return s->prior_weight;
+}
+
+/* Gamma of an offset from the prior. */
+static real mhe_prior_cost(const mhe_settings *s, const mhe_stage *first, const real *offset)
+{
+    return mhe_form(NX, mhe_prior_weight(s, first), offset);
+}
+
+/* hessian = A' Q A + C' R C (upper half), coupling = -A' Q, own = -(A' Q w + C' R v),
+ * following = Q w; A and C are in place. */
+static void mhe_set_terms(const mhe_settings *s, const mhe_stage *stage, const real *w,
+                          const real *v, mhe_terms *t)
+{
+    const real *A = t->f_jacobian, *C = t->h_jacobian;
+    const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
+    real RC[NY * NX], QA[NX * NX];
+    mhe_times(NX, Q, w, t->following);
+    for (int i = 0; i < NX * NX; i++) t->hessian[i] = QA[i] = 0;
+    for (int i = 0; i < NX; i++)
+        for (int k = 0; k < NX; k++) {
+            const real q = Q[i * NX + k];
+            if (q == 0) continue; /* weights are diagonal more often than not */
+            for (int j = 0; j < NX; j++) QA[i * NX + j] += q * A[k * NX + j];
+        }
+    for (int i = 0; i < NX; i++)
+        for (int k = 0; k < NX; k++) t->coupling[i * NX + k] = -QA[k * NX + i];
+    for (int k = 0; k < NX; k++)
+        for (int i = 0; i < NX; i++) {
+            const real a = A[k * NX + i];
+            if (a == 0) continue;
+            for (int j = i & ~3; j < NX; j++) t->hessian[i * NX + j] += a * QA[k * NX + j];
+        }
+    for (int i = 0; i < NY; i++)
+        for (int j = 0; j < NX; j++) {
+            real sum = 0;
+            for (int k = 0; k < NY; k++) sum += R[i * NY + k] * C[k * NX + j];
+            RC[i * NX + j] = sum;
+        }
+    for (int k = 0; k < NY; k++)
+        for (int i = 0; i < NX; i++) {
+            const real c = C[k * NX + i];
+            if (c == 0) continue;
+            for (int j = i & ~3; j < NX; j++) t->hessian[i * NX + j] += c * RC[k * NX + j];
+        }
+    for (int j = 0; j < NX; j++) t->own[j] = 0;
+    for (int k = 0; k < NX; k++)
+        for (int j = 0; j < NX; j++) t->own[j] -= w[k] * QA[k * NX + j];
+    for (int k = 0; k < NY; k++)
+        for (int j = 0; j < NX; j++) t->own[j] -= v[k] * RC[k * NX + j];
+}

@@ -1,0 +1,99 @@
+/* The sets W and V: their rows, and by how much a trajectory misses them. */
+
+#define CONSTRAINED (MHE_W_SET || MHE_V_SET)
+
+#if CONSTRAINED
+#define ROWS MHE_STAGE_ROWS
+#define W_COUNT (MHE_W_SET * (NX + MHE_W_ROWS))
+#define V_COUNT (MHE_V_SET * (NY + MHE_V_ROWS))
+
+/* How far a point q is from each side of a set: low <= 0 <= high where it is inside. */
+static void mhe_distances(int n, int count, const real *q, const real *lower, const real *upper,
+                          const real *rows, const real *row_lower, const real *row_upper,
+                          const uint8_t *known, real *low, real *high)
+{
+    for (int j = 0; j < n; j++) {
+        const int there = !known || known[j];
+        low[j] = there ? lower[j] - q[j] : -INFINITY;
+        high[j] = there ? upper[j] - q[j] : INFINITY;
+    }
+    for (int i = 0; i < count; i++) {
+        const real value = mhe_dot(n, rows + i * n, q);
+        int there = 1;
+        for (int j = 0; j < n; j++)
+            if (known && !known[j] && rows[i * n + j] != 0) there = 0;
+        low[n + i] = there ? row_lower[i] - value : -INFINITY;
+        high[n + i] = there ? row_upper[i] - value : INFINITY;
+    }
+}
+
+#define DISTANCES(set, n, count, q, known, low, high) \
+    mhe_distances(n, count, q, (set).lower, (set).upper, (set).rows, (set).row_lower, \
+                  (set).row_upper, known, low, high)
+
+/* The same for all rows of stage i, about residuals w and v of a trajectory. */
+static void mhe_stage_distances(mhe_estimator *e, int i, const real *w, const real *v, real *low,
+                                real *high)
+{
+#if MHE_W_SET
+    DISTANCES(e->settings->disturbances, NX, MHE_W_ROWS, w + i * NX, 0, low, high);
+#endif
+#if MHE_V_SET
+    const mhe_stage *stage = mhe_stage_at(e, i);
+    DISTANCES(e->settings->noises, NY, MHE_V_ROWS, v + i * NY,
+              stage->is_complete ? 0 : stage->is_observed, low + W_COUNT, high + W_COUNT);
+#endif
+    (void)w; (void)v;
+}
+
+/* The largest miss among rows of one set, in their scales. `sizes`: of the numbers whose
+ * differences the rows are of, for rounding. `missed` gets the sides that are. */
+static real mhe_missed(int n, int count, const real *low, const real *high, const real *rows,
+                       const real *scale, const real *row_scale, const real *sizes,
+                       const uint8_t *left_out, uint8_t *missed)
+{
+    real worst = 0;
+    for (int r = 0; r < n + count; r++) {
+        const int side = low[r] > 0 ? MHE_LOWER : high[r] < 0 ? MHE_UPPER : 0;
+        if (isnan(low[r]) || isnan(high[r])) return INFINITY;
+        if (!side || (left_out && left_out[r] & side)) continue;
+        real size = 0;
+        if (r < n)
+            size = fabs(sizes[r]);
+        else
+            for (int j = 0; j < n; j++) size += fabs(rows[(r - n) * n + j] * sizes[j]);
+        const real miss = (side == MHE_LOWER ? low[r] : -high[r]) - 8 * EPSILON * size;
+        const real share = miss / (r < n ? scale[r] : row_scale[r - n]);
+        if (isnan(share)) return INFINITY;
+        worst = mhe_max(share, worst);
+        if (missed && share > MHE_FEASIBLE) missed[r] = (uint8_t)side;
+    }
+    return worst;
+}
+
+#define MISSED(set, n, count, low, high, sizes, left_out, missed) \
+    mhe_missed(n, count, low, high, (set).rows, (set).scale, (set).row_scale, sizes, left_out, \
+               missed)
+
+/* The largest miss of a trial in the rows' scales, without the sides that are left out. */
+static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const uint8_t *left_out,
+                          uint8_t *missed)
+{
+    real worst = 0, low[ROWS], high[ROWS];
+    for (int i = 0; i < e->length; i++) {
+        const uint8_t *out = left_out ? left_out + i * ROWS : 0;
+        uint8_t *in = missed ? missed + i * ROWS : 0;
+        mhe_stage_distances(e, i, trial->w, trial->v, low, high);
+#if MHE_W_SET
+        worst = mhe_max(worst, MISSED(e->settings->disturbances, NX, MHE_W_ROWS, low, high,
+                                      trial->x + (i + 1) * NX, out, in));
+#endif
+#if MHE_V_SET
+        worst = mhe_max(worst, MISSED(e->settings->noises, NY, MHE_V_ROWS, low + W_COUNT,
+                                      high + W_COUNT, mhe_stage_at(e, i)->y,
+                                      out ? out + W_COUNT : 0, in ? in + W_COUNT : 0));
+#endif
+    }
+    return worst;
+}
+#endif

@@ -1,0 +1,51 @@
+/* A trajectory, judged by the true model. */
+
+/* Judge the trajectory of a trial by the true model: infinite cost where the model is not
+ * finite or a row is missed. */
+static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
+{
+    const mhe_settings *s = e->settings;
+    const real *prior = mhe_stage_at(e, 0)->z, *factors = k->factors;
+    real offset[NX], cost = 0;
+    for (int i = 0; i < e->length; i++) {
+        const mhe_stage *stage = mhe_stage_at(e, i);
+        const real *x = trial->x + i * NX;
+        real *w = trial->w + i * NX, *v = trial->v + i * NY, predicted[NX], output[NY];
+        mhe_f(x, stage->u, stage->step, predicted);
+        mhe_h(x, stage->u, output);
+        for (int j = 0; j < NX; j++) w[j] = x[NX + j] - predicted[j];
+        /* A model that fails in a missing output fails, as it does everywhere. */
+        for (int j = 0; j < NY; j++) v[j] = stage->y[j] - output[j];
+        cost += factors[i + 1] * mhe_stage_cost(s, stage, w, v);
+    }
+    for (int j = 0; j < NX; j++) offset[j] = trial->x[j] - prior[j];
+    cost += factors[0] * mhe_prior_cost(s, mhe_stage_at(e, 0), offset);
+    trial->cost = cost;
+    trial->violation = 0;
+    if (!isfinite(cost)) {
+        trial->cost = trial->violation = INFINITY;
+        return;
+    }
+#if CONSTRAINED
+    trial->violation = mhe_violation(e, trial, k->left_out, 0);
+    if (trial->violation > MHE_FEASIBLE) trial->cost = INFINITY;
+#endif
+}
+
+/* What rounding of the residuals of a trial can contribute to its cost. */
+static real mhe_rounding_cost(mhe_estimator *e, const mhe_workspace *k, const mhe_trial *trial)
+{
+    real cost = 0;
+    for (int i = 0; i < e->length; i++) {
+        const mhe_stage *stage = mhe_stage_at(e, i);
+        const real *Q = mhe_disturbance_weight(e->settings, stage), *R = stage->noise_weight;
+        const real *x = trial->x + (i + 1) * NX, *y = stage->y;
+        real sum = 0;
+        for (int j = 0; j < NX; j++)
+            for (int l = 0; l < NX; l++) sum += fabs(x[j] * Q[j * NX + l] * x[l]);
+        for (int j = 0; j < NY; j++)
+            for (int l = 0; l < NY; l++) sum += fabs(y[j] * R[j * NY + l] * y[l]);
+        cost += k->factors[i + 1] * sum;
+    }
+    return 64 * EPSILON * EPSILON * cost;
+}

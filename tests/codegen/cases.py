@@ -1,0 +1,138 @@
+"""Estimators with every feature of the step, each with a record: one table for all tests of C."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+import qpmhe
+from qpmhe.models.batch_reactor import batch_reactor
+from qpmhe.models.batch_reactor import casadi_output as reactor_output
+from qpmhe.models.batch_reactor import casadi_rate as reactor_rate
+
+STEPS = 24
+
+
+@dataclass(frozen=True)
+class Case:
+    """An estimator's arguments, and the arguments of each of its updates.
+
+    ``options`` are those of the estimator beside engine and initial state, ``samples`` the
+    arguments of `update`, by name. Both engines must agree to ``tolerance``, relative to the
+    magnitude of what is compared.
+    """
+
+    system: qpmhe.System
+    observer: qpmhe.Observer
+    cost: qpmhe.Cost
+    start: np.ndarray
+    samples: tuple[dict[str, Any], ...]
+    options: dict[str, Any] = field(default_factory=lambda: {"horizon": 5, "max_qps": 2})
+    tolerance: float = 1e-9
+
+    def estimator(self, engine: str, **options: Any) -> qpmhe.MovingHorizonEstimator:
+        """An estimator of this case."""
+        return qpmhe.MovingHorizonEstimator(
+            self.system, self.observer, self.cost, initial_state=self.start, engine=engine,
+            **(self.options | options),
+        )
+
+    def with_options(self, **options: Any) -> Case:
+        """The case with other options."""
+        return replace(self, options=self.options | options)
+
+    def with_gaps(self) -> Case:
+        """The case with missing components, missing samples and, of an ODE, other steps."""
+        samples = []
+        for t, sample in enumerate(self.samples):
+            y = np.array(sample["y"], float)
+            if t % 5 == 3:
+                y[t % y.size] = np.nan
+            if t % 11 == 7:
+                y[:] = np.nan
+            own = {"dt": 0.7 * self.system.dt} if self.system.dt and t % 6 == 4 else {}
+            samples.append(sample | {"y": y} | own)
+        return replace(self, samples=tuple(samples))
+
+
+def recorded(
+    system: qpmhe.System, start: Any, *, seed: int = 3, disturbance: float = 0.02,
+    noise: float = 0.1, steps: int = STEPS,
+) -> tuple[dict[str, Any], ...]:
+    """Samples of the system along a disturbed trajectory that starts near a state."""
+    generator = np.random.default_rng(seed)
+    x, samples = np.asarray(start) + noise * generator.standard_normal(system.n), []
+    for u in generator.uniform(-1.0, 1.0, (steps, system.m)):
+        y = system.h(x, u) + noise * generator.standard_normal(system.p)
+        samples.append({"y": y, "u": u} if system.m else {"y": y})
+        x = system.f(x, u) + disturbance * generator.standard_normal(system.n)
+    return tuple(samples)
+
+
+def spd(seed: int, n: int) -> np.ndarray:
+    """A positive definite matrix that is not diagonal."""
+    root = np.random.default_rng(seed).standard_normal((n, n))
+    return root @ root.T + 0.5 * np.eye(n)
+
+
+def reactor(method: str = "rk4", **options: Any) -> qpmhe.System:
+    """The paper's batch reactor in CasADi's language, evaluated by its virtual machine."""
+    return qpmhe.from_casadi(
+        reactor_rate, reactor_output, n=2, dt=0.1, method=method, compiled=False, **options
+    )
+
+
+def with_inputs(**options: Any) -> qpmhe.System:
+    """Three states, two outputs, two inputs: f and h both take the inputs."""
+    import casadi
+
+    def f(x, u):
+        return [0.9 * x[0] + 0.2 * casadi.sin(x[1]) + 0.1 * u[0],
+                0.8 * x[1] - 0.1 * x[0] ** 2 + 0.1 * u[0] * u[1],
+                0.7 * x[2] + 0.2 * x[0] * casadi.cos(x[1])]
+
+    return qpmhe.from_casadi(
+        f, lambda x, u: [x[0] + 0.3 * u[1] * x[1], x[2] + 0.1 * x[1] ** 2], n=3, m=2,
+        compiled=False, **options,
+    )
+
+
+def _reactor() -> Case:
+    _, observer, cost, scenario = batch_reactor("rk4")
+    samples = tuple({"y": y} for y in scenario.simulate(1, STEPS).measurements)
+    return Case(reactor(), observer, cost, np.array(scenario.initial_estimate), samples)
+
+
+def _with_inputs() -> Case:
+    system = with_inputs()
+    cost = qpmhe.QuadraticCost(
+        prior=spd(1, system.n), disturbance=10 * spd(2, system.n), noise=spd(3, system.p),
+        discount=0.95,
+    )
+    start = np.array([0.5, 0.5, 0.2])
+    gain = [[0.2, 0.0], [0.1, 0.05], [0.0, 0.2]]
+    return Case(system, qpmhe.Luenberger(gain), cost, start, recorded(system, start))
+
+
+#: Each is made when it is asked for; `case` keeps it.
+CASES: dict[str, Callable[[], Case]] = {
+    "reactor": _reactor,
+    "reactor with gaps": lambda: case("reactor").with_gaps(),
+    "reactor reinitialized": lambda: case("reactor").with_options(
+        candidate="reinitialized", warm_start=True
+    ),
+    "inputs": _with_inputs,
+    "inputs with gaps": lambda: case("inputs").with_gaps(),
+    "inputs converged": lambda: case("inputs").with_options(max_qps=None, delay=2),
+    "inputs observer": lambda: case("inputs").with_options(max_qps=0),
+}
+
+
+@functools.cache
+def case(name: str) -> Case:
+    """The case of this name."""
+    return CASES[name]()

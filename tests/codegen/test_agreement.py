@@ -1,0 +1,68 @@
+"""The compiled step and the Python one give the same estimates, with every feature."""
+
+import numpy as np
+import pytest
+
+from qpmhe.codegen.compiler import find_compiler
+
+from .cases import CASES, case
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+
+ARRAYS = ("state", "filtered", "trajectory", "candidate", "disturbances", "noises", "delayed")
+EVENTS = ("status", "qps", "dropped", "time", "corrections", "nearest_points")
+
+
+def agree(expected, found, tolerance):
+    """Equality up to rounding of all that two estimates of a window say."""
+    for name in EVENTS:
+        assert getattr(found, name) == getattr(expected, name), name
+    for name in ARRAYS:
+        one, other = getattr(expected, name), getattr(found, name)
+        assert (one is None) == (other is None), name
+        if one is None:
+            continue
+        assert one.shape == other.shape, name
+        magnitude = np.abs(one[np.isfinite(one)]).max(initial=0.0)
+        np.testing.assert_allclose(
+            other, one, rtol=0.0, atol=tolerance * (1.0 + magnitude), err_msg=name
+        )
+    for name in ("cost", "candidate_cost"):
+        one, other = getattr(expected, name), getattr(found, name)
+        assert other == pytest.approx(one, rel=tolerance, abs=tolerance), name
+    assert found.cost <= found.candidate_cost
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_same_estimates(name):
+    """Sample by sample, with a snapshot in the middle, and with a late measurement."""
+    one = case(name)
+    reference, compiled = one.estimator("python"), one.estimator("compiled")
+    assert (reference.engine, compiled.engine) == ("python", "compiled")
+    for t, sample in enumerate(one.samples):
+        agree(reference.update(**sample), compiled.update(**sample), one.tolerance)
+        if t == len(one.samples) // 2:
+            state = compiled.state_dict()
+            compiled = one.estimator("compiled")
+            compiled.load_state_dict(state)
+    time = len(one.samples) - 2
+    late = np.array(one.samples[time]["y"]) + 0.1
+    agree(reference.amend(time, late), compiled.amend(time, late), one.tolerance)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_same_runs(name):
+    """Whole records, as far as they have no conditions of single samples."""
+    one = case(name)
+    if any(set(sample) - {"y", "u"} for sample in one.samples):
+        pytest.skip("run takes measurements and inputs only")
+    Y = np.array([sample["y"] for sample in one.samples])
+    U = np.array([sample["u"] for sample in one.samples]) if one.system.m else None
+    expected, found = (one.estimator(engine).run(Y, U) for engine in ("python", "compiled"))
+    np.testing.assert_array_equal(found.flags, expected.flags)
+    for array in ("states", "filtered", "costs", "candidate_costs"):
+        a, b = getattr(expected, array), getattr(found, array)
+        np.testing.assert_allclose(
+            b, a, rtol=one.tolerance, atol=one.tolerance * np.abs(a).max(), err_msg=array
+        )
+    assert (found.costs <= found.candidate_costs).all()
