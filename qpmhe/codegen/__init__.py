@@ -7,6 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .._checks import flag
 from ..errors import InvalidInputError, OptionError
 
 if TYPE_CHECKING:
@@ -31,8 +32,8 @@ _LONGEST_NAME = 60
 
 def write(
     estimator: MovingHorizonEstimator, directory: str | PathLike[str], *, name: str = "mhe",
-    real: str = "double",
-) -> tuple[Path, Path]:
+    real: str = "double", fmu: bool = False,
+) -> tuple[Path, ...]:
     """Write the estimator as a C99 header and source that need nothing but libm.
 
     The source holds observer, growing window, candidate, Gauss-Newton QPs by a block-banded
@@ -54,20 +55,27 @@ def write(
     real : {"double", "float"}
         Precision. In single precision inequalities are kept to 1e-5 of their scale, and
         tolerances are no smaller than what can be distinguished.
+    fmu : bool
+        Whether to write ``<name>.fmu`` beside them: a unit for co-simulation by FMI 2.0, with
+        inputs y and u, the outputs state, filtered, cost, candidate_cost, status and qps, and the
+        parameter initial_state. Its communication step is the sampling time, 1 for a model in
+        discrete time. It holds the C sources, and a library for this kind of machine.
 
     Returns
     -------
     header, source : Path
-        ``<name>.h`` and ``<name>.c``.
+        ``<name>.h`` and ``<name>.c``; with ``fmu``, the path of the FMU, too.
 
     Raises
     ------
     OptionError, CompilationError
-        If something has no C form, or an option is unknown; if CasADi has no C code for the model.
+        If something has no C form, or an option is unknown; if CasADi has no C code for the model,
+        or an FMU is wanted and there is no C compiler.
     InvalidInputError
         If this is no estimator, or the directory cannot be written.
     """
     from ..estimation.estimator import MovingHorizonEstimator
+    from .fmu import write_fmu
     from .library import generated
 
     if not isinstance(estimator, MovingHorizonEstimator):
@@ -95,6 +103,7 @@ def write(
         )
     if real not in ("double", "float"):
         raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")
+    flag("fmu", fmu)
     files, _, _, _ = generated(
         estimator.system, estimator.observer, estimator.cost, estimator.settings, name, real
     )
@@ -103,8 +112,12 @@ def write(
         folder.mkdir(parents=True, exist_ok=True)
         for file, text in files.items():
             (folder / file).write_text(text, encoding="ascii")
+        if fmu:
+            initial = estimator.initial_state
+            write_fmu(folder / f"{name}.fmu", name, files, estimator.system, initial)
     except (OSError, TypeError, ValueError) as error:
         raise InvalidInputError(
             f"directory is {directory!r}, which cannot be written ({error})."
         ) from error
-    return folder / f"{name}.h", folder / f"{name}.c"
+    suffixes = ("h", "c", "fmu") if fmu else ("h", "c")
+    return tuple(folder / f"{name}.{suffix}" for suffix in suffixes)

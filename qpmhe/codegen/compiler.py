@@ -27,6 +27,7 @@ _LEVELS = (("-O3", "-march=native"), ("-O2", "-fno-tree-vectorize"), ("-O0",))
 # Folders of compilations in progress, in the cache; and the seconds after which none is.
 _SCRATCH = "qpmhe-making-"
 _STALE = 86400.0
+NO_COMPILER = "there is no C compiler (cc, gcc or clang); install one, or set CC to its path."
 # Libraries that this process has checked: path and content.
 _checked: set[tuple[str, str]] = set()
 
@@ -80,9 +81,7 @@ def compiled_library(
     """
     compiler = find_compiler()
     if compiler is None:
-        raise CompilationError(
-            "there is no C compiler (cc, gcc or clang); install one, or set CC to its path."
-        )
+        raise CompilationError(NO_COMPILER)
     stamp = os.stat(compiler[0])
     parts = (
         *compiler, str(stamp.st_size), str(stamp.st_mtime_ns), *_FLAGS, repr(_LEVELS),
@@ -120,6 +119,16 @@ def compiled_library(
         f"{' '.join(compiler)} makes wrong code ({fault}); set CC to another compiler, or "
         "update this one."
     )
+
+
+def shared_library(sources: list[Path], target: Path) -> None:
+    """Compile C sources to a shared library for any machine of this kind, beside the cache."""
+    compiler = find_compiler()
+    if compiler is None:
+        raise CompilationError(NO_COMPILER)
+    message = _run([*compiler, "-O2", "-fvisibility=hidden"], (), sources, target)
+    if message:
+        raise CompilationError(f"{' '.join(compiler)} failed: {message}")
 
 
 def _fault(
@@ -168,7 +177,7 @@ def _make(
         for name, text in files.items():
             Path(scratch, name).write_text(text, encoding="ascii")
         made, sealed = Path(scratch, "library.so"), Path(scratch, "seal")
-        message = _run(compiler, level, Path(scratch, main), made)
+        message = _run(compiler, _LEVELS[level], [Path(scratch, main)], made)
         if not message:
             sealed.write_text(hashlib.sha256(made.read_bytes()).hexdigest(), encoding="ascii")
             # Each in one motion; a process that sees the one without the other compiles, too.
@@ -209,9 +218,11 @@ def _usable_folder() -> Path:
     )
 
 
-def _run(compiler: list[str], level: int, source: Path, target: Path) -> str:
+def _run(
+    compiler: list[str], options: tuple[str, ...], sources: list[Path], target: Path
+) -> str:
     """Compile; what went wrong, or nothing."""
-    command = [*compiler, *_FLAGS, *_LEVELS[level], "-o", str(target), str(source), "-lm"]
+    command = [*compiler, *_FLAGS, *options, "-o", str(target), *map(str, sources), "-lm"]
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=600, check=False
