@@ -290,6 +290,7 @@ class _Rehearsal:
         library, usual = self._library, self._interpreter.model.dt or 0.0
         memory, workspace = library.estimators(self._start[None]), library.workspace()
         before, out = np.empty_like(memory), np.zeros(1, library.estimate_type)
+        sample = np.zeros(1, library.sample_type)
         library.reset(memory.ctypes.data, self._settings.ctypes.data, self._start.ctypes.data)
         count = min(_BY_RUN, len(self._ys))
         log = library.log((count,))
@@ -307,16 +308,19 @@ class _Rehearsal:
         for t in range(count, len(self._ys)):
             if fault:
                 return fault
-            at = [
-                ctypes.c_void_p(one.ctypes.data)
-                for one in (memory, before, workspace, self._ys[t], self._us[t], out)
-            ]
+            y, u = self._ys[t].ctypes.data, self._us[t].ctypes.data
             if t < _BY_RUN + _BY_MEMBERS:
-                library.update_members(at[0], 1, *at[2:])
+                library.update_members(
+                    memory.ctypes.data, 1, workspace.ctypes.data, y, u, out.ctypes.data
+                )
             else:
-                step = 0.0 if self._steps[t] == usual else self._steps[t]
-                weight = None if t % 6 else ctypes.c_void_p(self._own_noise.ctypes.data)
-                library.update(*at[:5], ctypes.c_double(step), weight, at[5])
+                sample["y"], sample["u"] = y, u
+                sample["step"] = 0.0 if self._steps[t] == usual else self._steps[t]
+                sample["noise_weight"] = 0 if t % 6 else self._own_noise.ctypes.data
+                library.update(*(
+                    ctypes.c_void_p(one.ctypes.data)
+                    for one in (memory, before, workspace, sample, out)
+                ))
             if t > count + 4 and t % 3:
                 continue
             found = out[0]

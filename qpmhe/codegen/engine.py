@@ -61,15 +61,21 @@ class CompiledEngine:
         self._block = self._out.view(np.float64)[:reals]
         self._numbers = self._out.view(np.int32)[2 * reals + 2 : 2 * reals + 8]
         self._before = np.empty_like(self._memory)  # before the last step
-        memory, before, workspace, late, inputs, out = (
+        # A sample as usual, and one with something of its own.
+        self._samples = np.zeros(2, library.sample_type)
+        self._samples["y"], self._samples["u"] = self._y.ctypes.data, self._u.ctypes.data
+        self._own = self._samples[1]
+        memory, before, workspace, usual, special, out = (
             ctypes.c_void_p(array.ctypes.data)
             for array in (
-                self._memory, self._before, self._workspace, self._y, self._u, self._out
+                self._memory, self._before, self._workspace, self._samples[:1], self._samples[1:],
+                self._out,
             )
         )
-        self._arguments = memory, before, workspace, late, inputs
-        self._usual, self._result = (*self._arguments, ctypes.c_double(0.0), None, out), out
-        self._amending = memory, workspace
+        self._usual, self._special = (
+            (memory, before, workspace, sample, out) for sample in (usual, special)
+        )
+        self._amending, self._result = (memory, workspace), out
         self._call = library.update
         self._observer, self._watch = observer, CompiledWatch(horizon)
         self._time = self._memory["time"]
@@ -132,10 +138,9 @@ class CompiledEngine:
                 self._call(*self._usual)
             else:
                 weight = None if noise_weight is None else np.ascontiguousarray(noise_weight)
-                self._call(
-                    *self._arguments, ctypes.c_double(dt or 0.0),
-                    None if weight is None else ctypes.c_void_p(weight.ctypes.data), self._result,
-                )
+                self._own["step"] = dt or 0.0
+                self._own["noise_weight"] = 0 if weight is None else weight.ctypes.data
+                self._call(*self._special)
             estimate = self._collect(time)
             estimate.step_time = perf_counter() - began
             if self._numbers[1] & WATCHED:

@@ -98,6 +98,11 @@ class Layout:
             ("dropped", np.uint8, (count, max(sum(self.set_rows), 1))),
         ])
 
+    def sample_type(self) -> np.dtype[Any]:
+        """``mhe_sample``."""
+        pointers = ("y", "u", "noise_weight")
+        return _struct([*((name, np.uintp) for name in pointers), ("step", self.number)])
+
     @property
     def set_rows(self) -> tuple[int, ...]:
         """Inequalities of each set at one stage: one for each component, then the rows."""

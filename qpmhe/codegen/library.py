@@ -197,6 +197,7 @@ class EstimatorLibrary:
         files, structure, layout, record = generated(system, observer, cost, settings)
         self.layout, self.settings = layout, record
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
+        self.sample_type = layout.sample_type()
         assert system.symbolic is not None
         model = system.symbolic
         made: list[Interpreter] = []  # only where there is something to check
@@ -230,13 +231,14 @@ class EstimatorLibrary:
 
     def _check_sizes(self, library: ctypes.PyDLL) -> int:
         """Refuse structures that C and NumPy lay out differently; the workspace's size."""
-        sizes = np.zeros(4, np.int64)
+        sizes = np.zeros(5, np.int64)
         library.mhe_sizes.restype = None
         library.mhe_sizes(ctypes.c_void_p(sizes.ctypes.data))
         mine = [
-            self.estimator_type.itemsize, self.estimate_type.itemsize, self.settings.dtype.itemsize
+            self.estimator_type.itemsize, self.estimate_type.itemsize,
+            self.settings.dtype.itemsize, self.sample_type.itemsize,
         ]
-        found = [int(sizes[0]), int(sizes[2]), int(sizes[3])]
+        found = [int(sizes[0]), *map(int, sizes[2:])]
         if mine != found:
             raise CompilationError(
                 f"the compiler lays structures out in {found} bytes; expected {mine}. "

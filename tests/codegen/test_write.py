@@ -118,7 +118,10 @@ int main(void)
             const mhe_real step = (mhe_real)number();
             const int own = number() != 0;
             mhe_real *R = numbers(MHE_NY * MHE_NY);
-            mhe_update_special(e, k, y, MHE_NU ? u : 0, step, own ? R : 0, o);
+            mhe_sample sample = {0};
+            sample.y = y, sample.u = MHE_NU ? u : 0, sample.step = step;
+            sample.noise_weight = own ? R : 0;
+            mhe_update_special(e, k, &sample, o);
             free(R);
         }
         if (command == 2) put(mhe_amend(e, k, time, y, o));

@@ -178,6 +178,14 @@ typedef struct {
     uint8_t left_out[MHE_ROWS]; /* sides that no trial must keep */
 } mhe_workspace;
 
+/* A sample, and what holds for it alone: 0 and null pointers stand for what usually does. Fill it
+ * by zeros first: `mhe_sample sample = {0};`. */
+typedef struct {
+    const mhe_real *y, *u;         /* y(t); u(t), not read where there are no inputs */
+    const mhe_real *noise_weight;  /* of v(t) */
+    mhe_real step;                 /* length of the step from t to t+1 */
+} mhe_sample;
+
 /* Where mhe_run writes; a null pointer leaves out. One entry for each sample. */
 typedef struct {
     mhe_real *states, *filtered, *delayed;   /* MHE_NX each */
@@ -189,19 +197,17 @@ typedef struct {
  * are as long as the estimator is in use. */
 void mhe_reset(mhe_estimator *estimator, const mhe_settings *settings, const mhe_real *x0);
 
-/* Take y(t) and u(t) in. step: length of this step where it is unusual, else 0;
- * noise_weight: of this sample where it is unusual, else a null pointer. */
-void mhe_update_special(mhe_estimator *estimator, mhe_workspace *workspace, const mhe_real *y,
-                        const mhe_real *u, mhe_real step, const mhe_real *noise_weight,
-                        mhe_estimate *estimate);
+/* Take a sample in that has something of its own; all of it is copied. */
+void mhe_update_special(mhe_estimator *estimator, mhe_workspace *workspace,
+                        const mhe_sample *sample, mhe_estimate *estimate);
 
 void mhe_update(mhe_estimator *estimator, mhe_workspace *workspace, const mhe_real *y,
                 const mhe_real *u, mhe_estimate *estimate);
 
 /* The same, after the estimator was copied to `before`, from where the sample can be undone. */
 void mhe_update_undoable(mhe_estimator *estimator, mhe_estimator *before,
-                         mhe_workspace *workspace, const mhe_real *y, const mhe_real *u,
-                         mhe_real step, const mhe_real *noise_weight, mhe_estimate *estimate);
+                         mhe_workspace *workspace, const mhe_sample *sample,
+                         mhe_estimate *estimate);
 
 /* Put a late measurement into a sample that is still in the window; 0, or -1 if it is not. */
 int mhe_amend(mhe_estimator *estimator, mhe_workspace *workspace, int64_t time,
@@ -219,7 +225,7 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *workspac
  * estimator that was saved. `reached`: MHE_HORIZON states, the one behind each stage. */
 void mhe_recompute(mhe_estimator *estimator, mhe_real *reached);
 
-/* Sizes of the structures above: estimator, workspace, estimate, settings. */
+/* Sizes of the structures above: estimator, workspace, estimate, settings, sample. */
 void mhe_sizes(int64_t *sizes);
 
 #ifdef __cplusplus

@@ -48,11 +48,11 @@ static void mhe_filtered(mhe_estimator *e, const mhe_outcome *o, real *out)
         memcpy(out, o->best->x + (e->length - 1) * NX, sizeof(real) * NX);
 }
 
-static void mhe_step(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u,
-                     real step, const real *noise_weight, mhe_outcome *o)
+static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sample,
+                     mhe_outcome *o)
 {
     const int before = e->has_trajectory ? e->length : -1;
-    int failed = mhe_push(e, y, u, step, noise_weight);
+    int failed = mhe_push(e, sample);
     if (e->settings->reinitialize) {
         /* The ring of estimates reaches back to that of the window's first state. */
         int at = e->newest - (e->length - 1);
@@ -109,26 +109,34 @@ void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
     memcpy(e->history, x0, sizeof(real) * NX);
 }
 
-void mhe_update_special(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u,
-                        real step, const real *noise_weight, mhe_estimate *out)
+static mhe_sample mhe_usual_sample(const real *y, const real *u)
+{
+    mhe_sample sample = {0};
+    sample.y = y;
+    sample.u = u;
+    return sample;
+}
+
+void mhe_update_special(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sample,
+                        mhe_estimate *out)
 {
     mhe_outcome outcome;
-    mhe_step(e, k, y, u, step, noise_weight, &outcome);
+    mhe_step(e, k, sample, &outcome);
     mhe_fill(e, k, &outcome, out);
 }
 
 void mhe_update(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u,
                 mhe_estimate *out)
 {
-    mhe_update_special(e, k, y, u, 0, 0, out);
+    const mhe_sample sample = mhe_usual_sample(y, u);
+    mhe_update_special(e, k, &sample, out);
 }
 
 void mhe_update_undoable(mhe_estimator *e, mhe_estimator *before, mhe_workspace *k,
-                         const real *y, const real *u, real step, const real *noise_weight,
-                         mhe_estimate *out)
+                         const mhe_sample *sample, mhe_estimate *out)
 {
     *before = *e;
-    mhe_update_special(e, k, y, u, step, noise_weight, out);
+    mhe_update_special(e, k, sample, out);
 }
 
 void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspace *k,
@@ -170,7 +178,8 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64
         mhe_estimator *e = estimators + member;
         for (int64_t t = 0; t < samples; t++, at++) {
             mhe_outcome o;
-            mhe_step(e, k, y + at * NY, u ? u + at * NU : 0, 0, 0, &o);
+            const mhe_sample sample = mhe_usual_sample(y + at * NY, u ? u + at * NU : 0);
+            mhe_step(e, k, &sample, &o);
             const int count = e->length, delay = e->settings->delay;
             const real *newest = o.best->x + count * NX;
             for (int j = 0; j < NX; j++) {
@@ -206,4 +215,5 @@ void mhe_sizes(int64_t *sizes)
     sizes[1] = (int64_t)sizeof(mhe_workspace);
     sizes[2] = (int64_t)sizeof(mhe_estimate);
     sizes[3] = (int64_t)sizeof(mhe_settings);
+    sizes[4] = (int64_t)sizeof(mhe_sample);
 }

@@ -66,8 +66,7 @@ static int mhe_replay(mhe_estimator *e, int i)
 }
 
 /* Take a sample in; MHE_MODEL_FAILED where the model could not be evaluated. */
-static int mhe_push(mhe_estimator *e, const real *y, const real *u, real step,
-                    const real *noise_weight)
+static int mhe_push(mhe_estimator *e, const mhe_sample *sample)
 {
     const mhe_settings *s = e->settings;
     if (e->length == MHE_HORIZON) {
@@ -79,14 +78,16 @@ static int mhe_push(mhe_estimator *e, const real *y, const real *u, real step,
     }
     mhe_stage *stage = mhe_stage_at(e, e->length - 1);
     memcpy(stage->z, e->z_end, sizeof stage->z);
-    for (int j = 0; j < NU; j++) stage->u[j] = u[j];
-    stage->step = step > 0 ? step : s->sample_time;
-    stage->is_irregular = step > 0;
-    stage->has_own_noise = noise_weight != 0;
-    if (noise_weight) memcpy(stage->own_noise_weight, noise_weight, sizeof stage->noise_weight);
+    for (int j = 0; j < NU; j++) stage->u[j] = sample->u[j];
+    stage->step = sample->step > 0 ? sample->step : s->sample_time;
+    stage->is_irregular = sample->step > 0;
+    stage->has_own_noise = sample->noise_weight != 0;
+    if (stage->has_own_noise)
+        memcpy(stage->own_noise_weight, sample->noise_weight, sizeof stage->own_noise_weight);
     for (int j = 0; j < NY; j++) {
-        stage->y[j] = y[j];
-        stage->is_observed[j] = y[j] < MHE_LARGEST && y[j] > -MHE_LARGEST; /* false for NaN */
+        const real y = sample->y[j];
+        stage->y[j] = y;
+        stage->is_observed[j] = y < MHE_LARGEST && y > -MHE_LARGEST; /* false for NaN */
     }
     mhe_set_noise_weight(s, stage);
     const int outcome = mhe_enter(e, e->length - 1);
