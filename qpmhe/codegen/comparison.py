@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..costs import QuadraticCost
+from ..costs import Cost, QuadraticCost, RobustCost
 from ..estimation.estimate import Status
 from ..estimation.limits import LARGEST
 from ..model.sets import ConvexSet
@@ -206,7 +207,7 @@ def _residual_fault(
     return ""
 
 
-def estimator_fault(interpreter: Interpreter, library: EstimatorLibrary) -> str:
+def estimator_fault(interpreter: Interpreter, library: EstimatorLibrary, cost: Cost) -> str:
     """Where a compiled estimator differs from the interpreter; empty where it does not.
 
     Short records are run through all of its functions. Costs, residuals and the candidate's
@@ -218,9 +219,24 @@ def estimator_fault(interpreter: Interpreter, library: EstimatorLibrary) -> str:
     other["start_at_best"] = not given["start_at_best"]
     other["reinitialize"] = not given["reinitialize"]
     return (
-        _Rehearsal(interpreter, library, given, False).fault()
-        or _Rehearsal(interpreter, library, other, True).fault()
+        _Rehearsal(interpreter, library, cost, given, False).fault()
+        or _Rehearsal(interpreter, library, cost, other, True).fault()
     )
+
+
+def _with_settings(cost: Cost, settings: NDArray[Any], n: int, p: int) -> Cost:
+    """A cost with the weights and the discount of a library's settings."""
+    terms: dict[str, Any] = {
+        name: settings[f"{name}_weight"].reshape(size, size)
+        for name, size in (("prior", n), ("disturbance", n), ("noise", p))
+    }
+    discount = float(settings["discount"])
+    if not isinstance(cost, RobustCost):
+        return QuadraticCost(**terms, discount=discount)
+    for name, weight in terms.items():
+        terms[name] = copy(getattr(cost, f"{name}_loss"))
+        terms[name].weight = weight
+    return RobustCost(**terms, discount=discount)
 
 
 class _Rehearsal:
@@ -231,8 +247,8 @@ class _Rehearsal:
     """
 
     def __init__(
-        self, interpreter: Interpreter, library: EstimatorLibrary, settings: NDArray[Any],
-        is_wild: bool,
+        self, interpreter: Interpreter, library: EstimatorLibrary, cost: Cost,
+        settings: NDArray[Any], is_wild: bool,
     ) -> None:
         n, p = interpreter.model.n, interpreter.model.p
         self._interpreter, self._library, self._settings = interpreter, library, settings
@@ -247,11 +263,7 @@ class _Rehearsal:
                 if 1e-100 < share < 1e100:
                     settings[name] *= share
         self._gain = settings["gain"].reshape(n, p)
-        self._cost = QuadraticCost(
-            prior=settings["prior_weight"].reshape(n, n),
-            disturbance=settings["disturbance_weight"].reshape(n, n), noise=noise,
-            discount=float(settings["discount"]),
-        )
+        self._cost = _with_settings(cost, settings, n, p)
         self._own_noise = 2.0 * noise
         self._start = state * (1 + 0.1 * self._generator.uniform(-1.0, 1.0, n))
         most = _SAMPLES if n <= _MANY_STATES else _FEW_SAMPLES
@@ -397,7 +409,7 @@ class _Judged:
 
     def __init__(
         self, xs: Array, found: dict[str, Array], ys: Array, weights: Array, gain: Array,
-        cost: QuadraticCost, offset: Array, is_candidate: bool,
+        cost: Cost, offset: Array, is_candidate: bool,
     ) -> None:
         n, count, f, h = xs.shape[1], len(ys), found["f"], found["h"]
         self.xs, observed = xs, np.isfinite(ys)
@@ -424,6 +436,8 @@ class _Judged:
         # |(r + d)' W (r + d) - r' W r| for |d| <= allowed, and the sums' own rounding.
         heavy = abs(weights)
         least, most = (cost.stage_costs(abs(r) + d, heavy) for d in (0.0, allowed))
+        if not cost.quadratic:  # a norm that is no square is steep where it is small
+            most += cost.stage_costs(allowed, heavy)
         rounding = cost.prior_cost(abs(offset), abs(cost.least_prior))
         self.allowed_cost = float(
             age[1:] @ (most - least + ROUNDING * most) + age[0] * ROUNDING * rounding

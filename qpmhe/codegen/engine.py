@@ -222,14 +222,19 @@ class CompiledEngine:
         trajectory = record["trajectory"][: length + 1].copy()
         with np.errstate(all="ignore"):
             assert model.kernel is not None  # of every system with a CasADi form
-            if not np.isfinite(model.kernel.residuals(trajectory, stages["y"], inputs)).all():
+            residuals = model.kernel.residuals(trajectory, stages["y"], inputs)
+            if not np.isfinite(residuals).all():
                 raise InvalidInputError("the model has no finite values along the estimate.")
+            weights = cost.majorise(residuals, weights)
+            prior = cost.majorise_prior(
+                trajectory[0] - stages["z"][0], cost.initial_weight(None)
+            )
             return window_covariances(
                 model,
                 trajectory,
                 inputs,
                 weights * factors[1:, None, None],
-                np.asarray(cost.prior) * factors[0],
+                prior * factors[0],
                 np.eye(model.n),
             )
 
@@ -338,8 +343,11 @@ class CompiledEngine:
         if not near(following, reached, sizes):
             raise mismatch("model (f)")
         r, joint = np.append(w, v), self._cost.joint_weight(stage["noise_weight"])
-        size = np.abs(r) @ np.abs(joint) @ np.abs(r)
-        if not near(stage["cost"], r @ joint @ r, size):
+        value, size = (
+            self._cost.stage_costs(one[None], weight)[0]
+            for one, weight in ((r, joint), (np.abs(r), np.abs(joint)))
+        )
+        if not near(stage["cost"], value, size):
             raise mismatch("cost")
 
     def _check_terms(self, stage: Any, fresh: Any, sizes: Array) -> None:
@@ -351,6 +359,9 @@ class CompiledEngine:
         sizes = np.append(np.maximum(sizes, np.abs(stage["w"])), np.abs(stage["y"]))
         sizes[n:] += np.abs(stage["v"])
         weight = np.abs(self._cost.joint_weight(stage["noise_weight"]))
+        if self._library.layout.loss:
+            scale = np.append(expected["disturbance_scale"], expected["noise_scale"])
+            weight *= scale[:, None]
         slopes = np.abs(np.vstack((expected["f_jacobian"], expected["h_jacobian"])))
         bounds = {
             "hessian": slopes.T @ weight @ slopes, "coupling": slopes.T @ weight[:, :n],

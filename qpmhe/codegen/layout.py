@@ -20,6 +20,9 @@ from ..model.system import System
 from ..observers import Observer
 
 SET_NAMES = ("disturbances", "noises")
+# Terms of the cost, and their losses in the order of their numbers in C.
+TERMS = ("prior", "disturbance", "noise")
+LOSSES = ("quadratic", "huber", "power")
 
 _MOST = int(np.iinfo(np.int32).max)
 _POLICIES = get_args(Infeasible)
@@ -36,15 +39,21 @@ class Layout:
     sets: tuple[tuple[bool, int], ...]
     continuous: int
     real: str = "double"
+    #: Whether a term of the cost has a loss that is not quadratic.
+    loss: bool = False
 
     @classmethod
-    def of(cls, system: System, horizon: int, continuous: int, real: str = "double") -> Layout:
+    def of(
+        cls, system: System, cost: Cost, horizon: int, continuous: int, real: str = "double"
+    ) -> Layout:
         """The sizes of an estimator of a system."""
+        form = cost.c_form
+        loss = form is not None and any(one.kind != "quadratic" for one in form.losses)
         sets = tuple(
             (one is not None, 0 if one is None else one.matrix.shape[0])
             for one in (system.disturbances, system.noises)
         )
-        return cls(system.n, system.p, system.m, horizon, sets, continuous, real)
+        return cls(system.n, system.p, system.m, horizon, sets, continuous, real, loss)
 
     @property
     def number(self) -> type[Any]:
@@ -56,7 +65,7 @@ class Layout:
         bits = (f"    {name.upper()}_{flag.name} = {flag.value}" for flag in Status)
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
-            "continuous": self.continuous, "real": self.real,
+            "continuous": self.continuous, "real": self.real, "loss": int(self.loss),
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wv", self.sets, strict=True):
@@ -67,9 +76,11 @@ class Layout:
     def settings_type(self) -> np.dtype[Any]:
         """``mhe_settings``."""
         r, n, p = self.number, self.nx, self.ny
+        loss = _struct([("parameter", r), ("kind", np.int32), ("per_component", np.int32)])
         fields: list[Any] = [
             ("gain", r, n * p), ("filter_gain", r, n * p), ("prior_weight", r, n * n),
             ("disturbance_weight", r, n * n), ("noise_weight", r, p * p),
+            *((f"{name}_loss", loss) for name in TERMS),
             ("discount", r), ("sample_time", r), ("tolerance", r),
             ("solver_tolerance", r),
         ]
@@ -129,6 +140,8 @@ class Layout:
         terms = _struct([
             ("f_jacobian", r, (n, n)), ("h_jacobian", r, (p, n)), ("hessian", r, (n, n)),
             ("coupling", r, (n, n)), ("own", r, n), ("following", r, n),
+            ("disturbance_scale", r, n if self.loss else 1),
+            ("noise_scale", r, p if self.loss else 1),
         ])
         stage = _struct([
             ("z", r, n), ("y", r, p), ("u", r, max(self.nu, 1)), ("step", r), ("w", r, n),
@@ -171,8 +184,11 @@ def _filled(
     assert form is not None
     record["gain"], record["filter_gain"] = gain.ravel(), filter_gain.ravel()
     record["discount"] = form.discount
-    for name in ("prior", "disturbance", "noise"):
+    for name, loss in zip(TERMS, form.losses, strict=True):
         record[f"{name}_weight"] = getattr(form, name).ravel()
+        part = record[f"{name}_loss"]
+        part["kind"], part["parameter"] = LOSSES.index(loss.kind), loss.parameter
+        part["per_component"] = loss.per_component
     record["sample_time"] = system.dt or 0.0
     single = layout.real == "float"
     # Single precision distinguishes less.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from .._linalg import inverse
-from ..costs import Cost
+from ..costs import Cost, RobustCost
 from ..errors import CompilationError, OptionError
 from ..estimation.estimate import Status
 from ..estimation.limits import FEASIBLE
@@ -20,7 +20,7 @@ from ..model.system import System
 from ..observers import Observer
 from .comparison import Interpreter, estimator_fault
 from .compiler import compiled_library
-from .layout import SET_NAMES, Layout, settings_record
+from .layout import SET_NAMES, TERMS, Layout, settings_record
 from .source import CONTINUOUS, estimator_files
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
@@ -65,7 +65,7 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     if cost.c_form is None:
         if cost.quadratic and cost.observer_prior is not None:
             return "a prior weight from the observer has no C form; take a constant one."
-        return f"{type(cost).__name__} has no C form; take a QuadraticCost."
+        return _without_form(cost)
     for name, weight in zip(SET_NAMES, (cost.disturbance, cost.noise), strict=True):
         one = getattr(system, name)
         if one is not None and _is_flat(one, inverse(weight)):
@@ -74,7 +74,7 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
                 f"less than {FEASIBLE:g} standard deviations wide), which the interior-point "
                 "method in C cannot take; widen it."
             )
-    size = _window_size(system, settings.horizon)
+    size = _window_size(system, cost, settings.horizon)
     if size > _MOST_BYTES:
         return (
             f"a horizon of {settings.horizon} with {system.n} states needs {size:.3g} bytes for "
@@ -98,9 +98,23 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     return ""
 
 
-def _window_size(system: System, horizon: int) -> int:
+def _without_form(cost: Cost) -> str:
+    """Which part of a cost has no C form, with the remedy."""
+    if type(cost) is RobustCost:
+        for name in TERMS:
+            loss = getattr(cost, f"{name}_loss")
+            if loss.c_form is None:
+                return (
+                    f"{type(loss).__name__}, the loss of {name}, has no C form; take Quadratic, "
+                    "Huber or Power, or engine='python'."
+                )
+        return "a prior weight from the observer has no C form; take a constant one."
+    return f"{type(cost).__name__} has no C form; take a QuadraticCost or a RobustCost."
+
+
+def _window_size(system: System, cost: Cost, horizon: int) -> int:
     """Bytes of an estimator's memory, in double precision."""
-    one, two = (Layout.of(system, count, 0).estimator_type().itemsize for count in (1, 2))
+    one, two = (Layout.of(system, cost, count, 0).estimator_type().itemsize for count in (1, 2))
     return one + (horizon - 1) * (two - one)
 
 
@@ -148,7 +162,7 @@ def generated(
         raise OptionError(f"no C code for this estimator: {reason}")
     model = system.symbolic
     assert model is not None
-    layout = Layout.of(system, settings.horizon, CONTINUOUS[model.method], real)
+    layout = Layout.of(system, cost, settings.horizon, CONTINUOUS[model.method], real)
     record = settings_record(layout, system, observer, cost, settings)
     files, structure = estimator_files(model, layout, record, name)
     return files, structure, layout, record
@@ -206,7 +220,7 @@ class EstimatorLibrary:
         def fault(library: ctypes.CDLL) -> str:
             self._bind(library)
             made[:] = made or [Interpreter(model)]
-            return estimator_fault(made[0], self)
+            return estimator_fault(made[0], self, cost)
 
         self._bind(compiled_library(files, "mhe.c", structure, fault))
 

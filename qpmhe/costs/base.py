@@ -46,6 +46,24 @@ class CostConstants:
     noise: tuple[float, float]
 
 
+class LossForm(NamedTuple):
+    """A loss as the step in C computes it.
+
+    Parameters
+    ----------
+    kind : {"quadratic", "huber", "power"}
+        Which function of the quadratic form.
+    parameter : float
+        Its threshold or exponent.
+    per_component : bool
+        Whether it is applied to each component and added.
+    """
+
+    kind: str = "quadratic"
+    parameter: float = 0.0
+    per_component: bool = False
+
+
 class CostForm(NamedTuple):
     """The matrices and the factor by which the step in C computes a cost.
 
@@ -55,12 +73,15 @@ class CostForm(NamedTuple):
         Weights of the initial error (n, n), of w (n, n) and of v (p, p).
     discount : float
         gamma.
+    losses : tuple of LossForm
+        The functions of the three quadratic forms, in the same order.
     """
 
     prior: Array
     disturbance: Array
     noise: Array
     discount: float
+    losses: tuple[LossForm, LossForm, LossForm] = (LossForm(), LossForm(), LossForm())
 
 
 class ObserverPrior:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from .._checks import Array, flag, positive, positive_definite
 from ..errors import OptionError, WeightError
-from .base import quadratic_form
+from .base import LossForm, quadratic_form
 
 
 class Loss(ABC):
@@ -45,6 +45,11 @@ class Loss(ABC):
 
     #: The exponent a with c |s|^a <= loss(s) <= C |s|^a, None if there is none.
     exponent: float | None = None
+
+    @property
+    def c_form(self) -> LossForm | None:
+        """What the step in C needs of the loss; None for one that it cannot compute."""
+        return None
 
     @abstractmethod
     def _value(self, q: Array) -> Array:
@@ -95,6 +100,11 @@ class Quadratic(Loss):
     def __init__(self, weight: ArrayLike) -> None:
         super().__init__(weight)
 
+    @property
+    def c_form(self) -> LossForm | None:
+        """See `Loss.c_form`."""
+        return LossForm() if type(self) is Quadratic else None
+
     def _value(self, q: Array) -> Array:
         return q
 
@@ -130,6 +140,13 @@ class Huber(Loss):
         super().__init__(weight, per_component)
         self.threshold = positive("threshold", threshold)
 
+    @property
+    def c_form(self) -> LossForm | None:
+        """See `Loss.c_form`; None of a derived class, which may compute another loss."""
+        if type(self) is not Huber:
+            return None
+        return LossForm("huber", self.threshold, self.per_component)
+
     def _value(self, q: Array) -> Array:
         k = self.threshold
         return np.where(q <= k * k, q, 2.0 * k * np.sqrt(q) - k * k)
@@ -163,6 +180,13 @@ class Power(Loss):
         self.exponent: float = positive("exponent", exponent)
         if self.exponent < 1.0:
             raise OptionError(f"exponent is {exponent!r}; expected a number >= 1: convexity.")
+
+    @property
+    def c_form(self) -> LossForm | None:
+        """See `Loss.c_form`; None of a derived class, which may compute another loss."""
+        if type(self) is not Power:
+            return None
+        return LossForm("power", self.exponent, self.per_component)
 
     def _value(self, q: Array) -> Array:
         return q ** (0.5 * self.exponent)

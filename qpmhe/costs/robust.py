@@ -9,7 +9,7 @@ from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import Array, check_prior_size, positive_definite
 from ..errors import InvalidInputError
-from .base import Cost, CostConstants, ObserverPrior
+from .base import Cost, CostConstants, CostForm, ObserverPrior
 from .losses import Loss, Quadratic
 
 
@@ -55,6 +55,19 @@ class RobustCost(Cost):
             self.prior_loss = _loss("prior", prior)
             weight = check_prior_size(positive_definite("prior", self.prior_loss.weight), r)
         super().__init__(weight, self.disturbance_loss.weight, self.noise_loss.weight, discount)
+
+    @property
+    def c_form(self) -> CostForm | None:
+        """Weights and losses; None where a derived class may compute another cost or loss."""
+        prior, disturbance, noise = (
+            loss.c_form for loss in (self.prior_loss, self.disturbance_loss, self.noise_loss)
+        )
+        if type(self) is not RobustCost or isinstance(self.prior, ObserverPrior):
+            return None
+        if prior is None or disturbance is None or noise is None:
+            return None
+        losses = prior, disturbance, noise
+        return CostForm(self.prior, self.disturbance, self.noise, self.discount, losses)
 
     @property
     def constants(self) -> CostConstants | None:

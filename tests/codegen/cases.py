@@ -118,6 +118,59 @@ def _with_inputs() -> Case:
     return Case(system, qpmhe.Luenberger(gain), cost, start, recorded(system, start))
 
 
+def with_outliers(one: Case, share: float = 0.2, size: float = 3.0) -> Case:
+    """The case with a large error in some of its measurements."""
+    generator = np.random.default_rng(9)
+    samples = tuple(
+        sample | {"y": sample["y"] + size * (generator.random(len(sample["y"])) < share)}
+        for sample in one.samples
+    )
+    return replace(one, samples=samples)
+
+
+def _robust(prior: Any = None, disturbance: Any = None, noise: Any = None, **options: Any) -> Case:
+    """The case with inputs, diagonal weights, outliers, and these losses of the weights."""
+    usual = case("inputs")
+    weights = {
+        "prior": (prior, [2.0, 1.0, 3.0]), "disturbance": (disturbance, [40.0, 20.0, 30.0]),
+        "noise": (noise, [20.0, 50.0]),
+    }
+    terms = {
+        name: np.diag(diagonal) if loss is None else loss(np.diag(diagonal))
+        for name, (loss, diagonal) in weights.items()
+    }
+    return with_outliers(replace(usual, cost=qpmhe.RobustCost(**terms, **options)))
+
+
+def _weighed(one: Case) -> Case:
+    """The case with another noise weight at some samples."""
+    p = one.system.p
+    samples = tuple(
+        sample | ({"noise_weight": np.diag(np.arange(3.0, 3.0 + p))} if t % 4 == 1 else {})
+        for t, sample in enumerate(one.samples)
+    )
+    return replace(one, samples=samples)
+
+
+def _boxed(one: Case, **options: Any) -> Case:
+    """The case with sets of disturbances and noises, solved to convergence."""
+    sets = {
+        "disturbances": qpmhe.Box([-0.1] * 3, [0.1, 0.2, 0.1])
+        & qpmhe.Polytope([[1.0, 1.0, -1.0]], [0.12]),
+        "noises": qpmhe.Box([-3.2] * 2, [3.2] * 2),
+    }
+    changed = replace(one, system=with_inputs(**sets))
+    return changed.with_options(max_qps=None, solver_tolerance=1e-9, **options)
+
+
+def _huber(threshold: float, per_component: bool = False) -> Callable[[Any], qpmhe.Huber]:
+    return functools.partial(qpmhe.Huber, threshold=threshold, per_component=per_component)
+
+
+def _power(exponent: float, per_component: bool = False) -> Callable[[Any], qpmhe.Power]:
+    return functools.partial(qpmhe.Power, exponent=exponent, per_component=per_component)
+
+
 #: Each is made when it is asked for; `case` keeps it.
 CASES: dict[str, Callable[[], Case]] = {
     "reactor": _reactor,
@@ -129,6 +182,23 @@ CASES: dict[str, Callable[[], Case]] = {
     "inputs with gaps": lambda: case("inputs").with_gaps(),
     "inputs converged": lambda: case("inputs").with_options(max_qps=None, delay=2),
     "inputs observer": lambda: case("inputs").with_options(max_qps=0),
+    "huber": lambda: _robust(noise=_huber(1.345)),
+    "huber with gaps": lambda: _weighed(case("huber").with_gaps()),
+    "huber in sets": lambda: _boxed(case("huber")),
+    "losses in sets": lambda: _boxed(case("mixed losses")),
+    "huber everywhere": lambda: _robust(
+        _huber(0.5), _huber(0.3), _huber(1.0), discount=0.9
+    ).with_options(warm_start=True),
+    "huber per component": lambda: _robust(
+        _huber(0.5, True), _huber(0.3, True), _huber(1.0, True)
+    ).with_gaps(),
+    "power": lambda: _robust(_power(1.5), _power(1.8), _power(1.2)).with_gaps(),
+    "power per component": lambda: _robust(
+        _power(1.0, True), _power(3.0, True), _power(1.5, True), discount=0.9
+    ).with_options(candidate="reinitialized"),
+    "mixed losses": lambda: _weighed(
+        _robust(_huber(1.0), _power(1.5, True), _huber(2.0, True)).with_gaps()
+    ).with_options(max_qps=4, candidate="reinitialized", warm_start=True),
 }
 
 

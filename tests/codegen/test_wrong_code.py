@@ -34,7 +34,7 @@ STEP_LIES = {
     "noises": "s/v\\[j\\] = stage->y\\[j\\] - output/v[j] = stage->y[j] + output/",
     "disturbances": "s/w\\[j\\] = x\\[NX + j\\] - predicted/w[j] = x[NX + j] + predicted/",
     "the candidate": "s/next\\[j\\] = predicted\\[j\\] + w/next[j] = predicted[j] - w/",
-    "its cost": "s/mhe_form(NX, s->disturbance_weight, w) + mhe_form(NY, stage/mhe_form(NY, stage/",
+    "its cost": "s/return mhe_lost(&s->disturbance_loss.*/return/",
     "discount": "s/trial->cost += k->factors\\[i + 1\\] \\*/trial->cost +=/",
     "prior": "s/cost += factors\\[0\\] \\*/cost += 0 */",
     "missing components": "s/R\\[i \\* NY + j\\] -= share/R[i * NY + j] += share/",

@@ -184,6 +184,17 @@ class OwnCost(qpmhe.QuadraticCost):
     """May weigh in another way."""
 
 
+class OwnRobustCost(qpmhe.RobustCost):
+    """May weigh in another way."""
+
+
+class OwnLoss(qpmhe.Huber):
+    """Loses something else."""
+
+    def _value(self, q):
+        return 2.0 * super()._value(q)
+
+
 def equality():
     return qpmhe.Box(-1.0, 1.0) & qpmhe.model.sets.ConvexSet(
         np.array([-INF]), np.array([INF]), np.eye(1), np.zeros(1), np.zeros(1)
@@ -197,8 +208,9 @@ def equality():
         ("OwnGain has no C form.*constant gain", {"observer": lambda: OwnGain([0.3])}),
         ("OutputInjection has no C form",
          {"observer": lambda: qpmhe.OutputInjection(lambda z, v: 0.3 * v)}),
-        ("take a QuadraticCost",
-         {"cost": lambda: qpmhe.RobustCost(**(ONES | {"noise": qpmhe.Huber(1.0, 1.0)}))}),
+        ("OwnLoss, the loss of noise, has no C form; take Quadratic, Huber or Power",
+         {"cost": lambda: qpmhe.RobustCost(**(ONES | {"noise": OwnLoss(1.0)}))}),
+        ("OwnRobustCost has no C form", {"cost": lambda: OwnRobustCost(**ONES)}),
         ("OwnCost has no C form; take a QuadraticCost", {"cost": lambda: OwnCost(**ONES)}),
         ("take a constant one",
          {"cost": lambda: qpmhe.QuadraticCost(**(ONES | {"prior": qpmhe.ObserverPrior()})),

@@ -33,12 +33,73 @@ static const real *mhe_disturbance_weight(const mhe_settings *s, const mhe_stage
     return s->disturbance_weight;
 }
 
+#if MHE_LOSS
+/* rho(q). */
+static real mhe_loss_value(const mhe_loss *loss, real q)
+{
+    const real k = loss->parameter;
+    if (loss->kind == MHE_HUBER) return q <= k * k ? q : 2 * k * sqrt(q) - k * k;
+    if (loss->kind == MHE_POWER) return pow(q, k / 2);
+    return q;
+}
+
+/* rho'(q): by what the weight is multiplied in the form that touches the loss. */
+static real mhe_loss_slope(const mhe_loss *loss, real q)
+{
+    const real k = loss->parameter;
+    if (loss->kind == MHE_HUBER) return q <= k * k ? 1 : k / sqrt(q);
+    /* The power's own slope may be infinite at 0. */
+    if (loss->kind == MHE_POWER) return k / 2 * pow(mhe_max((real)1e-8, q), k / 2 - 1);
+    return 1;
+}
+#endif
+
+/* The loss of s. */
+static real mhe_lost(const mhe_loss *loss, int n, const real *W, const real *s)
+{
+#if MHE_LOSS
+    real sum = 0;
+    if (!loss->per_component) return mhe_loss_value(loss, mhe_form(n, W, s));
+    for (int j = 0; j < n; j++) sum += mhe_loss_value(loss, W[j * n + j] * s[j] * s[j]);
+    return sum;
+#else
+    (void)loss;
+    return mhe_form(n, W, s);
+#endif
+}
+
+/* What the rows of W are multiplied with in the form that touches the loss at s; a loss of each
+ * component has a diagonal W. */
+static void mhe_set_scale(const mhe_loss *loss, int n, const real *W, const real *s, real *scale)
+{
+#if MHE_LOSS
+    if (loss->per_component)
+        for (int j = 0; j < n; j++) scale[j] = mhe_loss_slope(loss, W[j * n + j] * s[j] * s[j]);
+    else {
+        const real slope = mhe_loss_slope(loss, mhe_form(n, W, s));
+        for (int j = 0; j < n; j++) scale[j] = slope;
+    }
+#else
+    (void)loss; (void)n; (void)W; (void)s; (void)scale;
+#endif
+}
+
+static real mhe_scaled(real weight, const real *scale, int row)
+{
+#if MHE_LOSS
+    return scale[row] * weight;
+#else
+    (void)scale; (void)row;
+    return weight;
+#endif
+}
+
 /* l(w, v) of a stage. */
 static real mhe_stage_cost(const mhe_settings *s, const mhe_stage *stage, const real *w,
                            const real *v)
 {
-    return mhe_form(NX, mhe_disturbance_weight(s, stage), w) +
-           mhe_form(NY, stage->noise_weight, v);
+    return mhe_lost(&s->disturbance_loss, NX, mhe_disturbance_weight(s, stage), w) +
+           mhe_lost(&s->noise_loss, NY, stage->noise_weight, v);
 }
 
 /* The weight of the prior at the window's first stage. */
@@ -51,22 +112,32 @@ static const real *mhe_prior_weight(const mhe_settings *s, const mhe_stage *firs
 /* Gamma of an offset from the prior. */
 static real mhe_prior_cost(const mhe_settings *s, const mhe_stage *first, const real *offset)
 {
-    return mhe_form(NX, mhe_prior_weight(s, first), offset);
+    return mhe_lost(&s->prior_loss, NX, mhe_prior_weight(s, first), offset);
 }
 
 /* hessian = A' Q A + C' R C (upper half), coupling = -A' Q, own = -(A' Q w + C' R v),
- * following = Q w; A and C are in place. */
+ * following = Q w; A and C are in place. Q and R are of the form that touches the cost. */
 static void mhe_set_terms(const mhe_settings *s, const mhe_stage *stage, const real *w,
                           const real *v, mhe_terms *t)
 {
     const real *A = t->f_jacobian, *C = t->h_jacobian;
     const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
     real RC[NY * NX], QA[NX * NX];
+    if (MHE_LOSS && t == &stage->terms && !isfinite(stage->cost)) {
+        /* Of the candidate where the model failed: no residual, and the weight itself. */
+        for (int j = 0; j < NX; j++) t->disturbance_scale[MHE_LOSS ? j : 0] = 1;
+        for (int j = 0; j < NY; j++) t->noise_scale[MHE_LOSS ? j : 0] = 1;
+    } else {
+        mhe_set_scale(&s->disturbance_loss, NX, Q, w, t->disturbance_scale);
+        mhe_set_scale(&s->noise_loss, NY, R, v, t->noise_scale);
+    }
     mhe_times(NX, Q, w, t->following);
+    for (int i = 0; i < NX; i++)
+        t->following[i] = mhe_scaled(t->following[i], t->disturbance_scale, i);
     for (int i = 0; i < NX * NX; i++) t->hessian[i] = QA[i] = 0;
     for (int i = 0; i < NX; i++)
         for (int k = 0; k < NX; k++) {
-            const real q = Q[i * NX + k];
+            const real q = mhe_scaled(Q[i * NX + k], t->disturbance_scale, i);
             if (q == 0) continue; /* weights are diagonal more often than not */
             for (int j = 0; j < NX; j++) QA[i * NX + j] += q * A[k * NX + j];
         }
@@ -82,7 +153,7 @@ static void mhe_set_terms(const mhe_settings *s, const mhe_stage *stage, const r
         for (int j = 0; j < NX; j++) {
             real sum = 0;
             for (int k = 0; k < NY; k++) sum += R[i * NY + k] * C[k * NX + j];
-            RC[i * NX + j] = sum;
+            RC[i * NX + j] = mhe_scaled(sum, t->noise_scale, i);
         }
     for (int k = 0; k < NY; k++)
         for (int i = 0; i < NX; i++) {

@@ -37,6 +37,7 @@ typedef $real mhe_real;
 #define MHE_V_SET $v_set
 #define MHE_W_ROWS $w_rows  /* general inequalities in each */
 #define MHE_V_ROWS $v_rows
+#define MHE_LOSS $loss    /* whether a term of the cost has a loss that is not quadratic */
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
@@ -77,6 +78,15 @@ typedef struct {
     mhe_real row_scale[MHE_SIZE(MHE_V_ROWS)];
 } mhe_v_set;
 
+enum { MHE_QUADRATIC = 0, MHE_HUBER = 1, MHE_POWER = 2 };
+
+/* A term of the cost: a convex function of the quadratic form s'W s, or the sum of that of each
+ * W[j][j] s[j]^2. */
+typedef struct {
+    mhe_real parameter;        /* threshold in standard deviations, or exponent */
+    int32_t kind, per_component;
+} mhe_loss;
+
 /* Matrices are stored by rows. Weights are inverse covariances. */
 typedef struct {
     mhe_real gain[MHE_NX * MHE_NY];
@@ -84,6 +94,7 @@ typedef struct {
     mhe_real prior_weight[MHE_NX * MHE_NX];
     mhe_real disturbance_weight[MHE_NX * MHE_NX];
     mhe_real noise_weight[MHE_NY * MHE_NY];
+    mhe_loss prior_loss, disturbance_loss, noise_loss;
     mhe_real discount;         /* factor on a stage's cost for each step of age */
     mhe_real sample_time;      /* of the rate; 0 where f is a map */
     mhe_real tolerance;        /* relative decrease of the cost that counts as converged */
@@ -106,6 +117,8 @@ typedef struct {
     mhe_real hessian[MHE_NX * MHE_NX];  /* A' Q A + C' R C */
     mhe_real coupling[MHE_NX * MHE_NX]; /* -A' Q: rows of x(i), columns of x(i+1) */
     mhe_real own[MHE_NX], following[MHE_NX];
+    /* What the rows of the weights Q and R are multiplied with where a loss is not quadratic. */
+    mhe_real disturbance_scale[MHE_LOSS ? MHE_NX : 1], noise_scale[MHE_LOSS ? MHE_NY : 1];
 } mhe_terms;
 
 typedef struct {

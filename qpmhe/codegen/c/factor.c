@@ -19,19 +19,23 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     const mhe_settings *s = e->settings;
     const int count = e->length;
     const real *factors = k->factors;
+    real prior_scale[NX];
+    mhe_set_scale(&s->prior_loss, NX, mhe_prior_weight(s, mhe_stage_at(e, 0)), offset, prior_scale);
     for (int i = 0; i <= count; i++) {
         real *panel = k->panels + i * NX * WIDTH, *g = k->gradient + i * NX;
         const real *weight = i == 0 ? mhe_prior_weight(s, mhe_stage_at(e, 0))
                                     : mhe_disturbance_weight(s, mhe_stage_at(e, i - 1));
+        const real *scale = i == 0 ? prior_scale : k->at[i - 1]->disturbance_scale;
         const real factor = mhe_floored(factors[i]);
         for (int r = 0; r < NX; r++) {
             real *row = panel + r * WIDTH;
-            for (int c = 0; c < NX; c++) row[c] = factor * weight[r * NX + c];
+            const real scaled = mhe_scaled(factor, scale, r);
+            for (int c = 0; c < NX; c++) row[c] = scaled * weight[r * NX + c];
             for (int c = NX; c < WIDTH; c++) row[c] = 0;
         }
         if (i == 0) {
             mhe_times(NX, weight, offset, g);
-            for (int j = 0; j < NX; j++) g[j] *= factor;
+            for (int j = 0; j < NX; j++) g[j] *= mhe_scaled(factor, scale, j);
         } else {
             for (int j = 0; j < NX; j++) g[j] = factor * k->at[i - 1]->following[j];
         }

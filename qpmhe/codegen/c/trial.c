@@ -40,11 +40,15 @@ static real mhe_rounding_cost(mhe_estimator *e, const mhe_workspace *k, const mh
         const mhe_stage *stage = mhe_stage_at(e, i);
         const real *Q = mhe_disturbance_weight(e->settings, stage), *R = stage->noise_weight;
         const real *x = trial->x + (i + 1) * NX, *y = stage->y;
-        real sum = 0;
+        real sum = 0, w_scale[NX], v_scale[NY];
+        mhe_set_scale(&e->settings->disturbance_loss, NX, Q, trial->w + i * NX, w_scale);
+        mhe_set_scale(&e->settings->noise_loss, NY, R, trial->v + i * NY, v_scale);
         for (int j = 0; j < NX; j++)
-            for (int l = 0; l < NX; l++) sum += fabs(x[j] * Q[j * NX + l] * x[l]);
+            for (int l = 0; l < NX; l++)
+                sum += fabs(x[j] * mhe_scaled(Q[j * NX + l], w_scale, j) * x[l]);
         for (int j = 0; j < NY; j++)
-            for (int l = 0; l < NY; l++) sum += fabs(y[j] * R[j * NY + l] * y[l]);
+            for (int l = 0; l < NY; l++)
+                sum += fabs(y[j] * mhe_scaled(R[j * NY + l], v_scale, j) * y[l]);
         cost += k->factors[i + 1] * sum;
     }
     return 64 * EPSILON * EPSILON * cost;
