@@ -1,213 +1,104 @@
-"""Symbols in place of numbers: what a function does with its arguments whatever their values are.
-
-A function that returns when it is called on symbols has no branch on a value, no loop over
-values and no table look-up by one: it computes the same expression everywhere. Symbols carry
-labels, which shows in addition whether it keeps the states of a batch apart.
-"""
+"""Traces of users' functions: on labels, what each value depends on; in CasADi, the expression."""
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .operations import ExpressionRecord, numpy_on_symbols
+from .symbols import Record, Symbol, SymbolArray, in_arrays, place, plain, run, wrapped
+
+Array = NDArray[np.float64]
 Labels = NDArray[np.uint64]
 
-# A function that does more with single symbols than this is not traced any further.
-_MOST_OPERATIONS = 200_000
 
-
-class NotTraceableError(Exception):
-    """The function asks for the value of a symbol."""
-
-
-class _Record:
-    """What happened during one trace, which all of its symbols share."""
-
-    def __init__(self) -> None:
-        #: Whether a value was asked for. It stays so, whatever the function catches.
-        self.refused = False
-        #: Whether the trace is over: a symbol that the function kept then acts as NaN.
-        self.closed = False
-        self._operations = 0
-
-    def refuse(self) -> NotTraceableError:
-        self.refused = True
-        return NotTraceableError("a symbol has no value")
-
-    def symbol(self, labels: int) -> Symbol:
-        self._operations += 1
-        if self._operations > _MOST_OPERATIONS:
-            raise self.refuse()
-        return Symbol(self, labels)
+class _LabelRecord(Record):
+    """Symbols carry labels of the arguments that they were computed from."""
 
     def symbols(self, labels: Any) -> Any:
         """A symbol, or an array of symbols, with these labels."""
         labels = np.asarray(labels)
         if labels.ndim == 0:
             return Symbol(self, int(labels))
-        array = np.frompyfunc(lambda one: Symbol(self, one), 1, 1)(labels).view(SymbolArray)
-        array.record = self
-        return array
+        return self.array(np.frompyfunc(lambda one: Symbol(self, one), 1, 1)(labels))
+
+    def operate(self, ufunc: Any, operands: tuple[Any, ...]) -> Symbol:
+        """See `Record.operate`."""
+        labels = 0
+        for one in operands:
+            if isinstance(one, Symbol):
+                labels |= one.value
+        return self.symbol(labels)
+
+    def apply(
+        self, ufunc: Any, method: str, inputs: tuple[Any, ...], options: dict[str, Any]
+    ) -> Any:
+        """See `Record.apply`."""
+        out = options.get("out")
+        if options.get("where", True) is not True:
+            raise self.refuse(f"numpy.{ufunc.__name__} with where")
+        if method == "__call__" and ufunc is np.matmul:
+            labels = self._contracted(*inputs)
+        elif ufunc.signature is not None:
+            raise self.refuse(f"numpy.{ufunc.__name__}")
+        elif method == "__call__":
+            labels = _together(inputs)
+        elif method == "reduce":
+            axis, keepdims = options.get("axis", 0), options.get("keepdims", False)
+            labels = np.bitwise_or.reduce(_labels(inputs[0]), axis=axis, keepdims=keepdims)
+        elif method == "accumulate":
+            labels = np.bitwise_or.accumulate(_labels(inputs[0]), axis=options.get("axis", 0))
+        elif method == "outer":
+            labels = np.bitwise_or.outer(*(_labels(one) for one in inputs))
+        else:
+            raise self.refuse(f"numpy.{ufunc.__name__}.{method}")
+        value = self.symbols(labels)
+        if out is not None and any(one is not None for one in out):
+            if ufunc.nout > 1 or not isinstance(out[0], SymbolArray):
+                raise self.refuse("symbols in an array of numbers")
+            out[0][...] = value
+            return out[0]
+        return value if ufunc.nout == 1 else (value,) * ufunc.nout
+
+    def call(self, function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """See `Record.call`."""
+        if function in _ELEMENTWISE:
+            try:
+                labels = _ELEMENTWISE[function](*args, **kwargs)
+            except TypeError as error:  # arguments that are rarely given
+                raise self.refuse(f"numpy.{function.__name__} so") from error
+            return self.symbols(labels)
+        if function is np.dot and not kwargs and len(args) == 2 and all(
+            0 < np.ndim(plain(one)) < 3 for one in args
+        ):
+            return self.symbols(self._contracted(*args))
+        # On plain arrays, NumPy's own code moves symbols about, and computes with them one by one.
+        return wrapped(
+            self,
+            function(*in_arrays(args), **{key: in_arrays(one) for key, one in kwargs.items()}),
+        )
+
+    def _contracted(self, left: Any, right: Any) -> Any:
+        """Labels of a matrix product."""
+        a, b = _labels(left), _labels(right)
+        if a.ndim == 0 or b.ndim == 0 or a.shape[-1] != b.shape[-2 if b.ndim > 1 else -1]:
+            raise self.refuse("a matrix product of other shapes")
+        rows = np.bitwise_or.reduce(a, axis=-1)
+        columns = np.bitwise_or.reduce(b, axis=-2 if b.ndim > 1 else -1)
+        if a.ndim > 1 and b.ndim > 1:
+            rows, columns = rows[..., :, None], columns[..., None, :]
+        return rows | columns
 
 
-_NUMBERS = (bool, int, float, complex, np.generic)
-
-
-def _operation(self: Symbol, *others: Any) -> Any:
-    labels = self.labels
-    for other in others:
-        if isinstance(other, Symbol):
-            labels |= other.labels
-        elif not isinstance(other, _NUMBERS):
-            return NotImplemented
-    return float("nan") if self.record.closed else self.record.symbol(labels)
-
-
-def _comparison(self: Symbol, other: Any) -> Any:
-    return False if self.record.closed else _operation(self, other)
-
-
-def _value(self: Symbol, *_: Any) -> float:
-    if self.record.closed:
-        return float("nan")
-    raise self.record.refuse()
-
-
-class Symbol:
-    """A number without a value; `labels` says which arguments it was computed from."""
-
-    __slots__ = ("labels", "record")
-
-    def __init__(self, record: _Record, labels: int) -> None:
-        self.record, self.labels = record, labels
-
-    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = _operation
-    __truediv__ = __rtruediv__ = __floordiv__ = __rfloordiv__ = __mod__ = __rmod__ = _operation
-    __pow__ = __rpow__ = __neg__ = __pos__ = __abs__ = __invert__ = _operation
-    __and__ = __rand__ = __or__ = __ror__ = __xor__ = __rxor__ = _operation
-    conjugate = item = _operation
-    __lt__ = __le__ = __gt__ = __ge__ = _comparison
-    __eq__ = __ne__ = _comparison
-    __float__ = _value
-    __int__ = __index__ = __complex__ = __round__ = __trunc__ = _value
-    __floor__ = __ceil__ = __hash__ = __reduce__ = _value  # type: ignore[assignment]
-
-    def __bool__(self) -> bool:
-        return bool(_value(self))
-
-    def __copy__(self) -> Symbol:
-        return self
-
-    def __deepcopy__(self, memo: Any) -> Symbol:
-        return self
-
-    @property
-    def real(self) -> Symbol:
-        """Return the symbol itself: a state is real."""
-        return self
-
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
-        return _apply(self.record, ufunc, method, inputs, options)
-
-    def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
-        return _call(self.record, function, args, kwargs)
-
-
-class SymbolArray(np.ndarray[Any, Any]):
-    """An array of symbols, which NumPy's functions take and return."""
-
-    record: _Record = _Record()
-
-    def __array_finalize__(self, source: Any) -> None:
-        self.record = getattr(source, "record", SymbolArray.record)
-
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
-        return _apply(self.record, ufunc, method, inputs, options)
-
-    def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
-        return _call(self.record, function, args, kwargs)
-
-    def __getitem__(self, key: Any) -> Any:
-        if not self.record.closed and _holds_symbols(key):
-            raise self.record.refuse()
-        return _wrapped(self.record, _plain(self)[key])
-
-    def __setitem__(self, key: Any, value: Any) -> None:
-        if not self.record.closed and _holds_symbols(key):
-            raise self.record.refuse()
-        _plain(self)[key] = _plain(value)
-
-    def dot(self, other: Any, out: Any = None) -> Any:
-        """Return `np.dot(self, other)`, which the symbol records."""
-        return np.dot(self, other) if out is None else np.dot(self, other, out)
-
-    def _refuse(self, *_: Any) -> Any:
-        raise self.record.refuse()
-
-    tobytes: Any = _refuse
-    tofile: Any = _refuse
-    __reduce__: Any = _refuse
-    __array_interface__: Any = property(_refuse)
-    data: Any = property(_refuse)
-
-
-def _holds_symbols(value: Any) -> bool:
-    if isinstance(value, (tuple, list)):
-        return any(_holds_symbols(item) for item in value)
-    return isinstance(value, Symbol) or getattr(value, "dtype", None) == np.object_
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, SymbolArray):
-        return value.view(np.ndarray)
-    if isinstance(value, (tuple, list)):
-        return type(value)(_plain(item) for item in value)
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return value
-
-
-def _as_arrays(value: Any) -> Any:
-    """The same in plain arrays, which NumPy's functions do not hand back to a symbol."""
-    if isinstance(value, Symbol):
-        array = np.empty((), np.object_)
-        array[()] = value
-        return array
-    if isinstance(value, (tuple, list)):
-        return type(value)(_as_arrays(item) for item in value)
-    return _plain(value)
-
-
-def _as_nan(value: Any) -> Any:
-    """The same with NaN for symbols, of a trace that is over."""
-    if isinstance(value, Symbol):
-        return float("nan")
-    if isinstance(value, SymbolArray):
-        return np.full(value.shape, np.nan)
-    if isinstance(value, (tuple, list)):
-        return type(value)(_as_nan(item) for item in value)
-    if isinstance(value, dict):
-        return {key: _as_nan(item) for key, item in value.items()}
-    return value
-
-
-def _wrapped(record: _Record, value: Any) -> Any:
-    if isinstance(value, (tuple, list)):
-        return type(value)(_wrapped(record, item) for item in value)
-    if isinstance(value, np.ndarray) and value.dtype == np.object_:
-        value = value.view(SymbolArray)
-        value.record = record
-    return value
-
-
-_labels_of = np.frompyfunc(lambda one: one.labels if isinstance(one, Symbol) else 0, 1, 1)
+_labels_of = np.frompyfunc(lambda one: one.value if isinstance(one, Symbol) else 0, 1, 1)
 
 
 def _labels(value: Any) -> Labels:
-    array = np.asarray(_plain(value))
+    array = np.asarray(plain(value))
     if array.dtype == np.object_:
         return np.asarray(_labels_of(array), dtype=np.uint64)
     return np.zeros(array.shape, np.uint64)
@@ -219,51 +110,6 @@ def _together(values: Sequence[Any]) -> Any:
     for value in values:
         found = found | _labels(value)
     return found
-
-
-def _contracted(record: _Record, left: Any, right: Any) -> Any:
-    """Labels of a matrix product."""
-    a, b = _labels(left), _labels(right)
-    if a.ndim == 0 or b.ndim == 0 or a.shape[-1] != b.shape[-2 if b.ndim > 1 else -1]:
-        raise record.refuse()
-    rows = np.bitwise_or.reduce(a, axis=-1)
-    columns = np.bitwise_or.reduce(b, axis=-2 if b.ndim > 1 else -1)
-    if a.ndim > 1 and b.ndim > 1:
-        rows, columns = rows[..., :, None], columns[..., None, :]
-    return rows | columns
-
-
-def _apply(
-    record: _Record, ufunc: Any, method: str, inputs: tuple[Any, ...], options: dict[str, Any]
-) -> Any:
-    """Apply one of NumPy's elementwise functions, or a matrix product."""
-    if record.closed:
-        return getattr(ufunc, method)(*_as_nan(inputs), **_as_nan(options))
-    out = options.get("out")
-    if options.get("where", True) is not True:
-        raise record.refuse()
-    if method == "__call__" and ufunc is np.matmul:
-        labels = _contracted(record, *inputs)
-    elif ufunc.signature is not None:
-        raise record.refuse()
-    elif method == "__call__":
-        labels = _together(inputs)
-    elif method == "reduce":
-        axis, keepdims = options.get("axis", 0), options.get("keepdims", False)
-        labels = np.bitwise_or.reduce(_labels(inputs[0]), axis=axis, keepdims=keepdims)
-    elif method == "accumulate":
-        labels = np.bitwise_or.accumulate(_labels(inputs[0]), axis=options.get("axis", 0))
-    elif method == "outer":
-        labels = np.bitwise_or.outer(*(_labels(one) for one in inputs))
-    else:
-        raise record.refuse()
-    value = record.symbols(labels)
-    if out is not None and any(one is not None for one in out):
-        if ufunc.nout > 1 or not isinstance(out[0], SymbolArray):
-            raise record.refuse()
-        out[0][...] = value
-        return out[0]
-    return value if ufunc.nout == 1 else (value,) * ufunc.nout
 
 
 def _select(condlist: Any, choicelist: Any, default: Any = 0) -> Any:
@@ -293,48 +139,171 @@ _ELEMENTWISE: dict[Any, Callable[..., Any]] = {
 }
 
 
-def _call(
-    record: _Record, function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
-) -> Any:
-    """Call any other function of NumPy."""
-    if record.closed:
-        return function(*_as_nan(args), **_as_nan(kwargs))
-    if function in _ELEMENTWISE:
-        try:
-            labels = _ELEMENTWISE[function](*args, **kwargs)
-        except TypeError as error:  # arguments that are rarely given
-            raise record.refuse() from error
-        return record.symbols(labels)
-    if function is np.dot and not kwargs and len(args) == 2 and all(
-        0 < np.ndim(_plain(one)) < 3 for one in args
-    ):
-        return record.symbols(_contracted(record, *args))
-    # On plain arrays, NumPy's own code moves symbols about, and computes with them one by one.
-    return _wrapped(
-        record,
-        function(*_as_arrays(args), **{key: _as_arrays(one) for key, one in kwargs.items()}),
-    )
-
-
 def trace(function: Callable[..., Any], arguments: Sequence[Labels]) -> Labels | None:
-    """Call a function on symbols."""
-    record = _Record()
+    """Call a function on symbols with labels; the labels of its value, None where it refuses."""
+    record = _LabelRecord()
     given = [record.symbols(labels) for labels in arguments]
-    before = [one.view(np.ndarray).copy() for one in given]
-    for one in given:
-        one.flags.writeable = False
+    value, error = run(record, function, given)
     try:
-        with np.errstate(all="ignore"):
-            value = function(*given)
-        labels = _labels(value)
-    except KeyboardInterrupt:
-        raise
-    except BaseException:  # whatever it does with symbols, it may work on numbers
+        return None if error or record.refused else _labels(value)
+    except Exception:  # a ragged list, say
         return None
     finally:
         record.closed = True
-    unchanged = all(
-        all(a is b for a, b in zip(old.flat, new.view(np.ndarray).flat, strict=True))
-        for old, new in zip(before, given, strict=True)
-    )
-    return labels if unchanged and not record.refused else None
+
+
+class Traced(NamedTuple):
+    """A function as CasADi has it, or why it has none.
+
+    Attributes
+    ----------
+    function : casadi.Function or None
+        Of columns (size, 1), one for each argument, to one dense column: the entries of the
+        function's value row by row. Of scalar operations (SX) alone.
+    reason : str
+        Why there is no function; blank if there is one.
+    shape : tuple of int
+        The shape of the value; () without a function.
+    """
+
+    function: Any
+    reason: str
+    shape: tuple[int, ...] = ()
+
+
+def traced(
+    function: Callable[..., Any],
+    sizes: Sequence[int],
+    points: Sequence[Sequence[Array]] | None = None,
+    *,
+    name: str = "traced",
+) -> Traced:
+    """The CasADi form of a function of NumPy vectors, if it has one that gives the same numbers.
+
+    The function is called once, with symbols. It is refused where it asks for a symbol's value:
+    in a branch, a loop or an index, by ``float()``, in a function without CasADi form. Then it is
+    compared with itself at many points, where both must agree up to rounding, or both fail or
+    not be finite. So nothing is traced wrongly that depends on what the points show: random
+    numbers, the time, a state kept between calls. Never raises, whatever the function does.
+
+    Parameters
+    ----------
+    function : callable
+        Of one vector for each of ``sizes``, to an array, a list or a number.
+    sizes : sequence of int
+        The lengths of its arguments, all of shape (size,).
+    points : sequence, optional
+        Where to compare: a sequence of arguments for each point, of usual magnitudes. Left out,
+        random numbers of several magnitudes around one.
+    name : str
+        The name of the CasADi function.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> traced(lambda x, u: np.array([x[1], u[0] - np.sin(x[0])]), (2, 1)).function
+    Function(traced:(i0[2],i1)->(o0[2]) SXFunction)
+    """
+    found = expressed(function, sizes, name)
+    if found.function is None:
+        return found
+    reason = difference(found, function, random_points(sizes) if points is None else points)
+    return Traced(None, reason) if reason else found
+
+
+def expressed(function: Callable[..., Any], sizes: Sequence[int], name: str = "traced") -> Traced:
+    """The expression that a function computes from symbols, not compared with the function yet."""
+    import casadi  # late: `import qpmhe` does without
+
+    record = ExpressionRecord(casadi)
+    columns = [casadi.SX.sym(f"a{k}", size) for k, size in enumerate(sizes)]
+    with numpy_on_symbols(record):
+        value, error = run(record, function, [record.symbols(one) for one in columns])
+    try:
+        if error is not None and not record.refused:
+            return Traced(None, _failure(error))
+        if not record.refused:
+            values = np.asarray(plain(value))
+            if values.dtype.kind not in "fiubO":
+                return Traced(None, f"it returns {values.dtype}; expected numbers")
+            column = record.column(values)
+    except Exception:  # of a ragged list, or of entries that are no numbers
+        if value is None or not record.refused:
+            return Traced(None, f"it returns a {type(value).__name__} that is no array of numbers")
+    finally:
+        record.closed = True
+    if record.refused:
+        return Traced(None, record.reason)
+    return Traced(casadi.Function(name, columns, [column]), "", values.shape)
+
+
+def _failure(error: BaseException) -> str:
+    """What a function raised on symbols, and where."""
+    frames = [one for one, _ in traceback.walk_tb(error.__traceback__)]
+    where = place(frames[-1]) if frames else ""
+    text = f"raises {type(error).__name__} on symbols: {error}"
+    return f"{where} {text}" if where else f"it {text}"
+
+
+def random_points(sizes: Sequence[int], seed: int = 20210829) -> list[list[Array]]:
+    """Points of several magnitudes, positive ones and of all signs."""
+    generator = np.random.default_rng(seed)
+    scales = (1.0, 0.1, 3.0, 1.0, 10.0, 0.3, 30.0, 1e-3, 1e-6, 1e3, 1e5)
+    return [
+        [scale * generator.uniform(least, 1.0, size) for size in sizes]
+        for least in (0.2, -1.0) for scale in scales
+    ]
+
+
+# Relative change of the arguments that shows how rounding spreads, its weight, and the share of
+# a value that is rounding in any case.
+_NUDGE, _WEIGHT, _ROUNDING = 1e-13, 300.0, 1e-11
+
+
+def difference(
+    found: Traced, function: Callable[..., Any], points: Sequence[Sequence[Array]]
+) -> str:
+    """Where a trace and its function differ by more than rounding; blank where they do not."""
+    nudge = np.random.default_rng(0)
+    for point in points:
+        arguments = [np.asarray(one, np.float64) for one in point]
+        mine = np.array(found.function(*arguments)).reshape(found.shape)
+        theirs = _called(function, arguments)
+        finite = theirs is not None and bool(np.isfinite(theirs).all())
+        if finite == bool(np.isfinite(mine).all()):
+            if not finite:
+                continue
+            assert theirs is not None
+            again = _called(function, arguments)
+            if again is None or not np.array_equal(theirs, again):
+                return f"it returns other values when it is called again at {_shown(arguments)}"
+            if theirs.shape == mine.shape:
+                gap = np.abs(mine - theirs)
+                if (gap <= _ROUNDING * np.abs(theirs)).all():
+                    continue
+                moved = [one * (1.0 + _NUDGE * nudge.uniform(-1, 1, one.size)) for one in arguments]
+                other = _called(function, moved)
+                spread = np.inf if other is None else np.abs(other - theirs)
+                if (gap <= _ROUNDING * np.abs(theirs) + _WEIGHT * np.nan_to_num(spread)).all():
+                    continue
+        result = "an error" if theirs is None else str(theirs.tolist())
+        return (
+            f"it returns {result} at {_shown(arguments)}, but the same expression of symbols is "
+            f"{mine.tolist()}: it depends on more than its arguments, or on their type"
+        )
+    return ""
+
+
+def _shown(arguments: Sequence[Array]) -> str:
+    return ", ".join(str(one.tolist()) for one in arguments if one.size)
+
+
+def _called(function: Callable[..., Any], arguments: Sequence[Array]) -> Array | None:
+    """The function's value, a copy; None where it raises."""
+    try:
+        with np.errstate(all="ignore"):
+            return np.array(function(*(one.copy() for one in arguments)), np.float64)
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # outside of its domain
+        return None

@@ -1,0 +1,277 @@
+"""Functions of NumPy as CasADi expressions: the same numbers, or no trace and the reason."""
+
+import contextlib
+import math
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from qpmhe.model.tracing import traced
+
+A = np.array([[0.9, 0.2], [-0.1, 0.8]])
+BUFFER = np.zeros(2)
+
+
+def into_zeros(x):
+    out = np.zeros(2)
+    out[0] = x[1]
+    out[1] = -math.sin(x[0])
+    return out
+
+
+def into_like(x):
+    out = np.empty_like(x)
+    out[..., 0], out[..., 1] = x[..., 1], np.clip(x[..., 0], -1.0, 1.0)
+    return out
+
+
+def into_identity(x):
+    matrix = np.eye(2)
+    matrix[0, 1] = x[0]
+    return matrix @ x
+
+
+def in_place(x):
+    y = 0.5 * x
+    y += np.sin(x)
+    y[..., 0] *= 2.0
+    return y
+
+
+def divided(x):
+    out = np.zeros_like(x)
+    np.divide(1.0, x, out=out, where=np.abs(x) > 0.5)
+    return out
+
+
+STRAIGHT = {
+    "zeros": into_zeros,
+    "empty_like": into_like,
+    "eye": into_identity,
+    "in place": in_place,
+    "out and where": divided,
+    "list": lambda x: [x[1], -np.sin(x[0])],
+    "number": lambda x: x[0] * x[1],
+    "A @ x": lambda x: A @ x,
+    "x @ A.T": lambda x: x @ A.T,
+    "dot": lambda x: np.dot(A, x) + x.dot(A),
+    "einsum": lambda x: np.einsum("ij,...j->...i", A, x),
+    "outer": lambda x: np.outer(x, x) @ x,
+    "kron": lambda x: np.kron(x, [1.0, 2.0]),
+    "cross": lambda x: np.cross(np.array([x[0], x[1], 1.0]), [1.0, 2.0, 3.0]),
+    "solve": lambda x: np.linalg.solve(np.array([[2.0 + x[0] ** 2, 1.0], [1.0, 3.0]]), x),
+    "inv and det": lambda x: np.linalg.inv(np.diag(2.0 + x**2)) * np.linalg.det(A * x[0]),
+    "norm": lambda x: x / (1.0 + np.linalg.norm(x, axis=-1, keepdims=True)),
+    "norms": lambda x: [np.linalg.norm(x, 1), np.linalg.norm(x, np.inf)],
+    "sums": lambda x: x + x.sum() + np.mean(x) + x.prod() + np.cumsum(x) + np.std(x),
+    "where": lambda x: np.where((x > 0.0) & (x < 9.0), x, 2.0 * x),
+    "select": lambda x: np.select([x < 0.0, x > 3.0], [x, 3.0 + 0.0 * x], 1.0),
+    "heaviside": lambda x: np.heaviside(x, 0.5) * x,
+    "extrema": lambda x: np.maximum(x, 0.0) + np.minimum(x[::-1], x) + x.max() - np.min(x),
+    "clip": lambda x: np.clip(x, None, 2.0) + x.clip(-1.0, 1.0),
+    "interp": lambda x: np.interp(x, np.arange(4.0), [0.0, 1.0, 4.0, 9.0]),
+    "interp outside": lambda x: np.interp(x, [0.0, 2.0], [1.0, 3.0], left=-1.0, right=7.0),
+    "arctan2": lambda x: [np.arctan2(x[1], x[0]), np.hypot(x[0], x[1])],
+    "wrapped": lambda x: (x + np.pi) % (2.0 * np.pi) - np.pi,
+    "whole numbers": lambda x: np.floor(x) + np.ceil(x) + np.trunc(x) + np.rint(x) + x // 0.3,
+    "remainders": lambda x: np.mod(x, 0.7) + np.fmod(x, 0.3) + x % -0.2,
+    "rounded": lambda x: np.round(x, 1),
+    "powers": lambda x: np.abs(x) ** 0.3 + x**3 + np.square(x) + np.cbrt(x) + 2.0**x,
+    "logarithms": lambda x: np.log(np.abs(x)) + np.log1p(x * x) + np.log2(1.0 + x * x),
+    "exponentials": lambda x: np.exp(-x * x) + np.expm1(0.01 * x) + np.exp2(0.1 * x),
+    "hyperbolic": lambda x: np.tanh(x) + np.sinh(0.1 * x) + np.arcsinh(x) + np.cosh(0.1 * x),
+    "inverses": lambda x: np.arcsin(0.1 * np.tanh(x)) + np.arctan(x) + np.sign(x),
+    "outside of the domain": lambda x: np.sqrt(x) + np.log(x) + np.arccos(x),
+    "truth values": lambda x: (x > 0.0) * x + ((x > 0.0) + (x > 1.0)) + np.sum(x > 0.0) + ~(x > 2),
+    "any": lambda x: np.where(np.any(x > 1.0), x, -x) + np.where(np.all(x > 1.0), 1.0, x),
+    "pieces": lambda x: np.concatenate((x[1:], x[:1])) + np.roll(x, 1) + np.stack((x[1], x[0])),
+    "joined": lambda x: np.hstack((x, [1.0], np.append(np.diff(x), x[0]))),
+    "array of numbers": lambda x: np.array([x[1], 0.0], dtype=float) + np.asarray(x, float),
+    "astype": lambda x: x.astype(float) + np.array(x),
+    "math": lambda x: math.atan2(x[0], x[1]) + math.sqrt(x[0] ** 2) + math.log(abs(x[1])),
+    "math of numbers": lambda x: math.sin(0.3) * x + math.floor(2.5),
+    "constants": lambda x: np.linalg.inv(A) @ x + np.zeros(2) + np.linspace(0.0, 1.0, 2),
+    "loop over components": lambda x: [sum(v * v for v in x), abs(x[0])],
+}
+
+
+def points(sizes, count=60):
+    generator = np.random.default_rng(1)
+    for k in range(count):
+        scale = 10.0 ** generator.uniform(-3.0, 2.0)
+        yield [scale * generator.uniform(-1.0 if k % 2 else 0.0, 1.0, size) for size in sizes]
+
+
+@pytest.mark.parametrize("way", STRAIGHT)
+def test_a_traced_function_gives_the_same_numbers(way):
+    function = STRAIGHT[way]
+    found = traced(function, (2,))
+    assert found.function is not None, found.reason
+    with np.errstate(all="ignore"):
+        for (x,) in points((2,)):
+            try:
+                expected = np.asarray(function(x.copy()), float)
+            except ValueError:
+                expected = np.array(np.nan)
+            assert expected.shape == found.shape
+            np.testing.assert_allclose(
+                np.array(found.function(x)).reshape(found.shape), expected, rtol=1e-12, atol=1e-13
+            )
+
+
+class Stateful:
+    calls, last = 0, None
+
+    def counted(self, x):
+        self.calls += 1
+        return x * self.calls
+
+    def remembered(self, x):
+        last, self.last = self.last, x
+        return x if last is None else x + 1e-3 * last
+
+
+class Late:
+    calls = 0
+
+    def __call__(self, x):
+        Late.calls += 1
+        return x * Late.calls
+
+
+def swallowed(x):
+    try:
+        beyond = bool(x[0] > 12.0)
+    except Exception:  # whatever the symbol raises
+        beyond = False
+    return 0.5 * x if beyond else 0.95 * x
+
+
+def swallowed_in_an_array(x):
+    with contextlib.suppress(BaseException):
+        float(x[0])
+    return np.array([x[0], x[1]], dtype=float)
+
+
+def until_it_converges(x):
+    y = x
+    while np.abs(y - np.cos(y)).max() > 1e-9:
+        y = np.cos(y)
+    return y
+
+
+def into_a_global_buffer(x):
+    BUFFER[:] = x
+    return 2.0 * BUFFER
+
+
+def changed(x):
+    x[0] = 1.0
+    return x
+
+
+def bisected(x):
+    from scipy.optimize import brentq
+
+    return np.array([brentq(lambda s: s**3 + s - x[0], -1e9, 1e9), x[1]])
+
+
+def interpolated(x):
+    from scipy.interpolate import CubicSpline
+
+    return CubicSpline(np.arange(5.0), np.arange(5.0) ** 3)(x)
+
+
+# The function, and a word of the reason why it is not traced.
+BAD = {
+    "a branch": (lambda x: x if x[0] > 12.0 else 2.0 * x, "branch"),
+    "the builtin max": (lambda x: max(x[0], 0.0), "branch"),
+    "a caught refusal": (swallowed, "branch"),
+    "a caught refusal before an array": (swallowed_in_an_array, "float()"),
+    "float()": (lambda x: float(x[0]) * x, "float()"),
+    "int()": (lambda x: int(x[0]) * x, "int()"),
+    "a look-up": (lambda x: np.arange(9.0)[int(abs(x[0])) % 9] * x, "int()"),
+    "an index": (lambda x: np.arange(9.0)[x[0]], "index"),
+    "a hash": (lambda x: {0.3: 1.0}.get(x[0], 2.0) * x, "hash"),
+    "a text": (lambda x: x if str(x[0]).startswith("-") else -x, "text"),
+    "a type": (lambda x: x if isinstance(x[0], float) else -x, "same expression"),
+    "a kind of number": (lambda x: x if x.dtype == np.float64 else -x, "same expression"),
+    "integers": (lambda x: x.astype(int) * 1.0, "int64"),
+    "single precision": (lambda x: x.astype(np.float32) * 1.0, "float32"),
+    "sorting": (np.sort, "branch"),
+    "the largest": (lambda x: x[np.argmax(x)], "branch"),
+    "a mask": (lambda x: x[x > 0.0].sum(), "mask"),
+    "a loop until it converges": (until_it_converges, "branch"),
+    "a counter": (Stateful().counted, "again"),
+    "what it was called with": (Stateful().remembered, "same expression"),
+    "a global counter": (Late(), "again"),
+    "random numbers": (lambda x: x + np.random.default_rng().normal(), "again"),
+    "numpy's global random numbers": (lambda x: x * np.random.rand(), "again"),  # noqa: NPY002
+    "the time": (lambda x: x * math.sin(1e6 * time.perf_counter()), "again"),
+    "a buffer from outside": (into_a_global_buffer, "float()"),
+    "a change of its argument": (changed, "ValueError"),
+    "a root": (bisected, __file__),
+    "a spline": (interpolated, __file__),
+    "a special function": (lambda x: __import__("scipy.special").special.gamma(x), "gamma"),
+    "nothing": (lambda x: None, "NoneType"),
+    "an exception": (lambda x: 1 / 0, "ZeroDivisionError"),
+}
+
+
+@pytest.mark.parametrize("way", BAD)
+def test_a_function_that_asks_for_more_is_not_traced(way):
+    function, word = BAD[way]
+    found = traced(function, (2,))
+    assert found.function is None
+    assert word in found.reason
+
+
+def test_the_reason_names_file_and_line():
+    line = swallowed.__code__.co_firstlineno + 2
+    assert f"{__file__}:{line} asks for" in traced(swallowed, (2,)).reason
+    found = traced(lambda x: np.frompyfunc(lambda s: s if s > 0 else 0.0, 1, 1)(x), (1,))
+    assert __file__ in found.reason
+
+
+def test_numpy_and_math_are_themselves_again_after_a_trace():
+    before = np.zeros, np.array, math.sin
+    inside = []
+    traced(lambda x: inside.append(np.zeros) or x, (1,))
+    traced(swallowed, (2,))
+    assert (np.zeros, np.array, math.sin) == before
+    assert inside[0] is not np.zeros
+    made = inside[0](2)
+    assert type(made) is np.ndarray
+    assert made.dtype == np.float64
+
+
+def test_other_threads_see_numpy_while_one_traces():
+    kinds, go, done = [], threading.Event(), threading.Event()
+
+    def other():
+        go.wait(10.0)
+        kinds.append((type(np.zeros(2)), np.array([1, 2]).dtype.kind, math.sin(1.0)))
+        done.set()
+
+    def function(x):
+        go.set()
+        done.wait(10.0)
+        return x + np.zeros(2)
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    assert traced(function, (2,), [[np.ones(2)]]).function is not None
+    thread.join()
+    assert kinds == [(np.ndarray, "i", math.sin(1.0))]
+
+
+def test_a_function_of_several_arguments():
+    found = traced(lambda z, v: np.outer(z, v) * z.sum(), (2, 3))
+    assert found.shape == (2, 3)
+    z, v = np.array([1.0, 2.0]), np.array([3.0, 4.0, 5.0])
+    np.testing.assert_allclose(
+        np.array(found.function(z, v)).reshape(2, 3), 3.0 * np.outer(z, v), rtol=1e-15
+    )
+    assert traced(lambda x, u: 2.0 * x, (1, 0)).function is not None
