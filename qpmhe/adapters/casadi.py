@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 import ctypes
-import threading
 import warnings
-from collections.abc import Callable
 from functools import partial
 from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codegen.comparison import Batch, Buffers, Interpreter, model_fault, points
+from ..codegen.comparison import Batch, Interpreter, model_fault, points
 from ..codegen.compiler import WrongCodeError, compiled_library, find_compiler
-from ..codegen.evaluation import fixed_call, may_fail, separate_calls
-from ..codegen.expressions import CasadiModel, casadi_model, import_casadi
 from ..codegen.source import model_files
 from ..errors import CompilationError, EngineWarning, OptionError
 from ..model.augmentation import Augmentation
+from ..model.evaluation import NAMES, RESIDUALS, VALUES, Buffers, Evaluator, interpreted, results_of
+from ..model.expressions import CasadiModel, casadi_model, import_casadi
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
 from ..model.system import System, SystemOptions, checked_set, timed_options
 
 Array = NDArray[np.float64]
-# Makes buffers for a number of states and the wanted results.
-Maker = Callable[[int, tuple[str, ...]], Buffers]
-
-_MOST_KEPT = 64
 
 
 def from_casadi(
@@ -92,11 +86,11 @@ def from_casadi(
 
     def made(timed: bool) -> System:
         maker = (
-            partial(_interpreted, model, timed) if library is None
+            partial(interpreted, model, timed) if library is None
             else partial(_compiled, model, library, timed)
         )
-        evaluator = _Evaluator(maker)
-        one = {name: Trusted(partial(evaluator.one, name)) for name in _NAMES}
+        evaluator = Evaluator(maker)
+        one = {name: Trusted(partial(evaluator.one, name)) for name in NAMES}
         system = System(
             one["f"], one["h"], n=model.n, p=model.p, m=model.m + timed,
             f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"],
@@ -129,71 +123,6 @@ def from_casadi(
     return system
 
 
-_NAMES = ("f", "h", "f_jacobian", "h_jacobian")
-_VALUES = ("f", "h")
-_RESIDUALS = ("residuals",)
-
-
-class _Evaluator:
-    """Functions of (x, u) over (n,) or (B, n) that work on buffers kept between calls."""
-
-    def __init__(self, maker: Maker) -> None:
-        self._maker = maker
-        self._local = threading.local()  # two threads must not share buffers
-
-    def one(self, name: str, x: Array, u: Array | None = None) -> Array:
-        """A fresh array of one of the four functions' values."""
-        single = x.ndim == 1
-        if not single and x.shape[0] == 0:  # the virtual machine cannot map over nothing
-            return np.zeros_like(self._buffers(1, (name,))[2][name][:0])
-        states, inputs, results, evaluate = self._buffers(
-            1 if single else x.shape[0], (name,)
-        )
-        states[...] = x
-        if u is not None:
-            inputs[...] = u
-        evaluate()
-        result = results[name]
-        value: Array = result[0].copy() if single else result.copy()
-        return value
-
-    def stage(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """f, h and their joint Jacobian at one state: good until the next call."""
-        states, inputs, results, evaluate = self._buffers(1, _NAMES)
-        states[...] = x
-        inputs[...] = u
-        evaluate()
-        return results["f"], results["h"], results["joint"]
-
-    def residuals(self, trajectory: Array, y: Array, u: Array) -> Array:
-        """A fresh array of w and v along a trajectory."""
-        states, inputs, results, evaluate = self._buffers(y.shape[0], _RESIDUALS)
-        states[...] = trajectory
-        inputs[...] = u
-        results["y"][...] = y
-        evaluate()
-        value: Array = results["residuals"].copy()
-        return value
-
-    def prepare(self, horizon: int) -> None:
-        """Make the buffers of the first window and of a full one, in this thread."""
-        self._buffers(1, _NAMES)
-        for count in dict.fromkeys((1, horizon)):
-            self._buffers(count, _RESIDUALS)
-            for name in _NAMES:
-                self._buffers(count, (name,))
-
-    def _buffers(self, count: int, names: tuple[str, ...]) -> Buffers:
-        try:
-            found: Buffers = self._local.kept[count, names]
-        except (AttributeError, KeyError):
-            kept = self._local.__dict__.setdefault("kept", {})
-            if len(kept) >= _MOST_KEPT:  # of a caller whose batches have all sorts of lengths
-                kept.clear()
-            found = kept[count, names] = self._maker(count, names)
-        return found
-
-
 def _library(
     model: CasadiModel, states: ConvexSet | None, required: bool
 ) -> ctypes.PyDLL | None:
@@ -223,38 +152,24 @@ def _library(
     return ctypes.PyDLL(library._name)
 
 
-def _results(model: CasadiModel, count: int, names: tuple[str, ...]) -> dict[str, Array]:
-    n, p = model.n, model.p
-    shapes = {"f": (n,), "h": (p,), "f_jacobian": (n, n), "h_jacobian": (p, n)}
-    if names == _RESIDUALS:
-        return {"residuals": np.zeros((count, n + p)), "y": np.zeros((count, p))}
-    results = {name: np.zeros((count, *shapes[name])) for name in names}
-    if names == _NAMES:
-        # One state alone: both Jacobians are parts of one array.
-        joint = results["joint"] = np.zeros((n + p, n))
-        results["f_jacobian"], results["h_jacobian"] = joint[None, :n], joint[None, n:]
-        results["f"], results["h"] = results["f"][0], results["h"][0]
-    return results
-
-
 def _compiled(
     model: CasadiModel, library: ctypes.PyDLL, timed: bool, count: int, names: tuple[str, ...]
 ) -> Buffers:
     """Evaluation by the loops of model_api.c."""
-    along = names == _RESIDUALS
+    along = names == RESIDUALS
     states, inputs = np.zeros((count + along, model.n)), np.zeros((count, model.m + timed))
-    results = _results(model, count, names)
+    results = results_of(model, count, names)
     # C takes inputs and steps as arrays of their own.
     us = np.zeros((count, model.m)) if timed else inputs
     steps = np.zeros(count) if timed else None
     slopes = any(name.endswith("jacobian") for name in names)
     order: tuple[str, ...]
     if along:
-        function, order = library.mhe_residuals, ("y", *_RESIDUALS)
+        function, order = library.mhe_residuals, ("y", *RESIDUALS)
     elif slopes:
-        function, order = library.mhe_jacobians, _NAMES
+        function, order = library.mhe_jacobians, NAMES
     else:
-        function, order = library.mhe_values, _VALUES
+        function, order = library.mhe_values, VALUES
     function.restype = None
     targets = [results.get(name) for name in order]
     run = partial(
@@ -275,59 +190,3 @@ def _compiled(
 
 def _pointer(array: Array | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(None if array is None else array.ctypes.data)
-
-
-def _interpreted(
-    model: CasadiModel, timed: bool, count: int, names: tuple[str, ...]
-) -> Buffers:
-    """Evaluation by CasADi's virtual machine, mapped over the states."""
-    if names == _RESIDUALS:
-        return _interpreted_residuals(model, timed, count)
-    ca = import_casadi()
-    kind = ca.SX if model.f.is_a("SXFunction") and model.h.is_a("SXFunction") else ca.MX
-    x, given = kind.sym("x", model.n), kind.sym("u", model.m + 1)
-    u, dt = given[: model.m], given[model.m]
-    following, output = model.step()(x, u, dt), model.h(x, u)
-    # Transposed: CasADi stores by columns, NumPy by rows.
-    columns = {
-        "f": lambda: following,
-        "h": lambda: output,
-        "f_jacobian": lambda: ca.densify(ca.jacobian(following, x).T),
-        "h_jacobian": lambda: ca.densify(ca.jacobian(output, x).T),
-    }
-    functions = {
-        name: ca.Function("model", [x, given], [columns[name]()]) for name in names
-    }
-    function = ca.Function("model", [x, given], [columns[name]() for name in names])
-    fallible = may_fail(function)
-    if count > 1:
-        function = function.map(count)
-    states, inputs = np.zeros((count, model.n)), np.zeros((count, model.m + timed))
-    results = _results(model, count, names)
-    all_inputs = inputs if timed else np.full((count, model.m + 1), model.dt or 0.0)
-    run = fixed_call(function, (states, all_inputs), [results[name] for name in names], fallible)
-    again: list[Callable[[], None]] = []
-
-    def evaluate() -> None:
-        if not timed:
-            all_inputs[:, : model.m] = inputs
-        if not run():
-            if not again:
-                again.append(separate_calls(functions, states, all_inputs, results))
-            again[0]()
-
-    return states, inputs, results, evaluate
-
-
-def _interpreted_residuals(model: CasadiModel, timed: bool, count: int) -> Buffers:
-    states, inputs, values, evaluate_values = _interpreted(model, timed, count, _VALUES)
-    results = _results(model, count, _RESIDUALS)
-    trajectory, residuals, n = np.zeros((count + 1, model.n)), results["residuals"], model.n
-
-    def evaluate() -> None:
-        states[...] = trajectory[:-1]
-        evaluate_values()
-        np.subtract(trajectory[1:], values["f"], out=residuals[:, :n])
-        np.subtract(results["y"], values["h"], out=residuals[:, n:])
-
-    return trajectory, inputs, results, evaluate

@@ -17,16 +17,14 @@ from numpy.typing import NDArray
 from ..costs import Cost, QuadraticCost, RobustCost
 from ..estimation.estimate import Status
 from ..estimation.limits import LARGEST
+from ..model.evaluation import Buffers, fixed_call
+from ..model.expressions import CasadiModel, import_casadi
 from ..model.sets import ConvexSet
-from .evaluation import fixed_call
-from .expressions import CasadiModel, import_casadi
 
 if TYPE_CHECKING:
     from .library import EstimatorLibrary
 
 Array = NDArray[np.float64]
-# Fixed arrays for states, inputs and results, and what computes these from those.
-Buffers = tuple[Array, Array, dict[str, Array], Callable[[], object]]
 
 # A difference by this share of what a result is made of is rounding.
 ROUNDING = 1e-9

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .expressions import CasadiModel, import_casadi
+from ..model.expressions import CasadiModel, import_casadi
 
 
 def model_graph(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .._version import __version__
 from ..errors import CompilationError
-from .expressions import CasadiModel, import_casadi
+from ..model.expressions import CasadiModel, import_casadi
 from .layout import Layout
 
 # Eight (n, n) arrays of them fit on any usual stack.

@@ -6,15 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from .._checks import choice, dimension, need, positive
+from .._checks import choice, dimension, positive
 from ..errors import InvalidInputError, ModelError
-from ..model.discretize import METHODS
-from ..model.functions import check_inputs, takes_input
+from .discretize import METHODS
+from .functions import check_inputs, takes_input
 
 
 def import_casadi() -> Any:
-    """The casadi package, imported late; InvalidInputError if it is not installed."""
-    return need("casadi", "the model", "casadi")
+    """The casadi package, imported late: `import qpmhe` does without."""
+    import casadi
+
+    return casadi
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,210 @@
+"""CasADi models evaluated on fixed arrays, by CasADi's virtual machine or other means."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .expressions import CasadiModel, import_casadi
+
+Array = NDArray[np.float64]
+# Fixed arrays for states, inputs and results, and what computes these from those.
+Buffers = tuple[Array, Array, dict[str, Array], Callable[[], object]]
+# Makes buffers for a number of states and the wanted results.
+Maker = Callable[[int, tuple[str, ...]], Buffers]
+
+_MOST_KEPT = 64
+NAMES = ("f", "h", "f_jacobian", "h_jacobian")
+VALUES = ("f", "h")
+RESIDUALS = ("residuals",)
+
+
+class Evaluator:
+    """Functions of (x, u) over (n,) or (B, n) that work on buffers kept between calls."""
+
+    def __init__(self, maker: Maker) -> None:
+        self._maker = maker
+        self._local = threading.local()  # two threads must not share buffers
+
+    def one(self, name: str, x: Array, u: Array | None = None) -> Array:
+        """A fresh array of one of the four functions' values."""
+        single = x.ndim == 1
+        if not single and x.shape[0] == 0:  # the virtual machine cannot map over nothing
+            return np.zeros_like(self._buffers(1, (name,))[2][name][:0])
+        states, inputs, results, evaluate = self._buffers(
+            1 if single else x.shape[0], (name,)
+        )
+        states[...] = x
+        if u is not None:
+            inputs[...] = u
+        evaluate()
+        result = results[name]
+        value: Array = result[0].copy() if single else result.copy()
+        return value
+
+    def stage(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """f, h and their joint Jacobian at one state: good until the next call."""
+        states, inputs, results, evaluate = self._buffers(1, NAMES)
+        states[...] = x
+        inputs[...] = u
+        evaluate()
+        return results["f"], results["h"], results["joint"]
+
+    def residuals(self, trajectory: Array, y: Array, u: Array) -> Array:
+        """A fresh array of w and v along a trajectory."""
+        states, inputs, results, evaluate = self._buffers(y.shape[0], RESIDUALS)
+        states[...] = trajectory
+        inputs[...] = u
+        results["y"][...] = y
+        evaluate()
+        value: Array = results["residuals"].copy()
+        return value
+
+    def prepare(self, horizon: int) -> None:
+        """Make the buffers of the first window and of a full one, in this thread."""
+        self._buffers(1, NAMES)
+        for count in dict.fromkeys((1, horizon)):
+            self._buffers(count, RESIDUALS)
+            for name in NAMES:
+                self._buffers(count, (name,))
+
+    def _buffers(self, count: int, names: tuple[str, ...]) -> Buffers:
+        try:
+            found: Buffers = self._local.kept[count, names]
+        except (AttributeError, KeyError):
+            kept = self._local.__dict__.setdefault("kept", {})
+            if len(kept) >= _MOST_KEPT:  # of a caller whose batches have all sorts of lengths
+                kept.clear()
+            found = kept[count, names] = self._maker(count, names)
+        return found
+
+
+def may_fail(function: Any) -> bool:
+    """Whether an evaluation can break off: one of scalar operations alone cannot."""
+    call = import_casadi().OP_CALL
+    return not function.is_a("SXFunction") or any(
+        function.instruction_id(k) == call for k in range(function.n_instructions())
+    )
+
+
+def fixed_call(
+    function: Any, arguments: Sequence[Array], results: Sequence[Array], fallible: bool = True
+) -> Callable[[], bool]:
+    """A call of a function on arrays in place, which returns whether it worked.
+
+    Where it did not, the results are not written, or only in part.
+    """
+    buffer, run = function.buffer()
+    for i, array in enumerate(arguments):
+        buffer.set_arg(i, array.data)
+    for i, array in enumerate(results):
+        buffer.set_res(i, array.data)
+    kept = function, buffer, arguments, results  # `run` has no more than addresses
+
+    def call() -> bool:
+        if not fallible:
+            run()
+            return bool(kept)
+        try:
+            run()
+        except RuntimeError:  # of a solver or a callback within the function
+            return False
+        code: int = buffer.ret()
+        return code == 0
+
+    return call
+
+
+def separate_calls(
+    functions: dict[str, Any], states: Array, inputs: Array, results: dict[str, Array]
+) -> Callable[[], None]:
+    """Evaluation of each function at each state by itself, NaN where it fails."""
+    calls = []
+    for name, function in functions.items():
+        rows = results[name].reshape(len(states), -1)  # a view
+        calls += [
+            (fixed_call(function, (x, u), (row,)), row)
+            for x, u, row in zip(states, inputs, rows, strict=True)
+        ]
+
+    def evaluate() -> None:
+        for call, row in calls:
+            if not call():
+                row.fill(np.nan)
+
+    return evaluate
+
+
+def results_of(model: CasadiModel, count: int, names: tuple[str, ...]) -> dict[str, Array]:
+    """Arrays for the wanted results at so many states, by name."""
+    n, p = model.n, model.p
+    shapes = {"f": (n,), "h": (p,), "f_jacobian": (n, n), "h_jacobian": (p, n)}
+    if names == RESIDUALS:
+        return {"residuals": np.zeros((count, n + p)), "y": np.zeros((count, p))}
+    results = {name: np.zeros((count, *shapes[name])) for name in names}
+    if names == NAMES:
+        # One state alone: both Jacobians are parts of one array.
+        joint = results["joint"] = np.zeros((n + p, n))
+        results["f_jacobian"], results["h_jacobian"] = joint[None, :n], joint[None, n:]
+        results["f"], results["h"] = results["f"][0], results["h"][0]
+    return results
+
+
+def interpreted(
+    model: CasadiModel, timed: bool, count: int, names: tuple[str, ...]
+) -> Buffers:
+    """Evaluation by CasADi's virtual machine, mapped over the states."""
+    if names == RESIDUALS:
+        return _interpreted_residuals(model, timed, count)
+    ca = import_casadi()
+    kind = ca.SX if model.f.is_a("SXFunction") and model.h.is_a("SXFunction") else ca.MX
+    x, given = kind.sym("x", model.n), kind.sym("u", model.m + 1)
+    u, dt = given[: model.m], given[model.m]
+    following, output = model.step()(x, u, dt), model.h(x, u)
+    # Transposed: CasADi stores by columns, NumPy by rows.
+    columns = {
+        "f": lambda: following,
+        "h": lambda: output,
+        "f_jacobian": lambda: ca.densify(ca.jacobian(following, x).T),
+        "h_jacobian": lambda: ca.densify(ca.jacobian(output, x).T),
+    }
+    functions = {
+        name: ca.Function("model", [x, given], [columns[name]()]) for name in names
+    }
+    function = ca.Function("model", [x, given], [columns[name]() for name in names])
+    fallible = may_fail(function)
+    if count > 1:
+        function = function.map(count)
+    states, inputs = np.zeros((count, model.n)), np.zeros((count, model.m + timed))
+    results = results_of(model, count, names)
+    all_inputs = inputs if timed else np.full((count, model.m + 1), model.dt or 0.0)
+    run = fixed_call(function, (states, all_inputs), [results[name] for name in names], fallible)
+    again: list[Callable[[], None]] = []
+
+    def evaluate() -> None:
+        if not timed:
+            all_inputs[:, : model.m] = inputs
+        if not run():
+            if not again:
+                again.append(separate_calls(functions, states, all_inputs, results))
+            again[0]()
+
+    return states, inputs, results, evaluate
+
+
+def _interpreted_residuals(model: CasadiModel, timed: bool, count: int) -> Buffers:
+    states, inputs, values, evaluate_values = interpreted(model, timed, count, VALUES)
+    results = results_of(model, count, RESIDUALS)
+    trajectory, residuals, n = np.zeros((count + 1, model.n)), results["residuals"], model.n
+
+    def evaluate() -> None:
+        states[...] = trajectory[:-1]
+        evaluate_values()
+        np.subtract(trajectory[1:], values["f"], out=residuals[:, :n])
+        np.subtract(results["y"], values["h"], out=residuals[:, n:])
+
+    return trajectory, inputs, results, evaluate
