@@ -46,7 +46,10 @@ def estimate(
     initial_state: Annotated[
         str | None, typer.Option(help="Numbers between commas; default is the model's.")
     ] = None,
-    engine: Annotated[str | None, typer.Option(help="python or compiled.")] = None,
+    engine: Annotated[
+        str | None,
+        typer.Option(help="python, compiled, or auto: compiled where qpmhe compile made it."),
+    ] = None,
     covariances: Annotated[
         Literal["none", "std", "full"],
         typer.Option(help="Standard deviations or covariances of the estimates."),
@@ -151,6 +154,8 @@ def _print(console: Console, summary: Any, out: str) -> None:
     if summary.before:
         words[0] += f" after {summary.before} before"
     words.append(f"{summary.improved} improved on the observer")
+    if summary.engine != "python":
+        words.append(f"engine {summary.engine}")
     for number, text in (
         (summary.incomplete, "with missing outputs"),
         (summary.inserted, "inserted into gaps"),
