@@ -9,7 +9,7 @@ from .adapters.control import from_control
 from .adapters.jax import from_jax
 from .adapters.sympy import from_sympy
 from .batch import BatchEstimator
-from .codegen.ahead import Compiled, compile  # noqa: A004
+from .codegen import Compiled, compile  # noqa: A004
 from .codegen.compiler import check_any_cached
 from .codegen.source import MAIN
 from .costs import (

@@ -16,6 +16,7 @@ from ..codegen.comparison import Batch, Buffers, Interpreter, model_fault, point
 from ..codegen.compiler import WrongCodeError, compiled_library, find_compiler
 from ..codegen.evaluation import fixed_call, may_fail, separate_calls
 from ..codegen.expressions import CasadiModel, casadi_model, import_casadi
+from ..codegen.fingerprint import source_key
 from ..codegen.source import model_files
 from ..errors import CompilationError, EngineWarning, OptionError
 from ..model.augmentation import Augmentation
@@ -209,7 +210,9 @@ def _library(
         return model_fault(interpreter, partial(_compiled, model, quick), batches)
 
     try:
-        library = compiled_library(model_files(model), "model.c", check=fault)
+        library = compiled_library(
+            partial(model_files, model), "model.c", source_key(model), fault
+        )
     except CompilationError as error:
         if required:
             raise

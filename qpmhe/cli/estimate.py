@@ -105,7 +105,7 @@ def estimate(
             "--max-solver-iterations", max_solver_iterations, "none"
         )
     if initial_state is not None:
-        options["initial_state"] = _vector(initial_state)
+        options["initial_state"] = read_state(initial_state)
     run(Console(stderr=True), **options)
 
 
@@ -179,7 +179,8 @@ def _number(option: str, text: str, word: str) -> int | None:
         raise OptionError(f"{option} is {text!r}; expected an integer, or {word!r}.") from None
 
 
-def _vector(text: str) -> NDArray[np.float64]:
+def read_state(text: str) -> NDArray[np.float64]:
+    """The numbers of --initial-state."""
     try:
         return np.array([float(item) for item in text.split(",")])
     except ValueError:

@@ -107,12 +107,14 @@ def compile(  # noqa: A001 - the name that users look for
 def engine_choice(
     system: System, observer: Observer, cost: Cost, settings: Settings
 ) -> tuple[str, str]:
-    """The engine that ``engine="auto"`` takes for an estimator now, and why."""
+    """The engine that an estimator with these arguments runs now, and why."""
     from .library import EstimatorLibrary, uncovered
 
+    if settings.engine == "python":
+        return "python", "it asks for engine='python'."
     if settings.needs_python:
         return "python", "it names a QP solver, which only the Python step uses."
-    if python_only():
+    if settings.engine == "auto" and python_only():
         return "python", "the environment variable QPMHE_ENGINE asks for it."
     try:
         reason = uncovered(system, observer, cost, settings)
@@ -121,6 +123,10 @@ def engine_choice(
         if find_compiler() is None:
             return "python", "there is no C compiler (cc, gcc or clang); install one, or set CC."
         found = EstimatorLibrary(system, observer, cost, replace(settings, engine="auto"))
+    except NotCachedError as error:
+        if settings.engine == "compiled":
+            return "compiled", "it asks for engine='compiled', and waits for the compiler."
+        return "python", str(error)
     except QpmheError as error:
         return "python", str(error)
     return "compiled", f"its library is in the cache: {found.path.name}."

@@ -27,6 +27,8 @@ _LEVELS = (("-O3", "-march=native"), ("-O2", "-fno-tree-vectorize"), ("-O0",))
 # Folders of compilations in progress, in the cache; and the seconds after which none is.
 _SCRATCH = "qpmhe-making-"
 _STALE = 86400.0
+# Seconds after which a compiler is taken to hang.
+_PATIENCE = 600.0
 # Libraries that this process has checked: path and content.
 _checked: set[tuple[str, str]] = set()
 
@@ -88,7 +90,7 @@ def compiled_library(
         files = files() if callable(files) else files
         key = "".join(f"{name}\0{files[name]}\0" for name in sorted(files))
     digest = _digest(compiler, main, key)
-    for folder in _readable_folders():
+    for folder in cache_folders():
         if not os.access(folder, os.W_OK):
             ready = _loaded(folder, digest, check)
             if ready is not None:
@@ -134,7 +136,7 @@ def cached_library(
     if compiler is None:
         return None
     digest = _digest(compiler, main, key)
-    for folder in _readable_folders():
+    for folder in cache_folders():
         found = _loaded(folder, digest, check)
         if found is not None:
             return found
@@ -143,8 +145,13 @@ def cached_library(
 
 def cached_files(main: str) -> Iterator[Path]:
     """All libraries in the cache that were compiled from a file of this name."""
-    for folder in _readable_folders():
+    for folder in cache_folders():
         yield from folder.glob(f"{Path(main).stem}-*.so")
+
+
+def optimisation(library: Path) -> str:
+    """The compiler's flags that a library of the cache was found right with."""
+    return " ".join(_LEVELS[int(library.stem.rpartition("-")[2])])
 
 
 def check_any_cached(main: str) -> None:
@@ -272,7 +279,7 @@ def _folders() -> tuple[Path, Path]:
     return cache_directory(), Path(tempfile.gettempdir(), f"qpmhe-{_user()}")
 
 
-def _readable_folders() -> list[Path]:
+def cache_folders() -> list[Path]:
     """Those that exist and nobody else fills: code is run from there."""
     found = []
     for folder in _folders():
@@ -303,9 +310,14 @@ def _run(compiler: list[str], level: int, source: Path, target: Path) -> str:
     command = [*compiler, *_FLAGS, *_LEVELS[level], "-o", str(target), str(source), "-lm"]
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=600, check=False
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace",
+            timeout=_PATIENCE, check=False,
         )
-    except (OSError, subprocess.TimeoutExpired) as error:
+    except subprocess.TimeoutExpired as error:
+        raise CompilationError(
+            f"{' '.join(compiler)} did not end within {_PATIENCE:g} s; set CC to another compiler."
+        ) from error
+    except OSError as error:
         return str(error)
     if done.returncode == 0:
         return ""

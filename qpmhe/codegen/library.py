@@ -227,9 +227,6 @@ class EstimatorLibrary:
                     if key is None
                     else "its library is not in the cache; qpmhe.compile makes it."
                 )
-        elif key is None:
-            files, text = estimator_files(model, layout, record)
-            found = compiled_library(files, MAIN, text, fault)
         else:
             found = compiled_library(
                 lambda: estimator_files(model, layout, record)[0], MAIN, key, fault
