@@ -113,7 +113,7 @@ def _machine() -> Table:
 
 def _blas() -> str:
     try:
-        found = np.show_config(mode="dicts")["Build Dependencies"]["blas"]  # type: ignore[index]
+        found = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
         return f"{found['name']} {found['version']}"
     except (KeyError, TypeError):
         return "unknown"

@@ -14,7 +14,7 @@ from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.settings import Settings
 from ..model.system import System
 from ..observers import Observer
-from .compiler import NotCachedError, find_compiler
+from .compiler import NotCachedError, required_compiler
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,7 @@ def engine_choice(
         reason = uncovered(system, observer, cost, settings)
         if reason:
             return "python", reason
-        if find_compiler() is None:
-            return "python", "there is no C compiler (cc, gcc or clang); install one, or set CC."
+        required_compiler()
         found = EstimatorLibrary(system, observer, cost, replace(settings, engine="auto"))
     except NotCachedError as error:
         if settings.engine == "compiled":

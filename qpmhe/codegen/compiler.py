@@ -85,7 +85,7 @@ def compiled_library(
     only to compile. Compilers make mistakes. What `check` finds wrong is compiled again with less
     optimisation, and the cache remembers the level.
     """
-    compiler = _required_compiler()
+    compiler = required_compiler()
     if key is None:
         files = files() if callable(files) else files
         key = "".join(f"{name}\0{files[name]}\0" for name in sorted(files))
@@ -155,12 +155,14 @@ def optimisation(library: Path) -> str:
 
 
 def check_any_cached(main: str) -> None:
-    """Raise `NotCachedError` where no library can be there: before anything is imported."""
-    if find_compiler() is None or next(cached_files(main), None) is None:
-        raise NotCachedError("the cache has no library of an estimator.")
+    """Raise where no library can be there, before anything is imported or traced."""
+    required_compiler()
+    if next(cached_files(main), None) is None:
+        raise NotCachedError("its library is not in the cache; qpmhe.compile makes it.")
 
 
-def _required_compiler() -> list[str]:
+def required_compiler() -> list[str]:
+    """The C compiler's command; raises `CompilationError` without any."""
     compiler = find_compiler()
     if compiler is None:
         raise CompilationError(

@@ -147,9 +147,9 @@ def engine_of_snapshot(
         return _ENGINES[name](*parts, settings, initial_state)
     except (QpmheError, OSError) as error:
         raise InvalidInputError(
-            f"the state is of an estimator with engine={name!r}, which is not ready here ({error}) "
-            f"Call qpmhe.compile with the estimator's arguments first, or make the estimator with "
-            f"engine={name!r}, which waits for the compiler."
+            f"the state is of an estimator with engine={name!r}, which is not ready here: "
+            f"{str(error).rstrip('.')}. Call qpmhe.compile with this estimator before, or make it "
+            f"with engine={name!r}."
         ) from error
 
 
