@@ -130,7 +130,7 @@ def estimators(system: qpmhe.System, deadline: float) -> dict[str, qpmhe.MovingH
     ) -> qpmhe.MovingHorizonEstimator:
         return qpmhe.MovingHorizonEstimator(
             system, observer, cost, horizon=HORIZON, initial_state=GUESS, max_qps=max_qps,
-            time_budget=budget,
+            time_budget=budget, engine="python",
         )
 
     return {

@@ -120,6 +120,7 @@ def with_qpmhe(record: Record, max_qps: int | None) -> Result:
     mhe = qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger(np.vstack([gain, np.zeros((1, 3))])), cost, horizon=HORIZON,
         initial_state=np.append(np.zeros(8), GUESS), max_qps=max_qps, candidate="reinitialized",
+        engine="python",
     )
     # y(0) does not exist in do-mpc's loop; u(T) acts after the end.
     measurements = np.vstack([np.full(3, np.nan), record.measurements])

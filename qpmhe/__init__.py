@@ -9,6 +9,9 @@ from .adapters.control import from_control
 from .adapters.jax import from_jax
 from .adapters.sympy import from_sympy
 from .batch import BatchEstimator
+from .codegen import Compiled, compile  # noqa: A004
+from .codegen.compiler import check_any_cached
+from .codegen.source import MAIN
 from .costs import (
     Cost,
     CostConstants,
@@ -25,6 +28,7 @@ from .estimation.engines import Engine, register_engine
 from .estimation.estimate import DroppedRow, Estimate, Status
 from .estimation.estimator import MovingHorizonEstimator
 from .estimation.run import Run
+from .estimation.settings import Settings
 from .model.constraints import Constraint
 from .model.noisy_inputs import noisy_inputs
 from .model.parameters import augment_parameters
@@ -44,10 +48,14 @@ from .observers import (
 )
 
 
-def _compiled_engine(*parts: Any) -> Engine:
+def _compiled_engine(
+    system: System, observer: Observer, cost: Cost, settings: Settings, initial_state: Any
+) -> Engine:
+    if settings.engine == "auto":
+        check_any_cached(MAIN)
     from .codegen.engine import CompiledEngine  # late: most programs do without
 
-    return CompiledEngine(*parts)
+    return CompiledEngine(system, observer, cost, settings, initial_state)
 
 
 register_engine("compiled", _compiled_engine)
@@ -56,6 +64,7 @@ register_engine("compiled", _compiled_engine)
 __all__ = [
     "BatchEstimator",
     "Box",
+    "Compiled",
     "Constraint",
     "ConvexSet",
     "Cost",
@@ -90,6 +99,7 @@ __all__ = [
     "augment_parameters",
     "batch",
     "codegen",
+    "compile",
     "design_luenberger",
     "errors",
     "from_casadi",

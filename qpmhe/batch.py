@@ -35,8 +35,8 @@ class BatchEstimator:
     """K independent estimators of one system, for Monte Carlo studies and fleets.
 
     Each member estimates as a `qpmhe.MovingHorizonEstimator` with the same arguments does, and
-    falls back by itself. With ``engine="compiled"`` threads share the members; otherwise the
-    members take turns.
+    falls back by itself. Threads share the members of the compiled step; otherwise the members
+    take turns. ``engine="auto"`` chooses as for a single estimator.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class BatchEstimator:
     initial_states : (n,) or (K, n) array_like
         Initial estimate of all members, or of each.
     threads : int, optional
-        Number of threads with ``engine="compiled"``; one for each processor if left out.
+        Number of threads of the compiled step; one for each processor if left out.
     **options
         Of `qpmhe.MovingHorizonEstimator`, such as the horizon; each member has the whole time
         budget.
@@ -65,8 +65,8 @@ class BatchEstimator:
     >>> batch = qpmhe.BatchEstimator(
     ...     system, observer, cost, members=3, horizon=10, initial_states=[3.0, 0.0])
     >>> run = batch.run(Y)
-    >>> run.states.shape, batch.mode
-    ((3, 151, 2), 'looped')
+    >>> run.states.shape
+    (3, 151, 2)
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class BatchEstimator:
             one = MovingHorizonEstimator(
                 system, observer, cost, initial_state=states[0], **options
             )
-            # Where C could not be compiled, the single estimator has warned.
+            # The one engine of all members. Where C could not be compiled, `one` has warned.
             self.settings = replace(one.settings, engine=one.engine)
             self._initial_states = states
             self._engine = self._made(states)
@@ -127,6 +127,11 @@ class BatchEstimator:
 
             return CompiledMembers(*parts, states, self._threads)
         return _Looped(*parts, states)
+
+    @property
+    def engine(self) -> str:
+        """What runs the steps: ``python`` or ``compiled``, also where ``engine="auto"`` chose."""
+        return self.settings.engine
 
     @property
     def mode(self) -> str:
@@ -201,7 +206,9 @@ class BatchEstimator:
     def _step(self, y: Array, u: Array) -> BatchEstimate:
         if isinstance(self._engine, _Looped):
             return self._engine.step(y, u)
-        return BatchEstimate(**self._engine.step(y, u), delay=self.settings.delay)
+        return BatchEstimate(
+            **self._engine.step(y, u), delay=self.settings.delay, engine=self.engine
+        )
 
     def run(self, Y: ArrayLike, U: ArrayLike | None = None) -> BatchRun:
         """Take whole records, starting at the present states.
@@ -229,7 +236,7 @@ class BatchEstimator:
         shape, n = ys.shape[:2], self.system.n
         us = _inputs(U, (*shape, self.system.m), "run(Y, U)")
         if not isinstance(self._engine, _Looped):
-            return BatchRun(**self._engine.run(ys, us))
+            return BatchRun(**self._engine.run(ys, us), engine=self.engine)
         found = BatchRun(
             states=np.empty((shape[0], shape[1] + 1, n)), filtered=np.empty((*shape, n)),
             delayed=np.full((*shape, n), np.nan), costs=np.empty(shape),
@@ -345,6 +352,8 @@ class BatchEstimate:
         Estimates of x(t).
     delayed : (K, n) array or None
         Estimates of x(t+1-k) for the estimator's delay k.
+    engine : str
+        What ran the step: ``python`` or ``compiled``.
     """
 
     time: int
@@ -356,6 +365,7 @@ class BatchEstimate:
     qps: Index
     filtered: Array
     delay: InitVar[int] = 0
+    engine: str = "python"
 
     def __post_init__(self, delay: int) -> None:
         newest = self.trajectories.shape[1] - 1
@@ -400,6 +410,8 @@ class BatchRun:
         True cost J of estimates and candidates.
     statuses, qps : (K, T) int array
         Values of the statuses (``Status(value)`` makes a flag), and QPs solved.
+    engine : str
+        What ran the steps: ``python`` or ``compiled``.
     """
 
     states: Array
@@ -409,6 +421,7 @@ class BatchRun:
     candidate_costs: Array
     statuses: Flags
     qps: Index
+    engine: str = "python"
 
     def __len__(self) -> int:
         return int(self.costs.shape[1])

@@ -7,6 +7,7 @@ names of the cases only, so that the processes of pytest-xdist agree on it.
 """
 
 import hashlib
+import os
 from collections import defaultdict
 
 import hypothesis
@@ -39,6 +40,9 @@ def pytest_configure(config):
     examples = MANY if config.option.all else FEW
     hypothesis.settings.register_profile("here", max_examples=examples)
     hypothesis.settings.load_profile("here")
+    # No test depends on what the user's cache holds, or on what other tests have compiled.
+    os.environ.setdefault("QPMHE_CACHE_DIR", str(config.cache.mkdir("libraries")))
+    os.environ["QPMHE_ENGINE"] = "python"
 
 
 def named(config, item):

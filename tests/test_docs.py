@@ -67,6 +67,9 @@ def registered_backends():
 @pytest.mark.parametrize("page", PAGES)
 def test_page_runs(page, tmp_path, monkeypatch, registered_backends):
     monkeypatch.chdir(tmp_path)
+    if page == "how-to/speed.md":  # it starts with an empty cache
+        monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "cache"))
+        monkeypatch.delenv("QPMHE_ENGINE")
     blocks = fences(page)
     # A module, so that functions of a page can be pickled as those of a script can.
     module = types.ModuleType("page_" + re.sub(r"\W", "_", page))

@@ -272,5 +272,5 @@ def estimator(
         weight = np.asarray(np.linalg.inv(prior), np.float64)
     return qpmhe.MovingHorizonEstimator(
         system_of(cell, dt), observer, cost_of(cell, dt, weight), horizon=round(HORIZON / dt),
-        initial_state=start, max_qps=max_qps,
+        initial_state=start, max_qps=max_qps, engine="python",
     )

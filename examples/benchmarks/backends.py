@@ -116,7 +116,7 @@ def recorded(name: str, example: Any, horizon: int, width: float, samples: int) 
     qpmhe.solvers.register(Backend(name, make, "recorder"))
     mhe = qpmhe.MovingHorizonEstimator(
         system, example.observer, example.cost, horizon=horizon, max_qps=2,
-        initial_state=scenario.initial_estimate, backend=name,
+        initial_state=scenario.initial_estimate, backend=name, engine="python",
     )
     record = scenario.simulate(0, horizon + samples)
     for t, y in enumerate(record.measurements):

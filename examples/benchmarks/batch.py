@@ -43,7 +43,7 @@ def main() -> None:
     ])
     shared = {"members": arguments.members, "horizon": HORIZON, "initial_states": START}
     single = qpmhe.MovingHorizonEstimator(
-        plain, observer, cost, horizon=HORIZON, initial_state=START
+        plain, observer, cost, horizon=HORIZON, initial_state=START, engine="python"
     )
     batches = {}
     if find_compiler() is not None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..codegen.comparison import Batch, Interpreter, model_fault, points
 from ..codegen.compiler import WrongCodeError, compiled_library, find_compiler
+from ..codegen.fingerprint import source_key
 from ..codegen.source import model_files
 from ..errors import CompilationError, EngineWarning, OptionError
 from ..model.augmentation import Augmentation
@@ -138,7 +139,9 @@ def _library(
         return model_fault(interpreter, partial(_compiled, model, quick), batches)
 
     try:
-        library = compiled_library(model_files(model), "model.c", check=fault)
+        library = compiled_library(
+            partial(model_files, model), "model.c", source_key(model), fault
+        )
     except CompilationError as error:
         if required:
             raise

@@ -204,7 +204,7 @@ def certify_model(
     if certificate is not None:
         report.estimator = MovingHorizonEstimator(
             system, observer, cost, horizon=horizons[-1],
-            initial_state=scenario.initial_estimate, max_qps=_QPS,
+            initial_state=scenario.initial_estimate, max_qps=_QPS, engine="python",
         )
         report.run, report.summary = monitored_run(
             certificate, report.estimator, record.measurements, record.inputs

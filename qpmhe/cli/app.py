@@ -16,6 +16,8 @@ from qpmhe_solvers import backends
 from .._version import __version__
 from ..errors import QpmheError
 from .compare import compare, study
+from .compile import compile  # noqa: A004
+from .doctor import doctor
 from .estimate import estimate
 from .report import export, report
 from .reproduce import reproduce
@@ -58,7 +60,7 @@ def _common(
     """Suboptimal moving horizon estimation by sequences of convex QPs."""
 
 
-for command in (estimate, reproduce, compare, study, report, export):
+for command in (estimate, reproduce, compare, study, report, export, compile, doctor):
     app.command()(command)
 app.command("export-qps")(export_qps)
 

@@ -46,7 +46,10 @@ def estimate(
     initial_state: Annotated[
         str | None, typer.Option(help="Numbers between commas; default is the model's.")
     ] = None,
-    engine: Annotated[str | None, typer.Option(help="python or compiled.")] = None,
+    engine: Annotated[
+        str | None,
+        typer.Option(help="python, compiled, or auto: compiled where qpmhe compile made it."),
+    ] = None,
     covariances: Annotated[
         Literal["none", "std", "full"],
         typer.Option(help="Standard deviations or covariances of the estimates."),
@@ -102,7 +105,7 @@ def estimate(
             "--max-solver-iterations", max_solver_iterations, "none"
         )
     if initial_state is not None:
-        options["initial_state"] = _vector(initial_state)
+        options["initial_state"] = read_state(initial_state)
     run(Console(stderr=True), **options)
 
 
@@ -151,6 +154,8 @@ def _print(console: Console, summary: Any, out: str) -> None:
     if summary.before:
         words[0] += f" after {summary.before} before"
     words.append(f"{summary.improved} improved on the observer")
+    if summary.engine != "python":
+        words.append(f"engine {summary.engine}")
     for number, text in (
         (summary.incomplete, "with missing outputs"),
         (summary.inserted, "inserted into gaps"),
@@ -174,7 +179,8 @@ def _number(option: str, text: str, word: str) -> int | None:
         raise OptionError(f"{option} is {text!r}; expected an integer, or {word!r}.") from None
 
 
-def _vector(text: str) -> NDArray[np.float64]:
+def read_state(text: str) -> NDArray[np.float64]:
+    """The numbers of --initial-state."""
     try:
         return np.array([float(item) for item in text.split(",")])
     except ValueError:

@@ -122,7 +122,9 @@ def _table(
     best = {
         one.name: _best(rows.loc[case.whole.index], one.name, one.less) for one in columns
     }
-    drawn, caption = rows, "*: the best, of equals the fastest. front: Pareto front."
+    drawn, caption = rows, (
+        "*: the best, of equals the fastest. front: Pareto front. Times are of the Python step."
+    )
     if len(rows) > _MOST_ROWS:
         drawn = rows.loc[sorted(_selection(case) | {one for one in best.values() if one >= 0})]
         caption = (

@@ -50,7 +50,7 @@ def _paper_table(found: Reproduction) -> Table:
         f"N = {scenario.horizon}, QPs by {found.backend}",
         title_justify="left",
         caption=f"RMSE of the state, over all times and from t = {SETTLED:g} {scenario.time_unit} "
-        "on. Kept: the observer's candidate was the estimate.",
+        "on. Kept: the observer's candidate was the estimate. All runs are of the Python step.",
         caption_justify="left",
     )
     table.add_column("QPs per sample", no_wrap=True)

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 
 from .._checks import flag
 from ..errors import InvalidInputError, OptionError
+from .ahead import Compiled, compile, engine_choice  # noqa: A004
 
 if TYPE_CHECKING:
     from ..estimation.estimator import MovingHorizonEstimator
 
-__all__ = ["write"]
+__all__ = ["Compiled", "compile", "engine_choice", "write"]
 
 # Headers that a compiler, or its own headers, would find in the place of a system's.
 _SYSTEM_HEADERS = frozenset((

@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 
@@ -28,12 +28,18 @@ _LEVELS = (("-O3", "-march=native"), ("-O2", "-fno-tree-vectorize"), ("-O0",))
 _SCRATCH = "qpmhe-making-"
 _STALE = 86400.0
 NO_COMPILER = "there is no C compiler (cc, gcc or clang); install one, or set CC to its path."
+# Seconds after which a compiler is taken to hang.
+_PATIENCE = 600.0
 # Libraries that this process has checked: path and content.
 _checked: set[tuple[str, str]] = set()
 
 
 class WrongCodeError(CompilationError):
     """The compiler makes wrong code of the source, however little it optimises."""
+
+
+class NotCachedError(CompilationError):
+    """The library is not in the cache, and nobody asked to wait for a compiler."""
 
 
 def find_compiler() -> list[str] | None:
@@ -71,24 +77,25 @@ def _processor() -> str:
 
 
 def compiled_library(
-    files: dict[str, str], main: str, key: str | None = None,
+    files: dict[str, str] | Callable[[], dict[str, str]], main: str, key: str | None = None,
     check: Callable[[ctypes.CDLL], str] | None = None,
 ) -> ctypes.CDLL:
     """Compile C source and load it; a library made before is loaded from the cache.
 
-    Compilers make mistakes. What `check` finds wrong is compiled again with less
+    With a key, which must differ where the source does, `files` may be a function that is called
+    only to compile. Compilers make mistakes. What `check` finds wrong is compiled again with less
     optimisation, and the cache remembers the level.
     """
-    compiler = find_compiler()
-    if compiler is None:
-        raise CompilationError(NO_COMPILER)
-    stamp = os.stat(compiler[0])
-    parts = (
-        *compiler, str(stamp.st_size), str(stamp.st_mtime_ns), *_FLAGS, repr(_LEVELS),
-        _processor(),
-        key if key is not None else "".join(f"{name}\0{files[name]}\0" for name in sorted(files)),
-    )
-    digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+    compiler = required_compiler()
+    if key is None:
+        files = files() if callable(files) else files
+        key = "".join(f"{name}\0{files[name]}\0" for name in sorted(files))
+    digest = _digest(compiler, main, key)
+    for folder in cache_folders():
+        if not os.access(folder, os.W_OK):
+            ready = _loaded(folder, digest, check)
+            if ready is not None:
+                return ready
     folder = _usable_folder()
     note = folder / f"{digest}.level"
     first, fault = _remembered(note)
@@ -96,6 +103,7 @@ def compiled_library(
     for level in range(first, len(_LEVELS)):
         path, seal = folder / f"{digest}-{level}.so", folder / f"{digest}-{level}.sha256"
         if not _intact(path, seal):
+            files = files() if callable(files) else files
             try:
                 message = _make(compiler, files, main, level, path, seal)
             except OSError as error:  # no output, no space left
@@ -123,12 +131,79 @@ def compiled_library(
 
 def shared_library(sources: list[Path], target: Path) -> None:
     """Compile C sources to a shared library for any machine of this kind, beside the cache."""
-    compiler = find_compiler()
-    if compiler is None:
-        raise CompilationError(NO_COMPILER)
+    compiler = required_compiler()
     message = _run([*compiler, "-O2", "-fvisibility=hidden"], (), sources, target)
     if message:
         raise CompilationError(f"{' '.join(compiler)} failed: {message}")
+
+
+def cached_library(
+    main: str, key: str, check: Callable[[ctypes.CDLL], str] | None = None
+) -> ctypes.CDLL | None:
+    """What `compiled_library` has made of the source with this key; None if it would compile."""
+    compiler = find_compiler()
+    if compiler is None:
+        return None
+    digest = _digest(compiler, main, key)
+    for folder in cache_folders():
+        found = _loaded(folder, digest, check)
+        if found is not None:
+            return found
+    return None
+
+
+def cached_files(main: str) -> Iterator[Path]:
+    """All libraries in the cache that were compiled from a file of this name."""
+    for folder in cache_folders():
+        yield from folder.glob(f"{Path(main).stem}-*.so")
+
+
+def optimisation(library: Path) -> str:
+    """The compiler's flags that a library of the cache was found right with."""
+    return " ".join(_LEVELS[int(library.stem.rpartition("-")[2])])
+
+
+def check_any_cached(main: str) -> None:
+    """Raise where no library can be there, before anything is imported or traced."""
+    required_compiler()
+    if next(cached_files(main), None) is None:
+        raise NotCachedError("its library is not in the cache; qpmhe.compile makes it.")
+
+
+def required_compiler() -> list[str]:
+    """The C compiler's command; raises `CompilationError` without any."""
+    compiler = find_compiler()
+    if compiler is None:
+        raise CompilationError(NO_COMPILER)
+    return compiler
+
+
+def _digest(compiler: list[str], main: str, key: str) -> str:
+    """Name of the library of a source in the cache."""
+    stamp = os.stat(compiler[0])
+    parts = (
+        *compiler, str(stamp.st_size), str(stamp.st_mtime_ns), *_FLAGS, repr(_LEVELS),
+        _processor(), key,
+    )
+    digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+    return f"{Path(main).stem}-{digest}"
+
+
+def _loaded(
+    folder: Path, digest: str, check: Callable[[ctypes.CDLL], str] | None
+) -> ctypes.CDLL | None:
+    """A library of a folder, at the level that it was found right at."""
+    first, _ = _remembered(folder / f"{digest}.level")
+    for level in range(first, len(_LEVELS)):
+        path, seal = folder / f"{digest}-{level}.so", folder / f"{digest}-{level}.sha256"
+        if not _intact(path, seal):
+            continue
+        try:
+            library = ctypes.CDLL(str(path))
+        except OSError:  # of another machine
+            return None
+        return None if _fault(library, seal, check) else library
+    return None
 
 
 def _fault(
@@ -204,9 +279,30 @@ def _intact(library: Path, seal: Path) -> bool:
         return False
 
 
+def _user() -> int | None:
+    return os.getuid() if hasattr(os, "getuid") else None
+
+
+def _folders() -> tuple[Path, Path]:
+    """The cache, and what takes its place where it cannot be written."""
+    return cache_directory(), Path(tempfile.gettempdir(), f"qpmhe-{_user()}")
+
+
+def cache_folders() -> list[Path]:
+    """Those that exist and nobody else fills: code is run from there."""
+    found = []
+    for folder in _folders():
+        try:
+            if _user() in (None, folder.stat().st_uid) and os.access(folder, os.R_OK | os.X_OK):
+                found.append(folder)
+        except OSError:
+            continue
+    return found
+
+
 def _usable_folder() -> Path:
-    user = os.getuid() if hasattr(os, "getuid") else None
-    for folder in (cache_directory(), Path(tempfile.gettempdir(), f"qpmhe-{user}")):
+    user = _user()
+    for folder in _folders():
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         except OSError:
@@ -225,9 +321,14 @@ def _run(
     command = [*compiler, *_FLAGS, *options, "-o", str(target), *map(str, sources), "-lm"]
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=600, check=False
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace",
+            timeout=_PATIENCE, check=False,
         )
-    except (OSError, subprocess.TimeoutExpired) as error:
+    except subprocess.TimeoutExpired as error:
+        raise CompilationError(
+            f"{' '.join(compiler)} did not end within {_PATIENCE:g} s; set CC to another compiler."
+        ) from error
+    except OSError as error:
         return str(error)
     if done.returncode == 0:
         return ""

@@ -199,7 +199,7 @@ class CompiledEngine:
             candidate_costs=log.candidate_costs, times=times,
             solve_times=np.full(samples, np.nan), qps=log.qps.astype(np.intp),
             solver_iterations=log.iterations.astype(np.intp), delayed=log.delayed,
-            flags=log.flags,
+            flags=log.flags, engine=self.name,
         )
 
     def covariances(self) -> Array:
@@ -243,7 +243,7 @@ class CompiledEngine:
         memory = self._memory.view(np.uint8).copy()  # as bytes: padding is copied, too
         memory.view(self._memory.dtype)["settings"] = 0  # an address means nothing elsewhere
         return {
-            "problem": self._size(), "engine": "compiled", "estimator": self._description(),
+            "problem": self._size(), "engine": self.name, "estimator": self._description(),
             "linearized": self._settings.qp_limit > 0, "memory": memory,
         }
 
@@ -259,7 +259,8 @@ class CompiledEngine:
         check_problem(state, self._size())
         if str(state.get("engine")) != "compiled":
             raise InvalidInputError(
-                "the state is of an estimator with another engine; expected 'compiled'."
+                f"the state is of an estimator with engine={state.get('engine')!r}; expected "
+                "'compiled', as of this one: make this one with the engine of the state."
             )
         with reading():
             check_description(state["estimator"], self._description())

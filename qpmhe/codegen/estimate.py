@@ -39,6 +39,8 @@ class CompiledEstimate(Estimate):
 
     __slots__ = ("_block", "_delay", "_numbers", "_sizes")
 
+    engine = "compiled"
+
     def __init__(
         self, block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int], delay: int,
         dropped: tuple[DroppedRow, ...] = (),

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import ctypes
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 from .._linalg import inverse
 from ..costs import Cost, RobustCost
@@ -19,9 +19,10 @@ from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
 from .comparison import Interpreter, estimator_fault
-from .compiler import compiled_library
+from .compiler import NotCachedError, cached_library, compiled_library
+from .fingerprint import source_key
 from .layout import SET_NAMES, TERMS, Layout, settings_record
-from .source import CONTINUOUS, estimator_files
+from .source import CONTINUOUS, MAIN, estimator_files
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
 _MOST_BYTES = 2**31 - 1
@@ -134,6 +135,8 @@ def _is_flat(one: ConvexSet, covariance: NDArray[np.float64]) -> bool:
     matrix, low, high = matrix / norms[:, None], low / norms, high / norms
     above, below = np.isfinite(high), np.isfinite(low)
     rows, limits = np.vstack((matrix[above], -matrix[below])), np.append(high[above], -low[below])
+    from scipy.optimize import linprog  # late: it takes long to import
+
     found = linprog(
         np.append(np.zeros(one.dimension), -1.0), np.column_stack((rows, np.ones(limits.size))),
         limits, bounds=[(None, None)] * one.dimension + [(0.0, 1.0)],
@@ -157,15 +160,23 @@ def generated(
     real: str = "double",
 ) -> tuple[dict[str, str], str, Layout, NDArray[Any]]:
     """Source of an estimator, its structure, its layout and its settings."""
+    layout, record = planned(system, observer, cost, settings, real)
+    assert system.symbolic is not None
+    files, structure = estimator_files(system.symbolic, layout, record, name)
+    return files, structure, layout, record
+
+
+def planned(
+    system: System, observer: Observer, cost: Cost, settings: Settings, real: str = "double"
+) -> tuple[Layout, NDArray[Any]]:
+    """Layout and settings of an estimator's C code; raises if it has no C form."""
     reason = uncovered(system, observer, cost, settings)
     if reason:
         raise OptionError(f"no C code for this estimator: {reason}")
     model = system.symbolic
     assert model is not None
     layout = Layout.of(system, cost, settings.horizon, CONTINUOUS[model.method], real)
-    record = settings_record(layout, system, observer, cost, settings)
-    files, structure = estimator_files(model, layout, record, name)
-    return files, structure, layout, record
+    return layout, settings_record(layout, system, observer, cost, settings)
 
 
 class RunLog:
@@ -202,14 +213,14 @@ class EstimatorLibrary:
 
     ``settings``, the ``mhe_settings`` in use, must outlive all estimators that point to it.
     ``update``, ``update_members``, ``amend``, ``reset``, ``run`` and ``recompute`` are the C
-    functions of these names; `update` is ``mhe_update_undoable``.
+    functions of these names; `update` is ``mhe_update_undoable``. ``path`` is the library's. With
+    ``settings.engine="auto"`` it must be in the cache: `NotCachedError` is raised if it is not.
     """
 
     def __init__(
         self, system: System, observer: Observer, cost: Cost, settings: Settings
     ) -> None:
-        files, structure, layout, record = generated(system, observer, cost, settings)
-        self.layout, self.settings = layout, record
+        self.layout, self.settings = layout, record = planned(system, observer, cost, settings)
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
         assert system.symbolic is not None
@@ -222,7 +233,21 @@ class EstimatorLibrary:
             made[:] = made or [Interpreter(model)]
             return estimator_fault(made[0], self, cost)
 
-        self._bind(compiled_library(files, "mhe.c", structure, fault))
+        key = source_key(model, layout)
+        if settings.engine == "auto":
+            found = None if key is None else cached_library(MAIN, key, fault)
+            if found is None:
+                raise NotCachedError(
+                    "CasADi cannot serialize the model, by which the cache would know its library."
+                    if key is None
+                    else "its library is not in the cache; qpmhe.compile makes it."
+                )
+        else:
+            found = compiled_library(
+                lambda: estimator_files(model, layout, record)[0], MAIN, key, fault
+            )
+        self.path = Path(found._name)
+        self._bind(found)
 
     def _bind(self, library: ctypes.CDLL) -> None:
         # Single steps are shorter than handing the interpreter's lock over; runs are not.

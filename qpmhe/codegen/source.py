@@ -16,6 +16,8 @@ from ..errors import CompilationError
 from ..model.expressions import CasadiModel, import_casadi
 from .layout import Layout
 
+#: The file that holds a whole estimator.
+MAIN = "mhe.c"
 # Eight (n, n) arrays of them fit on any usual stack.
 _MOST_STATES = 256
 CONTINUOUS = {None: 0, "euler": 1, "rk4": 4}

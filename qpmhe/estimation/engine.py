@@ -403,6 +403,7 @@ class PythonEngine:
         modes, methods = self._system.call_modes()
         return {
             "problem": self._size(),
+            "engine": self.name,
             "estimator": self._description(),
             "linearized": self._with_terms,
             "usual": self._tools.usual.state_dict(),
@@ -427,8 +428,9 @@ class PythonEngine:
         check_problem(state, self._size())
         if str(state.get("engine", "python")) != "python":
             raise InvalidInputError(
-                f"the state is of an estimator with engine={state['engine']!r}, which does not "
-                "run here; install a C compiler, or snapshot with engine='python'."
+                f"the state is of an estimator with engine={state['engine']!r}, and this one "
+                "has the Python step; make it with that engine, which needs a C compiler, or "
+                "snapshot with engine='python'."
             )
         before = self._system.call_modes()
         try:

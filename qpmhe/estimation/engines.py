@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
-from ..errors import CompilationError, EngineWarning
+from ..errors import (
+    CompilationError,
+    EngineWarning,
+    InvalidInputError,
+    OptionError,
+    QpmheError,
+)
 from ..model.system import System
 from ..observers import Observer
 from .conditions import Conditions
@@ -82,7 +90,11 @@ _ENGINES: dict[str, Callable[[System, Observer, Cost, Settings, Array], Engine]]
 def register_engine(
     name: str, make: Callable[[System, Observer, Cost, Settings, Array], Engine]
 ) -> None:
-    """Let ``engine=name`` use this factory, which may raise `CompilationError`."""
+    """Let ``engine=name`` use this factory, which may raise `CompilationError`.
+
+    One named ``compiled`` also serves ``engine="auto"``. It must raise then rather than compile,
+    and wherever it lacks a feature.
+    """
     _ENGINES[name] = make
 
 
@@ -90,6 +102,8 @@ def engine_for(
     system: System, observer: Observer, cost: Cost, settings: Settings, initial_state: Array
 ) -> Engine:
     """The engine that the settings ask for, or the Python one where compilation fails."""
+    if settings.engine == "auto":
+        return _at_hand(system, observer, cost, settings, initial_state)
     try:
         return _ENGINES[settings.engine](system, observer, cost, settings, initial_state)
     except CompilationError as error:
@@ -99,3 +113,52 @@ def engine_for(
             stacklevel=4,
         )
     return PythonEngine(system, observer, cost, settings, initial_state)
+
+
+def _at_hand(
+    system: System, observer: Observer, cost: Cost, settings: Settings, initial_state: Array
+) -> Engine:
+    """The compiled engine where it is ready, else the Python one; no word, no wait."""
+    parts = system, observer, cost, settings, initial_state
+    make = _ENGINES.get("compiled")
+    if make is not None and not settings.needs_python and not python_only():
+        # Whatever is wrong with arguments, the Python engine reports.
+        with suppress(QpmheError, OSError, MemoryError):
+            return make(*parts)
+    return PythonEngine(*parts)
+
+
+def engine_of_snapshot(
+    name: str, system: System, observer: Observer, cost: Cost, settings: Settings,
+    initial_state: Array,
+) -> Engine:
+    """The engine that a snapshot was taken with, for an estimator whose engine is "auto"."""
+    parts = system, observer, cost
+    if name == "python":
+        return PythonEngine(*parts, settings, initial_state)
+    if name not in _ENGINES:
+        raise InvalidInputError(
+            f"the state is of an estimator with engine={name!r}; expected one of "
+            f"{', '.join(_ENGINES)}."
+        )
+    try:
+        if settings.needs_python:
+            raise OptionError("the compiled step solves its QPs itself, without a backend.")
+        return _ENGINES[name](*parts, settings, initial_state)
+    except (QpmheError, OSError) as error:
+        raise InvalidInputError(
+            f"the state is of an estimator with engine={name!r}, which is not ready here: "
+            f"{str(error).rstrip('.')}. Call qpmhe.compile with this estimator before, or make it "
+            f"with engine={name!r}."
+        ) from error
+
+
+def python_only() -> bool:
+    """Whether the environment keeps ``engine="auto"`` to the Python step."""
+    wanted = os.environ.get("QPMHE_ENGINE", "auto")
+    if wanted not in ("auto", "python"):
+        raise OptionError(
+            f"the environment variable QPMHE_ENGINE is {wanted!r}; expected 'python', which keeps "
+            "engine='auto' to the Python step, or 'auto'."
+        )
+    return wanted == "python"

@@ -168,7 +168,10 @@ class Estimate:
     solver_iterations : int or None
         Sum of the solver's own iterations; None where it reports none.
     step_time, solve_time : float
-        Seconds for the whole update, and for the QP solver in it.
+        Seconds for the whole update, and for the QP solver in it; the latter is NaN with the
+        compiled step, which does not measure it.
+    engine : str
+        What ran the step: ``python`` or ``compiled``.
     """
 
     __slots__ = (
@@ -176,6 +179,8 @@ class Estimate:
         "delayed", "dropped", "message", "nearest_points", "qps", "solve_time",
         "solver_iterations", "state", "status", "step_time", "time", "trajectory",
     )
+
+    engine = "python"
 
     def __init__(
         self,

@@ -24,7 +24,7 @@ from ..model.system import System
 from ..observers import Observer
 from ..observers.projection import NearestPoint
 from .conditions import ConditionReader, Conditions
-from .engines import engine_for
+from .engines import engine_for, engine_of_snapshot
 from .estimate import Estimate
 from .run import Run
 from .settings import Settings
@@ -76,12 +76,14 @@ class MovingHorizonEstimator:
     tolerance : float
         The sequence of QPs has converged when a QP that was solved to its own tolerance
         lowers J by less than this share of J.
-    engine : {"python", "compiled"}
+    engine : {"auto", "python", "compiled"}
         What runs the step. ``compiled`` generates C code for the whole step from a system
         made by `qpmhe.from_casadi` without a set of states, a quadratic cost and an observer with
         constant gain, compiles it once and keeps it in a cache on disk; it also solves
         QPs with active inequalities. Without a C compiler it warns and runs the
-        Python step.
+        Python step. ``auto`` takes the compiled step where its library is in the cache, see
+        `qpmhe.compile`, and else the Python step: it never waits for a compiler, never warns,
+        and takes every option. `mhe.engine` says which one runs.
     project_observer : bool
         Whether the observer's state is projected onto X after each step, in the observer's own
         metric: `Observer.metric`, the inverse of its covariance, or the Lyapunov matrix of its
@@ -148,7 +150,7 @@ class MovingHorizonEstimator:
         max_solver_iterations: int | None = None,
         solver_tolerance: float = 1e-7,
         tolerance: float = 1e-9,
-        engine: str = "python",
+        engine: str = "auto",
         project_observer: bool = True,
         infeasible: str = "drop_rows",
         warm_start: bool = False,
@@ -239,7 +241,7 @@ class MovingHorizonEstimator:
 
     @property
     def engine(self) -> str:
-        """What runs the step: ``python`` or ``compiled``."""
+        """What runs the step: ``python`` or ``compiled``, also where ``engine="auto"`` chose."""
         return self._engine.name
 
     @property
@@ -584,14 +586,23 @@ class MovingHorizonEstimator:
         ------
         InvalidInputError
             If it is not such a state: damaged, or of an estimator with another model,
-            observer, cost, sets or candidate. The estimator is left as it was. QP caps, backend,
-            tolerances, ``infeasible`` and ``warm_start`` may differ.
+            observer, cost, sets or candidate, or with another engine. The estimator is left as
+            it was. QP caps, backend, tolerances, ``infeasible`` and ``warm_start`` may differ.
 
         Notes
         -----
-        It computes every stored stage again and compares the results.
+        It computes every stored stage again and compares the results. With ``engine="auto"`` the
+        estimator goes on with the engine that the snapshot was taken with.
         """
-        self._engine.load_state_dict(state)
+        engine = self._engine
+        pinned = state.get("engine", "python") if isinstance(state, dict) else None
+        if self.settings.engine == "auto" and isinstance(pinned, str) and pinned != engine.name:
+            engine = engine_of_snapshot(
+                pinned, self._own_system, self.observer, self.cost, self.settings,
+                self._initial_state,
+            )
+        engine.load_state_dict(state)
+        self._engine = engine
 
     def __getstate__(self) -> dict[str, Any]:
         solver = self.settings.backend
@@ -613,8 +624,9 @@ class MovingHorizonEstimator:
 
     def __setstate__(self, saved: dict[str, Any]) -> None:
         # Construction checks everything again: a snapshot is input like any other.
+        options = vars(saved["settings"]) | {"engine": saved["state"]["engine"]}
         self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
-            *saved["arguments"], initial_state=saved["initial_state"], **vars(saved["settings"])
+            *saved["arguments"], initial_state=saved["initial_state"], **options
         )
         self.load_state_dict(saved["state"])
 

@@ -41,6 +41,8 @@ class Run:
     covariances : (T, n, n) array, optional
         Covariances of the estimates of x(1), ..., x(T), if requested; NaN where the model
         could not be linearised.
+    engine : str
+        What ran the steps: ``python`` or ``compiled``.
 
     Attributes
     ----------
@@ -62,12 +64,13 @@ class Run:
         delayed: Array,
         flags: NDArray[np.integer[Any]],
         covariances: Array | None = None,
+        engine: str = "python",
     ) -> None:
         self.states, self.filtered, self.delayed = states, filtered, delayed
         self.costs, self.candidate_costs = costs, candidate_costs
         self.times, self.solve_times = times, solve_times
         self.qps, self.solver_iterations = qps, solver_iterations
-        self.flags, self.covariances = flags, covariances
+        self.flags, self.covariances, self.engine = flags, covariances, engine
 
     @classmethod
     def of(
@@ -103,6 +106,7 @@ class Run:
             ).reshape(-1, n),
             flags=np.array([e.status.value for e in estimates], dtype=np.intp),
             covariances=covariances,
+            engine=estimates[0].engine if estimates else "python",
         )
 
     @cached_property

@@ -13,7 +13,7 @@ from ..errors import BackendError, OptionError
 Infeasible = Literal["drop_rows", "keep_candidate"]
 Candidate = Literal["observer", "reinitialized"]
 Arrival = Literal["observer", "smoothed"]
-Engine = Literal["python", "compiled"]
+Engine = Literal["auto", "python", "compiled"]
 
 # Bounds the sequence of QPs with max_qps=None where it does not converge.
 _SAFETY_LIMIT = 100
@@ -30,7 +30,7 @@ class Settings:
     max_solver_iterations: int | None = None
     solver_tolerance: float = _SOLVER_TOLERANCE
     tolerance: float = 1e-9
-    engine: str = "python"
+    engine: str = "auto"
     project_observer: bool = True
     infeasible: str = "drop_rows"
     warm_start: bool = False
@@ -126,6 +126,11 @@ class Settings:
             absolute_tolerance=float(self.solver_tolerance),
             time_limit=None if self.time_budget is None else float(self.time_budget),
         )
+
+    @property
+    def needs_python(self) -> bool:
+        """Whether these settings ask for a QP solver, which only the Python step uses."""
+        return self.isolated or self.backend not in ("auto", "banded")
 
     @property
     def qp_limit(self) -> int:

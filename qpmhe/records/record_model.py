@@ -30,8 +30,11 @@ class RecordModel:
     identity: dict[str, Any]
 
 
-def load_record_model(text: str, **options: Any) -> RecordModel:
-    """Make the estimator of a model from its name; `options` replace the model's own."""
+def load_record_model(text: str, engine_at_work: str | None = None, **options: Any) -> RecordModel:
+    """Make the estimator of a model from its name; `options` replace the model's own.
+
+    ``engine="auto"`` takes the engine `engine_at_work` of an earlier run, if there is one.
+    """
     source = find(text)
     name = source.name
     parts, given = _parts(name, build(source))
@@ -47,6 +50,9 @@ def load_record_model(text: str, **options: Any) -> RecordModel:
             )
     try:
         estimator = MovingHorizonEstimator(*parts, **chosen)
+        is_free = estimator.settings.engine == "auto"
+        if is_free and engine_at_work not in (None, estimator.engine):
+            estimator = MovingHorizonEstimator(*parts, **chosen | {"engine": engine_at_work})
     except QpmheError as error:
         place = code_place(error, source.file)
         kind = OptionError if isinstance(error, OptionError) else ModelError
@@ -58,7 +64,7 @@ def load_record_model(text: str, **options: Any) -> RecordModel:
         "file": source.fingerprint,
         "engine at work": estimator.engine,
         "initial_state": estimator.initial_state.tolist(),
-        **vars(estimator.settings),
+        **vars(estimator.settings), **({"engine": "auto"} if is_free else {}),
         "parameters": list(estimator.settings.parameters),  # as JSON has them
     }
     system = estimator.system

@@ -40,6 +40,8 @@ class Summary:
 
     Attributes
     ----------
+    engine : str
+        What ran the steps: ``python`` or ``compiled``. An estimation that resumes keeps it.
     samples, before : int
         Samples of this run, and of the earlier run that it resumed.
     improved, incomplete : int
@@ -58,6 +60,7 @@ class Summary:
         What else the user should know.
     """
 
+    engine: str = "python"
     samples: int = 0
     before: int = 0
     improved: int = 0
@@ -167,7 +170,8 @@ def estimate_record(
         stack.callback(output.close)
         if output.path is None:  # neither a model nor a solver may print among the rows
             output.use(stack.enter_context(standard_output_for_rows()))
-        loaded = load_record_model(model, **options)
+        before = found.identity.get("engine at work") if found is not None else None
+        loaded = load_record_model(model, before, **options)
         steps = Steps(
             loaded.estimator.system, usual=loaded.dt if dt is None else dt, scale=time_scale,
             equal=equal_steps, max_gap=max_gap,
@@ -246,7 +250,7 @@ class _Session:
         self._mhe, self._rows, self._steps = model.estimator, rows, steps
         self._reader, self._output = reader, output
         self._report, self._progress = report, progress
-        self._summary = Summary()
+        self._summary = Summary(model.estimator.engine)
         self._inserted = 0  # since the last row
         self._digest = ""  # of all samples so far
         self._newest, self._is_saved = checkpoint, False

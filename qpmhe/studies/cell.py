@@ -26,6 +26,8 @@ from .environment import environment
 
 Result = dict[str, Any]
 
+#: Engine of all cells: only the Python step calls the backends that a study compares.
+ENGINE = "python"
 #: Backend of a cell that solves no QP.
 OBSERVER = "observer"
 
@@ -182,7 +184,7 @@ def _estimator(example: Example, task: Task) -> MovingHorizonEstimator:
         backend="banded" if cell.backend == OBSERVER else cell.backend,
         max_qps=cell.qps, max_solver_iterations=cell.solver_iterations,
         warm_start=cell.start == "best",
-        isolated=task.isolated,
+        isolated=task.isolated, engine=ENGINE,
     )
 
 

@@ -41,6 +41,8 @@ class StudyError(OptionError):
 class Study:
     """A grid of estimators, each run on records of many seeds.
 
+    All run ``engine="python"``, which alone calls the backends.
+
     Cells that would be the same are one: with ``qps=0`` no QP is solved, so there is one cell,
     whose backend is called ``observer``; a backend without a cap has one cell for all
     ``solver_iterations``.

@@ -22,6 +22,7 @@ from ..models import Example
 from ..models.batch_reactor import batch_reactor, casadi_output, casadi_rate
 from ..models.scenario import Record
 from ..plots import save, trajectories
+from .cell import ENGINE
 from .ipopt import IpoptEstimator
 from .metrics import accuracy, timing
 
@@ -61,6 +62,7 @@ class PaperStudy:
             system, observer, cost,
             horizon=scenario.horizon, initial_state=scenario.initial_estimate,
             backend=backend_name, max_qps=iterations, max_solver_iterations=cap,
+            engine=ENGINE,
         )
 
     def ipopt(self, iterations: int | None) -> IpoptEstimator:

@@ -21,7 +21,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import dimension, flag, need
 from ..errors import OptionError
-from .cell import OBSERVER, Result, Task, compute, failure
+from .cell import ENGINE, OBSERVER, Result, Task, compute, failure
 from .environment import environment, revision
 from .grid import Study, StudyError
 from .store import Store
@@ -101,7 +101,9 @@ def run(
     )
     with closing(made) as workers, target.writing() as writer:
         writer.begin(
-            {**study.settings(), "jobs": workers.jobs, "scheduler": scheduler},
+            {
+                **study.settings(), "engine": ENGINE, "jobs": workers.jobs, "scheduler": scheduler,
+            },
             {source.name: source.fingerprint for source in study.sources},
         )
         tasks, found = _tasks(study, writer.present(retry_failed), workers.jobs > 1)

@@ -45,7 +45,7 @@ class Qpmhe(Peer):
     def setup(self, problem: Problem) -> None:
         """Build the estimator."""
         system = problem.system
-        options: dict[str, Any] = {}
+        options: dict[str, Any] = {"engine": "python"}
         if self.variant != "numpy":
             system = problem.casadi_system()
         if self.variant == "compiled":

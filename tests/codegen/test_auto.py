@@ -1,0 +1,457 @@
+"""engine="auto": the compiled step where its library is ready, else Python's without a word."""
+
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.codegen import compiler, fingerprint, library
+from qpmhe.codegen.source import estimator_files
+from qpmhe.errors import CompilationError, InvalidInputError, OptionError
+from qpmhe.estimation.settings import Settings
+
+casadi = pytest.importorskip("casadi")
+CC = shutil.which("cc")
+needed = pytest.mark.skipif(
+    CC is None or os.name != "posix", reason="there is no C compiler, or none that is a script"
+)
+
+
+@pytest.fixture(autouse=True)
+def calls(tmp_path, monkeypatch):
+    """An empty cache, the usual "auto", and a compiler that counts its calls."""
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.delenv("QPMHE_ENGINE", raising=False)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return wrapped(tmp_path, monkeypatch, f'exec "{CC}" "$@"')
+
+
+def wrapped(folder, monkeypatch, body):
+    """Set a compiler that is a script; returns how often it has been called."""
+    path, log = folder / "cc", folder / "calls"
+    path.write_text(f'#!/bin/sh\necho "$*" >> "{log}"\n{body}\n')
+    path.chmod(0o755)
+    os.utime(path, (1e9, 1e9))
+    monkeypatch.setenv("CC", str(path))
+    return lambda: len(log.read_text().splitlines()) if log.exists() else 0
+
+
+def system(factor=0.9, **options):
+    x = casadi.SX.sym("x", 2)
+    f = casadi.Function("f", [x], [factor * x + 0.01 * casadi.sin(x)])
+    return qpmhe.from_casadi(f, casadi.Function("h", [x], [x[0]]), compiled=False, **options)
+
+
+def arguments(weight=1.0, horizon=3, **options):
+    cost = qpmhe.QuadraticCost(prior=weight * np.eye(2), disturbance=np.eye(2), noise=weight)
+    parts = system(**options), qpmhe.Luenberger([0.1 * weight, 0.1]), cost
+    return parts, {"horizon": horizon, "initial_state": np.zeros(2)}
+
+
+def estimator(weight=1.0, horizon=3, **options):
+    parts, shared = arguments(weight, horizon)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return qpmhe.MovingHorizonEstimator(*parts, **shared | options)
+
+
+def compile_it(**options):
+    parts, shared = arguments(**options)
+    return qpmhe.compile(*parts, **shared)
+
+
+def test_an_empty_cache_is_the_python_step_without_generating_anything(calls, monkeypatch):
+    monkeypatch.setattr(library, "estimator_files", None)
+    mhe = estimator()
+    assert mhe.settings.engine == "auto"
+    assert (mhe.engine, mhe.update([1.0]).engine, mhe.run([1.0]).engine) == ("python",) * 3
+    assert not calls()
+
+
+@needed
+def test_what_was_compiled_is_taken_without_generating_it_again(calls, monkeypatch):
+    made = compile_it()
+    assert made.is_new
+    assert made.path.is_file()
+    assert made.engine == "compiled"
+    assert 0.0 < made.seconds
+    before = calls()
+    monkeypatch.setattr(library, "estimator_files", None)
+    for mhe in (estimator(), estimator(weight=2.0, max_qps=3), estimator(warm_start=True)):
+        assert (mhe.engine, mhe.update([1.0]).engine, mhe.run([1.0]).engine) == ("compiled",) * 3
+    assert estimator(engine="python").engine == "python"
+    assert estimator(horizon=4).engine == "python"
+    again = qpmhe.compile(estimator())
+    assert (again.is_new, again.path) == (False, made.path)
+    assert calls() == before
+
+
+@needed
+def test_an_estimator_that_exists_keeps_its_engine():
+    mhe = estimator()
+    qpmhe.compile(mhe)
+    mhe.update([1.0])
+    mhe.reset()
+    assert mhe.update([1.0]).engine == "python"
+    assert estimator().engine == "compiled"
+
+
+@needed
+def test_a_batch_has_one_engine():
+    def batch():
+        parts, shared = arguments()
+        states = shared.pop("initial_state")
+        return qpmhe.BatchEstimator(*parts, members=2, initial_states=states, **shared)
+
+    ys = np.ones((2, 3, 1))
+    one = batch()
+    assert (one.engine, one.mode, one.run(ys).engine) == ("python", "looped", "python")
+    compile_it()
+    two = batch()
+    found = two.update(ys[:, 0]).engine, two.run(ys).engine
+    assert (two.engine, two.mode, *found) == ("compiled",) * 4
+    assert pickle.loads(pickle.dumps(one)).engine == "python"
+    assert pickle.loads(pickle.dumps(two)).engine == "compiled"
+
+
+@needed
+def test_the_python_step_where_the_user_asks_for_a_solver():
+    compile_it()
+    solver = qpmhe.solvers.create("osqp")
+    for options in ({"backend": "osqp"}, {"backend": solver}, {"isolated": True}):
+        assert estimator(**options).engine == "python"
+    assert estimator(backend="banded").engine == "compiled"
+
+
+@needed
+@pytest.mark.parametrize("options", [
+    {"time_budget": 1.0}, {"arrival": "smoothed"}, {"candidate": "reinitialized"}, {"delay": 2},
+], ids=str)
+def test_no_option_is_refused(options):
+    compile_it()
+    mhe = estimator(**options)
+    assert np.isfinite(mhe.update([1.0]).cost)
+
+
+@needed
+@pytest.mark.parametrize("part", [
+    {"observer": qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=np.eye(2), noise=[[1.0]])},
+    {"cost": qpmhe.RobustCost(
+        prior=np.eye(2), disturbance=np.eye(2), noise=qpmhe.Huber([[1.0]]))},
+    {"states": qpmhe.Box([-5.0, -5.0], [5.0, 5.0])},
+    {"plain": True},
+], ids=lambda part: next(iter(part)))
+def test_no_part_is_refused(part):
+    compile_it()
+    (model, observer, cost), shared = arguments()
+    if "states" in part:
+        model = system(**part)
+    if "plain" in part:
+        model = qpmhe.System(lambda x: [0.9 * x[0], 0.8 * float(x[1])], lambda x: x[:1], n=2, p=1)
+    parts = model, part.get("observer", observer), part.get("cost", cost)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mhe = qpmhe.MovingHorizonEstimator(*parts, **shared)
+        assert np.isfinite(mhe.update([1.0]).cost)
+
+
+def test_the_environment_can_ask_for_python(monkeypatch):
+    if CC is not None:
+        compile_it()
+    monkeypatch.setenv("QPMHE_ENGINE", "python")
+    assert estimator().engine == "python"
+    monkeypatch.setenv("QPMHE_ENGINE", "fast")
+    with pytest.raises(OptionError, match="QPMHE_ENGINE is 'fast'; expected 'python'"):
+        estimator()
+
+
+# Bad luck: no compiler, one that is broken or hangs, a cache that cannot be written.
+
+
+@needed
+def test_without_a_compiler(monkeypatch):
+    compile_it()
+    monkeypatch.setenv("CC", "/nowhere/cc")
+    assert estimator().engine == "python"
+    with pytest.raises(CompilationError, match="no C compiler"):
+        compile_it()
+
+
+@needed
+def test_a_compiler_that_fails(tmp_path, monkeypatch):
+    wrapped(tmp_path, monkeypatch, "echo 'out of cheese' >&2\nexit 1")
+    assert estimator().engine == "python"
+    with pytest.raises(CompilationError, match="out of cheese"):
+        compile_it()
+    assert estimator().engine == "python"
+
+
+@needed
+def test_a_compiler_that_hangs_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(compiler, "_PATIENCE", 0.2)
+    calls = wrapped(tmp_path, monkeypatch, "exec sleep 600")
+    assert estimator().engine == "python"
+    began = time.monotonic()
+    with pytest.raises(CompilationError, match=r"did not end within 0\.2 s"):
+        compile_it()
+    assert time.monotonic() - began < 60.0
+    assert calls() == 1
+
+
+@needed
+def test_a_compiler_that_reads_standard_input(tmp_path, monkeypatch):
+    wrapped(tmp_path, monkeypatch, f'cat > /dev/null\nexec "{CC}" "$@"')
+    assert compile_it().is_new
+
+
+@needed
+def test_wrong_code_is_not_used_and_not_compiled_again(calls, monkeypatch):
+    compile_it()
+    before = calls()
+    compiler._checked.clear()
+    monkeypatch.setattr(library, "estimator_fault", lambda *_: "J of the estimate is 2")
+    assert estimator().engine == "python"
+    assert calls() == before
+
+
+@needed
+def test_damaged_and_foreign_files_in_the_cache(tmp_path):
+    made = compile_it()
+    made.path.with_suffix(".sha256").write_text("nonsense")
+    assert estimator().engine == "python"
+    made.path.with_suffix(".sha256").unlink()
+    assert estimator().engine == "python"
+    shutil.rmtree(tmp_path / "cache")
+    (tmp_path / "cache").write_text("a file")
+    assert estimator().engine == "python"
+
+
+def read_only(monkeypatch):
+    """No folder can be written, as os.access reports it: the tests may run as root."""
+    plain = os.access
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: not mode & os.W_OK and plain(path, mode)
+    )
+
+
+@needed
+def test_a_cache_that_cannot_be_written_can_be_read(calls, monkeypatch):
+    compile_it()
+    before = calls()
+    with monkeypatch.context() as patch:
+        read_only(patch)
+        assert estimator().engine == "compiled"
+        assert not compile_it().is_new
+        assert estimator(horizon=4).engine == "python"
+        with pytest.raises(CompilationError, match="cannot be written; set QPMHE_CACHE_DIR"):
+            compile_it(horizon=4)
+        assert estimator(engine="compiled").engine == "compiled"
+    assert calls() == before
+
+
+@needed
+def test_what_lies_beside_a_cache_that_cannot_be_made_is_found(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "file" / "below"))
+    assert estimator().engine == "python"
+    made = compile_it()
+    assert made.path.parent.parent == tmp_path
+    assert estimator().engine == "compiled"
+
+
+PROGRAM = """
+import sys, numpy as np, casadi, qpmhe
+x = casadi.SX.sym("x", 2)
+system = qpmhe.from_casadi(
+    casadi.Function("f", [x], [0.9 * x + 0.01 * casadi.sin(x)]),
+    casadi.Function("h", [x], [x[0]]), compiled=False)
+cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=1.0)
+parts = system, qpmhe.Luenberger([0.1, 0.1]), cost
+print("ready", flush=True)
+sys.stdin.readline()
+made = qpmhe.compile(*parts, horizon=3, initial_state=np.zeros(2))
+mhe = qpmhe.MovingHorizonEstimator(*parts, horizon=3, initial_state=np.zeros(2))
+print(mhe.engine, mhe.update([1.0]).cost.hex())
+"""
+
+
+@needed
+def test_two_processes_that_compile_at_once(tmp_path, monkeypatch):
+    calls = wrapped(tmp_path, monkeypatch, f'sleep 0.3\nexec "{CC}" "$@"')
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(2)
+    ]
+    assert [one.stdout.readline() for one in both] == ["ready\n"] * 2
+    for one in both:
+        one.stdin.write("\n")
+        one.stdin.flush()
+    found = [one.communicate(timeout=120)[0] for one in both]
+    assert found[0] == found[1]
+    assert found[0].startswith("compiled ")
+    before = calls()
+    assert before in (1, 2)
+    # The same model of another process is in the cache.
+    mhe = estimator()
+    assert f"{mhe.engine} {mhe.update([1.0]).cost.hex()}\n" == found[0]
+    assert calls() == before
+
+
+# The key by which the cache knows a library.
+
+
+def models():
+    """Systems and horizons, most of which have source of their own."""
+    x, u, ax = casadi.SX.sym("x", 2), casadi.SX.sym("u"), casadi.MX.sym("x", 2)
+    h = casadi.Function("h", [x], [x[0]])
+    rate = casadi.Function("f", [x], [-x])
+    box, rows = qpmhe.Box([-1.0, -1.0], [1.0, 1.0]), qpmhe.Polytope([[1.0, 1.0]], [1.0])
+    yield system(), 3
+    yield system(), 4
+    yield system(0.8), 3
+    yield system(0.9 + 1e-15), 3
+    yield system(disturbances=box), 3
+    yield system(disturbances=rows), 3
+    yield system(noises=qpmhe.Box([-1.0], [1.0])), 3
+    yield qpmhe.from_casadi(rate, h, dt=0.1, compiled=False), 3
+    yield qpmhe.from_casadi(rate, h, dt=0.2, compiled=False), 3
+    yield qpmhe.from_casadi(rate, h, dt=0.1, method="euler", compiled=False), 3
+    yield qpmhe.from_casadi(rate, h, compiled=False), 3
+    f = casadi.Function("f", [x, u], [0.9 * x + u])
+    yield qpmhe.from_casadi(f, h, compiled=False), 3
+    inner = casadi.Function("inner", [ax], [casadi.cos(ax)])
+    yield qpmhe.from_casadi(
+        casadi.Function("f", [ax], [inner(ax)]), casadi.Function("h", [ax], [ax[:1]]),
+        compiled=False,
+    ), 3
+
+
+def keys_and_sources():
+    (_, observer, cost), _ = arguments()
+    for model, horizon in models():
+        settings = Settings(horizon, engine="compiled")
+        layout, record = library.planned(model, observer, cost, settings)
+        files, structure = estimator_files(model.symbolic, layout, record)
+        yield fingerprint.source_key(model.symbolic, layout), structure
+
+
+def test_keys_differ_where_the_source_does():
+    found = list(keys_and_sources())
+    keys, sources = zip(*found, strict=True)
+    assert None not in keys
+    for key, text in found:
+        assert [one == key for one in keys] == [one == text for one in sources]
+    assert len(set(keys)) == len(keys) - 1  # two differ in their sampling time, which is data
+    assert keys == tuple(key for key, _ in keys_and_sources())
+
+
+@pytest.mark.parametrize("name", ["c/step.c", "c/estimator.h", "source.py"])
+def test_keys_change_with_the_generator(name, tmp_path, monkeypatch):
+    model = system().symbolic
+    before = fingerprint.source_key(model)
+    here = os.path.dirname(fingerprint.__file__)
+    shutil.copytree(here, tmp_path / "codegen")
+    monkeypatch.setattr(fingerprint, "files", lambda _: tmp_path / "codegen")
+    try:
+        fingerprint._generator.cache_clear()
+        assert fingerprint.source_key(model) == before
+        with (tmp_path / "codegen" / name).open("a") as file:
+            file.write("\n")
+        fingerprint._generator.cache_clear()
+        assert fingerprint.source_key(model) != before
+    finally:
+        fingerprint._generator.cache_clear()
+
+
+@needed
+def test_a_model_without_a_key_is_compiled_and_left_to_python_by_auto(monkeypatch):
+    monkeypatch.setattr(library, "source_key", lambda *_: None)
+    assert estimator(engine="compiled").engine == "compiled"
+    assert estimator().engine == "python"
+    with pytest.raises(CompilationError, match="cannot serialize"):
+        compile_it()
+
+
+# Snapshots go on with the engine that they were taken with.
+
+
+@needed
+def test_a_snapshot_pins_the_python_step():
+    mhe = estimator()
+    for y in (1.0, 2.0, np.nan, 1.5):
+        mhe.update([y])
+    snapshot = mhe.state_dict()
+    assert snapshot["engine"] == "python"
+    compile_it()
+    other = estimator()
+    assert other.engine == "compiled"
+    other.load_state_dict(snapshot)
+    copy = pickle.loads(pickle.dumps(mhe))
+    assert (other.engine, copy.engine, copy.settings.engine) == ("python",) * 3
+    wanted = mhe.update([1.0])
+    for one in (other, copy):
+        found = one.update([1.0])
+        assert found.engine == "python"
+        np.testing.assert_array_equal(found.trajectory, wanted.trajectory)
+    with pytest.raises(InvalidInputError, match="engine='python'; expected 'compiled'"):
+        estimator(engine="compiled").load_state_dict(snapshot)
+
+
+@needed
+def test_a_snapshot_pins_the_compiled_step(tmp_path, monkeypatch):
+    compile_it()
+    mhe = estimator()
+    for y in (1.0, 2.0, np.nan, 1.5):
+        mhe.update([y])
+    snapshot, kept = mhe.state_dict(), pickle.dumps(mhe)
+    wanted = mhe.update([1.0])
+    monkeypatch.setenv("QPMHE_ENGINE", "python")
+    others = [estimator(), pickle.loads(kept)]
+    others[0].load_state_dict(snapshot)
+    for one in others:
+        found = one.update([1.0])
+        assert found.engine == "compiled"
+        np.testing.assert_array_equal(found.trajectory, wanted.trajectory)
+    # Without its library the snapshot is refused, and the estimator stays as it was.
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "empty"))
+    mhe = estimator()
+    mhe.update([1.0])
+    for match in ("not in the cache", "qpmhe.compile", "engine='compiled'"):
+        with pytest.raises(InvalidInputError, match=match):
+            mhe.load_state_dict(snapshot)
+    assert (mhe.engine, mhe.time) == ("python", 1)
+    with pytest.raises(InvalidInputError, match="which is not ready here"):
+        estimator(backend="osqp").load_state_dict(snapshot)
+    for name in ("fast", 3, None):
+        with pytest.raises(InvalidInputError):
+            mhe.load_state_dict(snapshot | {"engine": name})
+    # An estimator that was pickled waits for the compiler, as it was made to run it.
+    assert pickle.loads(kept).engine == "compiled"
+
+
+def test_compile_validates_its_arguments():
+    parts, shared = arguments()
+    with pytest.raises(InvalidInputError, match="leave them out"):
+        qpmhe.compile(estimator(), horizon=3)
+    with pytest.raises(OptionError, match="horizn"):
+        qpmhe.compile(*parts, horizn=3, **shared)
+    with pytest.raises(InvalidInputError, match="observer is None"):
+        qpmhe.compile(parts[0], **shared)
+    with pytest.raises(OptionError, match="solves its QPs itself"):
+        qpmhe.compile(*parts, backend="osqp", **shared)
+    with pytest.raises(OptionError, match="isolated is True"):
+        qpmhe.compile(*parts, isolated=True, **shared)
+    plain = qpmhe.System(lambda x: [0.9 * x[0], 0.8 * float(x[1])], lambda x: x[:1], n=2, p=1)
+    with pytest.raises(OptionError, match="no C code for this estimator"):
+        qpmhe.compile(plain, *parts[1:], **shared)
