@@ -57,6 +57,7 @@ class Layout:
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
             "continuous": self.continuous, "real": self.real,
+            "lapack": int(self.nx >= int(__import__("os").environ.get("T","16"))),
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wv", self.sets, strict=True):

@@ -154,6 +154,23 @@ def generated(
     return files, structure, layout, record
 
 
+def lapack_functions() -> Any:
+    """Addresses of SciPy's LAPACK and BLAS functions, in the order of ``mhe_lapack`` in C."""
+    from scipy.linalg import cython_blas, cython_lapack
+
+    python = ctypes.pythonapi
+    name, pointer = python.PyCapsule_GetName, python.PyCapsule_GetPointer
+    name.restype, name.argtypes = ctypes.c_char_p, [ctypes.py_object]
+    pointer.restype, pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+    capsules = [
+        module.__pyx_capi__[function]
+        for module, function in (
+            (cython_lapack, "dpotrf"), (cython_blas, "dtrsm"), (cython_blas, "dsyrk"),
+        )
+    ]
+    return (ctypes.c_void_p * len(capsules))(*(pointer(one, name(one)) for one in capsules))
+
+
 class RunLog:
     """Arrays for what `mhe_run` writes, and the structure that points to them."""
 
@@ -214,6 +231,8 @@ class EstimatorLibrary:
         # Single steps are shorter than handing the interpreter's lock over; runs are not.
         quick = ctypes.PyDLL(library._name)
         self.workspace_size = self._check_sizes(quick)
+        if hasattr(quick, "mhe_set_lapack"):
+            quick.mhe_set_lapack(lapack_functions())
         pointer, integer = ctypes.c_void_p, ctypes.c_int64
         self.update = quick.mhe_update_undoable
         self.amend, self.reset, self.run = quick.mhe_amend, quick.mhe_reset, library.mhe_run

@@ -37,6 +37,7 @@ typedef $real mhe_real;
 #define MHE_V_SET $v_set
 #define MHE_W_ROWS $w_rows  /* general inequalities in each */
 #define MHE_V_ROWS $v_rows
+#define MHE_LAPACK $lapack   /* whether LAPACK's functions, handed over, factorise */
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
