@@ -22,6 +22,8 @@ from ..observers import Observer
 SET_NAMES = ("disturbances", "noises")
 
 _MOST = int(np.iinfo(np.int32).max)
+# From so many states on, LAPACK's calls take less time than loops that a compiler made.
+_LAPACK_STATES = 40
 _POLICIES = get_args(Infeasible)
 
 
@@ -36,15 +38,20 @@ class Layout:
     sets: tuple[tuple[bool, int], ...]
     continuous: int
     real: str = "double"
+    lapack: bool = False
 
     @classmethod
-    def of(cls, system: System, horizon: int, continuous: int, real: str = "double") -> Layout:
-        """The sizes of an estimator of a system."""
+    def of(
+        cls, system: System, horizon: int, continuous: int, real: str = "double",
+        lapack: bool = False,
+    ) -> Layout:
+        """The sizes of an estimator of a system. `lapack` allows it where it is quicker."""
         sets = tuple(
             (one is not None, 0 if one is None else one.matrix.shape[0])
             for one in (system.disturbances, system.noises)
         )
-        return cls(system.n, system.p, system.m, horizon, sets, continuous, real)
+        quicker = lapack and system.n >= _LAPACK_STATES
+        return cls(system.n, system.p, system.m, horizon, sets, continuous, real, quicker)
 
     @property
     def number(self) -> type[Any]:
@@ -57,7 +64,7 @@ class Layout:
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
             "continuous": self.continuous, "real": self.real,
-            "lapack": int(self.nx >= int(__import__("os").environ.get("T","16"))),
+            "lapack": int(self.lapack),
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wv", self.sets, strict=True):

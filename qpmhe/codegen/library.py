@@ -140,7 +140,7 @@ def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:
 
 def generated(
     system: System, observer: Observer, cost: Cost, settings: Settings, name: str = "mhe",
-    real: str = "double",
+    real: str = "double", lapack: bool = False,
 ) -> tuple[dict[str, str], str, Layout, NDArray[Any]]:
     """Source of an estimator, its structure, its layout and its settings."""
     reason = uncovered(system, observer, cost, settings)
@@ -148,7 +148,7 @@ def generated(
         raise OptionError(f"no C code for this estimator: {reason}")
     model = system.symbolic
     assert model is not None
-    layout = Layout.of(system, settings.horizon, CONTINUOUS[model.method], real)
+    layout = Layout.of(system, settings.horizon, CONTINUOUS[model.method], real, lapack)
     record = settings_record(layout, system, observer, cost, settings)
     files, structure = estimator_files(model, layout, record, name)
     return files, structure, layout, record
@@ -166,6 +166,7 @@ def lapack_functions() -> Any:
         module.__pyx_capi__[function]
         for module, function in (
             (cython_lapack, "dpotrf"), (cython_blas, "dtrsm"), (cython_blas, "dsyrk"),
+            (cython_blas, "dgemm"),
         )
     ]
     return (ctypes.c_void_p * len(capsules))(*(pointer(one, name(one)) for one in capsules))
@@ -205,13 +206,15 @@ class EstimatorLibrary:
 
     ``settings``, the ``mhe_settings`` in use, must outlive all estimators that point to it.
     ``update``, ``update_members``, ``amend``, ``reset``, ``run`` and ``recompute`` are the C
-    functions of these names; `update` is ``mhe_update_undoable``.
+    functions of these names; `update` is ``mhe_update_undoable``, which `undo` reverses.
     """
 
     def __init__(
         self, system: System, observer: Observer, cost: Cost, settings: Settings
     ) -> None:
-        files, structure, layout, record = generated(system, observer, cost, settings)
+        files, structure, layout, record = generated(
+            system, observer, cost, settings, lapack=True
+        )
         self.layout, self.settings = layout, record
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
@@ -231,15 +234,15 @@ class EstimatorLibrary:
         # Single steps are shorter than handing the interpreter's lock over; runs are not.
         quick = ctypes.PyDLL(library._name)
         self.workspace_size = self._check_sizes(quick)
-        if hasattr(quick, "mhe_set_lapack"):
+        if self.layout.lapack:
             quick.mhe_set_lapack(lapack_functions())
         pointer, integer = ctypes.c_void_p, ctypes.c_int64
         self.update = quick.mhe_update_undoable
         self.amend, self.reset, self.run = quick.mhe_amend, quick.mhe_reset, library.mhe_run
-        self.recompute = quick.mhe_recompute
+        self.recompute, self.undo = quick.mhe_recompute, quick.mhe_undo
         self.update_members = library.mhe_update_members
         for function in (
-            self.update, self.reset, self.run, self.update_members, self.recompute
+            self.update, self.undo, self.reset, self.run, self.update_members, self.recompute
         ):
             function.restype = None
         self.amend.argtypes = [pointer, pointer, integer, pointer, pointer]

@@ -50,22 +50,6 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
 }
 
 #if MHE_LAPACK
-/* SciPy's LAPACK and BLAS, as their callers in C see them; the caller hands them over. */
-static struct {
-    void (*dpotrf)(const char *uplo, const int *n, real *a, const int *lda, int *info);
-    void (*dtrsm)(const char *side, const char *uplo, const char *trans, const char *diag,
-                  const int *m, const int *n, const real *alpha, const real *a, const int *lda,
-                  real *b, const int *ldb);
-    void (*dsyrk)(const char *uplo, const char *trans, const int *n, const int *k,
-                  const real *alpha, const real *a, const int *lda, const real *beta, real *c,
-                  const int *ldc);
-} mhe_lapack;
-
-void mhe_set_lapack(void *const *functions)
-{
-    memcpy(&mhe_lapack, functions, sizeof mhe_lapack);
-}
-
 /* Overwrite the panels by the rows of L', with H = L L'; whether H was positive definite. By
  * columns, as LAPACK reads them, a panel is the lower half of a block above its coupling. */
 static int mhe_factorise(mhe_workspace *k, int count)
