@@ -149,7 +149,7 @@ class CompiledEngine:
             return estimate
         except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
             if self.time != time:
-                self._memory[...] = self._before
+                self._library.undo(*self._usual[:2])
             raise
 
     def _collect(self, time: int) -> CompiledEstimate:

@@ -25,6 +25,8 @@ TERMS = ("prior", "disturbance", "noise")
 LOSSES = ("quadratic", "huber", "power")
 
 _MOST = int(np.iinfo(np.int32).max)
+# From so many states on, LAPACK's calls take less time than loops that a compiler made.
+_LAPACK_STATES = 40
 _POLICIES = get_args(Infeasible)
 
 
@@ -41,19 +43,25 @@ class Layout:
     real: str = "double"
     #: Whether a term of the cost has a loss that is not quadratic.
     loss: bool = False
+    #: Whether the factorisation calls LAPACK.
+    lapack: bool = False
 
     @classmethod
     def of(
-        cls, system: System, cost: Cost, horizon: int, continuous: int, real: str = "double"
+        cls, system: System, cost: Cost, horizon: int, continuous: int, real: str = "double",
+        lapack: bool = False,
     ) -> Layout:
-        """The sizes of an estimator of a system."""
+        """The sizes of an estimator of a system. `lapack` allows it where it is quicker."""
         form = cost.c_form
         loss = form is not None and any(one.kind != "quadratic" for one in form.losses)
         sets = tuple(
             (one is not None, 0 if one is None else one.matrix.shape[0])
             for one in (system.disturbances, system.noises)
         )
-        return cls(system.n, system.p, system.m, horizon, sets, continuous, real, loss)
+        return cls(
+            system.n, system.p, system.m, horizon, sets, continuous, real, loss,
+            lapack and system.n >= _LAPACK_STATES,
+        )
 
     @property
     def number(self) -> type[Any]:
@@ -66,6 +74,7 @@ class Layout:
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
             "continuous": self.continuous, "real": self.real, "loss": int(self.loss),
+            "lapack": int(self.lapack),
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wv", self.sets, strict=True):

@@ -157,17 +157,18 @@ def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:
 
 def generated(
     system: System, observer: Observer, cost: Cost, settings: Settings, name: str = "mhe",
-    real: str = "double",
+    real: str = "double", lapack: bool = False,
 ) -> tuple[dict[str, str], str, Layout, NDArray[Any]]:
     """Source of an estimator, its structure, its layout and its settings."""
-    layout, record = planned(system, observer, cost, settings, real)
+    layout, record = planned(system, observer, cost, settings, real, lapack)
     assert system.symbolic is not None
     files, structure = estimator_files(system.symbolic, layout, record, name)
     return files, structure, layout, record
 
 
 def planned(
-    system: System, observer: Observer, cost: Cost, settings: Settings, real: str = "double"
+    system: System, observer: Observer, cost: Cost, settings: Settings, real: str = "double",
+    lapack: bool = False,
 ) -> tuple[Layout, NDArray[Any]]:
     """Layout and settings of an estimator's C code; raises if it has no C form."""
     reason = uncovered(system, observer, cost, settings)
@@ -175,8 +176,26 @@ def planned(
         raise OptionError(f"no C code for this estimator: {reason}")
     model = system.symbolic
     assert model is not None
-    layout = Layout.of(system, cost, settings.horizon, CONTINUOUS[model.method], real)
+    layout = Layout.of(system, cost, settings.horizon, CONTINUOUS[model.method], real, lapack)
     return layout, settings_record(layout, system, observer, cost, settings)
+
+
+def lapack_functions() -> Any:
+    """Addresses of SciPy's LAPACK and BLAS functions, in the order of ``mhe_lapack`` in C."""
+    from scipy.linalg import cython_blas, cython_lapack
+
+    python = ctypes.pythonapi
+    name, pointer = python.PyCapsule_GetName, python.PyCapsule_GetPointer
+    name.restype, name.argtypes = ctypes.c_char_p, [ctypes.py_object]
+    pointer.restype, pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+    capsules = [
+        module.__pyx_capi__[function]
+        for module, function in (
+            (cython_lapack, "dpotrf"), (cython_blas, "dtrsm"), (cython_blas, "dsyrk"),
+            (cython_blas, "dgemm"),
+        )
+    ]
+    return (ctypes.c_void_p * len(capsules))(*(pointer(one, name(one)) for one in capsules))
 
 
 class RunLog:
@@ -213,14 +232,17 @@ class EstimatorLibrary:
 
     ``settings``, the ``mhe_settings`` in use, must outlive all estimators that point to it.
     ``update``, ``update_members``, ``amend``, ``reset``, ``run`` and ``recompute`` are the C
-    functions of these names; `update` is ``mhe_update_undoable``. ``path`` is the library's. With
-    ``settings.engine="auto"`` it must be in the cache: `NotCachedError` is raised if it is not.
+    functions of these names; `update` is ``mhe_update_undoable``, which `undo` reverses.
+    ``path`` is the file. With ``settings.engine="auto"`` it must be in the cache: `NotCachedError`
+    is raised if it is not.
     """
 
     def __init__(
         self, system: System, observer: Observer, cost: Cost, settings: Settings
     ) -> None:
-        self.layout, self.settings = layout, record = planned(system, observer, cost, settings)
+        self.layout, self.settings = layout, record = planned(
+            system, observer, cost, settings, lapack=True
+        )
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
         assert system.symbolic is not None
@@ -253,13 +275,15 @@ class EstimatorLibrary:
         # Single steps are shorter than handing the interpreter's lock over; runs are not.
         quick = ctypes.PyDLL(library._name)
         self.workspace_size = self._check_sizes(quick)
+        if self.layout.lapack:
+            quick.mhe_set_lapack(lapack_functions())
         pointer, integer = ctypes.c_void_p, ctypes.c_int64
         self.update = quick.mhe_update_undoable
         self.amend, self.reset, self.run = quick.mhe_amend, quick.mhe_reset, library.mhe_run
-        self.recompute = quick.mhe_recompute
+        self.recompute, self.undo = quick.mhe_recompute, quick.mhe_undo
         self.update_members = library.mhe_update_members
         for function in (
-            self.update, self.reset, self.run, self.update_members, self.recompute
+            self.update, self.undo, self.reset, self.run, self.update_members, self.recompute
         ):
             function.restype = None
         self.amend.argtypes = [pointer, pointer, integer, pointer, pointer]

@@ -18,7 +18,7 @@ from .layout import Layout
 
 #: The file that holds a whole estimator.
 MAIN = "mhe.c"
-# Eight (n, n) arrays of them fit on any usual stack.
+# Four (n, n) arrays of them fit on any usual stack.
 _MOST_STATES = 256
 CONTINUOUS = {None: 0, "euler": 1, "rk4": 4}
 
@@ -43,7 +43,7 @@ def prologue() -> str:
         # CasADi's functions test each argument's pointer, which if-conversion makes a mask.
         "#if defined(__GNUC__) && !defined(__clang__)\n"
         '#pragma GCC optimize ("no-tree-loop-if-convert")\n#endif\n'
-        "#include <math.h>\n#include <string.h>\n\n"
+        "#include <math.h>\n#include <stddef.h>\n#include <string.h>\n\n"
         "#define real mhe_real\n#define NX MHE_NX\n#define NY MHE_NY\n#define NU MHE_NU\n"
         "#define SIZE(n) ((n) > 0 ? (n) : 1)\n\n"
     )

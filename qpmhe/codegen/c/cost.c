@@ -115,6 +115,26 @@ static real mhe_prior_cost(const mhe_settings *s, const mhe_stage *first, const 
     return mhe_lost(&s->prior_loss, NX, mhe_prior_weight(s, first), offset);
 }
 
+#if MHE_LAPACK
+/* The terms of f by BLAS, where enough of its Jacobian is not zero; whether they were made. What
+ * BLAS reads by columns is the transpose of what is stored by rows. */
+static int mhe_dense_terms(const real *Q, const real *w, mhe_terms *t)
+{
+    const int n = NX;
+    const real *A = t->f_jacobian, minus = -1, zero = 0;
+    int count = 0;
+    for (int i = 0; i < NX * NX; i++) count += A[i] != 0;
+    if (count < NX * NX / 4) return 0;
+    mhe_lapack.dgemm("N", "T", &n, &n, &n, &minus, Q, &n, A, &n, &zero, t->coupling, &n);
+    mhe_lapack.dgemm("N", "N", &n, &n, &n, &minus, A, &n, t->coupling, &n, &zero, t->hessian,
+                     &n);
+    mhe_times(NX, t->coupling, w, t->own);
+    return 1;
+}
+#else
+#define mhe_dense_terms(Q, w, t) 0
+#endif
+
 /* hessian = A' Q A + C' R C (upper half), coupling = -A' Q, own = -(A' Q w + C' R v),
  * following = Q w; A and C are in place. Q and R are of the form that touches the cost. */
 static void mhe_set_terms(const mhe_settings *s, const mhe_stage *stage, const real *w,
@@ -122,7 +142,7 @@ static void mhe_set_terms(const mhe_settings *s, const mhe_stage *stage, const r
 {
     const real *A = t->f_jacobian, *C = t->h_jacobian;
     const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
-    real RC[NY * NX], QA[NX * NX];
+    real *H = t->hessian, *QA = t->coupling;
     if (MHE_LOSS && t == &stage->terms && !isfinite(stage->cost)) {
         /* Of the candidate where the model failed: no residual, and the weight itself. */
         for (int j = 0; j < NX; j++) t->disturbance_scale[MHE_LOSS ? j : 0] = 1;
@@ -134,36 +154,43 @@ static void mhe_set_terms(const mhe_settings *s, const mhe_stage *stage, const r
     mhe_times(NX, Q, w, t->following);
     for (int i = 0; i < NX; i++)
         t->following[i] = mhe_scaled(t->following[i], t->disturbance_scale, i);
-    for (int i = 0; i < NX * NX; i++) t->hessian[i] = QA[i] = 0;
-    for (int i = 0; i < NX; i++)
-        for (int k = 0; k < NX; k++) {
-            const real q = mhe_scaled(Q[i * NX + k], t->disturbance_scale, i);
-            if (q == 0) continue; /* weights are diagonal more often than not */
-            for (int j = 0; j < NX; j++) QA[i * NX + j] += q * A[k * NX + j];
+    if (MHE_LOSS || !mhe_dense_terms(Q, w, t)) {
+        for (int i = 0; i < NX * NX; i++) H[i] = QA[i] = 0;
+        for (int i = 0; i < NX; i++)
+            for (int k = 0; k < NX; k++) {
+                const real q = mhe_scaled(Q[i * NX + k], t->disturbance_scale, i);
+                if (q == 0) continue; /* weights are diagonal more often than not */
+                for (int j = 0; j < NX; j++) QA[i * NX + j] += q * A[k * NX + j];
+            }
+        for (int k = 0; k < NX; k++)
+            for (int i = 0; i < NX; i++) {
+                const real a = A[k * NX + i];
+                if (a == 0) continue;
+                for (int j = i & ~3; j < NX; j++) H[i * NX + j] += a * QA[k * NX + j];
+            }
+        for (int j = 0; j < NX; j++) t->own[j] = 0;
+        for (int k = 0; k < NX; k++)
+            for (int j = 0; j < NX; j++) t->own[j] -= w[k] * QA[k * NX + j];
+        for (int i = 0; i < NX; i++)
+            for (int k = 0; k <= i; k++) {
+                const real other = QA[k * NX + i];
+                QA[k * NX + i] = -QA[i * NX + k];
+                QA[i * NX + k] = -other;
+            }
+    }
+    for (int k = 0; k < NY; k++) {
+        real RC[NX]; /* row k of it */
+        for (int j = 0; j < NX; j++) RC[j] = 0;
+        for (int l = 0; l < NY; l++) {
+            const real r = mhe_scaled(R[k * NY + l], t->noise_scale, k);
+            if (r == 0) continue;
+            for (int j = 0; j < NX; j++) RC[j] += r * C[l * NX + j];
         }
-    for (int i = 0; i < NX; i++)
-        for (int k = 0; k < NX; k++) t->coupling[i * NX + k] = -QA[k * NX + i];
-    for (int k = 0; k < NX; k++)
-        for (int i = 0; i < NX; i++) {
-            const real a = A[k * NX + i];
-            if (a == 0) continue;
-            for (int j = i & ~3; j < NX; j++) t->hessian[i * NX + j] += a * QA[k * NX + j];
-        }
-    for (int i = 0; i < NY; i++)
-        for (int j = 0; j < NX; j++) {
-            real sum = 0;
-            for (int k = 0; k < NY; k++) sum += R[i * NY + k] * C[k * NX + j];
-            RC[i * NX + j] = mhe_scaled(sum, t->noise_scale, i);
-        }
-    for (int k = 0; k < NY; k++)
         for (int i = 0; i < NX; i++) {
             const real c = C[k * NX + i];
             if (c == 0) continue;
-            for (int j = i & ~3; j < NX; j++) t->hessian[i * NX + j] += c * RC[k * NX + j];
+            for (int j = i & ~3; j < NX; j++) H[i * NX + j] += c * RC[j];
         }
-    for (int j = 0; j < NX; j++) t->own[j] = 0;
-    for (int k = 0; k < NX; k++)
-        for (int j = 0; j < NX; j++) t->own[j] -= w[k] * QA[k * NX + j];
-    for (int k = 0; k < NY; k++)
-        for (int j = 0; j < NX; j++) t->own[j] -= v[k] * RC[k * NX + j];
+        for (int j = 0; j < NX; j++) t->own[j] -= v[k] * RC[j];
+    }
 }

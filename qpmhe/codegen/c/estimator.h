@@ -38,6 +38,7 @@ typedef $real mhe_real;
 #define MHE_W_ROWS $w_rows  /* general inequalities in each */
 #define MHE_V_ROWS $v_rows
 #define MHE_LOSS $loss    /* whether a term of the cost has a loss that is not quadratic */
+#define MHE_LAPACK $lapack /* 1: needs mhe_set_lapack */
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
@@ -217,10 +218,12 @@ void mhe_update_special(mhe_estimator *estimator, mhe_workspace *workspace,
 void mhe_update(mhe_estimator *estimator, mhe_workspace *workspace, const mhe_real *y,
                 const mhe_real *u, mhe_estimate *estimate);
 
-/* The same, after the estimator was copied to `before`, from where the sample can be undone. */
+/* The same, after what it changes was copied to `before`, from where mhe_undo restores it. */
 void mhe_update_undoable(mhe_estimator *estimator, mhe_estimator *before,
                          mhe_workspace *workspace, const mhe_sample *sample,
                          mhe_estimate *estimate);
+
+void mhe_undo(mhe_estimator *estimator, const mhe_estimator *before);
 
 /* Put a late measurement into a sample that is still in the window; 0, or -1 if it is not. */
 int mhe_amend(mhe_estimator *estimator, mhe_workspace *workspace, int64_t time,
@@ -237,6 +240,11 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *workspac
 /* Compute the stages of the window again, each from its own state and sample, to check an
  * estimator that was saved. `reached`: MHE_HORIZON states, the one behind each stage. */
 void mhe_recompute(mhe_estimator *estimator, mhe_real *reached);
+
+#if MHE_LAPACK
+/* Before all else: dpotrf, dtrsm, dsyrk and dgemm, by Fortran's convention with 32-bit integers. */
+void mhe_set_lapack(void *const *functions);
+#endif
 
 /* Sizes of the structures above: estimator, workspace, estimate, settings, sample. */
 void mhe_sizes(int64_t *sizes);

@@ -53,6 +53,31 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     }
 }
 
+#if MHE_LAPACK
+/* Overwrite the panels by the rows of L', with H = L L'; whether H was positive definite. By
+ * columns, as LAPACK reads them, a panel is the lower half of a block above its coupling. */
+static int mhe_factorise(mhe_workspace *k, int count)
+{
+    const int n = NX, width = WIDTH;
+    const real one = 1, minus = -1;
+    for (int i = 0; i <= count; i++) {
+        real *panel = k->panels + i * NX * WIDTH, *inverse = k->inverse_pivots + i * NX;
+        int info = 0;
+        mhe_lapack.dpotrf("L", &n, panel, &width, &info);
+        if (info) return 0;
+        for (int r = 0; r < NX; r++) {
+            const real pivot = panel[r * WIDTH + r];
+            if (!(pivot > 0) || !isfinite(pivot)) return 0; /* some LAPACKs let NaN through */
+            inverse[r] = 1 / pivot;
+        }
+        if (i == count) break;
+        mhe_lapack.dtrsm("R", "L", "T", "N", &n, &n, &one, panel, &width, panel + NX, &width);
+        mhe_lapack.dsyrk("L", "N", &n, &n, &minus, panel + NX, &width, &one,
+                         panel + NX * WIDTH, &width);
+    }
+    return 1;
+}
+#else
 /* Columns of a panel that are updated at once: as many as fit in a processor's registers, and
  * a fixed number, so that a compiler can keep them there. */
 #define CHUNK (WIDTH <= 48 ? WIDTH : 32)
@@ -93,6 +118,7 @@ static int mhe_factorise(mhe_workspace *k, int count)
     }
     return 1;
 }
+#endif
 
 /* b := H^-1 b; whether the result is finite. */
 static int mhe_solve(const mhe_workspace *k, int count, real *restrict b)
@@ -104,7 +130,7 @@ static int mhe_solve(const mhe_workspace *k, int count, real *restrict b)
         for (int c = 0; c < NX; c++) sums[c] = 0;
         for (int j = 0; j < NX; j++) {
             const real *row = panel + j * WIDTH, value = own[j] * inverse[j];
-            own[j] = value;
+            own[j] = MHE_LAPACK ? value * inverse[j] : value;
             for (int c = j + 1; c < NX; c++) own[c] -= row[c] * value;
             for (int c = 0; c < NX; c++) sums[c] += row[NX + c] * value;
         }

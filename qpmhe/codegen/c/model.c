@@ -65,23 +65,25 @@ static void mhe_f_jacobian(const real *x, const real *u, real dt, real *next, re
 {
 #if MHE_CONTINUOUS == 4
     real k1[NX], k2[NX], k3[NX], k4[NX], at[NX], nonzeros[SIZE(MHE_F_NONZEROS)];
-    real s1[NX * NX], s2[NX * NX], s3[NX * NX], s4[NX * NX];
+    real odd[NX * NX], even[NX * NX]; /* slopes of the stages */
     const real half = (real)0.5 * dt, sixth = dt / 6;
     mhe_rate_jacobian(x, u, k1, nonzeros);
-    mhe_spread(NX * NX, MHE_F_NONZEROS, mhe_f_place, nonzeros, s1);
+    mhe_spread(NX * NX, MHE_F_NONZEROS, mhe_f_place, nonzeros, odd);
+    for (int i = 0; i < NX * NX; i++) A[i] = odd[i];
     for (int j = 0; j < NX; j++) at[j] = x[j] + half * k1[j];
     mhe_rate_jacobian(at, u, k2, nonzeros);
-    mhe_chain(nonzeros, half, s1, s2);
+    mhe_chain(nonzeros, half, odd, even);
+    for (int i = 0; i < NX * NX; i++) A[i] += 2 * even[i];
     for (int j = 0; j < NX; j++) at[j] = x[j] + half * k2[j];
     mhe_rate_jacobian(at, u, k3, nonzeros);
-    mhe_chain(nonzeros, half, s2, s3);
+    mhe_chain(nonzeros, half, even, odd);
+    for (int i = 0; i < NX * NX; i++) A[i] += 2 * odd[i];
     for (int j = 0; j < NX; j++) at[j] = x[j] + dt * k3[j];
     mhe_rate_jacobian(at, u, k4, nonzeros);
-    mhe_chain(nonzeros, dt, s3, s4);
+    mhe_chain(nonzeros, dt, odd, even);
     for (int j = 0; j < NX; j++)
         next[j] = x[j] + sixth * (k1[j] + 2 * (k2[j] + k3[j]) + k4[j]);
-    for (int i = 0; i < NX * NX; i++)
-        A[i] = sixth * (s1[i] + 2 * (s2[i] + s3[i]) + s4[i]);
+    for (int i = 0; i < NX * NX; i++) A[i] = sixth * (A[i] + even[i]);
     for (int j = 0; j < NX; j++) A[j * NX + j] += 1;
 #else
     real nonzeros[SIZE(MHE_F_NONZEROS)];

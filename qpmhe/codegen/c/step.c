@@ -132,11 +132,29 @@ void mhe_update(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u
     mhe_update_special(e, k, &sample, out);
 }
 
+/* Copy what a step from a window changes: of the stages the newest one, or all of them. */
+static void mhe_copy_changing(mhe_estimator *to, const mhe_estimator *from,
+                              const mhe_estimator *window)
+{
+    const int newest = window->length < MHE_HORIZON ? window->length : window->first;
+    const int reinitialize = window->settings->reinitialize;
+    memcpy(to, from, offsetof(mhe_estimator, stages));
+    if (reinitialize)
+        memcpy(to->stages, from->stages, sizeof to->stages);
+    else
+        to->stages[newest] = from->stages[newest];
+}
+
 void mhe_update_undoable(mhe_estimator *e, mhe_estimator *before, mhe_workspace *k,
                          const mhe_sample *sample, mhe_estimate *out)
 {
-    *before = *e;
+    mhe_copy_changing(before, e, e);
     mhe_update_special(e, k, sample, out);
+}
+
+void mhe_undo(mhe_estimator *e, const mhe_estimator *before)
+{
+    mhe_copy_changing(e, before, before);
 }
 
 void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspace *k,
