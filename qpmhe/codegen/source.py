@@ -41,7 +41,7 @@ def prologue() -> str:
         # CasADi's functions test each argument's pointer, which if-conversion makes a mask.
         "#if defined(__GNUC__) && !defined(__clang__)\n"
         '#pragma GCC optimize ("no-tree-loop-if-convert")\n#endif\n'
-        "#include <math.h>\n#include <string.h>\n\n"
+        "#include <math.h>\n#include <stddef.h>\n#include <string.h>\n\n"
         "#define real mhe_real\n#define NX MHE_NX\n#define NY MHE_NY\n#define NU MHE_NU\n"
         "#define SIZE(n) ((n) > 0 ? (n) : 1)\n\n"
     )
@@ -170,8 +170,8 @@ def estimator_files(
     """Header and source of a whole estimator."""
     head = header(name, {**layout.header_values(name), "version": __version__})
     parts = (
-        "algebra.c", "cost.c", "observer.c", "window.c", "sets.c", "trial.c", "factor.c",
-        "inequalities.c", "optimizer.c", "step.c",
+        "algebra.c", "conditions.c", "cost.c", "observer.c", "window.c", "sets.c", "trial.c",
+        "factor.c", "budget.c", "inequalities.c", "optimizer.c", "step.c",
     )
     body = prologue() + model_source(model) + "\n".join(template(part) for part in parts)
     data = (
