@@ -405,7 +405,7 @@ class CompiledEngine:
             raise mismatch("model (f)")
         r = np.append(w, v)
         value, size = (
-            tools.cost.stage_costs(one[None], weight)[0]
+            self._given_cost.stage_costs(one[None], weight)[0]
             for one, weight in ((r, joint), (np.abs(r), np.abs(joint)))
         )
         if not near(stage["cost"], value, size):
