@@ -216,6 +216,8 @@ def estimator_fault(interpreter: Interpreter, library: EstimatorLibrary, cost: C
     other["discount"] = 1.0 if given["discount"] < 1.0 else 0.95
     other["start_at_best"] = not given["start_at_best"]
     other["reinitialize"] = not given["reinitialize"]
+    if library.layout.clock:
+        given["time_budget"] = other["time_budget"] = 0.0
     return (
         _Rehearsal(interpreter, library, cost, given, False).fault()
         or _Rehearsal(interpreter, library, cost, other, True).fault()
@@ -262,7 +264,7 @@ class _Rehearsal:
                     settings[name] *= share
         self._gain = settings["gain"].reshape(n, p)
         self._cost = _with_settings(cost, settings, n, p)
-        self._own_noise = 2.0 * noise
+        self._own_noise, self._own_disturbance = 2.0 * noise, 0.5 * self._cost.disturbance
         self._start = state * (1 + 0.1 * self._generator.uniform(-1.0, 1.0, n))
         most = _SAMPLES if n <= _MANY_STATES else _FEW_SAMPLES
         self._make_record(state, min(library.layout.horizon + _BY_RUN + _BY_MEMBERS, most), is_wild)
@@ -288,8 +290,8 @@ class _Rehearsal:
                 y[t % p] = np.nan
             if t % 11 == 7:
                 y[:] = np.nan
-            own = self._own_noise if special else None
-            self._weights[t] = self._cost.partial_weight(np.isfinite(y), own)
+            own = (self._own_noise, self._own_disturbance) if special else ()
+            self._weights[t] = self._cost.partial_weight(np.isfinite(y), *own)
             x = interpreter.value("f", x, self._us[t], self._steps[t])
             x = x * (1 + 0.05 * generator.standard_normal(n))
             if not abs(x).max() <= 1e3 * abs(first).max():  # NaN, too
@@ -327,6 +329,7 @@ class _Rehearsal:
                 sample["y"], sample["u"] = y, u
                 sample["step"] = 0.0 if self._steps[t] == usual else self._steps[t]
                 sample["noise_weight"] = 0 if t % 6 else self._own_noise.ctypes.data
+                sample["disturbance_weight"] = 0 if t % 6 else self._own_disturbance.ctypes.data
                 library.update(*(
                     ctypes.c_void_p(one.ctypes.data)
                     for one in (memory, before, workspace, sample, out)

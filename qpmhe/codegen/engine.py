@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import ctypes
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import check_problem, positive_definite
+from .._checks import check_problem
 from ..costs import Cost
-from ..errors import InvalidInputError, OptionError
-from ..estimation.conditions import Conditions, usual_conditions
+from ..errors import InvalidInputError
+from ..estimation.conditions import ConditionReader, Conditions, usual_conditions
 from ..estimation.covariance import window_covariances
 from ..estimation.estimate import DroppedRow, Estimate, Status
 from ..estimation.run import Run
@@ -28,13 +28,24 @@ from ..estimation.snapshot import (
 from ..model.system import System
 from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
+from .layout import CHANGES, SET_NAMES, SIDES, STAGE_FLAGS
 from .library import EstimatorLibrary
+from .sample import SampleRecord
 
 Array = NDArray[np.float64]
 
 _ROWS_DROPPED = Status.ROWS_DROPPED.value
 # So that a long record can be interrupted, and its times are means of pieces.
 _PIECE = 256
+
+
+class Tools(NamedTuple):
+    """What a step uses; made anew where the usual conditions change."""
+
+    usual: Conditions
+    system: System
+    cost: Cost
+    record: NDArray[Any]
 
 
 class CompiledEngine:
@@ -47,9 +58,9 @@ class CompiledEngine:
         initial_state: Array,
     ) -> None:
         self._library = library = EstimatorLibrary(system, observer, cost, settings)
-        self._system, self._cost, self._settings = system, cost, settings
-        #: What holds where a sample has nothing of its own, and the system with its sets.
-        self.usual, self.system = usual_conditions(settings), system
+        self._system, self._given_cost, self._settings = system, cost, settings
+        self._reader = ConditionReader(system, cost)
+        self._tools = Tools(usual_conditions(settings), system, cost, library.settings)
         n, p, m, horizon = system.n, system.p, system.m, settings.horizon
         self._sizes, self._delay = (n, p, horizon), settings.delay
         self._workspace = library.workspace()
@@ -62,36 +73,56 @@ class CompiledEngine:
         self._numbers = self._out.view(np.int32)[2 * reals + 2 : 2 * reals + 8]
         self._before = np.empty_like(self._memory)  # before the last step
         # A sample as usual, and one with something of its own.
-        self._samples = np.zeros(2, library.sample_type)
-        self._samples["y"], self._samples["u"] = self._y.ctypes.data, self._u.ctypes.data
-        self._own = self._samples[1]
+        self._plain, self._own = (SampleRecord(library.layout, self._y, self._u) for _ in range(2))
         memory, before, workspace, usual, special, out = (
             ctypes.c_void_p(array.ctypes.data)
             for array in (
-                self._memory, self._before, self._workspace, self._samples[:1], self._samples[1:],
+                self._memory, self._before, self._workspace, self._plain.record, self._own.record,
                 self._out,
             )
         )
         self._usual, self._special = (
             (memory, before, workspace, sample, out) for sample in (usual, special)
         )
-        self._amending, self._result = (memory, workspace), out
+        self._amending, self._undoing, self._result = (memory, workspace), (memory, before), out
         self._call = library.update
         self._observer, self._watch = observer, CompiledWatch(horizon)
         self._time = self._memory["time"]
 
     def reset(self, initial_state: Array) -> None:
         """Forget all measurements and start at this state."""
-        self._replace(self._library.estimators(initial_state[None]))
+        tools = self._tools
+        self._replace(self._library.estimators(initial_state[None], tools.record), tools)
 
-    def _replace(self, memory: NDArray[Any]) -> None:
+    def _replace(self, memory: NDArray[Any], tools: Tools) -> None:
         """Remember this in place of all that was; whole or, if interrupted, not at all."""
-        before = self._memory.copy()
+        before = self._memory.copy(), self._tools
+        self._held = tools, self._tools  # the memory points to a record of these
         try:
-            self._memory[...] = memory
+            self._memory[...], self._tools = memory, tools
         except BaseException:
-            self._memory[...] = before
+            self._memory[...], self._tools = before
             raise
+
+    def _tools_for(self, usual: Conditions) -> Tools:
+        """What a step uses under these usual conditions."""
+        system, cost = usual.applied(self._system, self._given_cost)
+        return Tools(usual, system, cost, self._library.settings_for(system, cost))
+
+    @property
+    def usual(self) -> Conditions:
+        """What holds where a sample has nothing of its own."""
+        return self._tools.usual
+
+    @property
+    def system(self) -> System:
+        """The system with its present sets."""
+        return self._tools.system
+
+    @property
+    def cost(self) -> Cost:
+        """The cost with its present weights."""
+        return self._tools.cost
 
     @property
     def time(self) -> int:
@@ -111,35 +142,43 @@ class CompiledEngine:
         return int(self._memory[0]["length"])
 
     def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
-        """Refuse: samples in C have no usual conditions that could change."""
-        raise OptionError("engine='compiled' takes no set(...); take engine='python'.")
+        """Let other conditions hold at all samples of the window and from now on."""
+        began, memory, before = perf_counter(), self._memory.copy(), self._tools
+        usual = changes.over(self.usual)
+        if parameters is not None:
+            usual = usual._replace(parameters=parameters)
+        tools = self._tools_for(usual)
+        self._held = tools, before
+        bits = sum(1 << k for k, name in enumerate(CHANGES) if getattr(changes, name) is not None)
+        given = None if parameters is None else np.ascontiguousarray(parameters)
+        try:
+            self._library.set(
+                *self._amending, ctypes.c_void_p(tools.record.ctypes.data), bits,
+                None if given is None else ctypes.c_void_p(given.ctypes.data),
+                0 if given is None else given.size, self._result,
+            )
+            self._tools = tools
+            if not self.length:
+                return None
+            estimate = self._collect(self.time - 1)
+            estimate.step_time = perf_counter() - began
+            return estimate
+        except BaseException:
+            self._memory[...], self._tools = memory, before
+            raise
 
     def step(
         self, y: Array, u: Array, dt: float | None, own: Conditions | None, began: float
     ) -> Estimate:
         """Take a sample in, and estimate."""
-        noise_weight = None
-        if own is not None:
-            noise_weight = own.noise_weight
-            for name, given in (
-                ("disturbance_weight", own.disturbance_weight is not None),
-                ("bounds", own.has_bounds), ("sensors", own.sampled is not None),
-            ):
-                if given:
-                    raise OptionError(
-                        f"engine='compiled' takes no {name} of single samples; take "
-                        "engine='python', or leave it out."
-                    )
         time = self._time.item()
         try:
             self._y[...] = y
             self._inputs[...] = u
-            if dt is None and noise_weight is None:
+            if dt is None and own is None:
                 self._call(*self._usual)
             else:
-                weight = None if noise_weight is None else np.ascontiguousarray(noise_weight)
-                self._own["step"] = dt or 0.0
-                self._own["noise_weight"] = 0 if weight is None else weight.ctypes.data
+                self._own.fill(dt, own)
                 self._call(*self._special)
             estimate = self._collect(time)
             estimate.step_time = perf_counter() - began
@@ -149,7 +188,7 @@ class CompiledEngine:
             return estimate
         except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
             if self.time != time:
-                self._library.undo(*self._usual[:2])
+                self._library.undo(*self._undoing)
             raise
 
     def _collect(self, time: int) -> CompiledEstimate:
@@ -209,11 +248,14 @@ class CompiledEngine:
             raise InvalidInputError("there is no estimate yet; update first.")
         length = self.length
         stages = record["stages"][(record["first"] + np.arange(length)) % self._sizes[2]]
-        system, cost, count = self._system, self._cost, length
+        system, cost, count = self._system, self.cost, length
         irregular = bool(stages["is_irregular"].any())
         inputs = stages["u"][:, : system.m]
         weights = np.zeros((count, system.n + system.p, system.n + system.p))
-        weights[:, : system.n, : system.n] = cost.disturbance
+        weights[:, : system.n, : system.n] = np.where(
+            stages["has_own_disturbance"][:, None, None], stages["own_disturbance_weight"],
+            cost.disturbance,
+        )
         weights[:, system.n :, system.n :] = stages["noise_weight"]
         factors = cost.discount ** np.append(count, np.arange(count - 1, -1, -1.0))
         model = system.timed if irregular else system
@@ -245,10 +287,11 @@ class CompiledEngine:
         return {
             "problem": self._size(), "engine": self.name, "estimator": self._description(),
             "linearized": self._settings.qp_limit > 0, "memory": memory,
+            "usual": self.usual.state_dict(),
         }
 
     def _description(self) -> dict[str, Any]:
-        return described(self._system, self._observer, self._cost, self._settings)
+        return described(self._system, self._observer, self._given_cost, self._settings)
 
     def _size(self) -> tuple[int, ...]:
         system = self._system
@@ -264,17 +307,18 @@ class CompiledEngine:
             )
         with reading():
             check_description(state["estimator"], self._description())
+            tools = self._tools_for(self._reader.load(state["usual"], self.usual))
             size, linearized = self._memory.itemsize, state["linearized"]
             memory = checked_array("memory", state["memory"], (size,), np.uint8)
             memory = memory.view(self._memory.dtype)
             if not isinstance(linearized, bool):
                 raise TypeError(f"linearized is {linearized!r}")
-            memory["settings"] = self._library.settings.ctypes.data
+            memory["settings"] = tools.record.ctypes.data
             with np.errstate(all="ignore"):
-                self._check(memory, linearized)
-        self._replace(memory)
+                self._check(memory, linearized, tools)
+        self._replace(memory, tools)
 
-    def _check(self, memory: NDArray[Any], linearized: bool) -> None:
+    def _check(self, memory: NDArray[Any], linearized: bool, tools: Tools) -> None:
         """Refuse a window that is impossible, or whose stages the model does not reproduce."""
         record, n, horizon = memory[0], self._sizes[0], self._sizes[2]
         time, length, first = (int(record[name]) for name in ("time", "length", "first"))
@@ -294,42 +338,59 @@ class CompiledEngine:
         if time and not np.array_equal(trajectory[-1], history[record["newest"]]):
             raise ValueError("history does not end where the trajectory does")
         for stage in record["stages"][places]:
-            self._check_flags(stage)
+            self._check_flags(stage, tools)
         again, reached = memory.copy(), np.zeros((horizon, n))
         self._library.recompute(again.ctypes.data, reached.ctypes.data)
         sizes, wanted = np.abs(z).max(axis=0), self._settings.qp_limit > 0
         for k, place in enumerate(places):
             stage, fresh = record["stages"][place], again[0]["stages"][place]
-            self._check_stage(stage, fresh, z[k + 1], reached[k], sizes)
+            disturbance = stage["own_disturbance_weight"] if stage["has_own_disturbance"] else None
+            weight = tools.cost.joint_weight(stage["noise_weight"], disturbance)
+            self._check_stage(stage, fresh, z[k + 1], reached[k], sizes, weight)
             if linearized == wanted and wanted:
-                self._check_terms(stage, fresh, sizes)
+                self._check_terms(stage, fresh, sizes, np.abs(weight))
             else:
                 stage["terms"] = fresh["terms"]
 
-    def _check_flags(self, stage: Any) -> None:
+    def _check_flags(self, stage: Any, tools: Tools) -> None:
         """Refuse a stage whose sample is impossible."""
-        flags = [int(stage[name]) for name in ("has_own_noise", "is_irregular", "is_complete")]
-        observed, step, p = stage["is_observed"], stage["step"], self._sizes[1]
+        flags = {name: int(stage[name]) for name in STAGE_FLAGS}
+        observed, step, sampled = stage["is_observed"], stage["step"], stage["is_sampled"]
         if not (
-            np.isin([*flags, *observed], (0, 1)).all() and flags[2] == observed.all()
-            and np.isfinite(stage["y"]).all()
+            np.isin([*flags.values(), *observed, *sampled], (0, 1)).all() and sampled.any()
+            and flags["is_complete"] == observed.all() and np.isfinite(stage["y"]).all()
         ):
             raise ValueError("a stage is impossible")
         if not (
-            0.0 < step < np.inf and self._system.dt if flags[1]
-            else step == self._library.settings["sample_time"]
+            0.0 < step < np.inf and self._system.dt if flags["is_irregular"]
+            else step == tools.record["sample_time"]
         ):
             raise ValueError("a step's length is impossible")
-        if flags[0]:
-            positive_definite("noise_weight", stage["own_noise_weight"].reshape(p, p))
+        saved: dict[str, Any] = {}
+        for kind in ("noise", "disturbance"):
+            if flags[f"has_own_{kind}"]:
+                saved[f"{kind}_weight"] = stage[f"own_{kind}_weight"]
+        for letter, name in zip("wv", SET_NAMES, strict=True):
+            if flags[f"has_own_{letter}"]:
+                sides, built = stage[f"own_{letter}"], self._system.set_of(name)
+                if built is None:
+                    raise mismatch(f"set of {name}")
+                saved[name] = {
+                    side: sides[side][: getattr(built, side).size].copy() for side in SIDES
+                }
+        self._reader.load(saved, tools.usual)
 
     def _check_stage(
-        self, stage: Any, fresh: Any, following: Array, reached: Array, sizes: Array
+        self, stage: Any, fresh: Any, following: Array, reached: Array, sizes: Array,
+        joint: Array,
     ) -> None:
         """Compare a stage with what the model makes of it now."""
         weight = fresh["noise_weight"]
         if not near(stage["noise_weight"], weight, np.abs(weight).max()):
             raise mismatch("weight of the stages' cost")
+        for letter in "wv":
+            if stage[f"has_own_{letter}"]:  # all but the sides is computed
+                stage[f"own_{letter}"] = fresh[f"own_{letter}"]
         if np.isfinite(stage["cost"]) != np.isfinite(fresh["cost"]):
             raise mismatch("model")
         w, v = stage["w"], stage["v"]
@@ -343,15 +404,15 @@ class CompiledEngine:
             return  # the observer may have been restarted behind it
         if not near(following, reached, sizes):
             raise mismatch("model (f)")
-        r, joint = np.append(w, v), self._cost.joint_weight(stage["noise_weight"])
+        r = np.append(w, v)
         value, size = (
-            self._cost.stage_costs(one[None], weight)[0]
+            self._given_cost.stage_costs(one[None], weight)[0]
             for one, weight in ((r, joint), (np.abs(r), np.abs(joint)))
         )
         if not near(stage["cost"], value, size):
             raise mismatch("cost")
 
-    def _check_terms(self, stage: Any, fresh: Any, sizes: Array) -> None:
+    def _check_terms(self, stage: Any, fresh: Any, sizes: Array, weight: Array) -> None:
         """Compare Jacobians and terms with what the model makes of them now."""
         n, found, expected = self._sizes[0], stage["terms"], fresh["terms"]
         for name in ("f_jacobian", "h_jacobian"):
@@ -359,10 +420,9 @@ class CompiledEngine:
                 raise mismatch("model (its Jacobians)")
         sizes = np.append(np.maximum(sizes, np.abs(stage["w"])), np.abs(stage["y"]))
         sizes[n:] += np.abs(stage["v"])
-        weight = np.abs(self._cost.joint_weight(stage["noise_weight"]))
         if self._library.layout.loss:
             scale = np.append(expected["disturbance_scale"], expected["noise_scale"])
-            weight *= scale[:, None]
+            weight = weight * scale[:, None]
         slopes = np.abs(np.vstack((expected["f_jacobian"], expected["h_jacobian"])))
         bounds = {
             "hessian": slopes.T @ weight @ slopes, "coupling": slopes.T @ weight[:, :n],

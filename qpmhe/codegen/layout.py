@@ -24,6 +24,18 @@ SET_NAMES = ("disturbances", "noises")
 TERMS = ("prior", "disturbance", "noise")
 LOSSES = ("quadratic", "huber", "power")
 
+#: Sides of a set.
+SIDES = ("lower", "upper", "row_lower", "row_upper")
+#: Flags of a stage.
+STAGE_FLAGS = (
+    "has_own_noise", "has_own_disturbance", "has_own_w", "has_own_v", "is_irregular", "is_complete"
+)
+#: What mhe_set changes, in the order of its bits.
+CHANGES = ("noise_weight", "disturbance_weight", *SET_NAMES)
+
+_CLOCK_TEXT = """
+ *
+ * To keep time_budget, set `clock` in a copy of the settings to a function that returns seconds."""
 _MOST = int(np.iinfo(np.int32).max)
 # From so many states on, LAPACK's calls take less time than loops that a compiler made.
 _LAPACK_STATES = 40
@@ -45,11 +57,13 @@ class Layout:
     loss: bool = False
     #: Whether the factorisation calls LAPACK.
     lapack: bool = False
+    #: Whether there is a time budget, and a clock to keep it.
+    clock: bool = False
 
     @classmethod
     def of(
         cls, system: System, cost: Cost, horizon: int, continuous: int, real: str = "double",
-        lapack: bool = False,
+        lapack: bool = False, clock: bool = False,
     ) -> Layout:
         """The sizes of an estimator of a system. `lapack` allows it where it is quicker."""
         form = cost.c_form
@@ -59,8 +73,8 @@ class Layout:
             for one in (system.disturbances, system.noises)
         )
         return cls(
-            system.n, system.p, system.m, horizon, sets, continuous, real, loss,
-            lapack and system.n >= _LAPACK_STATES,
+            system.n, system.p, system.m, horizon, sets, continuous, real, loss=loss,
+            lapack=lapack and system.n >= _LAPACK_STATES, clock=clock,
         )
 
     @property
@@ -75,6 +89,7 @@ class Layout:
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
             "continuous": self.continuous, "real": self.real, "loss": int(self.loss),
             "lapack": int(self.lapack),
+            "clock": int(self.clock), "clock_text": _CLOCK_TEXT if self.clock else "",
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wv", self.sets, strict=True):
@@ -93,17 +108,13 @@ class Layout:
             ("discount", r), ("sample_time", r), ("tolerance", r),
             ("solver_tolerance", r),
         ]
-        for name, size, (_, rows) in zip(SET_NAMES, (n, p), self.sets, strict=True):
-            space = max(rows, 1)
-            fields.append((name, _struct([
-                ("lower", r, size), ("upper", r, size), ("scale", r, size),
-                ("rows", r, space * size), ("row_lower", r, space), ("row_upper", r, space),
-                ("row_scale", r, space),
-            ])))
+        fields += [(name, self.set_type(name)) for name in SET_NAMES]
         options = (
             "max_qps", "max_iterations", "infeasible", "start_at_best", "reinitialize", "delay"
         )
         fields += [(name, np.int32) for name in options]
+        if self.clock:
+            fields += [("time_budget", np.float64), ("clock", np.uintp)]
         return _struct(fields)
 
     def estimate_type(self) -> np.dtype[Any]:
@@ -118,9 +129,19 @@ class Layout:
             ("dropped", np.uint8, (count, max(sum(self.set_rows), 1))),
         ])
 
+    def set_type(self, name: str) -> np.dtype[Any]:
+        """``mhe_w_set`` or ``mhe_v_set``."""
+        r, k = self.number, SET_NAMES.index(name)
+        size, space = (self.nx, self.ny)[k], max(self.sets[k][1], 1)
+        return _struct([
+            ("lower", r, size), ("upper", r, size), ("scale", r, size), ("rows", r, space * size),
+            ("row_lower", r, space), ("row_upper", r, space), ("row_scale", r, space),
+            ("deviation", r, size), ("row_deviation", r, space),
+        ])
+
     def sample_type(self) -> np.dtype[Any]:
         """``mhe_sample``."""
-        pointers = ("y", "u", "noise_weight")
+        pointers = ("y", "u", "noise_weight", "disturbance_weight", *SET_NAMES, "sampled")
         return _struct([*((name, np.uintp) for name in pointers), ("step", self.number)])
 
     @property
@@ -155,8 +176,14 @@ class Layout:
         stage = _struct([
             ("z", r, n), ("y", r, p), ("u", r, max(self.nu, 1)), ("step", r), ("w", r, n),
             ("v", r, p), ("noise_weight", r, (p, p)), ("own_noise_weight", r, (p, p)),
-            ("cost", r), ("has_own_noise", np.int32), ("is_irregular", np.int32),
-            ("is_complete", np.int32), ("is_observed", np.uint8, p), ("terms", terms),
+            ("own_disturbance_weight", r, (n, n)),
+            *(
+                (f"own_{letter}", self.set_type(name))
+                for letter, name, (there, _) in zip("wv", SET_NAMES, self.sets, strict=True)
+                if there
+            ),
+            ("cost", r), *((flag, np.int32) for flag in STAGE_FLAGS), ("is_observed", np.uint8, p),
+            ("is_sampled", np.uint8, p), ("terms", terms),
         ])
         return _struct([
             ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
@@ -208,9 +235,10 @@ def _filled(
         if one is None:
             continue
         part, scaled = record[name], Rows(name, one, inverse(weight))
-        part["scale"], part["row_scale"] = 1.0, 1.0
-        part["scale"][scaled.components] = scaled.scale[: scaled.bounds]
-        part["row_scale"][: one.matrix.shape[0]] = scaled.scale[scaled.bounds :]
+        for kind, values in (("scale", scaled.scale), ("deviation", scaled.deviation)):
+            part[kind], part[f"row_{kind}"] = 1.0, 1.0
+            part[kind][scaled.components] = values[: scaled.bounds]
+            part[f"row_{kind}"][: one.matrix.shape[0]] = values[scaled.bounds :]
         part["lower"], part["upper"] = one.lower, one.upper
         rows = one.matrix.shape[0]
         part["rows"][: one.matrix.size] = one.matrix.ravel()
@@ -222,6 +250,8 @@ def _filled(
     record["start_at_best"] = settings.warm_start
     record["reinitialize"] = settings.candidate == "reinitialized"
     record["delay"] = settings.delay
+    if layout.clock:
+        record["time_budget"] = settings.time_budget
     return record
 
 

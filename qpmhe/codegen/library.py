@@ -15,6 +15,7 @@ from ..errors import CompilationError, OptionError
 from ..estimation.estimate import Status
 from ..estimation.limits import FEASIBLE
 from ..estimation.settings import Settings
+from ..model.expressions import CasadiModel
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
@@ -22,10 +23,12 @@ from .comparison import Interpreter, estimator_fault
 from .compiler import NotCachedError, cached_library, compiled_library
 from .fingerprint import source_key
 from .layout import SET_NAMES, TERMS, Layout, settings_record
-from .source import CONTINUOUS, MAIN, estimator_files
+from .source import CONTINUOUS, MAIN, estimator_files, template
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
 _MOST_BYTES = 2**31 - 1
+# Before any header: what declares the clock.
+_CLOCK_HEAD = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"
 
 
 def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings) -> str:
@@ -90,11 +93,6 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         return (
             f"the compiled step solves its QPs itself, not by {settings.backend!r}; take "
             "backend='auto', or 'banded' for QPs without inequalities."
-        )
-    if settings.time_budget is not None:
-        return (
-            "the compiled step has no clock; bound it by max_qps and max_solver_iterations "
-            "in place of time_budget."
         )
     return ""
 
@@ -176,7 +174,10 @@ def planned(
         raise OptionError(f"no C code for this estimator: {reason}")
     model = system.symbolic
     assert model is not None
-    layout = Layout.of(system, cost, settings.horizon, CONTINUOUS[model.method], real, lapack)
+    layout = Layout.of(
+        system, cost, settings.horizon, CONTINUOUS[model.method], real, lapack,
+        settings.time_budget is not None,
+    )
     return layout, settings_record(layout, system, observer, cost, settings)
 
 
@@ -196,6 +197,14 @@ def lapack_functions() -> Any:
         )
     ]
     return (ctypes.c_void_p * len(capsules))(*(pointer(one, name(one)) for one in capsules))
+
+
+def _engine_files(model: CasadiModel, layout: Layout, record: NDArray[Any]) -> dict[str, str]:
+    """Source of an estimator, with a clock where it keeps a time budget."""
+    made, _ = estimator_files(model, layout, record)
+    if layout.clock:
+        made[MAIN] = f"{_CLOCK_HEAD}{made[MAIN]}\n{template('clock.c')}"
+    return made
 
 
 class RunLog:
@@ -231,10 +240,10 @@ class EstimatorLibrary:
     """Functions and structures of one compiled estimator.
 
     ``settings``, the ``mhe_settings`` in use, must outlive all estimators that point to it.
-    ``update``, ``update_members``, ``amend``, ``reset``, ``run`` and ``recompute`` are the C
-    functions of these names; `update` is ``mhe_update_undoable``, which `undo` reverses.
-    ``path`` is the file. With ``settings.engine="auto"`` it must be in the cache: `NotCachedError`
-    is raised if it is not.
+    ``update``, ``undo``, ``set``, ``update_members``, ``amend``, ``reset``, ``run`` and
+    ``recompute`` are the C functions of these names; `update` is ``mhe_update_undoable``, which
+    `undo` reverses. ``path`` is the file. With ``settings.engine="auto"`` it must be in the cache:
+    `NotCachedError` is raised if it is not.
     """
 
     def __init__(
@@ -243,6 +252,7 @@ class EstimatorLibrary:
         self.layout, self.settings = layout, record = planned(
             system, observer, cost, settings, lapack=True
         )
+        self._observer, self._options = observer, settings
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
         assert system.symbolic is not None
@@ -266,10 +276,20 @@ class EstimatorLibrary:
                 )
         else:
             found = compiled_library(
-                lambda: estimator_files(model, layout, record)[0], MAIN, key, fault
+                lambda: _engine_files(model, layout, record), MAIN, key, fault
             )
         self.path = Path(found._name)
         self._bind(found)
+
+    def settings_for(self, system: System, cost: Cost) -> NDArray[Any]:
+        """``mhe_settings`` with the sets and weights of these."""
+        record = settings_record(self.layout, system, self._observer, cost, self._options)
+        self._set_clock(record)
+        return record
+
+    def _set_clock(self, record: NDArray[Any]) -> None:
+        if self.layout.clock:
+            record["clock"] = self._clock
 
     def _bind(self, library: ctypes.CDLL) -> None:
         # Single steps are shorter than handing the interpreter's lock over; runs are not.
@@ -280,15 +300,23 @@ class EstimatorLibrary:
         pointer, integer = ctypes.c_void_p, ctypes.c_int64
         self.update = quick.mhe_update_undoable
         self.amend, self.reset, self.run = quick.mhe_amend, quick.mhe_reset, library.mhe_run
-        self.recompute, self.undo = quick.mhe_recompute, quick.mhe_undo
+        self.recompute, self.undo, self.set = quick.mhe_recompute, quick.mhe_undo, quick.mhe_set
         self.update_members = library.mhe_update_members
         for function in (
-            self.update, self.undo, self.reset, self.run, self.update_members, self.recompute
+            self.update, self.undo, self.set, self.reset, self.run, self.update_members,
+            self.recompute,
         ):
             function.restype = None
         self.amend.argtypes = [pointer, pointer, integer, pointer, pointer]
         self.reset.argtypes = [pointer, pointer, pointer]
         self.recompute.argtypes = [pointer, pointer]
+        self.undo.argtypes = [pointer, pointer]
+        self.set.argtypes = [
+            pointer, pointer, pointer, ctypes.c_int32, pointer, ctypes.c_int32, pointer
+        ]
+        if self.layout.clock:
+            self._clock = ctypes.cast(library.mhe_seconds, pointer).value
+        self._set_clock(self.settings)
         self.update_members.argtypes = [pointer, integer, pointer, pointer, pointer, pointer]
         self.run.argtypes = [pointer, integer, pointer, integer, pointer, pointer, pointer]
 
@@ -313,14 +341,17 @@ class EstimatorLibrary:
         """Scratch for the estimators of one thread."""
         return _memory(self.workspace_size, np.dtype(np.uint8), "the compiled step's scratch")
 
-    def estimators(self, states: NDArray[np.float64]) -> NDArray[Any]:
+    def estimators(
+        self, states: NDArray[np.float64], settings: NDArray[Any] | None = None
+    ) -> NDArray[Any]:
         """Memory of one estimator for each row of initial states, reset."""
+        settings = self.settings if settings is None else settings
         memory = _memory(
             len(states), self.estimator_type, f"the memory of {len(states)} estimators"
         )
         base, size = memory.ctypes.data, self.estimator_type.itemsize
         for i, state in enumerate(np.ascontiguousarray(states)):
-            self.reset(base + i * size, self.settings.ctypes.data, state.ctypes.data)
+            self.reset(base + i * size, settings.ctypes.data, state.ctypes.data)
         return memory
 
     def log(self, shape: tuple[int, ...]) -> RunLog:

@@ -62,6 +62,15 @@ class Conditions(NamedTuple):
         pairs: Any = zip(self, others, strict=True)
         return Conditions(*(a if b is None else None for a, b in pairs))
 
+    def applied(self, system: System, cost: Cost) -> tuple[System, Cost]:
+        """The system with these sets and the cost with these weights, where they say something."""
+        if self.has_bounds:
+            sets = {name: getattr(self, name) for name in SET_NAMES}
+            system = system.with_sets({n: one for n, one in sets.items() if one is not None})
+        if self.noise_weight is not None or self.disturbance_weight is not None:
+            cost = cost.with_weights(self.noise_weight, self.disturbance_weight)
+        return system, cost
+
     def state_dict(self) -> dict[str, Any]:
         """Copies of all that is not None, as plain arrays."""
         return {

@@ -52,6 +52,8 @@ class Rows:
     scale : (r,) or (K, r) array
         The unit in which a miss of the row is measured: its width, or the standard deviation of
         M s if that is less.
+    deviation : (r,) array
+        The standard deviation of M s.
     fixed : (r,) bool array
         Rows that are never dropped: the components that have no width.
     numbers : (r,) array
@@ -59,7 +61,7 @@ class Rows:
     """
 
     __slots__ = (
-        "_columns", "_deviation", "_kept", "_magnitudes", "bounds", "components", "fixed", "lower",
+        "_columns", "_kept", "_magnitudes", "bounds", "components", "deviation", "fixed", "lower",
         "matrix", "name", "numbers", "scale", "upper",
     )
 
@@ -68,7 +70,7 @@ class Rows:
         self.name, self.components, self.bounds = name, components, components.size
         self.matrix: Array = np.vstack((np.eye(d)[components], convex_set.matrix))
         self._kept: Mask | None = None
-        self._deviation = np.sqrt(np.einsum("ri,ij,rj->r", self.matrix, covariance, self.matrix))
+        self.deviation = np.sqrt(np.einsum("ri,ij,rj->r", self.matrix, covariance, self.matrix))
         self.lower, self.upper = self._sides(convex_set)
         self.scale: Array = self._scale()
         fixed = self.lower == self.upper
@@ -90,7 +92,7 @@ class Rows:
         return np.append(lower[self._kept], noise_free), np.append(upper[self._kept], noise_free)
 
     def _scale(self) -> Array:
-        width, deviation = self.upper - self.lower, self._deviation
+        width, deviation = self.upper - self.lower, self.deviation
         scale: Array = np.where(width > 0.0, np.minimum(width, deviation), deviation)
         return scale
 
@@ -151,8 +153,8 @@ class Rows:
         other.lower = np.append(self.lower[kept], nothing)
         other.upper = np.append(self.upper[kept], nothing)
         # A row on a disturbance without variance has no deviation; N has a variance of 1.
-        deviation = np.where(self._deviation > 0.0, self._deviation, 1.0)
-        other._deviation = np.append(deviation[kept], nothing + 1.0)
+        deviation = np.where(self.deviation > 0.0, self.deviation, 1.0)
+        other.deviation = np.append(deviation[kept], nothing + 1.0)
         other.scale = other._scale()
         other.fixed = np.append(self.fixed[kept], nothing == 0.0)
         other.numbers = np.append(self.numbers[kept], np.full(nothing.size, -1))

@@ -29,7 +29,6 @@ from .problem import Formulation
 from .recheck import check_stages
 from .settings import Settings
 from .snapshot import (
-    SET_NAMES,
     check_description,
     check_size,
     checked_array,
@@ -130,12 +129,8 @@ class PythonEngine:
 
     def _tools_for(self, usual: Conditions) -> Tools:
         """What a step uses under these usual conditions."""
-        system, cost, settings = self._system, self._cost, self._settings
-        if usual.has_bounds:
-            sets = {name: getattr(usual, name) for name in SET_NAMES}
-            system = system.with_sets({n: one for n, one in sets.items() if one is not None})
-        if usual.noise_weight is not None or usual.disturbance_weight is not None:
-            cost = cost.with_weights(usual.noise_weight, usual.disturbance_weight)
+        settings = self._settings
+        system, cost = usual.applied(self._system, self._cost)
         formulation = Formulation(system, self._observer, cost)
         subproblem = Subproblem(
             system, cost, formulation.constraints, settings.horizon, formulation.penalties

@@ -13,6 +13,7 @@ import qpmhe
 from qpmhe.models.batch_reactor import batch_reactor
 from qpmhe.models.batch_reactor import casadi_output as reactor_output
 from qpmhe.models.batch_reactor import casadi_rate as reactor_rate
+from .conditions import with_changes, with_conditions, with_parameters
 
 STEPS = 24
 
@@ -22,7 +23,8 @@ class Case:
     """An estimator's arguments, and the arguments of each of its updates.
 
     ``options`` are those of the estimator beside engine and initial state, ``samples`` the
-    arguments of `update`, by name. Both engines must agree to ``tolerance``, relative to the
+    arguments of `update`, by name, and ``changes`` those of `set` after the samples that are its
+    keys. Both engines must agree to ``tolerance``, relative to the
     magnitude of what is compared.
     """
 
@@ -33,6 +35,7 @@ class Case:
     samples: tuple[dict[str, Any], ...]
     options: dict[str, Any] = field(default_factory=lambda: {"horizon": 5, "max_qps": 2})
     tolerance: float = 1e-9
+    changes: dict[int, dict[str, Any]] = field(default_factory=dict)
 
     def estimator(self, engine: str, **options: Any) -> qpmhe.MovingHorizonEstimator:
         """An estimator of this case."""
@@ -163,12 +166,44 @@ def _boxed(one: Case, **options: Any) -> Case:
     return changed.with_options(max_qps=None, solver_tolerance=1e-9, **options)
 
 
+def _narrow(one: Case, **options: Any) -> Case:
+    """The case with sets that bind, solved to convergence."""
+    sets = {
+        "disturbances": qpmhe.Box([-0.05] * 3, [0.05] * 3)
+        & qpmhe.Polytope([[1.0, 1.0, -1.0]], [0.06]),
+        "noises": qpmhe.Box([-0.3, -0.4], [0.3, 0.4]),
+    }
+    changed = replace(one, system=with_inputs(**sets))
+    return changed.with_options(max_qps=None, solver_tolerance=1e-9, **options)
+
+
 def _huber(threshold: float, per_component: bool = False) -> Callable[[Any], qpmhe.Huber]:
     return functools.partial(qpmhe.Huber, threshold=threshold, per_component=per_component)
 
 
 def _power(exponent: float, per_component: bool = False) -> Callable[[Any], qpmhe.Power]:
     return functools.partial(qpmhe.Power, exponent=exponent, per_component=per_component)
+
+
+def _tank() -> Case:
+    """A tank whose outflow's coefficient is a parameter, with two gauges and a push."""
+    import casadi
+
+    system = qpmhe.from_casadi(
+        lambda x, u: [u[0] - u[1] * casadi.sqrt(casadi.fmax(x[0], 0.01)) - 0.1 * x[1],
+                      0.5 * x[0] - x[1]],
+        lambda x, u: [x[0], x[0] + 0.3 * x[1] ** 2], n=2, m=2, dt=0.1, compiled=False,
+        noises=qpmhe.Box([-0.25, -0.4], [0.25, 0.4]),
+        disturbances=qpmhe.Box([-0.15, -0.2], [0.1, 0.15]),
+    )
+    cost = qpmhe.QuadraticCost(prior=spd(4, 2), disturbance=2500 * spd(5, 2), noise=40 * spd(6, 2))
+    start = np.array([1.0, 0.5])
+    samples = tuple(
+        sample | {"u": np.array([0.6 + 0.2 * np.sin(t), 0.5])}
+        for t, sample in enumerate(recorded(system, start))
+    )
+    one = Case(system, qpmhe.Luenberger([[0.2, 0.05], [0.0, 0.1]]), cost, start, samples)
+    return with_parameters(one, 0.5).with_options(max_qps=None, solver_tolerance=1e-9)
 
 
 #: Each is made when it is asked for; `case` keeps it.
@@ -199,6 +234,26 @@ CASES: dict[str, Callable[[], Case]] = {
     "mixed losses": lambda: _weighed(
         _robust(_huber(1.0), _power(1.5, True), _huber(2.0, True)).with_gaps()
     ).with_options(max_qps=4, candidate="reinitialized", warm_start=True),
+    "reactor conditions": lambda: with_conditions(case("reactor").with_gaps()),
+    "inputs conditions": lambda: with_conditions(case("inputs reinitialized")),
+    "inputs reinitialized": lambda: case("inputs").with_options(
+        candidate="reinitialized", warm_start=True, max_qps=1
+    ),
+    "inputs changes": lambda: with_changes(case("inputs")),
+    "narrow conditions": lambda: with_changes(with_conditions(_narrow(case("inputs")))),
+    "narrow, reinitialized": lambda: with_changes(with_conditions(
+        _narrow(case("inputs"), candidate="reinitialized")
+    )),
+    "huber conditions": lambda: with_changes(with_conditions(case("huber per component"))),
+    "tank": _tank,
+    "tank conditions": lambda: with_changes(with_conditions(case("tank"))),
+    "tank observer": lambda: with_changes(
+        with_conditions(case("tank").with_gaps()).with_options(max_qps=0)
+    ),
+    "tank kept": lambda: with_changes(
+        with_conditions(case("tank")).with_options(infeasible="keep_candidate", warm_start=True)
+    ),
+    "tank in time": lambda: case("tank conditions").with_options(time_budget=1e6),
 }
 
 

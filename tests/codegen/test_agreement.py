@@ -41,12 +41,15 @@ def test_the_same_estimates(name):
     assert (reference.engine, compiled.engine) == ("python", "compiled")
     for t, sample in enumerate(one.samples):
         agree(reference.update(**sample), compiled.update(**sample), one.tolerance)
+        if t in one.changes:
+            changed = (mhe.set(**one.changes[t]) for mhe in (reference, compiled))
+            agree(*changed, one.tolerance)
         if t == len(one.samples) // 2:
             state = compiled.state_dict()
             compiled = one.estimator("compiled")
             compiled.load_state_dict(state)
     time = len(one.samples) - 2
-    late = np.array(one.samples[time]["y"]) + 0.1
+    late = np.resize(one.samples[time]["y"], one.system.p) + 0.1
     agree(reference.amend(time, late), compiled.amend(time, late), one.tolerance)
 
 

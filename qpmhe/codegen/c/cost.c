@@ -29,8 +29,7 @@ static void mhe_set_noise_weight(const mhe_settings *s, mhe_stage *stage)
 /* The weight of w at a stage. */
 static const real *mhe_disturbance_weight(const mhe_settings *s, const mhe_stage *stage)
 {
-    (void)stage;
-    return s->disturbance_weight;
+    return stage->has_own_disturbance ? stage->own_disturbance_weight : s->disturbance_weight;
 }
 
 #if MHE_LOSS

@@ -17,6 +17,9 @@
  *
  * Components of y that are not finite are missing. After each update
  * estimate.cost <= estimate.candidate_cost: both are the true cost of the nonlinear problem.
+ *
+ * A sample with something of its own, such as a weight, is taken by mhe_update_special. Other
+ * settings for all samples: copy the settings, change the copy, and call mhe_set.$clock_text
  */
 #ifndef MHE_H
 #define MHE_H
@@ -39,6 +42,7 @@ typedef $real mhe_real;
 #define MHE_V_ROWS $v_rows
 #define MHE_LOSS $loss    /* whether a term of the cost has a loss that is not quadratic */
 #define MHE_LAPACK $lapack /* 1: needs mhe_set_lapack */
+#define MHE_CLOCK $clock /* whether time_budget is kept */
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
@@ -63,13 +67,20 @@ enum { MHE_DROP_ROWS = 0, MHE_KEEP_CANDIDATE = 1 };
 /* Sides of an inequality, as bits. */
 enum { MHE_LOWER = 1, MHE_UPPER = 2 };
 
+/* What mhe_set changes, as bits. */
+enum {
+    MHE_NOISE_WEIGHT = 1, MHE_DISTURBANCE_WEIGHT = 2, MHE_DISTURBANCES = 4, MHE_NOISES = 8
+};
+
 /* A convex set: lower <= s <= upper, row_lower <= rows s <= row_upper. A miss of an inequality
- * counts as a share of its scale, in the same unit: its width, or a standard deviation. */
+ * counts as a share of its scale, in the same unit: its width, or its standard deviation if that
+ * is less. */
 typedef struct {
     mhe_real lower[MHE_NX], upper[MHE_NX], scale[MHE_NX];
     mhe_real rows[MHE_SIZE(MHE_W_ROWS) * MHE_NX];
     mhe_real row_lower[MHE_SIZE(MHE_W_ROWS)], row_upper[MHE_SIZE(MHE_W_ROWS)];
     mhe_real row_scale[MHE_SIZE(MHE_W_ROWS)];
+    mhe_real deviation[MHE_NX], row_deviation[MHE_SIZE(MHE_W_ROWS)];
 } mhe_w_set;
 
 typedef struct {
@@ -77,6 +88,7 @@ typedef struct {
     mhe_real rows[MHE_SIZE(MHE_V_ROWS) * MHE_NY];
     mhe_real row_lower[MHE_SIZE(MHE_V_ROWS)], row_upper[MHE_SIZE(MHE_V_ROWS)];
     mhe_real row_scale[MHE_SIZE(MHE_V_ROWS)];
+    mhe_real deviation[MHE_NY], row_deviation[MHE_SIZE(MHE_V_ROWS)];
 } mhe_v_set;
 
 enum { MHE_QUADRATIC = 0, MHE_HUBER = 1, MHE_POWER = 2 };
@@ -108,6 +120,10 @@ typedef struct {
     int32_t start_at_best;     /* start at the shifted previous estimate where it is better */
     int32_t reinitialize;      /* observer restarted at the estimate of the window's start */
     int32_t delay;             /* of the delayed estimates that mhe_run writes */
+#if MHE_CLOCK
+    double time_budget;        /* seconds from the start of a step, after which no QP begins */
+    double (*clock)(void);     /* seconds from any start; a null pointer: no budget is kept */
+#endif
 } mhe_settings;
 
 extern const mhe_settings mhe_default_settings;
@@ -125,10 +141,17 @@ typedef struct {
 typedef struct {
     mhe_real z[MHE_NX], y[MHE_NY], u[MHE_SIZE(MHE_NU)], step;
     mhe_real w[MHE_NX], v[MHE_NY]; /* residuals of the candidate */
-    mhe_real noise_weight[MHE_NY * MHE_NY], own_noise_weight[MHE_NY * MHE_NY];
+    mhe_real noise_weight[MHE_NY * MHE_NY]; /* of the components that are observed */
+    mhe_real own_noise_weight[MHE_NY * MHE_NY], own_disturbance_weight[MHE_NX * MHE_NX];
+#if MHE_W_SET
+    mhe_w_set own_w;
+#endif
+#if MHE_V_SET
+    mhe_v_set own_v;
+#endif
     mhe_real cost;                 /* infinite where the model could not be evaluated */
-    int32_t has_own_noise, is_irregular, is_complete;
-    uint8_t is_observed[MHE_NY];
+    int32_t has_own_noise, has_own_disturbance, has_own_w, has_own_v, is_irregular, is_complete;
+    uint8_t is_observed[MHE_NY], is_sampled[MHE_NY];
     mhe_terms terms;
 } mhe_stage;
 
@@ -190,13 +213,22 @@ typedef struct {
     mhe_real product[(MHE_HORIZON + 1) * MHE_NX];
     mhe_rows rows;
     uint8_t left_out[MHE_ROWS]; /* sides that no trial must keep */
+#if MHE_CLOCK
+    double (*clock)(void), deadline; /* of the present step */
+#endif
 } mhe_workspace;
 
 /* A sample, and what holds for it alone: 0 and null pointers stand for what usually does. Fill it
  * by zeros first: `mhe_sample sample = {0};`. */
 typedef struct {
     const mhe_real *y, *u;         /* y(t); u(t), not read where there are no inputs */
-    const mhe_real *noise_weight;  /* of v(t) */
+    const mhe_real *noise_weight, *disturbance_weight;
+    /* Sets with other sides; rows and deviations are those of the settings, scales are computed. Not
+     * read where the settings have no such set. */
+    const mhe_w_set *disturbances;
+    const mhe_v_set *noises;
+    const uint8_t *sampled;        /* 1 for each component of y that was sampled: others are not
+                                    * missing, but have no measurement at this time */
     mhe_real step;                 /* length of the step from t to t+1 */
 } mhe_sample;
 
@@ -218,7 +250,8 @@ void mhe_update_special(mhe_estimator *estimator, mhe_workspace *workspace,
 void mhe_update(mhe_estimator *estimator, mhe_workspace *workspace, const mhe_real *y,
                 const mhe_real *u, mhe_estimate *estimate);
 
-/* The same, after what it changes was copied to `before`, from where mhe_undo restores it. */
+/* The same, but mhe_undo, called next, restores the estimator as it was before this sample.
+ * `before` is memory for that. */
 void mhe_update_undoable(mhe_estimator *estimator, mhe_estimator *before,
                          mhe_workspace *workspace, const mhe_sample *sample,
                          mhe_estimate *estimate);
@@ -245,6 +278,14 @@ void mhe_recompute(mhe_estimator *estimator, mhe_real *reached);
 /* Before all else: dpotrf, dtrsm, dsyrk and dgemm, by Fortran's convention with 32-bit integers. */
 void mhe_set_lapack(void *const *functions);
 #endif
+
+/* Let other settings hold for all samples of the window and from now on, run the observer again
+ * from the start of the window, and estimate the same state again. What the samples had of their
+ * own in place of what changes is forgotten; `changes` are its bits. parameters: a null pointer,
+ * or values of the last `count` inputs of all samples. Before the first sample, there is no
+ * estimate to write. */
+void mhe_set(mhe_estimator *estimator, mhe_workspace *workspace, const mhe_settings *settings,
+             int32_t changes, const mhe_real *parameters, int32_t count, mhe_estimate *estimate);
 
 /* Sizes of the structures above: estimator, workspace, estimate, settings, sample. */
 void mhe_sizes(int64_t *sizes);

@@ -22,25 +22,15 @@ enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED };
 /* Limits of all rows about a trajectory with residuals w and v. */
 static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *w, const real *v)
 {
-    const mhe_settings *s = e->settings;
     real low[ROWS], high[ROWS];
     for (int i = 0; i < e->length; i++) {
-        real *scale = k->rows.scale + i * ROWS;
+        mhe_stage_scales(e, i, k->rows.scale + i * ROWS);
         mhe_stage_distances(e, i, w, v, low, high);
         for (int r = 0; r < ROWS; r++) {
             const int at = i * ROWS + r, out = k->left_out[at];
             k->rows.low[at] = out & MHE_LOWER ? -INFINITY : low[r];
             k->rows.high[at] = out & MHE_UPPER ? INFINITY : high[r];
         }
-#if MHE_W_SET
-        for (int j = 0; j < NX; j++) scale[j] = s->disturbances.scale[j];
-        for (int j = 0; j < MHE_W_ROWS; j++) scale[NX + j] = s->disturbances.row_scale[j];
-        scale += W_COUNT;
-#endif
-#if MHE_V_SET
-        for (int j = 0; j < NY; j++) scale[j] = s->noises.scale[j];
-        for (int j = 0; j < MHE_V_ROWS; j++) scale[NY + j] = s->noises.row_scale[j];
-#endif
     }
 }
 
@@ -248,7 +238,7 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
             dual[i] = 0;
         }
         if (!changed) return SOLVED;
-        if (*iterations == limit || *iterations == GUESSES) return STOPPED;
+        if (*iterations == limit || *iterations == GUESSES || mhe_time_is_up(k)) return STOPPED;
         mhe_build(e, k, offset, nearest);
         mhe_add_weights(e, k);
         if (!mhe_factorise(k, count)) return STOPPED;
@@ -415,7 +405,7 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
             unbalanced <= s->solver_tolerance * s->solver_tolerance * scale &&
             products <= s->solver_tolerance / 1000 * scale)
             return SOLVED;
-        if (*iterations >= limit) return STOPPED;
+        if (*iterations >= limit || mhe_time_is_up(k)) return STOPPED;
         /* Of rows that exclude each other, residuals hardly shrink. */
         if (*iterations % STALL == 0) {
             if (infeasible > s->solver_tolerance / 100 && infeasible > far / 2) return STOPPED;

@@ -11,6 +11,14 @@ typedef struct {
     int events, qps, iterations, corrections, nearest_points, rows_dropped;
 } mhe_outcome;
 
+/* Whether no time is left; it is an event then. */
+static int mhe_is_late(const mhe_workspace *k, mhe_outcome *o)
+{
+    if (!mhe_time_is_up(k)) return 0;
+    o->events |= MHE_TIME_UP;
+    return 1;
+}
+
 /* Cost of the best trajectory as a trial. */
 static real mhe_best_cost(const mhe_outcome *o)
 {
@@ -94,7 +102,7 @@ static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
         if (limit == 0) return UNCONSTRAINED;
         const real promise = fabs(mhe_dot(size, k->gradient, k->step));
         int status = mhe_active_set(e, k, offset, nearest, limit, &guesses);
-        if (status != SOLVED && guesses < limit)
+        if (status != SOLVED && guesses < limit && !mhe_time_is_up(k))
             status = mhe_interior_point(e, k, offset, nearest, missed, promise, limit - guesses,
                                         &iterations);
         o->iterations += guesses + iterations;
@@ -160,7 +168,7 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
 /* Second-order corrections of the spare trial, which curvature takes out of a set. */
 static void mhe_correct(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
 {
-    for (int i = 0; i < MHE_CORRECTIONS; i++) {
+    for (int i = 0; i < MHE_CORRECTIONS && !mhe_is_late(k, o); i++) {
         mhe_bend(e, k, o);
         const int failed = mhe_solve_qp(e, k, o, o->best, 0) == FAILED;
         o->corrections++;
@@ -177,7 +185,9 @@ static int mhe_feasible_near(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 {
     for (int i = 0; i < MHE_NEAREST_POINTS; i++) {
         mhe_trial *trial = around == o->spare ? o->other : o->spare;
+        if (o->nearest_points >= MHE_NEAREST_POINTS * (1 + o->qps)) break;
         if (!isfinite(around->violation) || !mhe_linearize(e, k, o, around)) break;
+        if (mhe_is_late(k, o)) break;
         const int status = mhe_solve_qp(e, k, o, around, 1);
         o->nearest_points++;
         if (status == FAILED) break;
@@ -291,7 +301,7 @@ static void mhe_search(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int b
         mhe_shift(e, k, o, before);
         if (o->spare->cost < mhe_target(o)) mhe_take(k, o);
     }
-    while (limit-- > 0 && mhe_improve_once(e, k, o)) continue;
+    while (limit-- > 0 && !mhe_is_late(k, o) && mhe_improve_once(e, k, o)) continue;
 }
 
 #if CONSTRAINED
@@ -316,7 +326,7 @@ static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     if (o->best != o->candidate && o->best->cost < o->candidate->cost) return;
     if (o->best != o->candidate) o->spare = o->best;
     o->best = o->candidate;
-    if (e->settings->infeasible == MHE_KEEP_CANDIDATE) return;
+    if (e->settings->infeasible == MHE_KEEP_CANDIDATE || mhe_is_late(k, o)) return;
     o->events &= ~(MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED);
     mhe_violation(e, o->candidate, 0, k->left_out);
     o->candidate->violation = 0;

@@ -31,16 +31,35 @@ static void mhe_distances(int n, int count, const real *q, const real *lower, co
     mhe_distances(n, count, q, (set).lower, (set).upper, (set).rows, (set).row_lower, \
                   (set).row_upper, known, low, high)
 
+/* The scales of all rows of stage i. */
+static void mhe_stage_scales(mhe_estimator *e, int i, real *scale)
+{
+    const mhe_settings *s = e->settings;
+    const mhe_stage *stage = mhe_stage_at(e, i);
+#if MHE_W_SET
+    const mhe_w_set *W = mhe_w_set_at(s, stage);
+    for (int j = 0; j < NX; j++) scale[j] = W->scale[j];
+    for (int j = 0; j < MHE_W_ROWS; j++) scale[NX + j] = W->row_scale[j];
+    scale += W_COUNT;
+#endif
+#if MHE_V_SET
+    const mhe_v_set *V = mhe_v_set_at(s, stage);
+    for (int j = 0; j < NY; j++) scale[j] = V->scale[j];
+    for (int j = 0; j < MHE_V_ROWS; j++) scale[NY + j] = V->row_scale[j];
+#endif
+}
+
 /* The same for all rows of stage i, about residuals w and v of a trajectory. */
 static void mhe_stage_distances(mhe_estimator *e, int i, const real *w, const real *v, real *low,
                                 real *high)
 {
+    const mhe_settings *s = e->settings;
+    const mhe_stage *stage = mhe_stage_at(e, i);
 #if MHE_W_SET
-    DISTANCES(e->settings->disturbances, NX, MHE_W_ROWS, w + i * NX, 0, low, high);
+    DISTANCES(*mhe_w_set_at(s, stage), NX, MHE_W_ROWS, w + i * NX, 0, low, high);
 #endif
 #if MHE_V_SET
-    const mhe_stage *stage = mhe_stage_at(e, i);
-    DISTANCES(e->settings->noises, NY, MHE_V_ROWS, v + i * NY,
+    DISTANCES(*mhe_v_set_at(s, stage), NY, MHE_V_ROWS, v + i * NY,
               stage->is_complete ? 0 : stage->is_observed, low + W_COUNT, high + W_COUNT);
 #endif
     (void)w; (void)v;
@@ -80,17 +99,19 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const uint8_
                           uint8_t *missed)
 {
     real worst = 0, low[ROWS], high[ROWS];
+    const mhe_settings *s = e->settings;
     for (int i = 0; i < e->length; i++) {
+        const mhe_stage *stage = mhe_stage_at(e, i);
         const uint8_t *out = left_out ? left_out + i * ROWS : 0;
         uint8_t *in = missed ? missed + i * ROWS : 0;
         mhe_stage_distances(e, i, trial->w, trial->v, low, high);
 #if MHE_W_SET
-        worst = mhe_max(worst, MISSED(e->settings->disturbances, NX, MHE_W_ROWS, low, high,
+        worst = mhe_max(worst, MISSED(*mhe_w_set_at(s, stage), NX, MHE_W_ROWS, low, high,
                                       trial->x + (i + 1) * NX, out, in));
 #endif
 #if MHE_V_SET
-        worst = mhe_max(worst, MISSED(e->settings->noises, NY, MHE_V_ROWS, low + W_COUNT,
-                                      high + W_COUNT, mhe_stage_at(e, i)->y,
+        worst = mhe_max(worst, MISSED(*mhe_v_set_at(s, stage), NY, MHE_V_ROWS, low + W_COUNT,
+                                      high + W_COUNT, stage->y,
                                       out ? out + W_COUNT : 0, in ? in + W_COUNT : 0));
 #endif
     }

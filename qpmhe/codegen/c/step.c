@@ -25,7 +25,7 @@ static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
     const mhe_stage *newest = mhe_stage_at(e, e->length - 1);
     const size_t size = sizeof(real) * (size_t)(e->length + 1) * NX;
     mhe_improve(e, k, o, before);
-    if (!newest->is_complete) o->events |= MHE_MISSING;
+    if (mhe_is_missing(newest)) o->events |= MHE_MISSING;
     o->events |= failed;
     if (!isfinite(o->candidate->cost)) {
         o->events &= ~MHE_NO_DECREASE; /* the model failed, not the solver */
@@ -52,6 +52,7 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
                      mhe_outcome *o)
 {
     const int before = e->has_trajectory ? e->length : -1;
+    mhe_begin(e, k);
     int failed = mhe_push(e, sample);
     if (e->settings->reinitialize) {
         /* The ring of estimates reaches back to that of the window's first state. */
@@ -132,29 +133,27 @@ void mhe_update(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u
     mhe_update_special(e, k, &sample, out);
 }
 
-/* Copy what a step from a window changes: of the stages the newest one, or all of them. */
-static void mhe_copy_changing(mhe_estimator *to, const mhe_estimator *from,
-                              const mhe_estimator *window)
+/* Copy what a step changes: the stage that the new sample overwrites, and all that is not a stage.
+ * Only an observer that is re-initialised goes through the other stages again. */
+static void mhe_keep(mhe_estimator *to, const mhe_estimator *from, int overwritten)
 {
-    const int newest = window->length < MHE_HORIZON ? window->length : window->first;
-    const int reinitialize = window->settings->reinitialize;
     memcpy(to, from, offsetof(mhe_estimator, stages));
-    if (reinitialize)
+    if (from->settings->reinitialize)
         memcpy(to->stages, from->stages, sizeof to->stages);
     else
-        to->stages[newest] = from->stages[newest];
+        to->stages[overwritten] = from->stages[overwritten];
 }
 
 void mhe_update_undoable(mhe_estimator *e, mhe_estimator *before, mhe_workspace *k,
                          const mhe_sample *sample, mhe_estimate *out)
 {
-    mhe_copy_changing(before, e, e);
+    mhe_keep(before, e, (e->first + e->length) % MHE_HORIZON);
     mhe_update_special(e, k, sample, out);
 }
 
 void mhe_undo(mhe_estimator *e, const mhe_estimator *before)
 {
-    mhe_copy_changing(e, before, before);
+    mhe_keep(e, before, (before->first + before->length) % MHE_HORIZON);
 }
 
 void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspace *k,
@@ -164,12 +163,24 @@ void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspac
         mhe_update(estimators + i, k, y + i * NY, NU ? u + i * NU : 0, estimates + i);
 }
 
+/* Estimate the same state again, of samples that have changed. */
+static void mhe_estimate_again(mhe_estimator *e, mhe_workspace *k, int failed, mhe_estimate *out)
+{
+    mhe_outcome outcome;
+    const int32_t far = e->far, dropped = e->dropped;
+    /* The kept trajectory does not belong to the window before this one. */
+    mhe_estimate_now(e, k, &outcome, failed, -1);
+    e->far = far, e->dropped = dropped; /* no sample more */
+    memcpy(e->history + e->newest * NX, outcome.best->x + e->length * NX, sizeof(real) * NX);
+    mhe_fill(e, k, &outcome, out);
+}
+
 int mhe_amend(mhe_estimator *e, mhe_workspace *k, int64_t time, const real *y,
               mhe_estimate *out)
 {
     const int64_t age = e->time - time;
-    mhe_outcome outcome;
     if (age < 1 || age > e->length) return -1;
+    mhe_begin(e, k);
     const int i = e->length - (int)age;
     mhe_stage *stage = mhe_stage_at(e, i);
     for (int j = 0; j < NY; j++)
@@ -178,14 +189,24 @@ int mhe_amend(mhe_estimator *e, mhe_workspace *k, int64_t time, const real *y,
             stage->is_observed[j] = 1;
         }
     mhe_set_noise_weight(e->settings, stage);
-    const int failed = mhe_replay(e, i);
-    const int32_t far = e->far, dropped = e->dropped;
-    /* The kept trajectory does not belong to the window before this one. */
-    mhe_estimate_now(e, k, &outcome, failed, -1);
-    e->far = far, e->dropped = dropped; /* no sample more */
-    memcpy(e->history + e->newest * NX, outcome.best->x + e->length * NX, sizeof(real) * NX);
-    mhe_fill(e, k, &outcome, out);
+    mhe_estimate_again(e, k, mhe_replay(e, i), out);
     return 0;
+}
+
+void mhe_set(mhe_estimator *e, mhe_workspace *k, const mhe_settings *settings, int32_t changes,
+             const real *parameters, int32_t count, mhe_estimate *out)
+{
+    e->settings = settings;
+    mhe_begin(e, k);
+    for (int i = 0; i < e->length; i++) {
+        mhe_stage *stage = mhe_stage_at(e, i);
+        mhe_forget(stage, changes);
+        if (parameters)
+            for (int j = 0; j < count; j++) stage->u[NU - count + j] = parameters[j];
+        mhe_set_noise_weight(settings, stage);
+        mhe_complete_own_sets(settings, stage);
+    }
+    if (e->length) mhe_estimate_again(e, k, mhe_replay(e, 0), out);
 }
 
 void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64_t samples,
@@ -221,6 +242,7 @@ void mhe_recompute(mhe_estimator *e, mhe_real *reached)
         real *next = i + 1 < e->length ? mhe_stage_at(e, i + 1)->z : e->z_end, kept[NX];
         memcpy(kept, next, sizeof kept);
         mhe_set_noise_weight(e->settings, mhe_stage_at(e, i));
+        mhe_complete_own_sets(e->settings, mhe_stage_at(e, i));
         mhe_enter(e, i);
         memcpy(reached + i * NX, next, sizeof kept);
         memcpy(next, kept, sizeof kept);

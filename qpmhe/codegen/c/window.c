@@ -79,16 +79,7 @@ static int mhe_push(mhe_estimator *e, const mhe_sample *sample)
     mhe_stage *stage = mhe_stage_at(e, e->length - 1);
     memcpy(stage->z, e->z_end, sizeof stage->z);
     for (int j = 0; j < NU; j++) stage->u[j] = sample->u[j];
-    stage->step = sample->step > 0 ? sample->step : s->sample_time;
-    stage->is_irregular = sample->step > 0;
-    stage->has_own_noise = sample->noise_weight != 0;
-    if (stage->has_own_noise)
-        memcpy(stage->own_noise_weight, sample->noise_weight, sizeof stage->own_noise_weight);
-    for (int j = 0; j < NY; j++) {
-        const real y = sample->y[j];
-        stage->y[j] = y;
-        stage->is_observed[j] = y < MHE_LARGEST && y > -MHE_LARGEST; /* false for NaN */
-    }
+    mhe_take_conditions(s, stage, sample);
     mhe_set_noise_weight(s, stage);
     const int outcome = mhe_enter(e, e->length - 1);
     e->time++;
