@@ -51,6 +51,8 @@ def test_the_same_estimates(name):
     time = len(one.samples) - 2
     late = np.resize(one.samples[time]["y"], one.system.p) + 0.1
     agree(reference.amend(time, late), compiled.amend(time, late), one.tolerance)
+    expected, found = reference.covariances(), compiled.covariances()
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("name", CASES)

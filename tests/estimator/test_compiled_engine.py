@@ -12,7 +12,7 @@ import pytest
 
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
-from qpmhe.codegen.library import EstimatorLibrary
+from qpmhe.codegen.library import EstimatorLibrary, generated
 from qpmhe.errors import EngineWarning, OptionError, QpmheError
 
 from .test_compiled import estimator, made, system_of
@@ -233,6 +233,17 @@ def equality():
 def test_what_has_no_c_form_is_an_error_with_a_remedy(remedy, given):
     with pytest.raises(OptionError, match=f"no C code for this estimator: .*{remedy}"):
         uncovered(**given)
+
+
+def test_one_library_serves_other_losses():
+    costs = [
+        qpmhe.RobustCost(**(ONES | {name: loss}))
+        for name, loss in (("noise", qpmhe.Huber(1.0, 2.0)), ("noise", qpmhe.Huber(1.0, 3.0)),
+                           ("prior", qpmhe.Power(2.0, 1.5, per_component=True)))
+    ]
+    texts = {generated(mhe.system, mhe.observer, mhe.cost, mhe.settings)[1]
+             for mhe in (uncovered(cost=lambda cost=cost: cost) for cost in costs)}
+    assert len(texts) == 1
 
 
 @pytest.mark.parametrize("option", ["max_qps", "max_solver_iterations"])
