@@ -156,7 +156,7 @@ class CompiledEngine:
         block, numbers = self._block.copy(), self._numbers.tolist()
         dropped: tuple[DroppedRow, ...] = ()
         if numbers[1] & _ROWS_DROPPED:
-            sides = self._out[0]["dropped"][: numbers[0]]
+            sides = self._out[0]["dropped"][: numbers[0] + 1]
             dropped = self._library.layout.dropped_rows(sides, time + 1 - numbers[0])
         return CompiledEstimate(block, numbers, time, self._sizes, self._delay, dropped)
 

@@ -19,7 +19,7 @@ from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
 
-SET_NAMES = ("disturbances", "noises")
+SET_NAMES = ("disturbances", "noises", "states")
 # Terms of the cost, and their losses in the order of their numbers in C.
 TERMS = ("prior", "disturbance", "noise")
 LOSSES = ("quadratic", "huber", "power")
@@ -51,7 +51,7 @@ class Layout:
         loss = form is not None and any(one.kind != "quadratic" for one in form.losses)
         sets = tuple(
             (one is not None, 0 if one is None else one.matrix.shape[0])
-            for one in (system.disturbances, system.noises)
+            for one in (getattr(system, name) for name in SET_NAMES)
         )
         return cls(system.n, system.p, system.m, horizon, sets, continuous, real, loss)
 
@@ -68,7 +68,7 @@ class Layout:
             "continuous": self.continuous, "real": self.real, "loss": int(self.loss),
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
-        for letter, (there, rows) in zip("wv", self.sets, strict=True):
+        for letter, (there, rows) in zip("wvx", self.sets, strict=True):
             values[f"{letter}_set"] = int(there)
             values[f"{letter}_rows"] = rows
         return values
@@ -84,7 +84,7 @@ class Layout:
             ("discount", r), ("sample_time", r), ("tolerance", r),
             ("solver_tolerance", r),
         ]
-        for name, size, (_, rows) in zip(SET_NAMES, (n, p), self.sets, strict=True):
+        for name, size, (_, rows) in zip(SET_NAMES, (n, p, n), self.sets, strict=True):
             space = max(rows, 1)
             fields.append((name, _struct([
                 ("lower", r, size), ("upper", r, size), ("scale", r, size),
@@ -106,7 +106,7 @@ class Layout:
             ("noises", r, (count, p)), ("filtered", r, n), ("time", np.int64),
             ("length", np.int32), ("status", np.int32), ("qps", np.int32),
             ("iterations", np.int32), ("corrections", np.int32), ("nearest_points", np.int32),
-            ("dropped", np.uint8, (count, max(sum(self.set_rows), 1))),
+            ("dropped", np.uint8, (count + self.sets[2][0], max(sum(self.set_rows), 1))),
         ])
 
     def sample_type(self) -> np.dtype[Any]:
@@ -119,7 +119,9 @@ class Layout:
         """Inequalities of each set at one stage: one for each component, then the rows."""
         return tuple(
             there * (size + rows)
-            for size, (there, rows) in zip((self.nx, self.ny), self.sets, strict=True)
+            for size, (there, rows) in zip(
+                (self.nx, self.ny, self.nx), self.sets, strict=True
+            )
         )
 
     def dropped_rows(self, sides: NDArray[np.uint8], first: int) -> tuple[DroppedRow, ...]:
@@ -194,7 +196,8 @@ def _filled(
     # Single precision distinguishes less.
     record["tolerance"] = max(settings.tolerance, 1e-6 if single else 0.0)
     record["solver_tolerance"] = max(settings.solver_tolerance, 1e-4 if single else 0.0)
-    for name, weight in zip(SET_NAMES, (form.disturbance, form.noise), strict=True):
+    weights = form.disturbance, form.noise, form.prior
+    for name, weight in zip(SET_NAMES, weights, strict=True):
         one: ConvexSet | None = getattr(system, name)
         if one is None:
             continue

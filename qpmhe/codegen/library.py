@@ -67,7 +67,7 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         if cost.quadratic and cost.observer_prior is not None:
             return "a prior weight from the observer has no C form; take a constant one."
         return _without_form(cost)
-    for name, weight in zip(SET_NAMES, (cost.disturbance, cost.noise), strict=True):
+    for name, weight in zip(SET_NAMES[:2], (cost.disturbance, cost.noise), strict=True):
         one = getattr(system, name)
         if one is not None and _is_flat(one, inverse(weight)):
             return (

@@ -33,11 +33,13 @@ typedef $real mhe_real;
 #define MHE_NY $ny       /* outputs */
 #define MHE_NU $nu       /* inputs */
 #define MHE_HORIZON $horizon /* most samples in the window */
-#define MHE_W_SET $w_set   /* whether there is a set of disturbances, noises */
+#define MHE_W_SET $w_set   /* whether there is a set of disturbances, noises, states */
 #define MHE_V_SET $v_set
+#define MHE_X_SET $x_set
 #define MHE_W_ROWS $w_rows  /* general inequalities in each */
 #define MHE_V_ROWS $v_rows
 #define MHE_LOSS $loss    /* whether a term of the cost has a loss that is not quadratic */
+#define MHE_X_ROWS $x_rows
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
@@ -45,7 +47,8 @@ $limits
 
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
-    (MHE_W_SET * (MHE_NX + MHE_W_ROWS) + MHE_V_SET * (MHE_NY + MHE_V_ROWS))
+    (MHE_W_SET * (MHE_NX + MHE_W_ROWS) + MHE_V_SET * (MHE_NY + MHE_V_ROWS) + \
+     MHE_X_SET * (MHE_NX + MHE_X_ROWS))
 /* Length of a panel's rows, for whole registers. */
 #define MHE_PANEL_WIDTH (MHE_NX < 24 ? (2 * MHE_NX + 3) / 4 * 4 : (2 * MHE_NX + 31) / 32 * 32)
 
@@ -54,9 +57,10 @@ enum {
 $status
 };
 
-/* What to do where no trajectory in the sets costs at most what the candidate does. */
-#define MHE_ROWS (MHE_HORIZON * MHE_SIZE(MHE_STAGE_ROWS))
+/* Rows of a window: those of stage i on w(i), v(i) and x(i); a last stage has x only. */
+#define MHE_ROWS ((MHE_HORIZON + MHE_X_SET) * MHE_SIZE(MHE_STAGE_ROWS))
 
+/* What to do where no trajectory in the sets costs at most what the candidate does. */
 enum { MHE_DROP_ROWS = 0, MHE_KEEP_CANDIDATE = 1 };
 
 /* Sides of an inequality, as bits. */
@@ -86,6 +90,12 @@ typedef struct {
     mhe_real parameter;        /* threshold in standard deviations, or exponent */
     int32_t kind, per_component;
 } mhe_loss;
+typedef struct {
+    mhe_real lower[MHE_NX], upper[MHE_NX], scale[MHE_NX];
+    mhe_real rows[MHE_SIZE(MHE_X_ROWS) * MHE_NX];
+    mhe_real row_lower[MHE_SIZE(MHE_X_ROWS)], row_upper[MHE_SIZE(MHE_X_ROWS)];
+    mhe_real row_scale[MHE_SIZE(MHE_X_ROWS)];
+} mhe_x_set;
 
 /* Matrices are stored by rows. Weights are inverse covariances. */
 typedef struct {
@@ -101,6 +111,7 @@ typedef struct {
     mhe_real solver_tolerance; /* residuals of a constrained QP that is solved */
     mhe_w_set disturbances;
     mhe_v_set noises;
+    mhe_x_set states;
     int32_t max_qps;           /* QPs for each sample */
     int32_t max_iterations;    /* interior-point iterations in each; 0: no inequalities */
     int32_t infeasible;        /* MHE_DROP_ROWS or MHE_KEEP_CANDIDATE */
@@ -153,7 +164,8 @@ typedef struct {
     mhe_real filtered[MHE_NX];     /* estimate of x(t) that has used y(t) */
     int64_t time;                  /* of the newest sample */
     int32_t length, status, qps, iterations, corrections, nearest_points;
-    /* Sides that were dropped and are violated, by stage: components of W, its rows, those of V. */
+    /* Sides that were dropped and are violated, by stage: components of W, its rows, those of V
+     * and of X. */
     uint8_t dropped[MHE_ROWS];
 } mhe_estimate;
 

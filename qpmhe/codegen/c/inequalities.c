@@ -3,8 +3,9 @@
  *
  *     min d'H d / 2 + g'd   s.t.   low <= c(d) <= high
  *
- * The rows c of stage i are those of W (on d(i+1) - A d(i)) and of V (on -C d(i)): each set's
- * components first, then its general inequalities. */
+ * The rows c of stage i are those of W (on d(i+1) - A d(i)), of V (on -C d(i)) and of X (on d(i)):
+ * each set's components first, then its general inequalities. The last stage has rows of X only;
+ * its places for others are without limits. */
 
 enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED };
 
@@ -19,14 +20,15 @@ enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED };
 
 #if CONSTRAINED
 
-/* Limits of all rows about a trajectory with residuals w and v. */
-static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *w, const real *v)
+/* Limits of all rows about a trajectory x with residuals w and v. */
+static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, const real *w,
+                           const real *v)
 {
     const mhe_settings *s = e->settings;
     real low[ROWS], high[ROWS];
-    for (int i = 0; i < e->length; i++) {
+    for (int i = 0; i < mhe_row_stages(e); i++) {
         real *scale = k->rows.scale + i * ROWS;
-        mhe_stage_distances(e, i, w, v, low, high);
+        mhe_stage_distances(e, i, x, w, v, low, high);
         for (int r = 0; r < ROWS; r++) {
             const int at = i * ROWS + r, out = k->left_out[at];
             k->rows.low[at] = out & MHE_LOWER ? -INFINITY : low[r];
@@ -40,6 +42,11 @@ static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *w, co
 #if MHE_V_SET
         for (int j = 0; j < NY; j++) scale[j] = s->noises.scale[j];
         for (int j = 0; j < MHE_V_ROWS; j++) scale[NY + j] = s->noises.row_scale[j];
+        scale += V_COUNT;
+#endif
+#if MHE_X_SET
+        for (int j = 0; j < NX; j++) scale[j] = s->states.scale[j];
+        for (int j = 0; j < MHE_X_ROWS; j++) scale[NX + j] = s->states.row_scale[j];
 #endif
     }
 }
@@ -54,9 +61,16 @@ static void mhe_values_of(int n, int count, const real *q, const real *rows, rea
 static void mhe_rows_times(const mhe_estimator *e, mhe_workspace *k, const real *d)
 {
     const mhe_settings *s = e->settings;
-    for (int i = 0; i < e->length; i++) {
+    for (int i = 0; i < mhe_row_stages(e); i++) {
         real *value = k->rows.value + i * ROWS;
         const real *own = d + i * NX;
+#if MHE_X_SET
+        mhe_values_of(NX, MHE_X_ROWS, own, s->states.rows, value + W_COUNT + V_COUNT);
+        if (i == e->length) {
+            for (int r = 0; r < W_COUNT + V_COUNT; r++) value[r] = 0;
+            break;
+        }
+#endif
 #if MHE_W_SET
         real q[NX];
         for (int j = 0; j < NX; j++)
@@ -84,9 +98,15 @@ static void mhe_loads_of(int n, int count, const real *rows, const real *load, r
 static void mhe_add_loads(const mhe_estimator *e, const mhe_workspace *k, real *out)
 {
     const mhe_settings *s = e->settings;
-    for (int i = 0; i < e->length; i++) {
+    for (int i = 0; i < mhe_row_stages(e); i++) {
         const real *load = k->rows.load + i * ROWS;
         real *own = out + i * NX;
+#if MHE_X_SET
+        real x[NX];
+        mhe_loads_of(NX, MHE_X_ROWS, s->states.rows, load + W_COUNT + V_COUNT, x);
+        for (int j = 0; j < NX; j++) own[j] += x[j];
+        if (i == e->length) break;
+#endif
 #if MHE_W_SET
         real w[NX];
         const real *A = k->at[i]->f_jacobian;
@@ -122,9 +142,16 @@ static void mhe_add_square(real *panel, real weight, const real *a)
 static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
 {
     const mhe_settings *s = e->settings;
-    for (int i = 0; i < e->length; i++) {
+    for (int i = 0; i < mhe_row_stages(e); i++) {
         const real *weights = k->rows.weight + i * ROWS;
         real *panel = k->panels + i * NX * WIDTH;
+#if MHE_X_SET
+        const real *bounds = weights + W_COUNT + V_COUNT;
+        for (int j = 0; j < NX; j++) panel[j * WIDTH + j] += bounds[j];
+        for (int r = 0; r < MHE_X_ROWS; r++)
+            if (bounds[NX + r] != 0) mhe_add_square(panel, bounds[NX + r], s->states.rows + r * NX);
+        if (i == e->length) break;
+#endif
 #if MHE_W_SET
         const real *A = k->at[i]->f_jacobian;
         real *next = panel + NX * WIDTH;
@@ -176,7 +203,7 @@ static real mhe_row_violation(const mhe_estimator *e, mhe_workspace *k, const re
     const mhe_rows *q = &k->rows;
     real worst = 0;
     mhe_rows_times(e, k, d);
-    for (int i = 0; i < e->length * ROWS; i++) {
+    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) {
         const real missed = mhe_max(q->low[i] - q->value[i], q->value[i] - q->high[i]);
         if (missed > 0) worst = mhe_max(missed / q->scale[i], worst);
     }
@@ -226,7 +253,7 @@ static real mhe_product(int n, const real *a, const real *b)
 static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest,
                           int limit, int *iterations)
 {
-    const int count = e->length, size = (count + 1) * NX, rows = count * ROWS;
+    const int count = e->length, size = (count + 1) * NX, rows = mhe_row_stages(e) * ROWS;
     const real tolerance = e->settings->solver_tolerance / 100;
     mhe_rows *q = &k->rows;
     real *side = q->sides[0].there, *bound = q->sides[0].limit, *dual = q->sides[0].dual;
@@ -324,7 +351,7 @@ static real mhe_set_residuals(mhe_rows *q, int rows, real *infeasible)
 /* Right-hand side of the Newton equations for a target of the complementarity products. */
 static void mhe_set_loads(const mhe_estimator *e, mhe_workspace *k, real target)
 {
-    const int rows = e->length * ROWS;
+    const int rows = mhe_row_stages(e) * ROWS;
     mhe_rows *q = &k->rows;
     for (int i = 0; i < rows; i++) q->load[i] = 0;
     for (int side = 0; side < 2; side++) {
@@ -390,7 +417,7 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
                               int nearest, real missed, real promise, int limit, int *iterations)
 {
     const mhe_settings *s = e->settings;
-    const int count = e->length, size = (count + 1) * NX, rows = count * ROWS;
+    const int count = e->length, size = (count + 1) * NX, rows = mhe_row_stages(e) * ROWS;
     mhe_rows *q = &k->rows;
     real far = INFINITY;
     memset(k->step, 0, sizeof(real) * (size_t)size);

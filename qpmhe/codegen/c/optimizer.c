@@ -70,7 +70,7 @@ static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *
         mhe_set_terms(e->settings, stage, around->w + i * NX, around->v + i * NY, t);
     }
 #if CONSTRAINED
-    mhe_set_limits(e, k, around->w, around->v);
+    mhe_set_limits(e, k, around->x, around->w, around->v);
 #endif
     return 1;
 }
@@ -116,7 +116,7 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
     for (int j = 0; j < (count + 1) * NX; j++) d[j] = o->spare->x[j] - o->best->x[j];
     mhe_rows_times(e, k, d);
     mhe_rows *rows = &k->rows;
-    for (int i = 0; i < count * ROWS; i++)
+    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++)
         rows->load[i] = 2 * mhe_max(mhe_max(rows->low[i] - rows->value[i],
                                             rows->value[i] - rows->high[i]), 0);
     for (int i = 0; i < count; i++) {
@@ -134,7 +134,8 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
             v[at] = o->best->v[at] + (o->spare->v[at] - linear);
         }
     }
-    mhe_set_limits(e, k, w, v);
+    mhe_set_limits(e, k, o->best->x, w, v);
+    memset(rows->value, 0, sizeof rows->value); /* X has no curvature */
     for (int i = 0; i < count; i++) {
         real *value = rows->value + i * ROWS;
 #if MHE_W_SET
@@ -148,7 +149,7 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
         mhe_values_of(NY, MHE_V_ROWS, noise, e->settings->noises.rows, value + W_COUNT);
 #endif
     }
-    for (int i = 0; i < count * ROWS; i++) {
+    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) {
         rows->load[i] += MHE_BEYOND * fabs(rows->value[i]);
         if (rows->high[i] - rows->low[i] > 4 * rows->load[i]) {
             rows->low[i] += rows->load[i];

@@ -1,11 +1,12 @@
-/* The sets W and V: their rows, and by how much a trajectory misses them. */
+/* The sets W, V and X: their rows, and by how much a trajectory misses them. */
 
-#define CONSTRAINED (MHE_W_SET || MHE_V_SET)
+#define CONSTRAINED (MHE_W_SET || MHE_V_SET || MHE_X_SET)
 
 #if CONSTRAINED
 #define ROWS MHE_STAGE_ROWS
 #define W_COUNT (MHE_W_SET * (NX + MHE_W_ROWS))
 #define V_COUNT (MHE_V_SET * (NY + MHE_V_ROWS))
+#define X_COUNT (MHE_X_SET * (NX + MHE_X_ROWS))
 
 /* How far a point q is from each side of a set: low <= 0 <= high where it is inside. */
 static void mhe_distances(int n, int count, const real *q, const real *lower, const real *upper,
@@ -31,10 +32,21 @@ static void mhe_distances(int n, int count, const real *q, const real *lower, co
     mhe_distances(n, count, q, (set).lower, (set).upper, (set).rows, (set).row_lower, \
                   (set).row_upper, known, low, high)
 
-/* The same for all rows of stage i, about residuals w and v of a trajectory. */
-static void mhe_stage_distances(mhe_estimator *e, int i, const real *w, const real *v, real *low,
-                                real *high)
+/* Stages that have rows: behind the last sample, there is a state. */
+static int mhe_row_stages(const mhe_estimator *e) { return e->length + MHE_X_SET; }
+
+/* The same for all rows of stage i, about a trajectory x with residuals w and v. */
+static void mhe_stage_distances(mhe_estimator *e, int i, const real *x, const real *w,
+                                const real *v, real *low, real *high)
 {
+#if MHE_X_SET
+    DISTANCES(e->settings->states, NX, MHE_X_ROWS, x + i * NX, 0, low + W_COUNT + V_COUNT,
+              high + W_COUNT + V_COUNT);
+    if (i == e->length) {
+        for (int r = 0; r < W_COUNT + V_COUNT; r++) low[r] = -INFINITY, high[r] = INFINITY;
+        return;
+    }
+#endif
 #if MHE_W_SET
     DISTANCES(e->settings->disturbances, NX, MHE_W_ROWS, w + i * NX, 0, low, high);
 #endif
@@ -43,7 +55,7 @@ static void mhe_stage_distances(mhe_estimator *e, int i, const real *w, const re
     DISTANCES(e->settings->noises, NY, MHE_V_ROWS, v + i * NY,
               stage->is_complete ? 0 : stage->is_observed, low + W_COUNT, high + W_COUNT);
 #endif
-    (void)w; (void)v;
+    (void)x; (void)w; (void)v;
 }
 
 /* The largest miss among rows of one set, in their scales. `sizes`: of the numbers whose
@@ -80,10 +92,17 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const uint8_
                           uint8_t *missed)
 {
     real worst = 0, low[ROWS], high[ROWS];
-    for (int i = 0; i < e->length; i++) {
+    for (int i = 0; i < mhe_row_stages(e); i++) {
         const uint8_t *out = left_out ? left_out + i * ROWS : 0;
         uint8_t *in = missed ? missed + i * ROWS : 0;
-        mhe_stage_distances(e, i, trial->w, trial->v, low, high);
+        mhe_stage_distances(e, i, trial->x, trial->w, trial->v, low, high);
+#if MHE_X_SET
+        worst = mhe_max(worst, MISSED(e->settings->states, NX, MHE_X_ROWS, low + W_COUNT + V_COUNT,
+                                      high + W_COUNT + V_COUNT, trial->x + i * NX,
+                                      out ? out + W_COUNT + V_COUNT : 0,
+                                      in ? in + W_COUNT + V_COUNT : 0));
+        if (i == e->length) break;
+#endif
 #if MHE_W_SET
         worst = mhe_max(worst, MISSED(e->settings->disturbances, NX, MHE_W_ROWS, low, high,
                                       trial->x + (i + 1) * NX, out, in));
