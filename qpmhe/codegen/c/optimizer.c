@@ -148,6 +148,7 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
         for (int j = 0; j < NY; j++) noise[j] = v[i * NY + j] - o->best->v[i * NY + j];
         mhe_values_of(NY, MHE_V_ROWS, noise, e->settings->noises.rows, value + W_COUNT);
 #endif
+        (void)value;
     }
     for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) {
         rows->load[i] += MHE_BEYOND * fabs(rows->value[i]);
