@@ -23,6 +23,7 @@ int32_t solve(mhe_estimator *e, mhe_workspace *k, const mhe_settings *s, int32_t
     mhe_trial *trial = k->trials + 1;
     memset(&o, 0, sizeof o);
     memset(k->left_out, 0, sizeof k->left_out);
+    memset(k->rows.place, 0, sizeof k->rows.place);
     memset(e, 0, sizeof *e);
     e->settings = s;
     e->length = count;
@@ -40,7 +41,7 @@ int32_t solve(mhe_estimator *e, mhe_workspace *k, const mhe_settings *s, int32_t
         k->at[i] = t;
     }
     mhe_set_limits(e, k, trial->x, trial->w, trial->v);
-    const int status = mhe_solve_qp(e, k, &o, trial, nearest);
+    const int status = mhe_solve_qp(e, k, &o, trial, nearest, 0);
     memcpy(step, k->step, sizeof(real) * (size_t)(count + 1) * NX);
     return status + 4 * o.iterations;
 }

@@ -186,6 +186,8 @@ typedef struct {
 typedef struct {
     mhe_real low[MHE_ROWS], high[MHE_ROWS], scale[MHE_ROWS];
     mhe_real value[MHE_ROWS], weight[MHE_ROWS], load[MHE_ROWS];
+    mhe_real force[MHE_ROWS], missed[MHE_ROWS];
+    int8_t place[MHE_ROWS], next[MHE_ROWS];
     mhe_side sides[2];
 } mhe_rows;
 

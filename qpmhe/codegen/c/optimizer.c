@@ -9,6 +9,7 @@ typedef struct {
     mhe_trial *candidate, *best, *spare, *other; /* best may be the candidate */
     int outside; /* the candidate misses rows: as a trial, it has no finite cost */
     int events, qps, iterations, corrections, nearest_points, rows_dropped;
+    int factorised; /* the QP's matrix, with its active rows, is in the panels */
 } mhe_outcome;
 
 /* Cost of the best trajectory as a trial. */
@@ -75,35 +76,39 @@ static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *
     return 1;
 }
 
-/* Solve the QP around a trial; the increments are in k->step. */
-static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
-                        const mhe_trial *around, int nearest)
+/* Factorise the QP and solve it without inequalities; the increments are in k->step. */
+static int mhe_solve_free(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest)
 {
-    const int size = (e->length + 1) * NX;
+    mhe_build(e, k, offset, nearest);
+    for (int j = 0; j < (e->length + 1) * NX; j++) k->step[j] = -k->gradient[j];
+    return mhe_factorise(k, e->length) && mhe_solve(k, e->length, k->step);
+}
+
+/* Solve the QP around a trial; the increments are in k->step. With `again`, only
+ * limits have changed since the last one. */
+static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
+                        const mhe_trial *around, int nearest, int again)
+{
     const real *prior = mhe_stage_at(e, 0)->z;
     real offset[NX];
     for (int j = 0; j < NX; j++) offset[j] = around->x[j] - prior[j];
-    mhe_build(e, k, offset, nearest);
-    for (int j = 0; j < size; j++) k->step[j] = -k->gradient[j];
-    if (!mhe_factorise(k, e->length) || !mhe_solve(k, e->length, k->step)) return FAILED;
 #if CONSTRAINED
-    const real missed = mhe_row_violation(e, k, k->step);
-    if (missed > 0) {
-        const int limit = e->settings->max_iterations;
-        int guesses = 0, iterations = 0;
-        if (limit == 0) return UNCONSTRAINED;
-        const real promise = fabs(mhe_dot(size, k->gradient, k->step));
-        int status = mhe_active_set(e, k, offset, nearest, limit, &guesses);
-        if (status != SOLVED && guesses < limit)
-            status = mhe_interior_point(e, k, offset, nearest, missed, promise, limit - guesses,
-                                        &iterations);
-        o->iterations += guesses + iterations;
-        return status;
+    const int limit = e->settings->max_iterations;
+    int guesses = 0, iterations = 0;
+    int status = mhe_active_set(e, k, offset, nearest, limit, again && o->factorised, &guesses);
+    o->factorised = status == SOLVED;
+    if (status == STOPPED) {
+        if (!mhe_solve_free(e, k, offset, nearest)) return FAILED;
+        if (guesses < limit)
+            status = mhe_interior_point(e, k, offset, nearest, limit - guesses, &iterations);
     }
+    if (status != SOLVED) memset(k->rows.place, 0, sizeof k->rows.place);
+    o->iterations += guesses + iterations;
+    return status == EXCLUDED ? STOPPED : status;
 #else
-    (void)o;
+    (void)o; (void)again;
+    return mhe_solve_free(e, k, offset, nearest) ? SOLVED : FAILED;
 #endif
-    return SOLVED;
 }
 
 #if CONSTRAINED
@@ -164,7 +169,7 @@ static void mhe_correct(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
 {
     for (int i = 0; i < MHE_CORRECTIONS; i++) {
         mhe_bend(e, k, o);
-        const int failed = mhe_solve_qp(e, k, o, o->best, 0) == FAILED;
+        const int failed = mhe_solve_qp(e, k, o, o->best, 0, 1) == FAILED;
         o->corrections++;
         if (failed) break;
         mhe_try(e, k, o, 1);
@@ -179,8 +184,9 @@ static int mhe_feasible_near(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 {
     for (int i = 0; i < MHE_NEAREST_POINTS; i++) {
         mhe_trial *trial = around == o->spare ? o->other : o->spare;
+        if (o->nearest_points >= MHE_NEAREST_POINTS * (1 + o->qps)) break;
         if (!isfinite(around->violation) || !mhe_linearize(e, k, o, around)) break;
-        const int status = mhe_solve_qp(e, k, o, around, 1);
+        const int status = mhe_solve_qp(e, k, o, around, 1, 0);
         o->nearest_points++;
         if (status == FAILED) break;
         mhe_step_from(e, k, around, 1, trial);
@@ -248,7 +254,7 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
         o->events |= MHE_MODEL_FAILED;
         return 0;
     }
-    const int status = mhe_solve_qp(e, k, o, o->best, 0), solved = status == SOLVED;
+    const int status = mhe_solve_qp(e, k, o, o->best, 0, 0), solved = status == SOLVED;
     o->qps++;
     if (status == FAILED) {
         o->events |= MHE_SOLVER_FAILED;
@@ -365,6 +371,9 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     }
     k->factors[0] = factor;
     memset(o, 0, sizeof *o);
+#if CONSTRAINED
+    memset(k->rows.place, 0, sizeof k->rows.place);
+#endif
     o->candidate = o->best = k->trials;
     o->spare = k->trials + 1;
     o->other = k->trials + 2;
