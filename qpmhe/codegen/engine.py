@@ -295,6 +295,7 @@ class CompiledEngine:
             raise ValueError("history does not end where the trajectory does")
         for stage in record["stages"][places]:
             self._check_flags(stage)
+        self._check_metric(record)
         again, reached = memory.copy(), np.zeros((horizon, n))
         self._library.recompute(again.ctypes.data, reached.ctypes.data)
         sizes, wanted = np.abs(z).max(axis=0), self._settings.qp_limit > 0
@@ -305,6 +306,14 @@ class CompiledEngine:
                 self._check_terms(stage, fresh, sizes)
             else:
                 stage["terms"] = fresh["terms"]
+
+    def _check_metric(self, record: Any) -> None:
+        """Refuse a metric of the observer that is none."""
+        if record["metric_settled"] not in (0, 1):
+            raise ValueError("the observer's metric is impossible")
+        if self._system.states is not None:
+            n = self._sizes[0]
+            positive_definite("metric", record["metric"].reshape(n, n))
 
     def _check_flags(self, stage: Any) -> None:
         """Refuse a stage whose sample is impossible."""

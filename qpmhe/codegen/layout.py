@@ -91,8 +91,10 @@ class Layout:
                 ("rows", r, space * size), ("row_lower", r, space), ("row_upper", r, space),
                 ("row_scale", r, space),
             ])))
+        fields += [(name, r, self.metric_size) for name in ("metric", "metric_weight")]
         options = (
-            "max_qps", "max_iterations", "infeasible", "start_at_best", "reinitialize", "delay"
+            "metric_settled", "project", "max_qps", "max_iterations", "infeasible", "start_at_best", "reinitialize",
+            "delay",
         )
         fields += [(name, np.int32) for name in options]
         return _struct(fields)
@@ -115,6 +117,11 @@ class Layout:
         return _struct([*((name, np.uintp) for name in pointers), ("step", self.number)])
 
     @property
+    def metric_size(self) -> int:
+        """Entries of the observer's metric, of which there is one if there is X."""
+        return max(self.sets[2][0] * self.nx**2, 1)
+
+    @property
     def set_rows(self) -> tuple[int, ...]:
         """Inequalities of each set at one stage: one for each component, then the rows."""
         return tuple(
@@ -134,7 +141,8 @@ class Layout:
                 for k, r in np.argwhere(part)
             ]
             start += count
-        return tuple(found)
+        # As the Python step lists them: those of X first.
+        return tuple(sorted(found, key=lambda row: row.set != "states"))
 
     def estimator_type(self) -> np.dtype[Any]:
         """``mhe_estimator``."""
@@ -154,7 +162,8 @@ class Layout:
         return _struct([
             ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
             ("length", np.int32), ("newest", np.int32), ("has_trajectory", np.int32),
-            ("far", np.int32), ("dropped", np.int32), ("last_good", r, n), ("z_end", r, n),
+            ("far", np.int32), ("dropped", np.int32),
+            ("metric_settled", np.int32), ("metric", r, self.metric_size), ("last_good", r, n), ("z_end", r, n),
             ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
             ("stages", stage, count),
         ])
@@ -196,7 +205,8 @@ def _filled(
     # Single precision distinguishes less.
     record["tolerance"] = max(settings.tolerance, 1e-6 if single else 0.0)
     record["solver_tolerance"] = max(settings.solver_tolerance, 1e-4 if single else 0.0)
-    weights = form.disturbance, form.noise, form.prior
+    initial = cost.initial_weight(observer.initial_covariance())
+    weights = form.disturbance, form.noise, initial
     for name, weight in zip(SET_NAMES, weights, strict=True):
         one: ConvexSet | None = getattr(system, name)
         if one is None:
@@ -209,6 +219,11 @@ def _filled(
         rows = one.matrix.shape[0]
         part["rows"][: one.matrix.size] = one.matrix.ravel()
         part["row_lower"][:rows], part["row_upper"][:rows] = one.row_lower, one.row_upper
+    if system.states is not None:
+        own = observer.metric
+        record["metric"] = inverse(initial if own is None else own).ravel()
+        record["metric_weight"], record["metric_settled"] = initial.ravel(), own is not None
+    record["project"] = settings.project_observer
     record["max_qps"] = min(settings.qp_limit, _MOST)
     most = settings.max_solver_iterations
     record["max_iterations"] = 0 if settings.backend == "banded" else min(most or 50, _MOST)

@@ -42,11 +42,6 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             "engine='compiled' does not yet take a singular covariance of the disturbance; take "
             "engine='python'."
         )
-    if system.states is not None:
-        return (
-            "engine='compiled' does not yet project the observer onto X; take engine='python', or "
-            "leave states out."
-        )
     for name in ("output_residual", "state_residual"):
         if getattr(system, name) is not None:
             return (
@@ -67,7 +62,17 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         if cost.quadratic and cost.observer_prior is not None:
             return "a prior weight from the observer has no C form; take a constant one."
         return _without_form(cost)
-    for name, weight in zip(SET_NAMES[:2], (cost.disturbance, cost.noise), strict=True):
+    covariance = observer.initial_covariance()
+    if (
+        system.states is not None and settings.project_observer and covariance is not None
+        and observer.metric is None
+    ):
+        return (
+            f"engine='compiled' does not yet project {type(observer).__name__} onto X, by its "
+            "covariance; take engine='python', or leave states out."
+        )
+    weights = cost.disturbance, cost.noise, cost.initial_weight(covariance)
+    for name, weight in zip(SET_NAMES, weights, strict=True):
         one = getattr(system, name)
         if one is not None and _is_flat(one, inverse(weight)):
             return (

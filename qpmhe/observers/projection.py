@@ -271,11 +271,12 @@ class ErrorMetric:
 def _stable(error: Array) -> bool:
     """Whether a power of E halves every vector: all eigenvalues are within the unit circle."""
     power = error
-    for _ in range(_DOUBLINGS):
-        size = np.abs(power).sum(axis=1).max()
-        if not size > 0.5:
-            return bool(size <= 0.5)  # not NaN
-        power = power @ power
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_DOUBLINGS):
+            size = np.abs(power).sum(axis=1).max()
+            if not 0.5 < size < np.inf:  # also for NaN
+                return bool(size <= 0.5)
+            power = power @ power
     return False
 
 

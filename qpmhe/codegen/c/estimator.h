@@ -112,6 +112,12 @@ typedef struct {
     mhe_w_set disturbances;
     mhe_v_set noises;
     mhe_x_set states;
+    /* The observer's metric: as a covariance, before it has settled or for good; and the weight in the
+     * Lyapunov equation by which it settles. */
+    mhe_real metric[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)];
+    mhe_real metric_weight[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)];
+    int32_t metric_settled;    /* whether `metric` is for good */
+    int32_t project;           /* keep the observer in X */
     int32_t max_qps;           /* QPs for each sample */
     int32_t max_iterations;    /* interior-point iterations in each; 0: no inequalities */
     int32_t infeasible;        /* MHE_DROP_ROWS or MHE_KEEP_CANDIDATE */
@@ -148,6 +154,8 @@ typedef struct {
     int32_t first, length;         /* the window in the ring of stages */
     int32_t newest, has_trajectory;
     int32_t far, dropped;          /* samples running with a far observer, with rows dropped */
+    int32_t metric_settled;        /* whether the metric below is for good */
+    mhe_real metric[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)]; /* of the observer, as a covariance */
     mhe_real last_good[MHE_NX];    /* of the stages that have left the window */
     mhe_real z_end[MHE_NX];        /* the observer's state behind the last stage */
     mhe_real history[(MHE_HORIZON + 1) * MHE_NX]; /* ring of estimates of x(t), newest last */
@@ -220,8 +228,8 @@ typedef struct {
     int32_t *status, *qps, *iterations;
 } mhe_log;
 
-/* Forget all samples and start at x0. The settings are not copied: they must stay where they
- * are as long as the estimator is in use. */
+/* Forget all samples and start at x0, or at the nearest point of X. The settings are not copied:
+ * they must stay where they are as long as the estimator is in use. */
 void mhe_reset(mhe_estimator *estimator, const mhe_settings *settings, const mhe_real *x0);
 
 /* Take a sample in that has something of its own; all of it is copied. */

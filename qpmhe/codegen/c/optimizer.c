@@ -25,12 +25,30 @@ static real mhe_target(const mhe_outcome *o)
     return isfinite(cost) ? cost - MHE_ROUNDING * cost : INFINITY;
 }
 
+/* Clip a trial to the bounds of X. */
+static void mhe_clip_trial(const mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
+{
+#if MHE_X_SET
+    const mhe_x_set *set = &e->settings->states;
+    for (int i = 0; i <= e->length; i++) {
+        const uint8_t *out = k->left_out + i * ROWS + W_COUNT + V_COUNT;
+        real *x = trial->x + i * NX;
+        for (int j = 0; j < NX; j++) {
+            if (x[j] < set->lower[j] && !(out[j] & MHE_LOWER)) x[j] = set->lower[j];
+            if (x[j] > set->upper[j] && !(out[j] & MHE_UPPER)) x[j] = set->upper[j];
+        }
+    }
+#endif
+    (void)e; (void)k; (void)trial;
+}
+
 /* Make a trial, and judge it: another one + length * step. */
 static void mhe_step_from(mhe_estimator *e, mhe_workspace *k, const mhe_trial *around, real length,
                           mhe_trial *trial)
 {
     for (int j = 0; j < (e->length + 1) * NX; j++)
         trial->x[j] = around->x[j] + length * k->step[j];
+    mhe_clip_trial(e, k, trial);
     mhe_evaluate(e, k, trial);
 }
 
@@ -288,6 +306,7 @@ static void mhe_shift(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int be
     real *x = o->spare->x;
     memcpy(x, e->trajectory + skipped * NX, sizeof(real) * (size_t)count * NX);
     mhe_f(x + (count - 1) * NX, last->u, last->step, x + count * NX);
+    mhe_clip_trial(e, k, o->spare);
     mhe_evaluate(e, k, o->spare);
 }
 

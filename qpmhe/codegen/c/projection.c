@@ -395,4 +395,14 @@ static int mhe_settle(const mhe_settings *s, const real *K, const mhe_terms *t, 
     return 1;
 }
 
+/* Keep the observer's next state in X; bits of the status. The stage's Jacobians are there as long
+ * as the metric has not settled. */
+static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const real *predicted, real *next)
+{
+    const mhe_settings *s = e->settings;
+    if (!e->metric_settled) e->metric_settled = mhe_settle(s, s->gain, &stage->terms, e->metric);
+    if (mhe_is_inside(&s->states, next)) return 0;
+    return mhe_keep_inside(&s->states, e->metric, predicted, next, stage->w);
+}
+
 #endif
