@@ -296,16 +296,33 @@ class CompiledEngine:
         for stage in record["stages"][places]:
             self._check_flags(stage)
         self._check_metric(record)
-        again, reached = memory.copy(), np.zeros((horizon, n))
-        self._library.recompute(again.ctypes.data, reached.ctypes.data)
+        again, reached = self._recomputed(memory)
+        earlier, usual = None, self._library.settings
+        if record["metric_settled"] and not usual["metric_settled"]:
+            # Stages that were computed before the metric settled.
+            earlier = memory.copy()
+            earlier["metric"] = usual["metric"]
+            earlier = self._recomputed(earlier)
         sizes, wanted = np.abs(z).max(axis=0), self._settings.qp_limit > 0
         for k, place in enumerate(places):
             stage, fresh = record["stages"][place], again[0]["stages"][place]
-            self._check_stage(stage, fresh, z[k + 1], reached[k], sizes)
+            try:
+                self._check_stage(stage, fresh, z[k + 1], reached[k], sizes)
+            except InvalidInputError:
+                if earlier is None:
+                    raise
+                fresh = earlier[0][0]["stages"][place]
+                self._check_stage(stage, fresh, z[k + 1], earlier[1][k], sizes)
             if linearized == wanted and wanted:
                 self._check_terms(stage, fresh, sizes)
             else:
                 stage["terms"] = fresh["terms"]
+
+    def _recomputed(self, memory: NDArray[Any]) -> tuple[NDArray[Any], Array]:
+        """Stages as the model computes them now, and the states behind them."""
+        again, reached = memory.copy(), np.zeros((self._sizes[2], self._sizes[0]))
+        self._library.recompute(again.ctypes.data, reached.ctypes.data)
+        return again, reached
 
     def _check_metric(self, record: Any) -> None:
         """Refuse a metric of the observer that is none."""

@@ -221,8 +221,10 @@ class ErrorMetric:
         self._prior_weight = prior_weight
         self._scale = np.sqrt(prior_weight.diagonal())
         own = observer.metric
+        #: Inverse of the metric (n, n) before it is the final one.
+        self.initial: Array = inverse(prior_weight if own is None else own)
         #: Inverse of the metric (n, n).
-        self.covariance: Array = inverse(prior_weight if own is None else own)
+        self.covariance: Array = self.initial
         #: Whether the metric is the final one.
         self.settled: bool = own is not None
 
