@@ -216,8 +216,13 @@ def equality():
          {"cost": lambda: qpmhe.QuadraticCost(**(ONES | {"prior": qpmhe.ObserverPrior()})),
           "observer": lambda: qpmhe.SteadyStateKalman(
               plain(), [0.0], disturbance=[[1.0]], noise=[[1.0]])}),
-        ("engine='compiled' does not yet project the observer onto X; take engine='python', or "
-         "leave states out", {"system": lambda: symbolic(states=qpmhe.Box(0.0, 1.0))}),
+        ("engine='compiled' does not yet project SteadyStateKalman onto X, by its covariance; take "
+         "engine='python', or leave states out", {
+             "system": lambda: symbolic(states=qpmhe.Box(0.0, 1.0)),
+             "observer": lambda: qpmhe.SteadyStateKalman(
+                 plain(), [0.0], disturbance=[[1.0]], noise=[[1.0]])}),
+        ("states has a direction of zero width.*widen", {
+            "system": lambda: symbolic(states=qpmhe.Box(0.0, 0.0))}),
         ("disturbances has a direction of zero width.*widen", {"system": lambda: symbolic(
             disturbances=qpmhe.Box(0.1, 0.1))}),
         ("noises has a direction of zero width", {"system": lambda: symbolic(

@@ -15,7 +15,8 @@
  *     mhe_update(&estimator, &workspace, y, u, &estimate);      once a sample
  *     estimate.trajectory[estimate.length * MHE_NX + j]         state j at t+1
  *
- * Components of y that are not finite are missing. After each update
+ * Components of y that are not finite are missing. The observer is projected onto the set of states,
+ * if there is one, after each step. After each update
  * estimate.cost <= estimate.candidate_cost: both are the true cost of the nonlinear problem.
  */
 #ifndef MHE_H
