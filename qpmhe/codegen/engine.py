@@ -276,7 +276,7 @@ class CompiledEngine:
 
     def _check(self, memory: NDArray[Any], linearized: bool) -> None:
         """Refuse a window that is impossible, or whose stages the model does not reproduce."""
-        record, n, horizon = memory[0], self._sizes[0], self._sizes[2]
+        record, horizon = memory[0], self._sizes[2]
         time, length, first = (int(record[name]) for name in ("time", "length", "first"))
         if not (
             0 <= first < (horizon if length == horizon else 1)
@@ -296,23 +296,23 @@ class CompiledEngine:
         for stage in record["stages"][places]:
             self._check_flags(stage)
         self._check_metric(record)
-        again, reached = self._recomputed(memory)
-        earlier, usual = None, self._library.settings
+        computed, usual = [self._recomputed(memory)], self._library.settings
         if record["metric_settled"] and not usual["metric_settled"]:
-            # Stages that were computed before the metric settled.
-            earlier = memory.copy()
-            earlier["metric"] = usual["metric"]
-            earlier = self._recomputed(earlier)
+            # Some stages may have been computed before the metric settled.
+            before = memory.copy()
+            before["metric"] = usual["metric"]
+            computed.append(self._recomputed(before))
         sizes, wanted = np.abs(z).max(axis=0), self._settings.qp_limit > 0
         for k, place in enumerate(places):
-            stage, fresh = record["stages"][place], again[0]["stages"][place]
-            try:
-                self._check_stage(stage, fresh, z[k + 1], reached[k], sizes)
-            except InvalidInputError:
-                if earlier is None:
-                    raise
-                fresh = earlier[0][0]["stages"][place]
-                self._check_stage(stage, fresh, z[k + 1], earlier[1][k], sizes)
+            stage = record["stages"][place]
+            for left, (again, reached) in zip(range(len(computed))[::-1], computed, strict=True):
+                fresh = again[0]["stages"][place]
+                try:
+                    self._check_stage(stage, fresh, z[k + 1], reached[k], sizes)
+                    break
+                except InvalidInputError:
+                    if not left:
+                        raise
             if linearized == wanted and wanted:
                 self._check_terms(stage, fresh, sizes)
             else:

@@ -93,8 +93,8 @@ class Layout:
             ])))
         fields += [(name, r, self.metric_size) for name in ("metric", "metric_weight")]
         options = (
-            "metric_settled", "project", "max_qps", "max_iterations", "infeasible", "start_at_best", "reinitialize",
-            "delay",
+            "metric_settled", "project", "max_qps", "max_iterations", "infeasible",
+            "start_at_best", "reinitialize", "delay",
         )
         fields += [(name, np.int32) for name in options]
         return _struct(fields)
@@ -163,7 +163,8 @@ class Layout:
             ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
             ("length", np.int32), ("newest", np.int32), ("has_trajectory", np.int32),
             ("far", np.int32), ("dropped", np.int32),
-            ("metric_settled", np.int32), ("metric", r, self.metric_size), ("last_good", r, n), ("z_end", r, n),
+            ("metric_settled", np.int32), ("metric", r, self.metric_size),
+            ("last_good", r, n), ("z_end", r, n),
             ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
             ("stages", stage, count),
         ])

@@ -189,7 +189,7 @@ def _in_states(states: qpmhe.model.sets.ConvexSet, start: Any = (0.1, 4.5), **se
 
 
 def _inputs_in_states() -> Case:
-    """Bounds on one side and on both, some of them out of reach, and an observer that leaves them."""
+    """Bounds on one side and on both, and an observer that leaves them."""
     states = qpmhe.Box([0.0, -np.inf, -0.2], [0.6, 0.4, np.inf])
     observer = qpmhe.Luenberger([[0.6, 0.0], [0.3, -0.4], [0.1, 0.7]])
     one = replace(case("inputs"), system=with_inputs(states=states), observer=observer)
