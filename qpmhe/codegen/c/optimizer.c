@@ -142,6 +142,11 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
     for (int i = 0; i < mhe_row_stages(e) * ROWS; i++)
         rows->load[i] = 2 * mhe_max(mhe_max(rows->low[i] - rows->value[i],
                                             rows->value[i] - rows->high[i]), 0);
+#if MHE_X_SET
+    /* Trials are clipped to the bounds of X. */
+    for (int i = 0; i <= count; i++)
+        memset(rows->load + i * ROWS + W_COUNT + V_COUNT, 0, sizeof(real) * NX);
+#endif
     for (int i = 0; i < count; i++) {
         const mhe_terms *t = k->at[i];
         for (int j = 0; j < NX; j++) {
@@ -346,7 +351,7 @@ static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     if (e->settings->infeasible == MHE_KEEP_CANDIDATE) return;
     o->events &= ~(MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED);
     mhe_violation(e, o->candidate, 0, k->left_out);
-    o->candidate->violation = 0;
+    o->candidate->violation = mhe_violation(e, o->candidate, k->left_out, 0);
     mhe_search(e, k, o, start, limit > o->qps + 1 ? limit - o->qps : 1);
     memset(k->left_out, 0, sizeof k->left_out);
     if (o->best == o->candidate || !(mhe_violation(e, o->best, 0, k->left_out) > MHE_FEASIBLE))

@@ -59,7 +59,8 @@ static void mhe_stage_distances(mhe_estimator *e, int i, const real *x, const re
 }
 
 /* The largest miss among rows of one set, in their scales. `sizes`: of the numbers whose
- * differences the rows are of, for rounding. `missed` gets the sides that are. */
+ * differences the rows are of, for rounding. `missed` gets the sides that are, but for
+ * components without width, which are not dropped. */
 static real mhe_missed(int n, int count, const real *low, const real *high, const real *rows,
                        const real *scale, const real *row_scale, const real *sizes,
                        const uint8_t *left_out, uint8_t *missed)
@@ -76,9 +77,10 @@ static real mhe_missed(int n, int count, const real *low, const real *high, cons
             for (int j = 0; j < n; j++) size += fabs(rows[(r - n) * n + j] * sizes[j]);
         const real miss = (side == MHE_LOWER ? low[r] : -high[r]) - 8 * EPSILON * size;
         const real share = miss / (r < n ? scale[r] : row_scale[r - n]);
+        const int fixed = r < n && low[r] == high[r];
         if (isnan(share)) return INFINITY;
         worst = mhe_max(share, worst);
-        if (missed && share > MHE_FEASIBLE) missed[r] = (uint8_t)side;
+        if (missed && !fixed && share > MHE_FEASIBLE) missed[r] = (uint8_t)side;
     }
     return worst;
 }
