@@ -188,12 +188,17 @@ def _in_states(states: qpmhe.model.sets.ConvexSet, start: Any = (0.1, 4.5), **se
     return Case(system, observer, cost, np.array(start), samples, options)
 
 
+def _inputs_in(**sets: Any) -> Case:
+    """The case with inputs in sets."""
+    one = replace(case("inputs"), system=with_inputs(**sets))
+    return one.with_options(solver_tolerance=1e-12)
+
+
 def _inputs_in_states() -> Case:
     """Bounds on one side and on both, and an observer that leaves them."""
     states = qpmhe.Box([0.0, -np.inf, -0.2], [0.6, 0.4, np.inf])
     observer = qpmhe.Luenberger([[0.6, 0.0], [0.3, -0.4], [0.1, 0.7]])
-    one = replace(case("inputs"), system=with_inputs(states=states), observer=observer)
-    return one.with_options(solver_tolerance=1e-12)
+    return replace(_inputs_in(states=states), observer=observer)
 
 
 POSITIVE = qpmhe.Box([0.0, 0.0], [np.inf, np.inf])
@@ -265,6 +270,31 @@ CASES: dict[str, Callable[[], Case]] = {
     ),
     "states not projected, kept": lambda: case("states in a polytope").with_options(
         project_observer=False, infeasible="keep_candidate"
+    ),
+    "noise-free": lambda: _inputs_in(
+        disturbances=qpmhe.Box([-0.05, 0.01, -0.05], [0.05, 0.01, 0.05])
+    ),
+    "noise-free with gaps": lambda: case("noise-free").with_gaps(),
+    "noise-free reinitialized": lambda: case("noise-free").with_options(
+        candidate="reinitialized", max_qps=None
+    ),
+    "no disturbances": lambda: _inputs_in(disturbances=qpmhe.Box([0.0] * 3, [0.0] * 3)),
+    "a known noise": lambda: _inputs_in(noises=qpmhe.Box([0.1, -3.0], [0.1, 3.0])),
+    "equations of disturbances": lambda: _inputs_in(
+        disturbances=qpmhe.model.sets.ConvexSet(
+            np.full(3, -np.inf), np.full(3, np.inf), np.array([[1.0, 1.0, -1.0]]), np.zeros(1),
+            np.zeros(1),
+        )
+    ),
+    "a known state": lambda: _inputs_in(
+        states=qpmhe.Box([-2.0, 0.2, -2.0], [2.0, 0.2, 2.0])
+    ).with_gaps(),
+    "states in a plane": lambda: _inputs_in(
+        states=qpmhe.Polytope([[1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]], [0.5, -0.5])
+    ),
+    "noise-free in states": lambda: _inputs_in(
+        states=qpmhe.Box([0.0, -0.2, -2.0], [0.6, 0.4, 2.0]),
+        disturbances=qpmhe.Box([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]),
     ),
     "inputs and states": _inputs_in_states,
     "inputs and states with gaps": lambda: case("inputs and states").with_gaps(),
