@@ -213,6 +213,8 @@ def estimator_fault(interpreter: Interpreter, library: EstimatorLibrary, cost: C
     """
     given, other = library.settings.copy(), library.settings.copy()
     given["max_qps"], other["max_qps"] = np.clip(given["max_qps"], 1, 3), 2
+    # The candidate's dynamics are recomputed without a projection.
+    given["project"] = other["project"] = 0
     other["discount"] = 1.0 if given["discount"] < 1.0 else 0.95
     other["start_at_best"] = not given["start_at_best"]
     other["reinitialize"] = not given["reinitialize"]

@@ -9,10 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import check_problem
+from .._checks import check_problem, positive_definite
+from .._linalg import inverse
 from ..costs import Cost
 from ..errors import InvalidInputError
 from ..estimation.conditions import ConditionReader, Conditions, usual_conditions
+from ..estimation.constraints import Constraints
 from ..estimation.covariance import window_covariances
 from ..estimation.estimate import DroppedRow, Estimate, Status
 from ..estimation.run import Run
@@ -28,7 +30,7 @@ from ..estimation.snapshot import (
 from ..model.system import System
 from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
-from .layout import CHANGES, SET_NAMES, SIDES, STAGE_FLAGS
+from .layout import CHANGES, SAMPLE_SETS, SIDES, STAGE_FLAGS
 from .library import EstimatorLibrary
 from .sample import SampleRecord
 
@@ -195,7 +197,7 @@ class CompiledEngine:
         block, numbers = self._block.copy(), self._numbers.tolist()
         dropped: tuple[DroppedRow, ...] = ()
         if numbers[1] & _ROWS_DROPPED:
-            sides = self._out[0]["dropped"][: numbers[0]]
+            sides = self._out[0]["dropped"][: numbers[0] + 1]
             dropped = self._library.layout.dropped_rows(sides, time + 1 - numbers[0])
         return CompiledEstimate(block, numbers, time, self._sizes, self._delay, dropped)
 
@@ -277,8 +279,14 @@ class CompiledEngine:
                 inputs,
                 weights * factors[1:, None, None],
                 prior * factors[0],
-                np.eye(model.n),
+                self._basis(),
             )
+
+    def _basis(self) -> Array:
+        """The directions (n, k) in which there are disturbances."""
+        system, cost = self._tools.system, self._tools.cost
+        covariance = inverse(cost.initial_weight(self._observer.initial_covariance()))
+        return Constraints(system, cost, covariance).basis
 
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt from measurements so far, as plain arrays and numbers."""
@@ -320,7 +328,7 @@ class CompiledEngine:
 
     def _check(self, memory: NDArray[Any], linearized: bool, tools: Tools) -> None:
         """Refuse a window that is impossible, or whose stages the model does not reproduce."""
-        record, n, horizon = memory[0], self._sizes[0], self._sizes[2]
+        record, horizon = memory[0], self._sizes[2]
         time, length, first = (int(record[name]) for name in ("time", "length", "first"))
         if not (
             0 <= first < (horizon if length == horizon else 1)
@@ -339,18 +347,44 @@ class CompiledEngine:
             raise ValueError("history does not end where the trajectory does")
         for stage in record["stages"][places]:
             self._check_flags(stage, tools)
-        again, reached = memory.copy(), np.zeros((horizon, n))
-        self._library.recompute(again.ctypes.data, reached.ctypes.data)
+        self._check_metric(record)
+        computed, usual = [self._recomputed(memory)], tools.record
+        if record["metric_settled"] and not usual["metric_settled"]:
+            # Some stages may have been computed before the metric settled.
+            before = memory.copy()
+            before["metric"] = usual["metric"]
+            computed.append(self._recomputed(before))
         sizes, wanted = np.abs(z).max(axis=0), self._settings.qp_limit > 0
         for k, place in enumerate(places):
-            stage, fresh = record["stages"][place], again[0]["stages"][place]
+            stage = record["stages"][place]
             disturbance = stage["own_disturbance_weight"] if stage["has_own_disturbance"] else None
             weight = tools.cost.joint_weight(stage["noise_weight"], disturbance)
-            self._check_stage(stage, fresh, z[k + 1], reached[k], sizes, weight)
+            for left, (again, reached) in zip(range(len(computed))[::-1], computed, strict=True):
+                fresh = again[0]["stages"][place]
+                try:
+                    self._check_stage(stage, fresh, z[k + 1], reached[k], sizes, weight)
+                    break
+                except InvalidInputError:
+                    if not left:
+                        raise
             if linearized == wanted and wanted:
                 self._check_terms(stage, fresh, sizes, np.abs(weight))
             else:
                 stage["terms"] = fresh["terms"]
+
+    def _recomputed(self, memory: NDArray[Any]) -> tuple[NDArray[Any], Array]:
+        """Stages as the model computes them now, and the states behind them."""
+        again, reached = memory.copy(), np.zeros((self._sizes[2], self._sizes[0]))
+        self._library.recompute(again.ctypes.data, reached.ctypes.data)
+        return again, reached
+
+    def _check_metric(self, record: Any) -> None:
+        """Refuse a metric of the observer that is none."""
+        if record["metric_settled"] not in (0, 1):
+            raise ValueError("the observer's metric is impossible")
+        if self._system.states is not None:
+            n = self._sizes[0]
+            positive_definite("metric", record["metric"].reshape(n, n))
 
     def _check_flags(self, stage: Any, tools: Tools) -> None:
         """Refuse a stage whose sample is impossible."""
@@ -370,7 +404,7 @@ class CompiledEngine:
         for kind in ("noise", "disturbance"):
             if flags[f"has_own_{kind}"]:
                 saved[f"{kind}_weight"] = stage[f"own_{kind}_weight"]
-        for letter, name in zip("wv", SET_NAMES, strict=True):
+        for letter, name in zip("wv", SAMPLE_SETS, strict=True):
             if flags[f"has_own_{letter}"]:
                 sides, built = stage[f"own_{letter}"], self._system.set_of(name)
                 if built is None:

@@ -19,7 +19,9 @@ from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
 
-SET_NAMES = ("disturbances", "noises")
+SET_NAMES = ("disturbances", "noises", "states")
+#: Those of which a sample may have other sides.
+SAMPLE_SETS = SET_NAMES[:2]
 # Terms of the cost, and their losses in the order of their numbers in C.
 TERMS = ("prior", "disturbance", "noise")
 LOSSES = ("quadratic", "huber", "power")
@@ -31,7 +33,7 @@ STAGE_FLAGS = (
     "has_own_noise", "has_own_disturbance", "has_own_w", "has_own_v", "is_irregular", "is_complete"
 )
 #: What mhe_set changes, in the order of its bits.
-CHANGES = ("noise_weight", "disturbance_weight", *SET_NAMES)
+CHANGES = ("noise_weight", "disturbance_weight", *SAMPLE_SETS)
 
 _CLOCK_TEXT = """
  *
@@ -70,7 +72,7 @@ class Layout:
         loss = form is not None and any(one.kind != "quadratic" for one in form.losses)
         sets = tuple(
             (one is not None, 0 if one is None else one.matrix.shape[0])
-            for one in (system.disturbances, system.noises)
+            for one in (getattr(system, name) for name in SET_NAMES)
         )
         return cls(
             system.n, system.p, system.m, horizon, sets, continuous, real, loss=loss,
@@ -92,7 +94,7 @@ class Layout:
             "clock": int(self.clock), "clock_text": _CLOCK_TEXT if self.clock else "",
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
-        for letter, (there, rows) in zip("wv", self.sets, strict=True):
+        for letter, (there, rows) in zip("wvx", self.sets, strict=True):
             values[f"{letter}_set"] = int(there)
             values[f"{letter}_rows"] = rows
         return values
@@ -109,8 +111,10 @@ class Layout:
             ("solver_tolerance", r),
         ]
         fields += [(name, self.set_type(name)) for name in SET_NAMES]
+        fields += [(name, r, self.metric_size) for name in ("metric", "metric_weight")]
         options = (
-            "max_qps", "max_iterations", "infeasible", "start_at_best", "reinitialize", "delay"
+            "metric_settled", "project", "max_qps", "max_iterations", "infeasible",
+            "start_at_best", "reinitialize", "delay",
         )
         fields += [(name, np.int32) for name in options]
         if self.clock:
@@ -126,13 +130,13 @@ class Layout:
             ("noises", r, (count, p)), ("filtered", r, n), ("time", np.int64),
             ("length", np.int32), ("status", np.int32), ("qps", np.int32),
             ("iterations", np.int32), ("corrections", np.int32), ("nearest_points", np.int32),
-            ("dropped", np.uint8, (count, max(sum(self.set_rows), 1))),
+            ("dropped", np.uint8, (count + self.sets[2][0], max(sum(self.set_rows), 1))),
         ])
 
     def set_type(self, name: str) -> np.dtype[Any]:
-        """``mhe_w_set`` or ``mhe_v_set``."""
+        """``mhe_w_set``, ``mhe_v_set`` or ``mhe_x_set``."""
         r, k = self.number, SET_NAMES.index(name)
-        size, space = (self.nx, self.ny)[k], max(self.sets[k][1], 1)
+        size, space = (self.nx, self.ny, self.nx)[k], max(self.sets[k][1], 1)
         return _struct([
             ("lower", r, size), ("upper", r, size), ("scale", r, size), ("rows", r, space * size),
             ("row_lower", r, space), ("row_upper", r, space), ("row_scale", r, space),
@@ -141,15 +145,22 @@ class Layout:
 
     def sample_type(self) -> np.dtype[Any]:
         """``mhe_sample``."""
-        pointers = ("y", "u", "noise_weight", "disturbance_weight", *SET_NAMES, "sampled")
+        pointers = ("y", "u", "noise_weight", "disturbance_weight", *SAMPLE_SETS, "sampled")
         return _struct([*((name, np.uintp) for name in pointers), ("step", self.number)])
+
+    @property
+    def metric_size(self) -> int:
+        """Entries of the observer's metric, of which there is one if there is X."""
+        return max(self.sets[2][0] * self.nx**2, 1)
 
     @property
     def set_rows(self) -> tuple[int, ...]:
         """Inequalities of each set at one stage: one for each component, then the rows."""
         return tuple(
             there * (size + rows)
-            for size, (there, rows) in zip((self.nx, self.ny), self.sets, strict=True)
+            for size, (there, rows) in zip(
+                (self.nx, self.ny, self.nx), self.sets, strict=True
+            )
         )
 
     def dropped_rows(self, sides: NDArray[np.uint8], first: int) -> tuple[DroppedRow, ...]:
@@ -162,7 +173,8 @@ class Layout:
                 for k, r in np.argwhere(part)
             ]
             start += count
-        return tuple(found)
+        # As the Python step lists them: those of X first.
+        return tuple(sorted(found, key=lambda row: row.set != "states"))
 
     def estimator_type(self) -> np.dtype[Any]:
         """``mhe_estimator``."""
@@ -179,7 +191,7 @@ class Layout:
             ("own_disturbance_weight", r, (n, n)),
             *(
                 (f"own_{letter}", self.set_type(name))
-                for letter, name, (there, _) in zip("wv", SET_NAMES, self.sets, strict=True)
+                for letter, name, (there, _) in zip("wv", SAMPLE_SETS, self.sets[:2], strict=True)
                 if there
             ),
             ("cost", r), *((flag, np.int32) for flag in STAGE_FLAGS), ("is_observed", np.uint8, p),
@@ -188,7 +200,9 @@ class Layout:
         return _struct([
             ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
             ("length", np.int32), ("newest", np.int32), ("has_trajectory", np.int32),
-            ("far", np.int32), ("dropped", np.int32), ("last_good", r, n), ("z_end", r, n),
+            ("far", np.int32), ("dropped", np.int32),
+            ("metric_settled", np.int32), ("metric", r, self.metric_size),
+            ("last_good", r, n), ("z_end", r, n),
             ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
             ("stages", stage, count),
         ])
@@ -230,7 +244,9 @@ def _filled(
     # Single precision distinguishes less.
     record["tolerance"] = max(settings.tolerance, 1e-6 if single else 0.0)
     record["solver_tolerance"] = max(settings.solver_tolerance, 1e-4 if single else 0.0)
-    for name, weight in zip(SET_NAMES, (form.disturbance, form.noise), strict=True):
+    initial = cost.initial_weight(observer.initial_covariance())
+    weights = form.disturbance, form.noise, initial
+    for name, weight in zip(SET_NAMES, weights, strict=True):
         one: ConvexSet | None = getattr(system, name)
         if one is None:
             continue
@@ -243,6 +259,11 @@ def _filled(
         rows = one.matrix.shape[0]
         part["rows"][: one.matrix.size] = one.matrix.ravel()
         part["row_lower"][:rows], part["row_upper"][:rows] = one.row_lower, one.row_upper
+    if system.states is not None:
+        own = observer.metric
+        record["metric"] = inverse(initial if own is None else own).ravel()
+        record["metric_weight"], record["metric_settled"] = initial.ravel(), own is not None
+    record["project"] = settings.project_observer
     record["max_qps"] = min(settings.qp_limit, _MOST)
     most = settings.max_solver_iterations
     record["max_iterations"] = 0 if settings.backend == "banded" else min(most or 50, _MOST)

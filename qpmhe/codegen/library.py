@@ -9,20 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._linalg import inverse
 from ..costs import Cost, RobustCost
 from ..errors import CompilationError, OptionError
 from ..estimation.estimate import Status
-from ..estimation.limits import FEASIBLE
 from ..estimation.settings import Settings
 from ..model.expressions import CasadiModel
-from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
 from .comparison import Interpreter, estimator_fault
 from .compiler import NotCachedError, cached_library, compiled_library
 from .fingerprint import source_key
-from .layout import SET_NAMES, TERMS, Layout, settings_record
+from .layout import TERMS, Layout, settings_record
 from .source import CONTINUOUS, MAIN, estimator_files, template
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
@@ -45,11 +42,6 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             "engine='compiled' does not yet take a singular covariance of the disturbance; take "
             "engine='python'."
         )
-    if system.states is not None:
-        return (
-            "engine='compiled' does not yet project the observer onto X; take engine='python', or "
-            "leave states out."
-        )
     for name in ("output_residual", "state_residual"):
         if getattr(system, name) is not None:
             return (
@@ -70,14 +62,15 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         if cost.quadratic and cost.observer_prior is not None:
             return "a prior weight from the observer has no C form; take a constant one."
         return _without_form(cost)
-    for name, weight in zip(SET_NAMES, (cost.disturbance, cost.noise), strict=True):
-        one = getattr(system, name)
-        if one is not None and _is_flat(one, inverse(weight)):
-            return (
-                f"the set of {name} has a direction of zero width (equal bounds, or a polytope "
-                f"less than {FEASIBLE:g} standard deviations wide), which the interior-point "
-                "method in C cannot take; widen it."
-            )
+    covariance = observer.initial_covariance()
+    if (
+        system.states is not None and settings.project_observer and covariance is not None
+        and observer.metric is None
+    ):
+        return (
+            f"engine='compiled' does not yet project {type(observer).__name__} onto X, by its "
+            "covariance; take engine='python', or leave states out."
+        )
     size = _window_size(system, cost, settings.horizon)
     if size > _MOST_BYTES:
         return (
@@ -115,31 +108,6 @@ def _window_size(system: System, cost: Cost, horizon: int) -> int:
     """Bytes of an estimator's memory, in double precision."""
     one, two = (Layout.of(system, cost, count, 0).estimator_type().itemsize for count in (1, 2))
     return one + (horizon - 1) * (two - one)
-
-
-def _is_flat(one: ConvexSet, covariance: NDArray[np.float64]) -> bool:
-    """Whether a set has no interior: no ball within it is wider than what counts as none.
-
-    Components are measured in standard deviations.
-    """
-    if one.fixed_components.size or (one.row_lower == one.row_upper).any():
-        return True
-    if not one.matrix.size:
-        return False
-    deviations = np.sqrt(covariance.diagonal())
-    matrix = np.vstack((np.eye(one.dimension), one.matrix)) * deviations
-    low, high = np.append(one.lower, one.row_lower), np.append(one.upper, one.row_upper)
-    norms = np.linalg.norm(matrix, axis=1)
-    matrix, low, high = matrix / norms[:, None], low / norms, high / norms
-    above, below = np.isfinite(high), np.isfinite(low)
-    rows, limits = np.vstack((matrix[above], -matrix[below])), np.append(high[above], -low[below])
-    from scipy.optimize import linprog  # late: it takes long to import
-
-    found = linprog(
-        np.append(np.zeros(one.dimension), -1.0), np.column_stack((rows, np.ones(limits.size))),
-        limits, bounds=[(None, None)] * one.dimension + [(0.0, 1.0)],
-    )
-    return found.x is not None and bool(2.0 * found.x[-1] <= FEASIBLE)
 
 
 def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:

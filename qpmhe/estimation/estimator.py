@@ -78,7 +78,7 @@ class MovingHorizonEstimator:
         lowers J by less than this share of J.
     engine : {"auto", "python", "compiled"}
         What runs the step. ``compiled`` generates C code for the whole step from a system
-        made by `qpmhe.from_casadi` without a set of states, a quadratic cost and an observer with
+        made by `qpmhe.from_casadi`, a quadratic cost and an observer with
         constant gain, compiles it once and keeps it in a cache on disk; it also solves
         QPs with active inequalities. Without a C compiler it warns and runs the
         Python step. ``auto`` takes the compiled step where its library is in the cache, see

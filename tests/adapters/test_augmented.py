@@ -277,9 +277,14 @@ def test_a_casadi_model_runs_in_the_compiled_step():
     for run in runs[:2]:
         np.testing.assert_allclose(run.states, runs[2].states, rtol=1e-7, atol=1e-9)
     assert abs(runs[0].states[-1, 2] - 0.1) > 1e-3
-    # Constant parameters are noise-free components, which the step in C does not take.
-    with pytest.raises(qpmhe.errors.OptionError, match="zero width"):
-        estimator(qpmhe.augment_parameters(model, nominal=[0.1]), engine="compiled")
+    # Constant parameters are noise-free components.
+    constant = qpmhe.augment_parameters(model, nominal=[0.1])
+    runs = [
+        estimator(constant, engine=engine, solver_tolerance=1e-12).run(ys)
+        for engine in ("python", "compiled")
+    ]
+    np.testing.assert_allclose(runs[1].states, runs[0].states, rtol=1e-7, atol=1e-9)
+    assert (runs[1].costs <= runs[1].candidate_costs).all()
     with pytest.raises(qpmhe.errors.OptionError, match=r"no CasADi form.*noisy_inputs"):
         estimator(qpmhe.noisy_inputs(model), engine="compiled")
 

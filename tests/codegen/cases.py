@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,6 +14,7 @@ import qpmhe
 from qpmhe.models.batch_reactor import batch_reactor
 from qpmhe.models.batch_reactor import casadi_output as reactor_output
 from qpmhe.models.batch_reactor import casadi_rate as reactor_rate
+
 from .conditions import with_changes, with_conditions, with_parameters
 
 STEPS = 24
@@ -39,10 +41,13 @@ class Case:
 
     def estimator(self, engine: str, **options: Any) -> qpmhe.MovingHorizonEstimator:
         """An estimator of this case."""
-        return qpmhe.MovingHorizonEstimator(
-            self.system, self.observer, self.cost, initial_state=self.start, engine=engine,
-            **(self.options | options),
-        )
+        with warnings.catch_warnings():
+            # Of a start outside of the states, which some cases have.
+            warnings.simplefilter("ignore", qpmhe.errors.ObserverWarning)
+            return qpmhe.MovingHorizonEstimator(
+                self.system, self.observer, self.cost, initial_state=self.start, engine=engine,
+                **(self.options | options),
+            )
 
     def with_options(self, **options: Any) -> Case:
         """The case with other options."""
@@ -177,6 +182,44 @@ def _narrow(one: Case, **options: Any) -> Case:
     return changed.with_options(max_qps=None, solver_tolerance=1e-9, **options)
 
 
+def reaction(**options: Any) -> qpmhe.System:
+    """2A -> B in pressures, of which the sum is measured; runs away from negative ones."""
+
+    def f(x):
+        rate = 0.016 * x[0] ** 2
+        return [x[0] - 2.0 * rate, x[1] + rate]
+
+    return qpmhe.from_casadi(f, lambda x: [x[0] + x[1]], n=2, compiled=False, **options)
+
+
+def _in_states(states: qpmhe.model.sets.ConvexSet, start: Any = (0.1, 4.5), **sets: Any) -> Case:
+    """The reaction in a set of states, which its observer leaves."""
+    system, cost = reaction(states=states, **sets), qpmhe.QuadraticCost(
+        prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(1)
+    )
+    samples = recorded(system, [3.0, 1.0], disturbance=0.0)
+    options = {"horizon": 5, "max_qps": 2, "solver_tolerance": 1e-12}
+    observer = qpmhe.Luenberger([0.8, -0.3])
+    return Case(system, observer, cost, np.array(start), samples, options)
+
+
+def _inputs_in(**sets: Any) -> Case:
+    """The case with inputs in sets."""
+    one = replace(case("inputs"), system=with_inputs(**sets))
+    return one.with_options(solver_tolerance=1e-12)
+
+
+def _inputs_in_states() -> Case:
+    """Bounds on one side and on both, and an observer that leaves them."""
+    states = qpmhe.Box([0.0, -np.inf, -0.2], [0.6, 0.4, np.inf])
+    observer = qpmhe.Luenberger([[0.6, 0.0], [0.3, -0.4], [0.1, 0.7]])
+    return replace(_inputs_in(states=states), observer=observer)
+
+
+POSITIVE = qpmhe.Box([0.0, 0.0], [np.inf, np.inf])
+WEDGE = qpmhe.Polytope([[-1.0, 0.1], [0.1, -1.0], [1.0, 1.0]], [0.0, 0.0, 4.2])
+
+
 def _huber(threshold: float, per_component: bool = False) -> Callable[[Any], qpmhe.Huber]:
     return functools.partial(qpmhe.Huber, threshold=threshold, per_component=per_component)
 
@@ -231,6 +274,69 @@ CASES: dict[str, Callable[[], Case]] = {
     "power per component": lambda: _robust(
         _power(1.0, True), _power(3.0, True), _power(1.5, True), discount=0.9
     ).with_options(candidate="reinitialized"),
+    "states in a box": lambda: _in_states(POSITIVE),
+    "states in a box observer": lambda: case("states in a box").with_options(max_qps=0),
+    "states in a box reinitialized": lambda: case("states in a box").with_options(
+        candidate="reinitialized", warm_start=True
+    ),
+    "states from outside": lambda: _in_states(WEDGE, (-1.0, 4.5)).with_options(max_qps=None),
+    "states in a metric": lambda: replace(
+        case("states in a box"),
+        observer=qpmhe.Luenberger([0.8, -0.3], metric=[[2.0, 1.0], [1.0, 1.0]]),
+    ).with_gaps(),
+    "states in a polytope": lambda: _in_states(WEDGE),
+    "states in a polytope with gaps": lambda: case("states in a polytope").with_gaps().with_options(
+        candidate="reinitialized"
+    ),
+    "states in both": lambda: _in_states(
+        qpmhe.Box([0.0, 0.0], [np.inf, 4.0]) & qpmhe.Polytope([[1.0, 1.0]], [4.2]),
+        noises=qpmhe.Box([-0.15], [0.2]),
+    ),
+    # Bounds that a solution touches with a multiplier near zero: the solvers end apart.
+    "states, disturbances and noises": lambda: replace(
+        _in_states(
+            POSITIVE, disturbances=qpmhe.Box([-0.05, -0.05], [0.05, 0.05]),
+            noises=qpmhe.Box([-0.15], [np.inf]),
+        ),
+        tolerance=1e-7,
+    ),
+    # The window never is full of such samples, about which there is a warning.
+    "states not projected": lambda: case("states in a polytope").with_options(
+        project_observer=False, horizon=STEPS + 1
+    ),
+    "states not projected, kept": lambda: case("states in a polytope").with_options(
+        project_observer=False, infeasible="keep_candidate"
+    ),
+    "noise-free": lambda: _inputs_in(
+        disturbances=qpmhe.Box([-0.05, 0.01, -0.05], [0.05, 0.01, 0.05])
+    ),
+    "noise-free with gaps": lambda: case("noise-free").with_gaps(),
+    "noise-free reinitialized": lambda: case("noise-free").with_options(
+        candidate="reinitialized", max_qps=None
+    ),
+    "no disturbances": lambda: _inputs_in(disturbances=qpmhe.Box([0.0] * 3, [0.0] * 3)),
+    "a known noise": lambda: _inputs_in(noises=qpmhe.Box([0.1, -3.0], [0.1, 3.0])),
+    "equations of disturbances": lambda: _inputs_in(
+        disturbances=qpmhe.model.sets.ConvexSet(
+            np.full(3, -np.inf), np.full(3, np.inf), np.array([[1.0, 1.0, -1.0]]), np.zeros(1),
+            np.zeros(1),
+        )
+    ),
+    "a known state": lambda: _inputs_in(
+        states=qpmhe.Box([-2.0, 0.2, -2.0], [2.0, 0.2, 2.0])
+    ).with_gaps(),
+    "states in a plane": lambda: _inputs_in(
+        states=qpmhe.Polytope([[1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]], [0.5, -0.5])
+    ),
+    "noise-free in states": lambda: _inputs_in(
+        states=qpmhe.Box([0.0, -0.2, -2.0], [0.6, 0.4, 2.0]),
+        disturbances=qpmhe.Box([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]),
+    ),
+    "inputs and states": _inputs_in_states,
+    "inputs and states with gaps": lambda: case("inputs and states").with_gaps(),
+    "inputs and states reinitialized": lambda: case("inputs and states").with_options(
+        candidate="reinitialized", max_qps=1
+    ),
     "mixed losses": lambda: _weighed(
         _robust(_huber(1.0), _power(1.5, True), _huber(2.0, True)).with_gaps()
     ).with_options(max_qps=4, candidate="reinitialized", warm_start=True),

@@ -15,7 +15,8 @@
  *     mhe_update(&estimator, &workspace, y, u, &estimate);      once a sample
  *     estimate.trajectory[estimate.length * MHE_NX + j]         state j at t+1
  *
- * Components of y that are not finite are missing. After each update
+ * Components of y that are not finite are missing. The observer is projected onto the set of states,
+ * if there is one, after each step. After each update
  * estimate.cost <= estimate.candidate_cost: both are the true cost of the nonlinear problem.
  *
  * A sample with something of its own, such as a weight, is taken by mhe_update_special. Other
@@ -36,13 +37,15 @@ typedef $real mhe_real;
 #define MHE_NY $ny       /* outputs */
 #define MHE_NU $nu       /* inputs */
 #define MHE_HORIZON $horizon /* most samples in the window */
-#define MHE_W_SET $w_set   /* whether there is a set of disturbances, noises */
+#define MHE_W_SET $w_set   /* whether there is a set of disturbances, noises, states */
 #define MHE_V_SET $v_set
+#define MHE_X_SET $x_set
 #define MHE_W_ROWS $w_rows  /* general inequalities in each */
 #define MHE_V_ROWS $v_rows
 #define MHE_LOSS $loss    /* whether a term of the cost has a loss that is not quadratic */
 #define MHE_LAPACK $lapack /* 1: needs mhe_set_lapack */
 #define MHE_CLOCK $clock /* whether time_budget is kept */
+#define MHE_X_ROWS $x_rows
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
@@ -50,7 +53,8 @@ $limits
 
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
-    (MHE_W_SET * (MHE_NX + MHE_W_ROWS) + MHE_V_SET * (MHE_NY + MHE_V_ROWS))
+    (MHE_W_SET * (MHE_NX + MHE_W_ROWS) + MHE_V_SET * (MHE_NY + MHE_V_ROWS) + \
+     MHE_X_SET * (MHE_NX + MHE_X_ROWS))
 /* Length of a panel's rows, for whole registers. */
 #define MHE_PANEL_WIDTH (MHE_NX < 24 ? (2 * MHE_NX + 3) / 4 * 4 : (2 * MHE_NX + 31) / 32 * 32)
 
@@ -59,9 +63,10 @@ enum {
 $status
 };
 
-/* What to do where no trajectory in the sets costs at most what the candidate does. */
-#define MHE_ROWS (MHE_HORIZON * MHE_SIZE(MHE_STAGE_ROWS))
+/* Rows of a window: those of stage i on w(i), v(i) and x(i); a last stage has x only. */
+#define MHE_ROWS ((MHE_HORIZON + MHE_X_SET) * MHE_SIZE(MHE_STAGE_ROWS))
 
+/* What to do where no trajectory in the sets costs at most what the candidate does. */
 enum { MHE_DROP_ROWS = 0, MHE_KEEP_CANDIDATE = 1 };
 
 /* Sides of an inequality, as bits. */
@@ -100,6 +105,14 @@ typedef struct {
     int32_t kind, per_component;
 } mhe_loss;
 
+typedef struct {
+    mhe_real lower[MHE_NX], upper[MHE_NX], scale[MHE_NX];
+    mhe_real rows[MHE_SIZE(MHE_X_ROWS) * MHE_NX];
+    mhe_real row_lower[MHE_SIZE(MHE_X_ROWS)], row_upper[MHE_SIZE(MHE_X_ROWS)];
+    mhe_real row_scale[MHE_SIZE(MHE_X_ROWS)];
+    mhe_real deviation[MHE_NX], row_deviation[MHE_SIZE(MHE_X_ROWS)];
+} mhe_x_set;
+
 /* Matrices are stored by rows. Weights are inverse covariances. */
 typedef struct {
     mhe_real gain[MHE_NX * MHE_NY];
@@ -114,6 +127,13 @@ typedef struct {
     mhe_real solver_tolerance; /* residuals of a constrained QP that is solved */
     mhe_w_set disturbances;
     mhe_v_set noises;
+    mhe_x_set states;
+    /* The observer's metric: as a covariance, before it has settled or for good; and the weight in the
+     * Lyapunov equation by which it settles. */
+    mhe_real metric[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)];
+    mhe_real metric_weight[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)];
+    int32_t metric_settled;    /* whether `metric` is for good */
+    int32_t project;           /* keep the observer in X */
     int32_t max_qps;           /* QPs for each sample */
     int32_t max_iterations;    /* interior-point iterations in each; 0: no inequalities */
     int32_t infeasible;        /* MHE_DROP_ROWS or MHE_KEEP_CANDIDATE */
@@ -161,6 +181,8 @@ typedef struct {
     int32_t first, length;         /* the window in the ring of stages */
     int32_t newest, has_trajectory;
     int32_t far, dropped;          /* samples running with a far observer, with rows dropped */
+    int32_t metric_settled;        /* whether the metric below is for good */
+    mhe_real metric[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)]; /* of the observer, as a covariance */
     mhe_real last_good[MHE_NX];    /* of the stages that have left the window */
     mhe_real z_end[MHE_NX];        /* the observer's state behind the last stage */
     mhe_real history[(MHE_HORIZON + 1) * MHE_NX]; /* ring of estimates of x(t), newest last */
@@ -177,7 +199,8 @@ typedef struct {
     mhe_real filtered[MHE_NX];     /* estimate of x(t) that has used y(t) */
     int64_t time;                  /* of the newest sample */
     int32_t length, status, qps, iterations, corrections, nearest_points;
-    /* Sides that were dropped and are violated, by stage: components of W, its rows, those of V. */
+    /* Sides that were dropped and are violated, by stage: components of W, its rows, those of V
+     * and of X. */
     uint8_t dropped[MHE_ROWS];
 } mhe_estimate;
 
@@ -198,6 +221,8 @@ typedef struct {
 typedef struct {
     mhe_real low[MHE_ROWS], high[MHE_ROWS], scale[MHE_ROWS];
     mhe_real value[MHE_ROWS], weight[MHE_ROWS], load[MHE_ROWS];
+    mhe_real force[MHE_ROWS], missed[MHE_ROWS];
+    int8_t place[MHE_ROWS], next[MHE_ROWS];
     mhe_side sides[2];
 } mhe_rows;
 
@@ -239,8 +264,8 @@ typedef struct {
     int32_t *status, *qps, *iterations;
 } mhe_log;
 
-/* Forget all samples and start at x0. The settings are not copied: they must stay where they
- * are as long as the estimator is in use. */
+/* Forget all samples and start at x0, or at the nearest point of X. The settings are not copied:
+ * they must stay where they are as long as the estimator is in use. */
 void mhe_reset(mhe_estimator *estimator, const mhe_settings *settings, const mhe_real *x0);
 
 /* Take a sample in that has something of its own; all of it is copied. */

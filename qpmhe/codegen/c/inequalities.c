@@ -3,29 +3,33 @@
  *
  *     min d'H d / 2 + g'd   s.t.   low <= c(d) <= high
  *
- * The rows c of stage i are those of W (on d(i+1) - A d(i)) and of V (on -C d(i)): each set's
- * components first, then its general inequalities. */
+ * The rows c of stage i are those of W (on d(i+1) - A d(i)), of V (on -C d(i)) and of X (on d(i)):
+ * each set's components first, then its general inequalities. The last stage has rows of X only;
+ * its places for others are without limits. */
 
-enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED };
+enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
 
 /* Iterations after which rows are compared with what they were. */
-#define STALL 8
+#define STALL 4
 
 /* Guesses of the active rows, and rounds of the augmented Lagrangian for each; each round makes
  * the rows' gaps smaller by about this factor. */
-#define GUESSES 12
+#define GUESSES 25
+#define PATIENCE 2
+#define FEW 10
 #define ROUNDS 5
 #define STIFFNESS (sizeof(real) == 8 ? (real)1e6 : (real)1e3)
 
 #if CONSTRAINED
 
-/* Limits of all rows about a trajectory with residuals w and v. */
-static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *w, const real *v)
+/* Limits of all rows about a trajectory x with residuals w and v. */
+static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, const real *w,
+                           const real *v)
 {
     real low[ROWS], high[ROWS];
-    for (int i = 0; i < e->length; i++) {
+    for (int i = 0; i < mhe_row_stages(e); i++) {
         mhe_stage_scales(e, i, k->rows.scale + i * ROWS);
-        mhe_stage_distances(e, i, w, v, low, high);
+        mhe_stage_distances(e, i, x, w, v, low, high);
         for (int r = 0; r < ROWS; r++) {
             const int at = i * ROWS + r, out = k->left_out[at];
             k->rows.low[at] = out & MHE_LOWER ? -INFINITY : low[r];
@@ -44,9 +48,16 @@ static void mhe_values_of(int n, int count, const real *q, const real *rows, rea
 static void mhe_rows_times(const mhe_estimator *e, mhe_workspace *k, const real *d)
 {
     const mhe_settings *s = e->settings;
-    for (int i = 0; i < e->length; i++) {
+    for (int i = 0; i < mhe_row_stages(e); i++) {
         real *value = k->rows.value + i * ROWS;
         const real *own = d + i * NX;
+#if MHE_X_SET
+        mhe_values_of(NX, MHE_X_ROWS, own, s->states.rows, value + W_COUNT + V_COUNT);
+        if (i == e->length) {
+            for (int r = 0; r < W_COUNT + V_COUNT; r++) value[r] = 0;
+            break;
+        }
+#endif
 #if MHE_W_SET
         real q[NX];
         for (int j = 0; j < NX; j++)
@@ -74,14 +85,21 @@ static void mhe_loads_of(int n, int count, const real *rows, const real *load, r
 static void mhe_add_loads(const mhe_estimator *e, const mhe_workspace *k, real *out)
 {
     const mhe_settings *s = e->settings;
-    for (int i = 0; i < e->length; i++) {
+    for (int i = 0; i < mhe_row_stages(e); i++) {
         const real *load = k->rows.load + i * ROWS;
         real *own = out + i * NX;
+#if MHE_X_SET
+        real x[NX];
+        mhe_loads_of(NX, MHE_X_ROWS, s->states.rows, load + W_COUNT + V_COUNT, x);
+        for (int j = 0; j < NX; j++) own[j] += x[j];
+        if (i == e->length) break;
+#endif
 #if MHE_W_SET
         real w[NX];
         const real *A = k->at[i]->f_jacobian;
         mhe_loads_of(NX, MHE_W_ROWS, s->disturbances.rows, load, w);
         for (int r = 0; r < NX; r++) {
+            if (w[r] == 0) continue;
             own[NX + r] += w[r];
             for (int j = 0; j < NX; j++) own[j] -= w[r] * A[r * NX + j];
         }
@@ -112,9 +130,16 @@ static void mhe_add_square(real *panel, real weight, const real *a)
 static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
 {
     const mhe_settings *s = e->settings;
-    for (int i = 0; i < e->length; i++) {
+    for (int i = 0; i < mhe_row_stages(e); i++) {
         const real *weights = k->rows.weight + i * ROWS;
         real *panel = k->panels + i * NX * WIDTH;
+#if MHE_X_SET
+        const real *bounds = weights + W_COUNT + V_COUNT;
+        for (int j = 0; j < NX; j++) panel[j * WIDTH + j] += bounds[j];
+        for (int r = 0; r < MHE_X_ROWS; r++)
+            if (bounds[NX + r] != 0) mhe_add_square(panel, bounds[NX + r], s->states.rows + r * NX);
+        if (i == e->length) break;
+#endif
 #if MHE_W_SET
         const real *A = k->at[i]->f_jacobian;
         real *next = panel + NX * WIDTH;
@@ -166,7 +191,7 @@ static real mhe_row_violation(const mhe_estimator *e, mhe_workspace *k, const re
     const mhe_rows *q = &k->rows;
     real worst = 0;
     mhe_rows_times(e, k, d);
-    for (int i = 0; i < e->length * ROWS; i++) {
+    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) {
         const real missed = mhe_max(q->low[i] - q->value[i], q->value[i] - q->high[i]);
         if (missed > 0) worst = mhe_max(missed / q->scale[i], worst);
     }
@@ -208,57 +233,168 @@ static real mhe_product(int n, const real *a, const real *b)
     return sums[0];
 }
 
+/* The place of a row in the active set: at its lower or upper limit, or between them. Of an
+ * equation, the limits are the same. */
+enum { AT_LOWER = -1, BETWEEN = 0, AT_UPPER = 1, EQUATION = 2 };
+
+static real mhe_limit_of(const mhe_rows *q, int i)
+{
+    return q->place[i] == BETWEEN ? 0 : q->place[i] < 0 ? q->low[i] : q->high[i];
+}
+
+/* The first guess is the active set that was left there, as far as its limits exist; how many rows
+ * are in it. Without iterations, all rows are left out. */
+static int mhe_first_guess(mhe_rows *q, int rows, int limit)
+{
+    int active = 0;
+    for (int i = 0; i < rows; i++) {
+        const int place = q->place[i];
+        q->force[i] = 0;
+        if (q->low[i] == q->high[i]) q->place[i] = EQUATION;
+        else if (place == EQUATION || !isfinite(mhe_limit_of(q, i))) q->place[i] = BETWEEN;
+        if (limit == 0) q->place[i] = BETWEEN;
+        active += q->place[i] != BETWEEN;
+    }
+    return active;
+}
+
+/* What the next guess is made from. */
+typedef struct {
+    int wrong, fewest; /* places that contradict the solution: now, and at best */
+    int patience;      /* guesses in which they need not become fewer */
+} mhe_guess;
+
+/* Compare the places of rows with the solution for them. */
+static void mhe_compare(mhe_rows *q, int rows, real tolerance, mhe_guess *guess)
+{
+    guess->wrong = 0;
+    for (int i = 0; i < rows; i++) {
+        const real little = tolerance * q->scale[i];
+        int next = q->place[i];
+        if (next == BETWEEN) {
+            const real below = q->low[i] - q->value[i], above = q->value[i] - q->high[i];
+            if (below > little) next = AT_LOWER;
+            if (above > little) next = AT_UPPER;
+        } else if (next != EQUATION && next * q->force[i] < 0)
+            next = BETWEEN;
+        q->next[i] = (int8_t)next;
+        guess->wrong += next != q->place[i];
+    }
+}
+
+/* Rows that are missed enter the active set, those that hold the solution back leave it: all of
+ * them, as long as they become fewer, else only the last, until they are. So Judice and Pires
+ * (Computers and Operations Research 21, 1994) keep such methods from cycling. 0 where one by one
+ * would take too long. */
+static int mhe_next_guess(mhe_rows *q, int rows, mhe_guess *guess)
+{
+    int all = 1;
+    if (guess->wrong < guess->fewest)
+        guess->fewest = guess->wrong, guess->patience = PATIENCE;
+    else
+        all = guess->patience-- > 0;
+    if (!all && guess->fewest > FEW) return 0;
+    for (int i = rows - 1; i >= 0; i--) {
+        if (q->next[i] == q->place[i]) continue;
+        q->place[i] = q->next[i];
+        if (q->place[i] == BETWEEN) q->force[i] = 0;
+        if (!all) break;
+    }
+    return 1;
+}
+
+/* Add what the active rows miss their limits by to their forces, where rows.value = c(step), and
+ * the next loads; the largest miss in a row's scale, beyond rounding. `energy`: the sum of their
+ * weighted squares. */
+static real mhe_push_back(mhe_rows *q, int rows, real *energy)
+{
+    real open = 0;
+    *energy = 0;
+    for (int i = 0; i < rows; i++) {
+        if (q->place[i] == BETWEEN) {
+            q->load[i] = 0;
+            continue;
+        }
+        const real limit = mhe_limit_of(q, i), gap = q->value[i] - limit;
+        const real force = q->weight[i] * gap;
+        q->force[i] += force;
+        q->load[i] = -force;
+        *energy += force * gap;
+        open = mhe_max((fabs(gap) - 64 * EPSILON * fabs(limit)) / q->scale[i], open);
+    }
+    return open;
+}
+
+/* The number of inequalities that must leave the active set where its rows exclude each other:
+ * those whose last change of force could not go on for ever. */
+static int mhe_exclude(mhe_rows *q, int rows, real open)
+{
+    int changes = 0;
+    for (int i = 0; i < rows; i++) {
+        q->next[i] = q->place[i];
+        if (q->place[i] == BETWEEN || q->place[i] == EQUATION) continue;
+        const real gap = -q->load[i] / q->weight[i];
+        if (gap * q->place[i] < -open * q->scale[i] / 100) q->next[i] = BETWEEN, changes++;
+    }
+    return changes;
+}
+
 /* Guess which rows are active, solve the QP with these as equations, guess anew: the primal-dual
  * active-set method of Hintermueller, Ito and Kunisch (SIAM Journal on Optimization 13, 2002),
  * which mostly ends after a few factorisations, with an exact solution. The equations are those of
- * an augmented Lagrangian, so that rows may depend on each other. `step` and rows.value
- * are those of the minimiser without inequalities. STOPPED where the guesses do not settle. */
+ * an augmented Lagrangian, so that rows may depend on each other. The first guess
+ * is in rows.place; with `again`, it is factorised. STOPPED where the guesses do not
+ * settle, EXCLUDED where the rows exclude each other. */
 static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest,
-                          int limit, int *iterations)
+                          int limit, int again, int *iterations)
 {
-    const int count = e->length, size = (count + 1) * NX, rows = count * ROWS;
+    const int count = e->length, size = (count + 1) * NX, rows = mhe_row_stages(e) * ROWS;
     const real tolerance = e->settings->solver_tolerance / 100;
     mhe_rows *q = &k->rows;
-    real *side = q->sides[0].there, *bound = q->sides[0].limit, *dual = q->sides[0].dual;
-    for (int i = 0; i < rows; i++) side[i] = dual[i] = 0;
-    for (*iterations = 0;; ++*iterations) {
-        int changed = 0;
-        real open = INFINITY;
+    int active = mhe_first_guess(q, rows, limit);
+    mhe_guess guess = {0, rows + 1, 0};
+    for (*iterations = 0;; again = 0) {
+        real open = 0, energy = 0, last = INFINITY;
+        if (active && (*iterations == limit || *iterations == GUESSES)) return STOPPED;
+        *iterations += active > 0;
         for (int i = 0; i < rows; i++) {
-            const real before = side[i], little = tolerance * q->scale[i];
-            if (before == 0) {
-                if (q->low[i] - q->value[i] > little) side[i] = -1;
-                if (q->value[i] - q->high[i] > little) side[i] = 1;
-            } else if (before * dual[i] < 0)
-                side[i] = 0;
-            changed += side[i] != before;
-            bound[i] = side[i] < 0 ? q->low[i] : side[i] > 0 ? q->high[i] : 0;
-            q->weight[i] = side[i] == 0 ? 0 : STIFFNESS / (q->scale[i] * q->scale[i]);
-            q->load[i] = q->weight[i] * bound[i];
-            dual[i] = 0;
+            q->weight[i] = q->place[i] == BETWEEN ? 0 : STIFFNESS / (q->scale[i] * q->scale[i]);
+            q->load[i] = q->weight[i] * mhe_limit_of(q, i) - q->force[i];
         }
-        if (!changed) return SOLVED;
-        if (*iterations == limit || *iterations == GUESSES || mhe_time_is_up(k)) return STOPPED;
-        mhe_build(e, k, offset, nearest);
-        mhe_add_weights(e, k);
-        if (!mhe_factorise(k, count)) return STOPPED;
-        for (int j = 0; j < size; j++) k->direction[j] = -k->gradient[j];
-        memset(k->step, 0, sizeof(real) * (size_t)size);
-        for (int round = 0; open > tolerance; round++) {
-            if (round == ROUNDS) return STOPPED; /* rows that exclude each other */
+        if (!again) {
+            if (active && mhe_time_is_up(k)) return STOPPED;
+            mhe_build(e, k, offset, nearest);
+            if (active) mhe_add_weights(e, k);
+            if (!mhe_factorise(k, count)) return STOPPED;
+        }
+        for (int j = 0; j < size; j++) k->step[j] = -k->gradient[j];
+        if (active) mhe_add_loads(e, k, k->step);
+        if (!mhe_solve(k, count, k->step)) return STOPPED;
+        mhe_rows_times(e, k, k->step);
+        if (active) open = mhe_push_back(q, rows, &energy);
+        mhe_compare(q, rows, tolerance, &guess);
+        if (limit == 0 && guess.wrong) return UNCONSTRAINED;
+        /* Forces are exact enough for a guess; not yet for a solution. */
+        for (int round = 0; !guess.wrong && open > tolerance; round++) {
+            if (energy > last * (1 - 1 / STIFFNESS)) {
+                guess.wrong = mhe_exclude(q, rows, open);
+                if (!guess.wrong) return EXCLUDED;
+                break;
+            }
+            if (round == ROUNDS) return STOPPED;
+            last = energy;
+            memset(k->direction, 0, sizeof(real) * (size_t)size);
             mhe_add_loads(e, k, k->direction);
             if (!mhe_solve(k, count, k->direction)) return STOPPED;
             for (int j = 0; j < size; j++) k->step[j] += k->direction[j];
             mhe_rows_times(e, k, k->step);
-            open = 0;
-            for (int i = 0; i < rows; i++) {
-                const real gap = q->value[i] - bound[i], force = q->weight[i] * gap;
-                dual[i] += force;
-                q->load[i] = -force;
-                if (side[i] != 0) open = mhe_max(fabs(gap) / q->scale[i], open);
-            }
-            memset(k->direction, 0, sizeof(real) * (size_t)size);
+            open = mhe_push_back(q, rows, &energy);
+            if (open <= tolerance) mhe_compare(q, rows, tolerance, &guess);
         }
+        if (!guess.wrong) return SOLVED;
+        if (!mhe_next_guess(q, rows, &guess)) return STOPPED;
+        active = 0;
+        for (int i = 0; i < rows; i++) active += q->place[i] != BETWEEN;
     }
 }
 
@@ -273,7 +409,7 @@ static int mhe_start(mhe_rows *q, int rows, real missed, real product)
         mhe_side *p = q->sides + side;
         for (int i = 0; i < rows; i++) {
             const real limit = side ? q->high[i] : -q->low[i];
-            const int there = isfinite(limit);
+            const int there = isfinite(limit) && q->low[i] < q->high[i];
             p->there[i] = there;
             p->limit[i] = there ? limit : 0;
             p->slack[i] = there ? mhe_max(limit, missed * q->scale[i]) : 1;
@@ -285,11 +421,18 @@ static int mhe_start(mhe_rows *q, int rows, real missed, real product)
 }
 
 /* Residuals, weights and loads where rows.value = c(d). Returns the sum of the products, and
- * the largest residual in its row's scale. */
+ * the largest residual in its row's scale. Equations have no sides, but stiffness and force as in
+ * the active-set method. */
 static real mhe_set_residuals(mhe_rows *q, int rows, real *infeasible)
 {
     real products = 0, worst[STRANDS] = {0};
-    for (int i = 0; i < rows; i++) q->weight[i] = q->load[i] = 0;
+    for (int i = 0; i < rows; i++) {
+        const int s = i % STRANDS, equation = q->low[i] == q->high[i];
+        q->missed[i] = equation ? q->value[i] - q->high[i] : 0;
+        q->weight[i] = equation ? STIFFNESS / (q->scale[i] * q->scale[i]) : 0;
+        q->load[i] = -q->force[i];
+        worst[s] = mhe_max(fabs(q->missed[i]) / q->scale[i], worst[s]);
+    }
     for (int side = 0; side < 2; side++) {
         mhe_side *p = q->sides + side;
         const real sign = mhe_sign(side);
@@ -314,9 +457,9 @@ static real mhe_set_residuals(mhe_rows *q, int rows, real *infeasible)
 /* Right-hand side of the Newton equations for a target of the complementarity products. */
 static void mhe_set_loads(const mhe_estimator *e, mhe_workspace *k, real target)
 {
-    const int rows = e->length * ROWS;
+    const int rows = mhe_row_stages(e) * ROWS;
     mhe_rows *q = &k->rows;
-    for (int i = 0; i < rows; i++) q->load[i] = 0;
+    for (int i = 0; i < rows; i++) q->load[i] = -q->weight[i] * q->missed[i];
     for (int side = 0; side < 2; side++) {
         const mhe_side *p = q->sides + side;
         const real sign = mhe_sign(side);
@@ -372,23 +515,39 @@ static real mhe_set_corrections(mhe_rows *q, int rows, real length)
     return mhe_max(after, 0);
 }
 
-/* Solve the QP whose limits and terms are in place. The minimiser without inequalities misses a row
- * by `missed` scales at most, and `promise` is its |g'd|. No unit matters: rows are compared with their scales,
- * products of slacks and duals with what the objective has to gain or to pay, gradients with the
- * roots of the Hessian's diagonal. */
+/* The active set of a solution. */
+static void mhe_set_places(mhe_rows *q, int rows)
+{
+    for (int i = 0; i < rows; i++) {
+        const real square = q->scale[i] * q->scale[i];
+        const mhe_side *lower = q->sides, *upper = q->sides + 1;
+        q->place[i] = BETWEEN;
+        if (lower->there[i] != 0 && lower->slack[i] < square * lower->dual[i]) q->place[i] = AT_LOWER;
+        if (upper->there[i] != 0 && upper->slack[i] < square * upper->dual[i]) q->place[i] = AT_UPPER;
+    }
+}
+
+/* Solve the QP whose limits and terms are in place; `step` is that of the minimiser without
+ * inequalities. No unit matters: rows are compared with their scales, products of slacks and duals
+ * with what the objective has to gain or to pay, gradients with the roots of the Hessian's
+ * diagonal. */
 static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *offset,
-                              int nearest, real missed, real promise, int limit, int *iterations)
+                              int nearest, int limit, int *iterations)
 {
     const mhe_settings *s = e->settings;
-    const int count = e->length, size = (count + 1) * NX, rows = count * ROWS;
+    const int count = e->length, size = (count + 1) * NX, rows = mhe_row_stages(e) * ROWS;
     mhe_rows *q = &k->rows;
     real far = INFINITY;
+    const real missed = mhe_row_violation(e, k, k->step);
+    const real promise = fabs(mhe_product(size, k->gradient, k->step));
+    if (!(missed > 0)) return SOLVED;
     memset(k->step, 0, sizeof(real) * (size_t)size);
+    memset(q->force, 0, sizeof q->force);
     const real outside = mhe_row_violation(e, k, k->step);
     const real scale = mhe_max(promise, outside * outside);
     /* Generous products: from smaller ones it creeps on some QPs. */
     const int sides = mhe_start(q, rows, missed, mhe_max(scale, EPSILON * EPSILON));
-    if (!sides) return SOLVED;
+    if (!sides) return STOPPED;
     for (*iterations = 0;; ++*iterations) {
         real infeasible, unbalanced = 0, length = 1, target = 0;
         mhe_build(e, k, offset, nearest);
@@ -403,12 +562,14 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
         }
         if (infeasible <= s->solver_tolerance / 100 &&
             unbalanced <= s->solver_tolerance * s->solver_tolerance * scale &&
-            products <= s->solver_tolerance / 1000 * scale)
+            products <= s->solver_tolerance / 1000 * scale) {
+            mhe_set_places(q, rows);
             return SOLVED;
+        }
         if (*iterations >= limit || mhe_time_is_up(k)) return STOPPED;
         /* Of rows that exclude each other, residuals hardly shrink. */
         if (*iterations % STALL == 0) {
-            if (infeasible > s->solver_tolerance / 100 && infeasible > far / 2) return STOPPED;
+            if (infeasible > s->solver_tolerance / 100 && infeasible > far * (real)0.8) return STOPPED;
             far = infeasible;
         }
         mhe_add_weights(e, k);
@@ -425,6 +586,9 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
         length *= (real)0.995;
         if (!(length > 1e-10)) return STOPPED;
         for (int j = 0; j < size; j++) k->step[j] += length * k->direction[j];
+        for (int i = 0; i < rows; i++)
+            if (q->low[i] == q->high[i])
+                q->force[i] += length * q->weight[i] * (q->missed[i] + q->value[i]);
         for (int side = 0; side < 2; side++) {
             mhe_side *p = q->sides + side;
             for (int i = 0; i < rows; i++) {

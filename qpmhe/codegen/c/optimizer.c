@@ -9,6 +9,7 @@ typedef struct {
     mhe_trial *candidate, *best, *spare, *other; /* best may be the candidate */
     int outside; /* the candidate misses rows: as a trial, it has no finite cost */
     int events, qps, iterations, corrections, nearest_points, rows_dropped;
+    int factorised; /* the QP's matrix, with its active rows, is in the panels */
 } mhe_outcome;
 
 /* Whether no time is left; it is an event then. */
@@ -32,12 +33,30 @@ static real mhe_target(const mhe_outcome *o)
     return isfinite(cost) ? cost - MHE_ROUNDING * cost : INFINITY;
 }
 
+/* Clip a trial to the bounds of X. */
+static void mhe_clip_trial(const mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
+{
+#if MHE_X_SET
+    const mhe_x_set *set = &e->settings->states;
+    for (int i = 0; i <= e->length; i++) {
+        const uint8_t *out = k->left_out + i * ROWS + W_COUNT + V_COUNT;
+        real *x = trial->x + i * NX;
+        for (int j = 0; j < NX; j++) {
+            if (x[j] < set->lower[j] && !(out[j] & MHE_LOWER)) x[j] = set->lower[j];
+            if (x[j] > set->upper[j] && !(out[j] & MHE_UPPER)) x[j] = set->upper[j];
+        }
+    }
+#endif
+    (void)e; (void)k; (void)trial;
+}
+
 /* Make a trial, and judge it: another one + length * step. */
 static void mhe_step_from(mhe_estimator *e, mhe_workspace *k, const mhe_trial *around, real length,
                           mhe_trial *trial)
 {
     for (int j = 0; j < (e->length + 1) * NX; j++)
         trial->x[j] = around->x[j] + length * k->step[j];
+    mhe_clip_trial(e, k, trial);
     mhe_evaluate(e, k, trial);
 }
 
@@ -78,40 +97,44 @@ static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *
         mhe_set_terms(e->settings, stage, around->w + i * NX, around->v + i * NY, t);
     }
 #if CONSTRAINED
-    mhe_set_limits(e, k, around->w, around->v);
+    mhe_set_limits(e, k, around->x, around->w, around->v);
 #endif
     return 1;
 }
 
-/* Solve the QP around a trial; the increments are in k->step. */
-static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
-                        const mhe_trial *around, int nearest)
+/* Factorise the QP and solve it without inequalities; the increments are in k->step. */
+static int mhe_solve_free(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest)
 {
-    const int size = (e->length + 1) * NX;
+    mhe_build(e, k, offset, nearest);
+    for (int j = 0; j < (e->length + 1) * NX; j++) k->step[j] = -k->gradient[j];
+    return mhe_factorise(k, e->length) && mhe_solve(k, e->length, k->step);
+}
+
+/* Solve the QP around a trial; the increments are in k->step. With `again`, only
+ * limits have changed since the last one. */
+static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
+                        const mhe_trial *around, int nearest, int again)
+{
     const real *prior = mhe_stage_at(e, 0)->z;
     real offset[NX];
     for (int j = 0; j < NX; j++) offset[j] = around->x[j] - prior[j];
-    mhe_build(e, k, offset, nearest);
-    for (int j = 0; j < size; j++) k->step[j] = -k->gradient[j];
-    if (!mhe_factorise(k, e->length) || !mhe_solve(k, e->length, k->step)) return FAILED;
 #if CONSTRAINED
-    const real missed = mhe_row_violation(e, k, k->step);
-    if (missed > 0) {
-        const int limit = e->settings->max_iterations;
-        int guesses = 0, iterations = 0;
-        if (limit == 0) return UNCONSTRAINED;
-        const real promise = fabs(mhe_dot(size, k->gradient, k->step));
-        int status = mhe_active_set(e, k, offset, nearest, limit, &guesses);
-        if (status != SOLVED && guesses < limit && !mhe_time_is_up(k))
-            status = mhe_interior_point(e, k, offset, nearest, missed, promise, limit - guesses,
-                                        &iterations);
-        o->iterations += guesses + iterations;
-        return status;
+    const int limit = e->settings->max_iterations;
+    int guesses = 0, iterations = 0;
+    int status = mhe_active_set(e, k, offset, nearest, limit, again && o->factorised, &guesses);
+    o->factorised = status == SOLVED;
+    if (status == STOPPED) {
+        if (!mhe_solve_free(e, k, offset, nearest)) return FAILED;
+        if (guesses < limit && !mhe_time_is_up(k))
+            status = mhe_interior_point(e, k, offset, nearest, limit - guesses, &iterations);
     }
+    if (status != SOLVED) memset(k->rows.place, 0, sizeof k->rows.place);
+    o->iterations += guesses + iterations;
+    return status == EXCLUDED ? STOPPED : status;
 #else
-    (void)o;
+    (void)o; (void)again;
+    return mhe_solve_free(e, k, offset, nearest) ? SOLVED : FAILED;
 #endif
-    return SOLVED;
 }
 
 #if CONSTRAINED
@@ -124,9 +147,14 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
     for (int j = 0; j < (count + 1) * NX; j++) d[j] = o->spare->x[j] - o->best->x[j];
     mhe_rows_times(e, k, d);
     mhe_rows *rows = &k->rows;
-    for (int i = 0; i < count * ROWS; i++)
+    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++)
         rows->load[i] = 2 * mhe_max(mhe_max(rows->low[i] - rows->value[i],
                                             rows->value[i] - rows->high[i]), 0);
+#if MHE_X_SET
+    /* Trials are clipped to the bounds of X. */
+    for (int i = 0; i <= count; i++)
+        memset(rows->load + i * ROWS + W_COUNT + V_COUNT, 0, sizeof(real) * NX);
+#endif
     for (int i = 0; i < count; i++) {
         const mhe_terms *t = k->at[i];
         for (int j = 0; j < NX; j++) {
@@ -142,7 +170,8 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
             v[at] = o->best->v[at] + (o->spare->v[at] - linear);
         }
     }
-    mhe_set_limits(e, k, w, v);
+    mhe_set_limits(e, k, o->best->x, w, v);
+    memset(rows->value, 0, sizeof rows->value); /* X has no curvature */
     for (int i = 0; i < count; i++) {
         real *value = rows->value + i * ROWS;
 #if MHE_W_SET
@@ -155,8 +184,9 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
         for (int j = 0; j < NY; j++) noise[j] = v[i * NY + j] - o->best->v[i * NY + j];
         mhe_values_of(NY, MHE_V_ROWS, noise, e->settings->noises.rows, value + W_COUNT);
 #endif
+        (void)value;
     }
-    for (int i = 0; i < count * ROWS; i++) {
+    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) {
         rows->load[i] += MHE_BEYOND * fabs(rows->value[i]);
         if (rows->high[i] - rows->low[i] > 4 * rows->load[i]) {
             rows->low[i] += rows->load[i];
@@ -170,7 +200,7 @@ static void mhe_correct(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
 {
     for (int i = 0; i < MHE_CORRECTIONS && !mhe_is_late(k, o); i++) {
         mhe_bend(e, k, o);
-        const int failed = mhe_solve_qp(e, k, o, o->best, 0) == FAILED;
+        const int failed = mhe_solve_qp(e, k, o, o->best, 0, 1) == FAILED;
         o->corrections++;
         if (failed) break;
         mhe_try(e, k, o, 1);
@@ -188,7 +218,7 @@ static int mhe_feasible_near(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
         if (o->nearest_points >= MHE_NEAREST_POINTS * (1 + o->qps)) break;
         if (!isfinite(around->violation) || !mhe_linearize(e, k, o, around)) break;
         if (mhe_is_late(k, o)) break;
-        const int status = mhe_solve_qp(e, k, o, around, 1);
+        const int status = mhe_solve_qp(e, k, o, around, 1, 0);
         o->nearest_points++;
         if (status == FAILED) break;
         mhe_step_from(e, k, around, 1, trial);
@@ -256,7 +286,7 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
         o->events |= MHE_MODEL_FAILED;
         return 0;
     }
-    const int status = mhe_solve_qp(e, k, o, o->best, 0), solved = status == SOLVED;
+    const int status = mhe_solve_qp(e, k, o, o->best, 0, 0), solved = status == SOLVED;
     o->qps++;
     if (status == FAILED) {
         o->events |= MHE_SOLVER_FAILED;
@@ -290,6 +320,7 @@ static void mhe_shift(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int be
     real *x = o->spare->x;
     memcpy(x, e->trajectory + skipped * NX, sizeof(real) * (size_t)count * NX);
     mhe_f(x + (count - 1) * NX, last->u, last->step, x + count * NX);
+    mhe_clip_trial(e, k, o->spare);
     mhe_evaluate(e, k, o->spare);
 }
 
@@ -329,7 +360,7 @@ static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     if (e->settings->infeasible == MHE_KEEP_CANDIDATE || mhe_is_late(k, o)) return;
     o->events &= ~(MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED);
     mhe_violation(e, o->candidate, 0, k->left_out);
-    o->candidate->violation = 0;
+    o->candidate->violation = mhe_violation(e, o->candidate, k->left_out, 0);
     mhe_search(e, k, o, start, limit > o->qps + 1 ? limit - o->qps : 1);
     memset(k->left_out, 0, sizeof k->left_out);
     if (o->best == o->candidate || !(mhe_violation(e, o->best, 0, k->left_out) > MHE_FEASIBLE))
@@ -373,6 +404,9 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     }
     k->factors[0] = factor;
     memset(o, 0, sizeof *o);
+#if CONSTRAINED
+    memset(k->rows.place, 0, sizeof k->rows.place);
+#endif
     o->candidate = o->best = k->trials;
     o->spare = k->trials + 1;
     o->other = k->trials + 2;

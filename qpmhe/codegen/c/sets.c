@@ -1,11 +1,12 @@
-/* The sets W and V: their rows, and by how much a trajectory misses them. */
+/* The sets W, V and X: their rows, and by how much a trajectory misses them. */
 
-#define CONSTRAINED (MHE_W_SET || MHE_V_SET)
+#define CONSTRAINED (MHE_W_SET || MHE_V_SET || MHE_X_SET)
 
 #if CONSTRAINED
 #define ROWS MHE_STAGE_ROWS
 #define W_COUNT (MHE_W_SET * (NX + MHE_W_ROWS))
 #define V_COUNT (MHE_V_SET * (NY + MHE_V_ROWS))
+#define X_COUNT (MHE_X_SET * (NX + MHE_X_ROWS))
 
 /* How far a point q is from each side of a set: low <= 0 <= high where it is inside. */
 static void mhe_distances(int n, int count, const real *q, const real *lower, const real *upper,
@@ -31,11 +32,15 @@ static void mhe_distances(int n, int count, const real *q, const real *lower, co
     mhe_distances(n, count, q, (set).lower, (set).upper, (set).rows, (set).row_lower, \
                   (set).row_upper, known, low, high)
 
+/* Stages that have rows: behind the last sample, there is a state. */
+static int mhe_row_stages(const mhe_estimator *e) { return e->length + MHE_X_SET; }
+
 /* The scales of all rows of stage i. */
 static void mhe_stage_scales(mhe_estimator *e, int i, real *scale)
 {
     const mhe_settings *s = e->settings;
-    const mhe_stage *stage = mhe_stage_at(e, i);
+    /* The state behind the last sample has rows of X alone. */
+    const mhe_stage *stage = mhe_stage_at(e, i < e->length ? i : i - 1);
 #if MHE_W_SET
     const mhe_w_set *W = mhe_w_set_at(s, stage);
     for (int j = 0; j < NX; j++) scale[j] = W->scale[j];
@@ -46,14 +51,28 @@ static void mhe_stage_scales(mhe_estimator *e, int i, real *scale)
     const mhe_v_set *V = mhe_v_set_at(s, stage);
     for (int j = 0; j < NY; j++) scale[j] = V->scale[j];
     for (int j = 0; j < MHE_V_ROWS; j++) scale[NY + j] = V->row_scale[j];
+    scale += V_COUNT;
 #endif
+#if MHE_X_SET
+    for (int j = 0; j < NX; j++) scale[j] = s->states.scale[j];
+    for (int j = 0; j < MHE_X_ROWS; j++) scale[NX + j] = s->states.row_scale[j];
+#endif
+    (void)stage;
 }
 
-/* The same for all rows of stage i, about residuals w and v of a trajectory. */
-static void mhe_stage_distances(mhe_estimator *e, int i, const real *w, const real *v, real *low,
-                                real *high)
+/* The same for all rows of stage i, about a trajectory x with residuals w and v. */
+static void mhe_stage_distances(mhe_estimator *e, int i, const real *x, const real *w,
+                                const real *v, real *low, real *high)
 {
     const mhe_settings *s = e->settings;
+#if MHE_X_SET
+    DISTANCES(s->states, NX, MHE_X_ROWS, x + i * NX, 0, low + W_COUNT + V_COUNT,
+              high + W_COUNT + V_COUNT);
+    if (i == e->length) {
+        for (int r = 0; r < W_COUNT + V_COUNT; r++) low[r] = -INFINITY, high[r] = INFINITY;
+        return;
+    }
+#endif
     const mhe_stage *stage = mhe_stage_at(e, i);
 #if MHE_W_SET
     DISTANCES(*mhe_w_set_at(s, stage), NX, MHE_W_ROWS, w + i * NX, 0, low, high);
@@ -62,11 +81,12 @@ static void mhe_stage_distances(mhe_estimator *e, int i, const real *w, const re
     DISTANCES(*mhe_v_set_at(s, stage), NY, MHE_V_ROWS, v + i * NY,
               stage->is_complete ? 0 : stage->is_observed, low + W_COUNT, high + W_COUNT);
 #endif
-    (void)w; (void)v;
+    (void)x; (void)w; (void)v; (void)s; (void)stage;
 }
 
 /* The largest miss among rows of one set, in their scales. `sizes`: of the numbers whose
- * differences the rows are of, for rounding. `missed` gets the sides that are. */
+ * differences the rows are of, for rounding. `missed` gets the sides that are, but for
+ * components without width, which are not dropped. */
 static real mhe_missed(int n, int count, const real *low, const real *high, const real *rows,
                        const real *scale, const real *row_scale, const real *sizes,
                        const uint8_t *left_out, uint8_t *missed)
@@ -83,9 +103,10 @@ static real mhe_missed(int n, int count, const real *low, const real *high, cons
             for (int j = 0; j < n; j++) size += fabs(rows[(r - n) * n + j] * sizes[j]);
         const real miss = (side == MHE_LOWER ? low[r] : -high[r]) - 8 * EPSILON * size;
         const real share = miss / (r < n ? scale[r] : row_scale[r - n]);
+        const int fixed = r < n && low[r] == high[r];
         if (isnan(share)) return INFINITY;
         worst = mhe_max(share, worst);
-        if (missed && share > MHE_FEASIBLE) missed[r] = (uint8_t)side;
+        if (missed && !fixed && share > MHE_FEASIBLE) missed[r] = (uint8_t)side;
     }
     return worst;
 }
@@ -100,11 +121,18 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const uint8_
 {
     real worst = 0, low[ROWS], high[ROWS];
     const mhe_settings *s = e->settings;
-    for (int i = 0; i < e->length; i++) {
-        const mhe_stage *stage = mhe_stage_at(e, i);
+    for (int i = 0; i < mhe_row_stages(e); i++) {
         const uint8_t *out = left_out ? left_out + i * ROWS : 0;
         uint8_t *in = missed ? missed + i * ROWS : 0;
-        mhe_stage_distances(e, i, trial->w, trial->v, low, high);
+        mhe_stage_distances(e, i, trial->x, trial->w, trial->v, low, high);
+#if MHE_X_SET
+        worst = mhe_max(worst, MISSED(e->settings->states, NX, MHE_X_ROWS, low + W_COUNT + V_COUNT,
+                                      high + W_COUNT + V_COUNT, trial->x + i * NX,
+                                      out ? out + W_COUNT + V_COUNT : 0,
+                                      in ? in + W_COUNT + V_COUNT : 0));
+        if (i == e->length) break;
+#endif
+        const mhe_stage *stage = mhe_stage_at(e, i);
 #if MHE_W_SET
         worst = mhe_max(worst, MISSED(*mhe_w_set_at(s, stage), NX, MHE_W_ROWS, low, high,
                                       trial->x + (i + 1) * NX, out, in));

@@ -19,14 +19,14 @@ static void mhe_watch(mhe_estimator *e, mhe_outcome *o)
 }
 
 /* Estimate on the window as it stands, and keep what the next step needs. */
-static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int failed,
+static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int events,
                              int before)
 {
     const mhe_stage *newest = mhe_stage_at(e, e->length - 1);
     const size_t size = sizeof(real) * (size_t)(e->length + 1) * NX;
     mhe_improve(e, k, o, before);
     if (mhe_is_missing(newest)) o->events |= MHE_MISSING;
-    o->events |= failed;
+    o->events |= events;
     if (!isfinite(o->candidate->cost)) {
         o->events &= ~MHE_NO_DECREASE; /* the model failed, not the solver */
         if (!(o->events & MHE_MODEL_FAILED)) o->events |= MHE_FAILED_STAGE;
@@ -53,15 +53,15 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
 {
     const int before = e->has_trajectory ? e->length : -1;
     mhe_begin(e, k);
-    int failed = mhe_push(e, sample);
+    int events = mhe_push(e, sample);
     if (e->settings->reinitialize) {
         /* The ring of estimates reaches back to that of the window's first state. */
         int at = e->newest - (e->length - 1);
         if (at < 0) at += MHE_HORIZON + 1;
         memcpy(mhe_stage_at(e, 0)->z, e->history + at * NX, sizeof(real) * NX);
-        failed = mhe_replay(e, 0);
+        events = mhe_replay(e, 0);
     }
-    mhe_estimate_now(e, k, o, failed, before);
+    mhe_estimate_now(e, k, o, events, before);
     mhe_remember(e, o->best->x + e->length * NX);
 }
 
@@ -105,9 +105,15 @@ void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
 {
     memset(e, 0, sizeof *e);
     e->settings = settings;
-    memcpy(e->last_good, x0, sizeof e->last_good);
     memcpy(e->z_end, x0, sizeof e->z_end);
-    memcpy(e->history, x0, sizeof(real) * NX);
+#if MHE_X_SET
+    memcpy(e->metric, settings->metric, sizeof e->metric);
+    e->metric_settled = settings->metric_settled;
+    if (!mhe_is_inside(&settings->states, x0))
+        mhe_project(&settings->states, settings->metric, x0, e->z_end);
+#endif
+    memcpy(e->last_good, e->z_end, sizeof e->last_good);
+    memcpy(e->history, e->z_end, sizeof e->z_end);
 }
 
 static mhe_sample mhe_usual_sample(const real *y, const real *u)

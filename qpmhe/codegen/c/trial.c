@@ -1,7 +1,8 @@
 /* A trajectory, judged by the true model. */
 
 /* Judge the trajectory of a trial by the true model: infinite cost where the model is not
- * finite or a row is missed. */
+ * finite or a row is missed. Where a component of W has no width, the trial first becomes what the
+ * model makes of it. */
 static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
 {
     const mhe_settings *s = e->settings;
@@ -9,10 +10,15 @@ static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *tr
     real offset[NX], cost = 0;
     for (int i = 0; i < e->length; i++) {
         const mhe_stage *stage = mhe_stage_at(e, i);
-        const real *x = trial->x + i * NX;
+        real *x = trial->x + i * NX;
         real *w = trial->w + i * NX, *v = trial->v + i * NY, predicted[NX], output[NY];
         mhe_f(x, stage->u, stage->step, predicted);
         mhe_h(x, stage->u, output);
+#if MHE_W_SET
+        const mhe_w_set *set = &s->disturbances;
+        for (int j = 0; j < NX; j++)
+            if (set->lower[j] == set->upper[j]) x[NX + j] = predicted[j] + set->lower[j];
+#endif
         for (int j = 0; j < NX; j++) w[j] = x[NX + j] - predicted[j];
         /* A model that fails in a missing output fails, as it does everywhere. */
         for (int j = 0; j < NY; j++) v[j] = stage->y[j] - output[j];

@@ -6,10 +6,15 @@ static mhe_stage *mhe_stage_at(mhe_estimator *e, int i)
     return e->stages + (k < MHE_HORIZON ? k : k - MHE_HORIZON);
 }
 
-/* Evaluate the stage at its z and step the observer to `next`; the cost, or infinity. */
-static real mhe_advance(const mhe_settings *s, mhe_stage *stage, int linear, real *next)
+/* Evaluate the stage at its z and step the observer to `next`; the cost, or infinity. `events` gets
+ * bits of the status. */
+static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *next, int *events)
 {
+    const mhe_settings *s = e->settings;
     real *v = stage->v, *w = stage->w, predicted[NX], output[NY];
+#if MHE_X_SET
+    if (s->project && !e->metric_settled) linear = 1;
+#endif
     if (linear) {
         mhe_f_jacobian(stage->z, stage->u, stage->step, predicted, stage->terms.f_jacobian);
         mhe_h_jacobian(stage->z, stage->u, output, stage->terms.h_jacobian);
@@ -21,12 +26,17 @@ static real mhe_advance(const mhe_settings *s, mhe_stage *stage, int linear, rea
     mhe_correction(s, stage, w);
     for (int j = 0; j < NX; j++) next[j] = predicted[j] + w[j];
     if (!mhe_all_finite(NX, next)) return INFINITY;
+#if MHE_X_SET
+    if (s->project) *events = mhe_stay_inside(e, stage, predicted, next);
+#else
+    (void)events;
+#endif
     const real cost = mhe_stage_cost(s, stage, w, v);
     return isfinite(cost) ? cost : INFINITY;
 }
 
-/* Compute stage i of the window from z(i) and its sample; 0, MODEL_FAILED where the model has
- * no finite values (held) or only no finite Jacobians. */
+/* Compute stage i of the window from z(i) and its sample; bits of the status: MODEL_FAILED where the
+ * model has no finite values (held) or only no finite Jacobians. */
 static int mhe_enter(mhe_estimator *e, int i)
 {
     const mhe_settings *s = e->settings;
@@ -34,7 +44,8 @@ static int mhe_enter(mhe_estimator *e, int i)
     mhe_terms *t = &stage->terms;
     const int linear = s->max_qps > 0;
     real *next = i + 1 < e->length ? mhe_stage_at(e, i + 1)->z : e->z_end;
-    stage->cost = mhe_advance(s, stage, linear, next);
+    int events = 0;
+    stage->cost = mhe_advance(e, stage, linear, next, &events);
     const int held = !isfinite(stage->cost);
     if (held) {
         /* z(i) is where the model does not work: go on where it last did. */
@@ -45,7 +56,7 @@ static int mhe_enter(mhe_estimator *e, int i)
         memset(stage->w, 0, sizeof stage->w);
         memset(stage->v, 0, sizeof stage->v);
     }
-    if (!linear) return held ? MHE_MODEL_FAILED : 0;
+    if (!linear) return held ? events | MHE_MODEL_FAILED : events;
     const int finite = mhe_all_finite(NX * NX, t->f_jacobian) &&
                        mhe_all_finite(NY * NX, t->h_jacobian);
     if (held || !finite) {
@@ -54,7 +65,7 @@ static int mhe_enter(mhe_estimator *e, int i)
         for (int j = 0; j < NX; j++) t->f_jacobian[j * NX + j] = 1;
     }
     mhe_set_terms(s, stage, stage->w, stage->v, t);
-    return held || !finite ? MHE_MODEL_FAILED : 0;
+    return held || !finite ? events | MHE_MODEL_FAILED : events;
 }
 
 /* Redo all stages from i on. */
@@ -65,7 +76,7 @@ static int mhe_replay(mhe_estimator *e, int i)
     return outcome;
 }
 
-/* Take a sample in; MHE_MODEL_FAILED where the model could not be evaluated. */
+/* Take a sample in; bits of the status. */
 static int mhe_push(mhe_estimator *e, const mhe_sample *sample)
 {
     const mhe_settings *s = e->settings;
