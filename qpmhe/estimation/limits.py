@@ -30,6 +30,10 @@ BEYOND = 0.1
 #: most this many for each QP of its sequence, and this many more.
 NEAREST_POINTS = 5
 
+#: The search for a feasible trajectory ends at one that misses the rows by more than this share of
+#: what the last one missed: it approaches no feasible one.
+NEARER = 0.9
+
 #: Largest miss of a row of a feasible trial, as a share of the row's scale: QP solvers end on the
 #: boundary up to their tolerance.
 FEASIBLE = 5e-9
@@ -47,7 +51,7 @@ def c_definitions(prefix: str, real: str) -> str:
     """The same as C macros, for reals of type "double" or "float"."""
     values = {
         "ROUNDING": ROUNDING, "NEARLY": NEARLY, "STALLED": STALLED, "BEYOND": BEYOND,
-        "FEASIBLE": FEASIBLE, "LARGEST": LARGEST, "FAR": FAR,
+        "FEASIBLE": FEASIBLE, "LARGEST": LARGEST, "FAR": FAR, "NEARER": NEARER,
     }
     if real == "float":
         values |= _SINGLE

@@ -19,6 +19,7 @@ from .limits import (
     CORRECTIONS,
     FEASIBLE,
     LENGTHS,
+    NEARER,
     NEAREST_POINTS,
     NEARLY,
     ROUNDING,
@@ -235,7 +236,7 @@ class Optimizer:
             if solution.d is None:
                 break
             before, nearest = nearest, self._trial(problem, nearest, solution.d)
-            if not nearest.violation < before.violation:
+            if not nearest.violation < NEARER * before.violation:
                 break
         return nearest if nearest.cost < math.inf else trial
 

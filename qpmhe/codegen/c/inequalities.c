@@ -9,15 +9,19 @@
 
 enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
 
-/* Iterations after which rows are compared with what they were. */
+/* Iterations in which residuals must shrink to a share, and those that are left more time: near a
+ * vertex, they may linger. */
 #define STALL 4
+#define SHARE (real)0.8
+#define SMALL (real)1e-3
 
 /* Guesses of the active rows, and rounds of the augmented Lagrangian for each; each round makes
  * the rows' gaps smaller by about this factor. */
+#define STUCK (sizeof(real) == 8 ? (real)1e-8 : (real)1e-3)
 #define GUESSES 25
 #define PATIENCE 2
 #define FEW 10
-#define ROUNDS 5
+#define ROUNDS 20
 #define STIFFNESS (sizeof(real) == 8 ? (real)1e6 : (real)1e3)
 
 #if CONSTRAINED
@@ -334,7 +338,7 @@ static int mhe_exclude(mhe_rows *q, int rows, real open)
         q->next[i] = q->place[i];
         if (q->place[i] == BETWEEN || q->place[i] == EQUATION) continue;
         const real gap = -q->load[i] / q->weight[i];
-        if (gap * q->place[i] < -open * q->scale[i] / 100) q->next[i] = BETWEEN, changes++;
+        if (gap * q->place[i] < -STUCK * open * q->scale[i]) q->next[i] = BETWEEN, changes++;
     }
     return changes;
 }
@@ -376,7 +380,7 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
         if (limit == 0 && guess.wrong) return UNCONSTRAINED;
         /* Forces are exact enough for a guess; not yet for a solution. */
         for (int round = 0; !guess.wrong && open > tolerance; round++) {
-            if (energy > last * (1 - 1 / STIFFNESS)) {
+            if (energy > last * (1 - STUCK)) {
                 guess.wrong = mhe_exclude(q, rows, open);
                 if (!guess.wrong) return EXCLUDED;
                 break;
@@ -423,13 +427,13 @@ static int mhe_start(mhe_rows *q, int rows, real missed, real product)
 /* Residuals, weights and loads where rows.value = c(d). Returns the sum of the products, and
  * the largest residual in its row's scale. Equations have no sides, but stiffness and force as in
  * the active-set method. */
-static real mhe_set_residuals(mhe_rows *q, int rows, real *infeasible)
+static real mhe_set_residuals(mhe_rows *q, int rows, real stiffness, real *infeasible)
 {
     real products = 0, worst[STRANDS] = {0};
     for (int i = 0; i < rows; i++) {
         const int s = i % STRANDS, equation = q->low[i] == q->high[i];
         q->missed[i] = equation ? q->value[i] - q->high[i] : 0;
-        q->weight[i] = equation ? STIFFNESS / (q->scale[i] * q->scale[i]) : 0;
+        q->weight[i] = equation ? stiffness / (q->scale[i] * q->scale[i]) : 0;
         q->load[i] = -q->force[i];
         worst[s] = mhe_max(fabs(q->missed[i]) / q->scale[i], worst[s]);
     }
@@ -537,7 +541,7 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     const mhe_settings *s = e->settings;
     const int count = e->length, size = (count + 1) * NX, rows = mhe_row_stages(e) * ROWS;
     mhe_rows *q = &k->rows;
-    real far = INFINITY;
+    real far = INFINITY, stiffness = STIFFNESS;
     const real missed = mhe_row_violation(e, k, k->step);
     const real promise = fabs(mhe_product(size, k->gradient, k->step));
     if (!(missed > 0)) return SOLVED;
@@ -553,7 +557,8 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
         mhe_build(e, k, offset, nearest);
         mhe_hessian_times(k, count, k->step, k->product);
         mhe_rows_times(e, k, k->step);
-        const real products = mhe_set_residuals(q, rows, &infeasible);
+        const real products = mhe_set_residuals(q, rows, stiffness, &infeasible);
+        stiffness = mhe_min(mhe_max(stiffness, STIFFNESS * scale / products), STIFFNESS * STIFFNESS);
         for (int j = 0; j < size; j++) k->residual[j] = -k->product[j] - k->gradient[j];
         mhe_add_loads(e, k, k->residual);
         for (int j = 0; j < size; j++) {
@@ -569,7 +574,7 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
         if (*iterations >= limit || mhe_time_is_up(k)) return STOPPED;
         /* Of rows that exclude each other, residuals hardly shrink. */
         if (*iterations % STALL == 0) {
-            if (infeasible > s->solver_tolerance / 100 && infeasible > far * (real)0.8) return STOPPED;
+            if (infeasible > SMALL && infeasible > SHARE * far) return STOPPED;
             far = infeasible;
         }
         mhe_add_weights(e, k);

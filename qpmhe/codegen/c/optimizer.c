@@ -227,7 +227,7 @@ static int mhe_feasible_near(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
             o->spare = trial;
             return 1;
         }
-        if (!(trial->violation < around->violation)) break;
+        if (!(trial->violation < MHE_NEARER * around->violation)) break;
         around = trial;
     }
     o->spare->cost = INFINITY;
