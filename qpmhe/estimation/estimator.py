@@ -266,6 +266,11 @@ class MovingHorizonEstimator:
         weights = usual.noise_weight, usual.disturbance_weight
         return usual.has_bounds or any(one is not None for one in weights)
 
+    @property
+    def present(self) -> tuple[System, Cost]:
+        """The system with its present sets, and the cost with its present weights."""
+        return self._engine.usual.applied(self.system, self.cost)
+
     def update(
         self,
         y: ArrayLike | None,

@@ -24,7 +24,7 @@ pytestmark = [
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror"]
 WATCHED = ["-std=c99", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover"]
 PUBLIC = ["amend", "default_settings", "recompute", "reset", "run", "sizes", "update",
-          "update_members", "update_special", "update_undoable"]
+          "set", "undo", "update_members", "update_special", "update_undoable"]
 
 # Reads options and commands as doubles: 0 update, 1 special update, 2 amend, 3 run.
 PROGRAM = r"""
@@ -500,7 +500,7 @@ def test_exports_its_public_names_and_needs_libm_only(real, tmp_path):
     assert symbols(made, "-u") <= memory | libm | {f"{name}f" for name in libm}
     text = source.read_text()
     assert set(re.findall(r"^#include (.*)", text, re.M)) <= {
-        "<math.h>", "<tgmath.h>", "<string.h>", '"reactor.h"'
+        "<math.h>", "<tgmath.h>", "<stddef.h>", "<string.h>", '"reactor.h"'
     }
     declared = set(re.findall(r"\breactor_(\w+)[(;]", (tmp_path / "reactor.h").read_text()))
     assert set(PUBLIC) <= declared
@@ -634,15 +634,13 @@ def without_form(case):
         parts[0] = model(p=1, disturbances=qpmhe.Box([-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]))
     elif case == "backend='auto'":
         options["backend"] = "osqp"
-    elif case == "time_budget":
-        options["time_budget"] = 0.1
     return qpmhe.MovingHorizonEstimator(
         *parts, horizon=2, initial_state=np.zeros(3), **options
     )
 
 
 @pytest.mark.parametrize("remedy", [
-    "from_casadi", "constant gain", "QuadraticCost", "widen", "backend='auto'", "time_budget",
+    "from_casadi", "constant gain", "QuadraticCost", "widen", "backend='auto'",
 ])
 def test_what_has_no_c_form_tells_the_remedy(remedy, tmp_path):
     with pytest.raises(OptionError, match=remedy):

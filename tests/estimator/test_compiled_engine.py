@@ -227,7 +227,6 @@ def equality():
         ("noises has a direction of zero width.*less than 5e-09", {"system": lambda: symbolic(
             noises=qpmhe.Polytope([[1.0], [-1.0]], [1e-9, 1e-9]))}),
         ("not by 'osqp'; take backend='auto'", {"backend": "osqp"}),
-        ("max_qps and max_solver_iterations", {"time_budget": 1.0}),
     ],
 )
 def test_what_has_no_c_form_is_an_error_with_a_remedy(remedy, given):
