@@ -13,6 +13,7 @@ import qpmhe
 from qpmhe.models.batch_reactor import batch_reactor
 from qpmhe.models.batch_reactor import casadi_output as reactor_output
 from qpmhe.models.batch_reactor import casadi_rate as reactor_rate
+
 from .conditions import with_changes, with_conditions, with_parameters
 
 STEPS = 24

@@ -611,9 +611,10 @@ def test_a_batch_has_no_parameters():
 def test_the_written_code_has_the_present_weights_and_bounds(changes, tmp_path):
     ca = pytest.importorskip("casadi")
 
-    def made(noise=1.0, disturbance=1.0, noises=qpmhe.Box(-1.0, 1.0)):
+    def made(noise=1.0, disturbance=1.0, noises=None):
         system = qpmhe.from_casadi(
-            lambda x: 0.9 * x + 0.1 * ca.sin(x), lambda x: x, n=1, p=1, noises=noises
+            lambda x: 0.9 * x + 0.1 * ca.sin(x), lambda x: x, n=1, p=1,
+            noises=noises or qpmhe.Box(-1.0, 1.0),
         )
         cost = qpmhe.QuadraticCost(prior=1.0, disturbance=disturbance, noise=noise)
         return qpmhe.MovingHorizonEstimator(
