@@ -40,8 +40,9 @@ def write(
     The source holds observer, growing window, candidate, Gauss-Newton QPs by a block-banded
     factorisation (active sets where inequalities bind), the verdict by the true
     cost, and the fallback, without allocation and with bounded loops. ``engine="compiled"``
-    compiles the same text. Weights, gain, sets and options of the estimator become
-    ``<name>_default_settings``; the top of the header says how to call it.
+    compiles the same text. Gain, options and present weights and sets of the estimator become
+    ``<name>_default_settings``; the top of the header says how to call it. Parameters are the last
+    inputs of each sample.
 
     Parameters
     ----------
@@ -84,11 +85,6 @@ def write(
         raise InvalidInputError(
             f"estimator is {estimator!r}; expected a qpmhe.MovingHorizonEstimator."
         )
-    if estimator.has_changed:
-        raise OptionError(
-            "the estimator's weights or bounds were changed by set(...); make one with these "
-            "values to write it."
-        )
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise OptionError(
             f"name is {name!r}; expected a C identifier: letters, digits and underscores."
@@ -106,8 +102,9 @@ def write(
     if real not in ("double", "float"):
         raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")
     flag("fmu", fmu)
+    system, cost = estimator.present
     files, _, _, _ = generated(
-        estimator.system, estimator.observer, estimator.cost, estimator.settings, name, real
+        system, estimator.observer, cost, estimator.settings, name, real
     )
     try:
         folder = Path(directory)

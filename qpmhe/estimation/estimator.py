@@ -266,6 +266,11 @@ class MovingHorizonEstimator:
         weights = usual.noise_weight, usual.disturbance_weight
         return usual.has_bounds or any(one is not None for one in weights)
 
+    @property
+    def present(self) -> tuple[System, Cost]:
+        """The system with its present sets, and the cost with its present weights."""
+        return self._engine.usual.applied(self.system, self.cost)
+
     def update(
         self,
         y: ArrayLike | None,
@@ -594,15 +599,17 @@ class MovingHorizonEstimator:
         It computes every stored stage again and compares the results. With ``engine="auto"`` the
         estimator goes on with the engine that the snapshot was taken with.
         """
-        engine = self._engine
-        pinned = state.get("engine", "python") if isinstance(state, dict) else None
-        if self.settings.engine == "auto" and isinstance(pinned, str) and pinned != engine.name:
+        pinned, own = state.get("engine", "python") if isinstance(state, dict) else None, self.engine
+        # Whole or, if interrupted, not at all.
+        if self.settings.engine == "auto" and isinstance(pinned, str) and pinned != own:
             engine = engine_of_snapshot(
                 pinned, self._own_system, self.observer, self.cost, self.settings,
                 self._initial_state,
             )
-        engine.load_state_dict(state)
-        self._engine = engine
+            engine.load_state_dict(state)
+            self._engine = engine
+        else:
+            self._engine.load_state_dict(state)
 
     def __getstate__(self) -> dict[str, Any]:
         solver = self.settings.backend

@@ -24,12 +24,13 @@ pytestmark = [
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror"]
 WATCHED = ["-std=c99", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover"]
 PUBLIC = ["amend", "default_settings", "recompute", "reset", "run", "sizes", "update",
-          "update_members", "update_special", "update_undoable"]
+          "set", "undo", "update_members", "update_special", "update_undoable"]
 
-# Reads options and commands as doubles: 0 update, 1 special update, 2 amend, 3 run.
+# Reads options and commands as doubles: 0 update, 1 special update, 2 amend, 3 run, 4 set.
 PROGRAM = r"""
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include "mhe.h"
 
 static double number(void)
@@ -116,15 +117,28 @@ int main(void)
         if (command == 0) mhe_update(e, k, y, MHE_NU ? u : 0, o);
         if (command == 1) {
             const mhe_real step = (mhe_real)number();
-            const int own = number() != 0;
-            mhe_real *R = numbers(MHE_NY * MHE_NY);
+            const int own = number() != 0, weighs = number() != 0, narrows = number() != 0;
+            mhe_real *R = numbers(MHE_NY * MHE_NY), *Q = numbers(MHE_NX * MHE_NX);
+            uint8_t *mask = malloc(MHE_NY);
             mhe_sample sample = {0};
+            mhe_w_set *W = malloc(sizeof *W); /* of which only the sides may be read */
+            memcpy(W->lower, settings.disturbances.lower, sizeof W->lower);
+            memcpy(W->row_lower, settings.disturbances.row_lower, sizeof W->row_lower);
+            memcpy(W->row_upper, settings.disturbances.row_upper, sizeof W->row_upper);
+            for (int j = 0; j < MHE_NX; j++) W->upper[j] = settings.disturbances.upper[j] / 2;
+            for (int j = 0; j < MHE_NY; j++) mask[j] = number() != 0;
             sample.y = y, sample.u = MHE_NU ? u : 0, sample.step = step;
-            sample.noise_weight = own ? R : 0;
+            sample.noise_weight = own ? R : 0, sample.disturbance_weight = weighs ? Q : 0;
+            sample.sampled = mask, sample.disturbances = narrows ? W : 0;
             mhe_update_special(e, k, &sample, o);
-            free(R);
+            free(R), free(Q), free(mask), free(W);
         }
         if (command == 2) put(mhe_amend(e, k, time, y, o));
+        if (command == 4) {
+            const mhe_real factor = (mhe_real)number();
+            for (int j = 0; j < MHE_NY * MHE_NY; j++) settings.noise_weight[j] *= factor;
+            mhe_set(e, k, &settings, MHE_NOISE_WEIGHT, 0, 0, o);
+        }
         tell(o);
         free(y); free(u); free(k);
         k = malloc(sizeof *k); /* scratch: nothing of it may be needed again */
@@ -242,16 +256,30 @@ def record(mhe, steps=14, seed=0, spread=0.1, special=True):
             y[t % p] = [np.nan, np.inf, -np.inf, 1e200][t // 4 % 4]
         if special and t == 7:
             y[:] = np.nan
-        options, own = {}, np.eye(p) * 5.0 + 1.0
+        options, own, weight = {}, np.eye(p) * 5.0 + 1.0, np.eye(n) * 15.0 + 1.0
+        mask, one = np.ones(p), system.disturbances
         if special and t % 5 == 3:
             options["noise_weight"] = own
+        if special and t % 5 == 4:
+            options["disturbance_weight"] = weight
+        if special and t % 6 == 5:
+            mask[t % p] = p == 1
+            options["sensors"] = mask > 0
+        if special and t % 7 == 6 and one is not None:
+            options["bounds"] = {"disturbances": one.with_sides(
+                one.lower, 0.5 * one.upper, one.row_lower, one.row_upper)}
         if special and system.dt and t % 5 in (1, 3):
             options["dt"] = 0.35
         commands.append(
-            (1, y, u, options.get("dt", 0.0), "noise_weight" in options, own)
+            (1, y, u, options.get("dt", 0.0), "noise_weight" in options,
+             "disturbance_weight" in options, "bounds" in options, own, weight, mask)
             if options else (0, y, u)
         )
-        expected.append(mhe.update(y, u if m else None, **options))
+        expected.append(mhe.update(y[mask > 0], u if m else None, **options))
+        if special and t % 8 == 6:
+            commands.append((4, np.zeros(p), 1.5))
+            usual = mhe.present[1].noise
+            expected.append(mhe.set(noise_weight=1.5 * usual))
         if special and t % 6 == 4:
             late = rng.uniform(-0.3, 0.3, p)
             late[: p // 2] = np.nan
@@ -500,7 +528,7 @@ def test_exports_its_public_names_and_needs_libm_only(real, tmp_path):
     assert symbols(made, "-u") <= memory | libm | {f"{name}f" for name in libm}
     text = source.read_text()
     assert set(re.findall(r"^#include (.*)", text, re.M)) <= {
-        "<math.h>", "<tgmath.h>", "<string.h>", '"reactor.h"'
+        "<math.h>", "<tgmath.h>", "<stddef.h>", "<string.h>", '"reactor.h"'
     }
     declared = set(re.findall(r"\breactor_(\w+)[(;]", (tmp_path / "reactor.h").read_text()))
     assert set(PUBLIC) <= declared
@@ -634,15 +662,13 @@ def without_form(case):
         parts[0] = model(p=1, disturbances=qpmhe.Box([-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]))
     elif case == "backend='auto'":
         options["backend"] = "osqp"
-    elif case == "time_budget":
-        options["time_budget"] = 0.1
     return qpmhe.MovingHorizonEstimator(
         *parts, horizon=2, initial_state=np.zeros(3), **options
     )
 
 
 @pytest.mark.parametrize("remedy", [
-    "from_casadi", "constant gain", "QuadraticCost", "widen", "backend='auto'", "time_budget",
+    "from_casadi", "constant gain", "QuadraticCost", "widen", "backend='auto'",
 ])
 def test_what_has_no_c_form_tells_the_remedy(remedy, tmp_path):
     with pytest.raises(OptionError, match=remedy):

@@ -1,5 +1,6 @@
 /* What a sample comes with in place of the usual: weights, sides of sets, sensors, a step's length. */
 
+#if MHE_W_SET || MHE_V_SET
 /* A miss of a row counts as a share of its width, or of a standard deviation if that is less. */
 static void mhe_set_scales(int count, const real *lower, const real *upper, const real *deviation,
                            real *scale)
@@ -19,6 +20,7 @@ static void mhe_set_scales(int count, const real *lower, const real *upper, cons
         mhe_set_scales(count, (own).row_lower, (own).row_upper, (own).row_deviation, \
                        (own).row_scale); \
     } while (0)
+#endif
 
 /* Complete a stage's own sets, in which only the sides are known. */
 static void mhe_complete_own_sets(const mhe_settings *s, mhe_stage *stage)

@@ -215,7 +215,6 @@ static int mhe_feasible_near(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 {
     for (int i = 0; i < MHE_NEAREST_POINTS; i++) {
         mhe_trial *trial = around == o->spare ? o->other : o->spare;
-        if (o->nearest_points >= MHE_NEAREST_POINTS * (1 + o->qps)) break;
         if (!isfinite(around->violation) || !mhe_linearize(e, k, o, around)) break;
         if (mhe_is_late(k, o)) break;
         const int status = mhe_solve_qp(e, k, o, around, 1, 0);
