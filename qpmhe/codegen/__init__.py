@@ -106,7 +106,7 @@ def write(
     if real not in ("double", "float"):
         raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")
     flag("fmu", fmu)
-    files, _, _, _ = generated(
+    files = generated(
         estimator.system, estimator.observer, estimator.cost, estimator.settings, name, real
     )
     try:
