@@ -42,7 +42,7 @@ def pytest_configure(config):
     hypothesis.settings.load_profile("here")
     # No test depends on what the user's cache holds, or on what other tests have compiled.
     os.environ.setdefault("QPMHE_CACHE_DIR", str(config.cache.mkdir("libraries")))
-    os.environ["QPMHE_ENGINE"] = "python"
+    os.environ.setdefault("QPMHE_ENGINE", "python")
 
 
 def named(config, item):

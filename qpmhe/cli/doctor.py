@@ -89,7 +89,7 @@ def _machine() -> Table:
         + (f"OMP_NUM_THREADS={threads}" if threads else "OMP_NUM_THREADS is not set"))
     add(True, "NumPy", f"{versions['numpy']}, BLAS: {_blas()}; SciPy {versions['scipy']}")
     casadi = versions.get("casadi")
-    add(casadi is not None, "CasADi", casadi or "not installed: pip install 'qpmhe[casadi]'")
+    add(casadi is not None, "CasADi", casadi or "not installed: pip install casadi")
     command = find_compiler()
     if command is None:
         wanted = os.environ.get("CC")

@@ -103,9 +103,7 @@ def write(
         raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")
     flag("fmu", fmu)
     system, cost = estimator.present
-    files, _, _, _ = generated(
-        system, estimator.observer, cost, estimator.settings, name, real
-    )
+    files = generated(system, estimator.observer, cost, estimator.settings, name, real)
     try:
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)

@@ -46,7 +46,8 @@ def compile(  # noqa: A001 - the name that users look for
     """Compile the step of an estimator, so that ``engine="auto"`` takes it from now on.
 
     One library serves all weights, gains, bounds, initial states and most options. Another model,
-    horizon or kind of sets needs another. An estimator that exists keeps its engine.
+    horizon, kind of sets or of cost, or a time budget needs another. An estimator that exists
+    keeps its engine.
 
     Parameters
     ----------

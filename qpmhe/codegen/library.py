@@ -124,12 +124,11 @@ def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:
 def generated(
     system: System, observer: Observer, cost: Cost, settings: Settings, name: str = "mhe",
     real: str = "double", lapack: bool = False,
-) -> tuple[dict[str, str], str, Layout, NDArray[Any]]:
-    """Source of an estimator, its structure, its layout and its settings."""
+) -> dict[str, str]:
+    """Header and source of an estimator, by the names of their files."""
     layout, record = planned(system, observer, cost, settings, real, lapack)
     assert system.symbolic is not None
-    files, structure = estimator_files(system.symbolic, layout, record, name)
-    return files, structure, layout, record
+    return estimator_files(system.symbolic, layout, record, name)
 
 
 def planned(
@@ -169,7 +168,7 @@ def lapack_functions() -> Any:
 
 def _engine_files(model: CasadiModel, layout: Layout, record: NDArray[Any]) -> dict[str, str]:
     """Source of an estimator, with a clock where it keeps a time budget."""
-    made, _ = estimator_files(model, layout, record)
+    made = estimator_files(model, layout, record)
     if layout.clock:
         made[MAIN] = f"{_CLOCK_HEAD}{made[MAIN]}\n{template('clock.c')}"
     return made

@@ -168,7 +168,7 @@ def header(name: str, values: dict[str, Any]) -> str:
 
 def estimator_files(
     model: CasadiModel, layout: Layout, settings: NDArray[Any], name: str = "mhe"
-) -> tuple[dict[str, str], str]:
+) -> dict[str, str]:
     """Header and source of a whole estimator."""
     head = header(name, {**layout.header_values(name), "version": __version__})
     parts = (
@@ -181,7 +181,7 @@ def estimator_files(
         f"const mhe_settings mhe_default_settings = {_initializer(settings)};\n"
     )
     text = renamed(f'#include "mhe.h"\n{body}{data}', name).replace('"mhe.h"', f'"{name}.h"')
-    return {f"{name}.h": head, f"{name}.c": text}, head + body
+    return {f"{name}.h": head, f"{name}.c": text}
 
 
 def _initializer(record: NDArray[Any]) -> str:

@@ -8,40 +8,62 @@ import sys
 import tempfile
 import time
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import qpmhe
 from qpmhe.codegen import compiler, fingerprint, library
-from qpmhe.codegen.source import estimator_files
 from qpmhe.errors import CompilationError, InvalidInputError, OptionError
 from qpmhe.estimation.settings import Settings
 
+from .cases import CASES, case
+
 casadi = pytest.importorskip("casadi")
 CC = shutil.which("cc")
+RIGHT = f'exec "{CC}" "$@"'
 needed = pytest.mark.skipif(
     CC is None or os.name != "posix", reason="there is no C compiler, or none that is a script"
 )
 
 
+@pytest.fixture(scope="module")
+def script(tmp_path_factory):
+    """A compiler whose body is in the environment: the same one for the cache, whatever it does."""
+    path = tmp_path_factory.mktemp("compiler") / "cc"
+    path.write_text('#!/bin/sh\necho "$*" >> "$COMPILER_LOG"\neval "$COMPILER_BODY"\n')
+    path.chmod(0o755)
+    return path
+
+
 @pytest.fixture(autouse=True)
-def calls(tmp_path, monkeypatch):
+def calls(script, tmp_path, monkeypatch):
     """An empty cache, the usual "auto", and a compiler that counts its calls."""
-    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "cache"))
+    log = tmp_path / "calls"
+    for name, value in {
+        "QPMHE_CACHE_DIR": tmp_path / "cache", "CC": script, "COMPILER_LOG": log,
+        "COMPILER_BODY": RIGHT,
+    }.items():
+        monkeypatch.setenv(name, str(value))
     monkeypatch.delenv("QPMHE_ENGINE", raising=False)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    return wrapped(tmp_path, monkeypatch, f'exec "{CC}" "$@"')
-
-
-def wrapped(folder, monkeypatch, body):
-    """Set a compiler that is a script; returns how often it has been called."""
-    path, log = folder / "cc", folder / "calls"
-    path.write_text(f'#!/bin/sh\necho "$*" >> "{log}"\n{body}\n')
-    path.chmod(0o755)
-    os.utime(path, (1e9, 1e9))
-    monkeypatch.setenv("CC", str(path))
     return lambda: len(log.read_text().splitlines()) if log.exists() else 0
+
+
+@pytest.fixture(scope="module")
+def library_folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("library")
+
+
+@pytest.fixture
+def filled(library_folder, tmp_path, calls, monkeypatch):
+    """The cache with the estimator's library, which is made once for all tests."""
+    with monkeypatch.context() as patch:
+        patch.setenv("QPMHE_CACHE_DIR", str(library_folder))
+        name = compile_it().path.name
+    shutil.copytree(library_folder, tmp_path / "cache")
+    return tmp_path / "cache" / name
 
 
 def system(factor=0.9, **options):
@@ -123,8 +145,7 @@ def test_a_batch_has_one_engine():
 
 
 @needed
-def test_the_python_step_where_the_user_asks_for_a_solver():
-    compile_it()
+def test_the_python_step_where_the_user_asks_for_a_solver(filled):
     solver = qpmhe.solvers.create("osqp")
     for options in ({"backend": "osqp"}, {"backend": solver}, {"isolated": True}):
         assert estimator(**options).engine == "python"
@@ -135,8 +156,7 @@ def test_the_python_step_where_the_user_asks_for_a_solver():
 @pytest.mark.parametrize("options", [
     {"time_budget": 1.0}, {"arrival": "smoothed"}, {"candidate": "reinitialized"}, {"delay": 2},
 ], ids=str)
-def test_no_option_is_refused(options):
-    compile_it()
+def test_no_option_is_refused(filled, options):
     mhe = estimator(**options)
     assert np.isfinite(mhe.update([1.0]).cost)
 
@@ -149,8 +169,7 @@ def test_no_option_is_refused(options):
     {"states": qpmhe.Box([-5.0, -5.0], [5.0, 5.0])},
     {"plain": True},
 ], ids=lambda part: next(iter(part)))
-def test_no_part_is_refused(part):
-    compile_it()
+def test_no_part_is_refused(filled, part):
     (model, observer, cost), shared = arguments()
     if "states" in part:
         model = system(**part)
@@ -163,9 +182,9 @@ def test_no_part_is_refused(part):
         assert np.isfinite(mhe.update([1.0]).cost)
 
 
-def test_the_environment_can_ask_for_python(monkeypatch):
-    if CC is not None:
-        compile_it()
+@needed
+def test_the_environment_can_ask_for_python(filled, monkeypatch):
+    assert estimator().engine == "compiled"
     monkeypatch.setenv("QPMHE_ENGINE", "python")
     assert estimator().engine == "python"
     monkeypatch.setenv("QPMHE_ENGINE", "fast")
@@ -177,8 +196,7 @@ def test_the_environment_can_ask_for_python(monkeypatch):
 
 
 @needed
-def test_without_a_compiler(monkeypatch):
-    compile_it()
+def test_without_a_compiler(filled, monkeypatch):
     monkeypatch.setenv("CC", "/nowhere/cc")
     assert estimator().engine == "python"
     with pytest.raises(CompilationError, match="no C compiler"):
@@ -186,8 +204,8 @@ def test_without_a_compiler(monkeypatch):
 
 
 @needed
-def test_a_compiler_that_fails(tmp_path, monkeypatch):
-    wrapped(tmp_path, monkeypatch, "echo 'out of cheese' >&2\nexit 1")
+def test_a_compiler_that_fails(monkeypatch):
+    monkeypatch.setenv("COMPILER_BODY", "echo 'out of cheese' >&2; exit 1")
     assert estimator().engine == "python"
     with pytest.raises(CompilationError, match="out of cheese"):
         compile_it()
@@ -195,9 +213,9 @@ def test_a_compiler_that_fails(tmp_path, monkeypatch):
 
 
 @needed
-def test_a_compiler_that_hangs_is_given_up(tmp_path, monkeypatch):
+def test_a_compiler_that_hangs_is_given_up(calls, monkeypatch):
     monkeypatch.setattr(compiler, "_PATIENCE", 0.2)
-    calls = wrapped(tmp_path, monkeypatch, "exec sleep 600")
+    monkeypatch.setenv("COMPILER_BODY", "exec sleep 600")
     assert estimator().engine == "python"
     began = time.monotonic()
     with pytest.raises(CompilationError, match=r"did not end within 0\.2 s"):
@@ -207,14 +225,21 @@ def test_a_compiler_that_hangs_is_given_up(tmp_path, monkeypatch):
 
 
 @needed
-def test_a_compiler_that_reads_standard_input(tmp_path, monkeypatch):
-    wrapped(tmp_path, monkeypatch, f'cat > /dev/null\nexec "{CC}" "$@"')
-    assert compile_it().is_new
+def test_a_compiler_that_reads_standard_input(monkeypatch):
+    monkeypatch.setenv("COMPILER_BODY", f"cat > /dev/null; {RIGHT}")
+    before = os.dup(0)
+    reading, writing = os.pipe()  # nobody ever writes to it
+    try:
+        os.dup2(reading, 0)
+        assert compile_it().is_new
+    finally:
+        os.dup2(before, 0)
+        for one in (before, reading, writing):
+            os.close(one)
 
 
 @needed
-def test_wrong_code_is_not_used_and_not_compiled_again(calls, monkeypatch):
-    compile_it()
+def test_wrong_code_is_not_used_and_not_compiled_again(filled, calls, monkeypatch):
     before = calls()
     compiler._checked.clear()
     monkeypatch.setattr(library, "estimator_fault", lambda *_: "J of the estimate is 2")
@@ -223,11 +248,10 @@ def test_wrong_code_is_not_used_and_not_compiled_again(calls, monkeypatch):
 
 
 @needed
-def test_damaged_and_foreign_files_in_the_cache(tmp_path):
-    made = compile_it()
-    made.path.with_suffix(".sha256").write_text("nonsense")
+def test_damaged_and_foreign_files_in_the_cache(filled, tmp_path):
+    filled.with_suffix(".sha256").write_text("nonsense")
     assert estimator().engine == "python"
-    made.path.with_suffix(".sha256").unlink()
+    filled.with_suffix(".sha256").unlink()
     assert estimator().engine == "python"
     shutil.rmtree(tmp_path / "cache")
     (tmp_path / "cache").write_text("a file")
@@ -243,8 +267,7 @@ def read_only(monkeypatch):
 
 
 @needed
-def test_a_cache_that_cannot_be_written_can_be_read(calls, monkeypatch):
-    compile_it()
+def test_a_cache_that_cannot_be_written_can_be_read(filled, calls, monkeypatch):
     before = calls()
     with monkeypatch.context() as patch:
         read_only(patch)
@@ -284,8 +307,8 @@ print(mhe.engine, mhe.update([1.0]).cost.hex())
 
 
 @needed
-def test_two_processes_that_compile_at_once(tmp_path, monkeypatch):
-    calls = wrapped(tmp_path, monkeypatch, f'sleep 0.3\nexec "{CC}" "$@"')
+def test_two_processes_that_compile_at_once(calls, monkeypatch):
+    monkeypatch.setenv("COMPILER_BODY", f"sleep 0.3; {RIGHT}")
     both = [
         subprocess.Popen(
             [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -337,23 +360,36 @@ def models():
     ), 3
 
 
-def keys_and_sources():
+class Captured(Exception):  # noqa: N818 - no error
+    """What was to be compiled."""
+
+
+def key_and_source(parts, settings, monkeypatch):
+    """The key of an estimator's library, and its source without the data at its end."""
+    def capture(files, main, key, check):
+        raise Captured(key, files())
+
+    monkeypatch.setattr(library, "compiled_library", capture)
+    with pytest.raises(Captured) as caught:
+        library.EstimatorLibrary(*parts, replace(settings, engine="compiled"))
+    key, files = caught.value.args
+    code, mark, _ = files["mhe.c"].partition("/* Weights, gain, sets")
+    assert mark
+    return key, files["mhe.h"] + code
+
+
+def test_keys_differ_where_the_source_does(monkeypatch):
     (_, observer, cost), _ = arguments()
-    for model, horizon in models():
-        settings = Settings(horizon, engine="compiled")
-        layout, record = library.planned(model, observer, cost, settings)
-        files, structure = estimator_files(model.symbolic, layout, record)
-        yield fingerprint.source_key(model.symbolic, layout), structure
-
-
-def test_keys_differ_where_the_source_does():
-    found = list(keys_and_sources())
+    estimators = [((model, observer, cost), Settings(horizon)) for model, horizon in models()]
+    for name in CASES:
+        one = case(name).estimator("python")
+        estimators.append(((one.system, one.observer, one.cost), one.settings))
+    found = [key_and_source(*one, monkeypatch) for one in estimators]
     keys, sources = zip(*found, strict=True)
     assert None not in keys
     for key, text in found:
         assert [one == key for one in keys] == [one == text for one in sources]
-    assert len(set(keys)) == len(keys) - 1  # two differ in their sampling time, which is data
-    assert keys == tuple(key for key, _ in keys_and_sources())
+    assert len(set(keys)) < len(keys)  # sampling times, weights and options are data
 
 
 @pytest.mark.parametrize("name", ["c/step.c", "c/estimator.h", "source.py"])
@@ -409,8 +445,7 @@ def test_a_snapshot_pins_the_python_step():
 
 
 @needed
-def test_a_snapshot_pins_the_compiled_step(tmp_path, monkeypatch):
-    compile_it()
+def test_a_snapshot_pins_the_compiled_step(filled, tmp_path, monkeypatch):
     mhe = estimator()
     for y in (1.0, 2.0, np.nan, 1.5):
         mhe.update([y])
