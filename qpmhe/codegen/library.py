@@ -51,10 +51,10 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             "leave states out."
         )
     for name in ("output_residual", "state_residual"):
-        if getattr(system, name) is not None:
+        residual = getattr(system, name)
+        if residual is not None and residual.periods is None:
             return (
-                f"engine='compiled' does not yet take a residual function; take engine='python', "
-                f"or leave {name} out."
+                f"{name}, a function, has no C form; take qpmhe.angles, or engine='python'."
             )
     if system.extensions:
         return (
@@ -263,7 +263,7 @@ class EstimatorLibrary:
         def fault(library: ctypes.CDLL) -> str:
             self._bind(library)
             made[:] = made or [Interpreter(model)]
-            return estimator_fault(made[0], self, cost)
+            return estimator_fault(made[0], self, system, cost)
 
         key = source_key(model, layout)
         if settings.engine == "auto":

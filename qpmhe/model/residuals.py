@@ -33,9 +33,15 @@ class Residual(ABC):
     ----------
     components : (k,) array
         The components that may be moved by such a constant; the others are a - b.
+    periods : (k,) array or None
+        What whole multiples of they are moved by; None of a user's function.
+    function : callable or None
+        The user's function of the first components of a and b.
     """
 
     components: NDArray[np.intp]
+    periods: Array | None = None
+    function: Callable[..., Any] | None = None
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Array:
         """A [-] b, for arrays (..., d)."""
@@ -81,7 +87,8 @@ class Angles(Residual):
     """
 
     def __init__(self, components: NDArray[np.intp], periods: Array) -> None:
-        self.components, self.periods = components, periods
+        self.components = components
+        self.periods: Array = periods
         # Neighbours are a slice, which is faster than an index.
         first = int(components[0])
         neighbours = np.array_equal(components, np.arange(first, first + components.size))
@@ -177,7 +184,8 @@ class _Given(Residual):
     """A user's function (a, b)."""
 
     def __init__(self, name: str, function: Callable[..., Any], dimension: int) -> None:
-        self._name, self._user, self._dimension = name, function, dimension
+        self._name, self._dimension = name, dimension
+        self.function: Callable[..., Any] = function
         rng = np.random.default_rng(20210829)
         pairs = [
             tuple(10.0**k * rng.uniform(-1.0, 1.0, (2, dimension))) for k in range(-12, 13)
@@ -264,7 +272,7 @@ class _Given(Residual):
             raise ShapeError(f"{name} is for {self._dimension} components; expected {dimension}.")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _Given, (self._name, self._user, self._dimension)
+        return _Given, (self._name, self.function, self._dimension)
 
 
 class _Extended(Residual):
@@ -272,7 +280,8 @@ class _Extended(Residual):
 
     def __init__(self, first: Residual, count: int, dimension: int) -> None:
         self._first, self._count, self._dimension = first, count, dimension
-        self.components = first.components
+        self.components, self.periods = first.components, first.periods
+        self.function = first.function
 
     def wrap(self, differences: Array, minuends: Array) -> None:
         """See `Residual.wrap`."""
