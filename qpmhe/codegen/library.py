@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -52,9 +53,10 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         )
     for name in ("output_residual", "state_residual"):
         residual = getattr(system, name)
-        if residual is not None and residual.periods is None:
+        if residual is not None and residual.periods is None and residual.expression.reason:
             return (
-                f"{name}, a function, has no C form; take qpmhe.angles, or engine='python'."
+                f"{name}, a function, has no C form ({residual.expression.reason}); take "
+                "qpmhe.angles, or engine='python'."
             )
     if system.extensions:
         return (
@@ -159,9 +161,20 @@ def generated(
 ) -> tuple[dict[str, str], str, Layout, NDArray[Any]]:
     """Source of an estimator, its structure, its layout and its settings."""
     layout, record = planned(system, observer, cost, settings, real, lapack)
-    assert system.symbolic is not None
-    files, structure = estimator_files(system.symbolic, layout, record, name)
+    files, structure = estimator_files(symbolic_model(system), layout, record, name)
     return files, structure, layout, record
+
+
+def symbolic_model(system: System) -> CasadiModel:
+    """The model of a system that has a C form, with all that is generated from CasADi."""
+    model = system.symbolic
+    assert model is not None
+    residuals = {
+        name: residual.expression.function
+        for name in ("output_residual", "state_residual")
+        if (residual := getattr(system, name)) is not None and residual.periods is None
+    }
+    return replace(model, **residuals) if residuals else model
 
 
 def planned(
@@ -255,8 +268,7 @@ class EstimatorLibrary:
         self._observer, self._options = observer, settings
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
-        assert system.symbolic is not None
-        model = system.symbolic
+        model = symbolic_model(system)
         made: list[Interpreter] = []  # only where there is something to check
 
         @np.errstate(all="ignore")

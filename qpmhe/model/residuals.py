@@ -14,8 +14,10 @@ from qpmhe_solvers.values import integer, shown
 
 from .._checks import numbers
 from ..errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
+from .expressions import import_casadi
 from .functions import BatchedFunction, contained
 from .sets import ConvexSet
+from .tracing import Traced, traced
 
 Array = NDArray[np.float64]
 
@@ -35,13 +37,15 @@ class Residual(ABC):
         The components that may be moved by such a constant; the others are a - b.
     periods : (k,) array or None
         What whole multiples of they are moved by; None of a user's function.
-    function : callable or None
-        The user's function of the first components of a and b.
     """
 
     components: NDArray[np.intp]
     periods: Array | None = None
-    function: Callable[..., Any] | None = None
+
+    @property
+    def expression(self) -> Traced:
+        """A user's function of (a, b) as CasADi has it."""
+        return Traced(None, "it is no function")
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Array:
         """A [-] b, for arrays (..., d)."""
@@ -184,8 +188,8 @@ class _Given(Residual):
     """A user's function (a, b)."""
 
     def __init__(self, name: str, function: Callable[..., Any], dimension: int) -> None:
-        self._name, self._dimension = name, dimension
-        self.function: Callable[..., Any] = function
+        self._name, self._user, self._dimension = name, function, dimension
+        self._expression: Traced | None = None
         rng = np.random.default_rng(20210829)
         pairs = [
             tuple(10.0**k * rng.uniform(-1.0, 1.0, (2, dimension))) for k in range(-12, 13)
@@ -271,8 +275,15 @@ class _Given(Residual):
         if dimension != self._dimension:
             raise ShapeError(f"{name} is for {self._dimension} components; expected {dimension}.")
 
+    @property
+    def expression(self) -> Traced:
+        """See `Residual.expression`; found at the first use."""
+        if self._expression is None:
+            self._expression = traced(self._user, (self._dimension, self._dimension))
+        return self._expression
+
     def __reduce__(self) -> tuple[Any, ...]:
-        return _Given, (self._name, self.function, self._dimension)
+        return _Given, (self._name, self._user, self._dimension)
 
 
 class _Extended(Residual):
@@ -281,7 +292,17 @@ class _Extended(Residual):
     def __init__(self, first: Residual, count: int, dimension: int) -> None:
         self._first, self._count, self._dimension = first, count, dimension
         self.components, self.periods = first.components, first.periods
-        self.function = first.function
+
+    @property
+    def expression(self) -> Traced:
+        """See `Residual.expression`."""
+        first, count = self._first.expression, self._count
+        if first.function is None:
+            return first
+        ca = import_casadi()
+        a, b = (ca.SX.sym(name, self._dimension) for name in "ab")
+        joined = ca.vertcat(first.function(a[:count], b[:count]), a[count:] - b[count:])
+        return Traced(ca.Function("residual", [a, b], [joined]), "", (self._dimension,))
 
     def wrap(self, differences: Array, minuends: Array) -> None:
         """See `Residual.wrap`."""

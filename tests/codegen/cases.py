@@ -206,11 +206,24 @@ def _tank() -> Case:
     return with_parameters(one, 0.5).with_options(max_qps=None, solver_tolerance=1e-9)
 
 
-def _rover(outputs: bool, states: bool, **sets: Any) -> Case:
+def _turned_outputs(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The rover's difference of two outputs."""
+    d = a - b
+    degrees = (d[..., 1] + 180.0) % 360.0 - 180.0
+    return np.stack((d[..., 0], degrees, np.arctan2(np.sin(d[..., 2]), np.cos(d[..., 2]))), -1)
+
+
+def _turned_states(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The rover's difference of two states."""
+    d = a - b
+    return d - np.array([0.0, 0.0, 2.0 * np.pi, 0.0]) * np.floor(d / (2.0 * np.pi) + 0.5)
+
+
+def _rover(outputs: bool, states: bool, functions: bool = False, **sets: Any) -> Case:
     """A turning rover with a compass that sees distance and bearing of a beacon.
 
     Where states have angles, f keeps the heading in one turn. Where outputs have none, they are
-    smooth functions of both.
+    smooth functions of both. The angles may be stated by functions of two vectors.
     """
     import casadi as ca
 
@@ -232,9 +245,10 @@ def _rover(outputs: bool, states: bool, **sets: Any) -> Case:
 
     residuals = {}
     if outputs:
-        residuals["output_residual"] = qpmhe.angles([1, 2], [360.0, 2.0 * np.pi])
+        angles = qpmhe.angles([1, 2], [360.0, 2.0 * np.pi])
+        residuals["output_residual"] = _turned_outputs if functions else angles
     if states:
-        residuals["state_residual"] = qpmhe.angles([2])
+        residuals["state_residual"] = _turned_states if functions else qpmhe.angles([2])
     system = qpmhe.from_casadi(f, h, n=4, compiled=False, **residuals, **sets)
     unit = 57.3 if outputs else 1.0
     deviations = {
@@ -275,6 +289,9 @@ CASES: dict[str, Callable[[], Case]] = {
         candidate="reinitialized"
     ),
     "angles of both": lambda: _rover(True, True).with_gaps(),
+    "residual functions": lambda: _rover(True, True, True).with_gaps().with_options(
+        warm_start=True
+    ),
     "angles in sets": lambda: _rover(
         True, True,
         disturbances=qpmhe.Box([-0.4, -0.4, -0.03, -0.02], [0.4, 0.4, 0.03, 0.02]),
