@@ -167,8 +167,7 @@ def generated(
 
 def symbolic_model(system: System) -> CasadiModel:
     """The model of a system that has a C form, with all that is generated from CasADi."""
-    model = system.symbolic
-    assert model is not None
+    model: CasadiModel = system.symbolic
     residuals = {
         name: residual.expression.function
         for name in ("output_residual", "state_residual")
