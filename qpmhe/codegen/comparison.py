@@ -19,7 +19,9 @@ from ..estimation.estimate import Status
 from ..estimation.limits import LARGEST
 from ..model.evaluation import Buffers, fixed_call
 from ..model.expressions import CasadiModel, import_casadi
+from ..model.residuals import difference
 from ..model.sets import ConvexSet
+from ..model.system import System
 
 if TYPE_CHECKING:
     from .library import EstimatorLibrary
@@ -205,7 +207,9 @@ def _residual_fault(
     return ""
 
 
-def estimator_fault(interpreter: Interpreter, library: EstimatorLibrary, cost: Cost) -> str:
+def estimator_fault(
+    interpreter: Interpreter, library: EstimatorLibrary, system: System, cost: Cost
+) -> str:
     """Where a compiled estimator differs from the interpreter; empty where it does not.
 
     Short records are run through all of its functions. Costs, residuals and the candidate's
@@ -221,8 +225,8 @@ def estimator_fault(interpreter: Interpreter, library: EstimatorLibrary, cost: C
     if library.layout.clock:
         given["time_budget"] = other["time_budget"] = 0.0
     return (
-        _Rehearsal(interpreter, library, cost, given, False).fault()
-        or _Rehearsal(interpreter, library, cost, other, True).fault()
+        _Rehearsal(interpreter, library, system, cost, given, False).fault()
+        or _Rehearsal(interpreter, library, system, cost, other, True).fault()
     )
 
 
@@ -249,11 +253,12 @@ class _Rehearsal:
     """
 
     def __init__(
-        self, interpreter: Interpreter, library: EstimatorLibrary, cost: Cost,
+        self, interpreter: Interpreter, library: EstimatorLibrary, system: System, cost: Cost,
         settings: NDArray[Any], is_wild: bool,
     ) -> None:
         n, p = interpreter.model.n, interpreter.model.p
         self._interpreter, self._library, self._settings = interpreter, library, settings
+        self._system = system
         self._generator = np.random.default_rng(int(is_wild))
         first, _, _, values = next(points(interpreter, None, int(is_wild)))
         state, output = first[0], values["h"][0]
@@ -402,8 +407,8 @@ class _Rehearsal:
     def _judged(self, t: int, prior: Array, xs: Array, is_candidate: bool) -> _Judged:
         at, found = self._along(t, xs, False)
         return _Judged(
-            xs, found, self._ys[at], self._weights[at], self._gain, self._cost, xs[0] - prior,
-            is_candidate,
+            xs, found, self._ys[at], self._weights[at], self._gain, self._system, self._cost,
+            prior, is_candidate,
         )
 
 
@@ -412,12 +417,14 @@ class _Judged:
 
     def __init__(
         self, xs: Array, found: dict[str, Array], ys: Array, weights: Array, gain: Array,
-        cost: Cost, offset: Array, is_candidate: bool,
+        system: System, cost: Cost, prior: Array, is_candidate: bool,
     ) -> None:
         n, count, f, h = xs.shape[1], len(ys), found["f"], found["h"]
         self.xs, observed = xs, np.isfinite(ys)
         self.observed = np.hstack((np.ones_like(f, np.bool_), observed))
         self.residuals = np.hstack((xs[1:] - f, ys - h))
+        system.wrap(self.residuals, xs[1:], ys)
+        offset = difference(system.state_residual, xs[0], prior)
         sizes = np.hstack((abs(xs[1:]) + abs(f), abs(ys) + abs(h)))
         self.allowed = ROUNDING * sizes + np.hstack((found["spread_f"], found["spread_h"]))
         v, allowed_v = (
@@ -429,13 +436,15 @@ class _Judged:
         self._allowed_following = self.allowed[:, :n] + allowed_correction
         if is_candidate:
             self.residuals[:, :n], self.allowed[:, :n] = correction, allowed_correction
+            if system.state_residual is not None:
+                system.state_residual.wrap(self.residuals[:, :n], self._following)
         # Of a trial, an output that is not finite fails the model, measured or not.
         known = observed if is_candidate else observed | ~np.isfinite(h)
         r = np.hstack((self.residuals[:, :n], np.where(known, self.residuals[:, n:], 0.0)))
         allowed = np.hstack((self.allowed[:, :n], allowed_v))
         age = cost.discount ** np.arange(count, -1, -1.0)
-        stages, prior = cost.stage_costs(r, weights), cost.prior_cost(offset, cost.least_prior)
-        self.cost = float(age[1:] @ stages + age[0] * prior)
+        stages, initial = cost.stage_costs(r, weights), cost.prior_cost(offset, cost.least_prior)
+        self.cost = float(age[1:] @ stages + age[0] * initial)
         # |(r + d)' W (r + d) - r' W r| for |d| <= allowed, and the sums' own rounding.
         heavy = abs(weights)
         least, most = (cost.stage_costs(abs(r) + d, heavy) for d in (0.0, allowed))
@@ -449,7 +458,7 @@ class _Judged:
             self.cost = np.inf
         # A stage without finite squares fails in C, and the candidate goes on elsewhere.
         self._has_squares = np.isfinite(stages + (f**2 + self._following**2).sum(axis=1))
-        self.has_squares = bool(self._has_squares.all() and np.isfinite(prior))
+        self.has_squares = bool(self._has_squares.all() and np.isfinite(initial))
 
     def moved(self) -> bool:
         """Whether states do not follow f + K v where these are finite."""

@@ -27,6 +27,7 @@ from ..estimation.snapshot import (
     near,
     reading,
 )
+from ..model.residuals import difference
 from ..model.system import System
 from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
@@ -267,12 +268,12 @@ class CompiledEngine:
         with np.errstate(all="ignore"):
             assert model.kernel is not None  # of every system with a CasADi form
             residuals = model.kernel.residuals(trajectory, stages["y"], inputs)
+            system.wrap(residuals, trajectory[1:], stages["y"])
             if not np.isfinite(residuals).all():
                 raise InvalidInputError("the model has no finite values along the estimate.")
             weights = cost.majorise(residuals, weights)
-            prior = cost.majorise_prior(
-                trajectory[0] - stages["z"][0], cost.initial_weight(None)
-            )
+            offset = difference(system.state_residual, trajectory[0], stages["z"][0])
+            prior = cost.majorise_prior(offset, cost.initial_weight(None))
             return window_covariances(
                 model,
                 trajectory,

@@ -15,6 +15,7 @@ from ..estimation.constraints import Rows
 from ..estimation.estimate import DroppedRow, Status
 from ..estimation.limits import c_definitions
 from ..estimation.settings import Infeasible, Settings
+from ..model.residuals import Residual
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
@@ -61,6 +62,8 @@ class Layout:
     lapack: bool = False
     #: Whether there is a time budget, and a clock to keep it.
     clock: bool = False
+    #: How outputs and states differ: 0 plainly, 1 by angles, 2 by functions.
+    residuals: tuple[int, int] = (0, 0)
 
     @classmethod
     def of(
@@ -77,6 +80,7 @@ class Layout:
         return cls(
             system.n, system.p, system.m, horizon, sets, continuous, real, loss=loss,
             lapack=lapack and system.n >= _LAPACK_STATES, clock=clock,
+            residuals=(_kind(system.output_residual), _kind(system.state_residual)),
         )
 
     @property
@@ -92,6 +96,7 @@ class Layout:
             "continuous": self.continuous, "real": self.real, "loss": int(self.loss),
             "lapack": int(self.lapack),
             "clock": int(self.clock), "clock_text": _CLOCK_TEXT if self.clock else "",
+            "output_residual": self.residuals[0], "state_residual": self.residuals[1],
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
@@ -107,6 +112,7 @@ class Layout:
             ("gain", r, n * p), ("filter_gain", r, n * p), ("prior_weight", r, n * n),
             ("disturbance_weight", r, n * n), ("noise_weight", r, p * p),
             *((f"{name}_loss", loss) for name in TERMS),
+            ("output_periods", r, p), ("state_periods", r, n),
             ("discount", r), ("sample_time", r), ("tolerance", r),
             ("solver_tolerance", r),
         ]
@@ -239,6 +245,10 @@ def _filled(
         part = record[f"{name}_loss"]
         part["kind"], part["parameter"] = LOSSES.index(loss.kind), loss.parameter
         part["per_component"] = loss.per_component
+    for name, residual in (("output", system.output_residual), ("state", system.state_residual)):
+        if residual is not None and residual.periods is not None:
+            periods = record[f"{name}_periods"]
+            periods[residual.components] = residual.periods
     record["sample_time"] = system.dt or 0.0
     single = layout.real == "float"
     # Single precision distinguishes less.
@@ -274,6 +284,10 @@ def _filled(
     if layout.clock:
         record["time_budget"] = settings.time_budget
     return record
+
+
+def _kind(residual: Residual | None) -> int:
+    return 0 if residual is None else 2 if residual.periods is None else 1
 
 
 def _struct(fields: list[Any]) -> np.dtype[Any]:

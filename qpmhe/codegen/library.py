@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +44,17 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             "engine='python'."
         )
     for name in ("output_residual", "state_residual"):
-        if getattr(system, name) is not None:
+        residual = getattr(system, name)
+        if residual is not None and residual.periods is None and residual.expression.reason:
             return (
-                f"engine='compiled' does not yet take a residual function; take engine='python', "
-                f"or leave {name} out."
+                f"{name}, a function, has no C form ({residual.expression.reason}); take "
+                "qpmhe.angles, or engine='python'."
             )
+    if system.turns is not None:
+        return (
+            "engine='compiled' does not yet take bounds of states that are angles; take "
+            "engine='python', or leave these bounds out."
+        )
     if system.extensions:
         return (
             f"engine='compiled' does not have {' and '.join(system.extensions)}; take "
@@ -127,8 +134,18 @@ def generated(
 ) -> dict[str, str]:
     """Header and source of an estimator, by the names of their files."""
     layout, record = planned(system, observer, cost, settings, real, lapack)
-    assert system.symbolic is not None
-    return estimator_files(system.symbolic, layout, record, name)
+    return estimator_files(symbolic_model(system), layout, record, name)
+
+
+def symbolic_model(system: System) -> CasadiModel:
+    """The model of a system that has a C form, with all that is generated from CasADi."""
+    model: CasadiModel = system.symbolic
+    residuals = {
+        name: residual.expression.function
+        for name in ("output_residual", "state_residual")
+        if (residual := getattr(system, name)) is not None and residual.periods is None
+    }
+    return replace(model, **residuals) if residuals else model
 
 
 def planned(
@@ -139,8 +156,8 @@ def planned(
     reason = uncovered(system, observer, cost, settings)
     if reason:
         raise OptionError(f"no C code for this estimator: {reason}")
-    model = system.symbolic
-    assert model is not None
+    assert system.symbolic is not None
+    model = symbolic_model(system)
     layout = Layout.of(
         system, cost, settings.horizon, CONTINUOUS[model.method], real, lapack,
         settings.time_budget is not None,
@@ -222,15 +239,14 @@ class EstimatorLibrary:
         self._observer, self._options = observer, settings
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
-        assert system.symbolic is not None
-        model = system.symbolic
+        model = symbolic_model(system)
         made: list[Interpreter] = []  # only where there is something to check
 
         @np.errstate(all="ignore")
         def fault(library: ctypes.CDLL) -> str:
             self._bind(library)
             made[:] = made or [Interpreter(model)]
-            return estimator_fault(made[0], self, cost)
+            return estimator_fault(made[0], self, system, cost)
 
         key = source_key(model, layout)
         if settings.engine == "auto":

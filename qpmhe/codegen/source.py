@@ -62,12 +62,12 @@ def model_source(model: CasadiModel) -> str:
     for which in ("f", "h"):
         function = getattr(model, which)
         name = f"mhe_casadi_{which}"
-        named = _named(ca, function, name, model)
+        named = _named(ca, function, name, model.n, model.m)
         generator.add(named)
         calls.append(_call(f"mhe_call_{which}", name, named))
         slopes, places = model.with_jacobian(which)
         name = f"mhe_casadi_{which}_jacobian"
-        named = _named(ca, slopes, name, model)
+        named = _named(ca, slopes, name, model.n, model.m)
         generator.add(named)
         calls.append(_call(f"mhe_call_{which}_jacobian", name, named))
         listed = ", ".join(str(place) for place in places) or "0"
@@ -75,6 +75,14 @@ def model_source(model: CasadiModel) -> str:
             f"#define MHE_{which.upper()}_NONZEROS {len(places)}\n"
             f"static const int mhe_{which}_place[] = {{{listed}}};\n"
         )
+    for which, size in (("output_residual", model.p), ("state_residual", model.n)):
+        function = getattr(model, which)
+        if function is None:
+            continue
+        name = f"mhe_casadi_{which}"
+        named = _named(ca, function, name, size, size)
+        generator.add(named)
+        calls.append(_call(f"mhe_call_{which}", name, named))
     code = _bare(generator.dump())
     if "#error" in code:
         line = next(line for line in code.splitlines() if "#error" in line)
@@ -123,10 +131,10 @@ def _bare(text: str) -> str:
     return text
 
 
-def _named(ca: Any, function: Any, name: str, model: CasadiModel) -> Any:
+def _named(ca: Any, function: Any, name: str, *sizes: int) -> Any:
     kind = ca.SX if function.is_a("SXFunction") else ca.MX
-    x, u = kind.sym("x", model.n), kind.sym("u", model.m)
-    return ca.Function(name, [x, u], function.call([x, u]))
+    given = [kind.sym(f"x{k}", size) for k, size in enumerate(sizes)]
+    return ca.Function(name, given, function.call(given))
 
 
 def _call(name: str, inner: str, function: Any) -> str:
@@ -172,8 +180,9 @@ def estimator_files(
     """Header and source of a whole estimator."""
     head = header(name, {**layout.header_values(name), "version": __version__})
     parts = (
-        "algebra.c", "conditions.c", "cost.c", "observer.c", "projection.c", "window.c", "sets.c",
-        "trial.c", "factor.c", "budget.c", "inequalities.c", "optimizer.c", "step.c",
+        "algebra.c", "residuals.c", "conditions.c", "cost.c", "observer.c", "projection.c",
+        "window.c", "sets.c", "trial.c", "factor.c", "budget.c", "inequalities.c", "optimizer.c",
+        "step.c",
     )
     body = prologue() + model_source(model) + "\n".join(template(part) for part in parts)
     data = (

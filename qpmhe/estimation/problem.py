@@ -412,11 +412,7 @@ class Problem:
 
     def wrap(self, residuals: Array, trajectory: Array) -> None:
         """Turn the plain differences of a trajectory into residuals, in place."""
-        n, model = trajectory.shape[1], self.model
-        if model.state_residual is not None:
-            model.state_residual.wrap(residuals[:, :n], trajectory[1:])
-        if model.output_residual is not None:
-            model.output_residual.wrap(residuals[:, n:], self.measurements)
+        self.model.wrap(residuals, trajectory[1:], self.measurements)
 
     def _weights_and_cost(self, residuals: Array) -> tuple[Array, float]:
         """The weights of `Trial`, and the stages' cost."""

@@ -14,8 +14,10 @@ from qpmhe_solvers.values import integer, shown
 
 from .._checks import numbers
 from ..errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
+from .expressions import import_casadi
 from .functions import BatchedFunction, contained
 from .sets import ConvexSet
+from .tracing import Traced, traced
 
 Array = NDArray[np.float64]
 
@@ -33,9 +35,17 @@ class Residual(ABC):
     ----------
     components : (k,) array
         The components that may be moved by such a constant; the others are a - b.
+    periods : (k,) array or None
+        What whole multiples of they are moved by; None of a user's function.
     """
 
     components: NDArray[np.intp]
+    periods: Array | None = None
+
+    @property
+    def expression(self) -> Traced:
+        """A user's function of (a, b) as CasADi has it."""
+        return Traced(None, "it is no function")
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Array:
         """A [-] b, for arrays (..., d)."""
@@ -81,7 +91,8 @@ class Angles(Residual):
     """
 
     def __init__(self, components: NDArray[np.intp], periods: Array) -> None:
-        self.components, self.periods = components, periods
+        self.components = components
+        self.periods: Array = periods
         # Neighbours are a slice, which is faster than an index.
         first = int(components[0])
         neighbours = np.array_equal(components, np.arange(first, first + components.size))
@@ -178,6 +189,7 @@ class _Given(Residual):
 
     def __init__(self, name: str, function: Callable[..., Any], dimension: int) -> None:
         self._name, self._user, self._dimension = name, function, dimension
+        self._expression: Traced | None = None
         rng = np.random.default_rng(20210829)
         pairs = [
             tuple(10.0**k * rng.uniform(-1.0, 1.0, (2, dimension))) for k in range(-12, 13)
@@ -263,6 +275,13 @@ class _Given(Residual):
         if dimension != self._dimension:
             raise ShapeError(f"{name} is for {self._dimension} components; expected {dimension}.")
 
+    @property
+    def expression(self) -> Traced:
+        """See `Residual.expression`; found at the first use."""
+        if self._expression is None:
+            self._expression = traced(self._user, (self._dimension, self._dimension))
+        return self._expression
+
     def __reduce__(self) -> tuple[Any, ...]:
         return _Given, (self._name, self._user, self._dimension)
 
@@ -272,7 +291,18 @@ class _Extended(Residual):
 
     def __init__(self, first: Residual, count: int, dimension: int) -> None:
         self._first, self._count, self._dimension = first, count, dimension
-        self.components = first.components
+        self.components, self.periods = first.components, first.periods
+
+    @property
+    def expression(self) -> Traced:
+        """See `Residual.expression`."""
+        first, count = self._first.expression, self._count
+        if first.function is None:
+            return first
+        ca = import_casadi()
+        a, b = (ca.SX.sym(name, self._dimension) for name in "ab")
+        joined = ca.vertcat(first.function(a[:count], b[:count]), a[count:] - b[count:])
+        return Traced(ca.Function("residual", [a, b], [joined]), "", (self._dimension,))
 
     def wrap(self, differences: Array, minuends: Array) -> None:
         """See `Residual.wrap`."""

@@ -495,6 +495,21 @@ class System:
         found = [f"a soft set of {name}" for name in self.soft]
         return (*found, "nonlinear constraints") if self.constraints else tuple(found)
 
+    def wrap(self, residuals: Array, states: Array, measurements: Array) -> None:
+        """Turn differences (w, v), (K, n + p), into residuals, in place.
+
+        Parameters
+        ----------
+        residuals : (K, n + p) array
+            Differences from f and h of the states and the measurements.
+        states, measurements : array
+            What they are differences of: x(i+1) (K, n), and y(i) (K, p).
+        """
+        if self.state_residual is not None:
+            self.state_residual.wrap(residuals[:, : self.n], states)
+        if self.output_residual is not None:
+            self.output_residual.wrap(residuals[:, self.n :], measurements)
+
     @property
     def derivatives(self) -> dict[str, str]:
         """How the Jacobians of f and h are computed."""

@@ -249,6 +249,73 @@ def _tank() -> Case:
     return with_parameters(one, 0.5).with_options(max_qps=None, solver_tolerance=1e-9)
 
 
+def _turned_outputs(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The rover's difference of two outputs."""
+    d = a - b
+    degrees = (d[..., 1] + 180.0) % 360.0 - 180.0
+    return np.stack((d[..., 0], degrees, np.arctan2(np.sin(d[..., 2]), np.cos(d[..., 2]))), -1)
+
+
+def _turned_states(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The rover's difference of two states."""
+    d = a - b
+    return d - np.array([0.0, 0.0, 2.0 * np.pi, 0.0]) * np.floor(d / (2.0 * np.pi) + 0.5)
+
+
+def _rover(outputs: bool, states: bool, functions: bool = False, **sets: Any) -> Case:
+    """A turning rover with a compass that sees distance and bearing of a beacon.
+
+    Where states have angles, f keeps the heading in one turn. Where outputs have none, they are
+    smooth functions of both. The angles may be stated by functions of two vectors.
+    """
+    import casadi as ca
+
+    def f(x):
+        heading = x[2] + x[3]
+        if states:
+            heading = ca.atan2(ca.sin(heading), ca.cos(heading))
+        return ca.vertcat(x[0] + 0.3 * ca.cos(x[2]), x[1] + 0.3 * ca.sin(x[2]), heading, x[3])
+
+    def h(x):
+        bearing = ca.atan2(-3.0 - x[1], -2.0 - x[0]) - x[2]
+        north, compass = ca.sqrt((2.0 + x[0]) ** 2 + (3.0 + x[1]) ** 2), x[2]
+        if outputs:
+            bearing *= 180.0 / ca.pi
+            compass = ca.atan2(ca.sin(compass), ca.cos(compass))
+        else:
+            bearing, compass = ca.sin(bearing), ca.cos(compass)
+        return ca.vertcat(north, bearing, compass)
+
+    residuals = {}
+    if outputs:
+        angles = qpmhe.angles([1, 2], [360.0, 2.0 * np.pi])
+        residuals["output_residual"] = _turned_outputs if functions else angles
+    if states:
+        residuals["state_residual"] = _turned_states if functions else qpmhe.angles([2])
+    system = qpmhe.from_casadi(f, h, n=4, compiled=False, **residuals, **sets)
+    unit = 57.3 if outputs else 1.0
+    deviations = {
+        "prior": [0.5, 0.5, 0.4, 0.1], "disturbance": [0.1, 0.1, 0.03, 0.02],
+        "noise": [0.2, 0.1 * unit, 0.1],
+    }
+    cost = qpmhe.QuadraticCost.from_covariances(
+        **{name: np.diag(np.square(one)) for name, one in deviations.items()}
+    )
+    generator, x, samples = np.random.default_rng(4), np.array([0.3, -0.2, 0.5, 1.7]), []
+    for _ in range(3 * STEPS):
+        y = system.h(x, np.zeros(0)) + generator.normal(0.0, deviations["noise"])
+        if outputs:  # measured within one turn
+            y = system.output_residual(y, np.zeros(3))
+        samples.append({"y": y})
+        x = system.f(x, np.zeros(0)) + generator.normal(0.0, deviations["disturbance"])
+    turning = [[0.0, -0.2 / unit, 0.4], [0.0, 0.0, 0.1]] if outputs else np.zeros((2, 3))
+    gain = [[0.2, 0.0, 0.0], [0.0, 0.0, 0.0], *turning]
+    start = np.array([0.0, 0.0, 0.9, 1.6])
+    return Case(
+        system, qpmhe.Luenberger(gain), cost, start, tuple(samples), {"horizon": 6, "max_qps": 3}
+    )
+
+
 #: Each is made when it is asked for; `case` keeps it.
 CASES: dict[str, Callable[[], Case]] = {
     "reactor": _reactor,
@@ -260,6 +327,19 @@ CASES: dict[str, Callable[[], Case]] = {
     "inputs with gaps": lambda: case("inputs").with_gaps(),
     "inputs converged": lambda: case("inputs").with_options(max_qps=None, delay=2),
     "inputs observer": lambda: case("inputs").with_options(max_qps=0),
+    "angles of outputs": lambda: _rover(True, False).with_options(warm_start=True),
+    "angles of states": lambda: _rover(False, True).with_gaps().with_options(
+        candidate="reinitialized"
+    ),
+    "angles of both": lambda: _rover(True, True).with_gaps(),
+    "residual functions": lambda: _rover(True, True, True).with_gaps().with_options(
+        warm_start=True
+    ),
+    "angles in sets": lambda: _rover(
+        True, True,
+        disturbances=qpmhe.Box([-0.4, -0.4, -0.03, -0.02], [0.4, 0.4, 0.03, 0.02]),
+        noises=qpmhe.Polytope([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0]], [20.0, 0.2]),
+    ).with_options(max_qps=None),
     "huber": lambda: _robust(noise=_huber(1.345)),
     "huber with gaps": lambda: _weighed(case("huber").with_gaps()),
     "huber in sets": lambda: _boxed(case("huber")),

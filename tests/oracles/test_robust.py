@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.codegen.compiler import find_compiler
 
 from .convex import minimum
 
@@ -65,10 +66,24 @@ KINDS = {
 }
 
 
+def linear_system(engine, sets):
+    if engine == "python":
+        return qpmhe.System(lambda x: x @ A.T, lambda x: x @ C.T, n=2, p=2, **sets)
+    ca = pytest.importorskip("casadi")
+    if find_compiler() is None:
+        pytest.skip("there is no C compiler")
+    return qpmhe.from_casadi(
+        lambda x: ca.DM(A) @ x, lambda x: ca.DM(C) @ x, n=2, compiled=False, **sets
+    )
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
 @pytest.mark.parametrize("boxed", [False, True])
 @pytest.mark.parametrize("discount", [1.0, 0.8])
 @pytest.mark.parametrize("name", KINDS)
-def test_on_a_linear_system_the_minimum_is_that_of_the_convex_problem(name, discount, boxed):
+def test_on_a_linear_system_the_minimum_is_that_of_the_convex_problem(
+    name, discount, boxed, engine
+):
     kind, stated, tolerance = KINDS[name]
     disturbance, noise = np.diag([4.0, 9.0]), np.diag([2.0, 5.0])
     cost = qpmhe.RobustCost(
@@ -76,10 +91,9 @@ def test_on_a_linear_system_the_minimum_is_that_of_the_convex_problem(name, disc
         noise=kind(noise, stated[1], per_component=stated[2]),
     )
     box = {"disturbances": qpmhe.Box(*WIDE)} if boxed else {}
-    system = qpmhe.System(lambda x: x @ A.T, lambda x: x @ C.T, n=2, p=2, **box)
     mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(np.zeros((2, 2))), cost, horizon=5, initial_state=[0.5, -0.5],
-        max_qps=None,
+        linear_system(engine, box), qpmhe.Luenberger(np.zeros((2, 2))), cost, horizon=5,
+        initial_state=[0.5, -0.5], max_qps=None, engine=engine,
     )
     generator, measured = np.random.default_rng(3), []
     for t in range(9):

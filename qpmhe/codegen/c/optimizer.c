@@ -118,6 +118,7 @@ static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
     const real *prior = mhe_stage_at(e, 0)->z;
     real offset[NX];
     for (int j = 0; j < NX; j++) offset[j] = around->x[j] - prior[j];
+    mhe_wrap_state(e->settings, around->x, offset);
 #if CONSTRAINED
     const int limit = e->settings->max_iterations;
     int guesses = 0, iterations = 0;
@@ -145,6 +146,7 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
     const int count = e->length;
     real *w = k->bent.w, *v = k->bent.v, *d = k->product;
     for (int j = 0; j < (count + 1) * NX; j++) d[j] = o->spare->x[j] - o->best->x[j];
+    for (int i = 0; i <= count; i++) mhe_wrap_state(e->settings, o->spare->x + i * NX, d + i * NX);
     mhe_rows_times(e, k, d);
     mhe_rows *rows = &k->rows;
     for (int i = 0; i < mhe_row_stages(e) * ROWS; i++)
@@ -157,18 +159,23 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
 #endif
     for (int i = 0; i < count; i++) {
         const mhe_terms *t = k->at[i];
+        const int own = i * NX, out = i * NY;
+        /* First the curvature, then where it leads from the best trajectory. */
         for (int j = 0; j < NX; j++) {
-            const int at = i * NX + j;
+            const int at = own + j;
             const real linear = o->best->w[at] + d[at + NX] -
-                                mhe_dot(NX, t->f_jacobian + j * NX, d + i * NX);
-            w[at] = o->best->w[at] + (o->spare->w[at] - linear);
+                                mhe_dot(NX, t->f_jacobian + j * NX, d + own);
+            w[at] = o->spare->w[at] - linear;
         }
         for (int j = 0; j < NY; j++) {
-            const int at = i * NY + j;
-            const real linear =
-                o->best->v[at] - mhe_dot(NX, t->h_jacobian + j * NX, d + i * NX);
-            v[at] = o->best->v[at] + (o->spare->v[at] - linear);
+            const int at = out + j;
+            const real linear = o->best->v[at] - mhe_dot(NX, t->h_jacobian + j * NX, d + own);
+            v[at] = o->spare->v[at] - linear;
         }
+        mhe_wrap_state(e->settings, o->spare->x + own + NX, w + own);
+        mhe_wrap_output(e->settings, mhe_stage_at(e, i)->y, v + out);
+        for (int j = 0; j < NX; j++) w[own + j] += o->best->w[own + j];
+        for (int j = 0; j < NY; j++) v[out + j] += o->best->v[out + j];
     }
     mhe_set_limits(e, k, o->best->x, w, v);
     memset(rows->value, 0, sizeof rows->value); /* X has no curvature */

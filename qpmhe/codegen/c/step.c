@@ -12,6 +12,7 @@ static void mhe_watch(mhe_estimator *e, mhe_outcome *o)
     real offset[NX];
     for (int j = 0; j < NX; j++)
         offset[j] = o->best->x[e->length * NX + j] - o->candidate->x[e->length * NX + j];
+    mhe_wrap_state(e->settings, o->best->x + e->length * NX, offset);
     const int far = mhe_form(NX, mhe_prior_weight(e->settings, mhe_stage_at(e, 0)), offset) > MHE_FAR * MHE_FAR;
     e->far = far ? e->far + (e->far < INT32_MAX) : 0;
     e->dropped = o->rows_dropped ? e->dropped + (e->dropped < INT32_MAX) : 0;

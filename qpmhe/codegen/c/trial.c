@@ -22,9 +22,12 @@ static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *tr
         for (int j = 0; j < NX; j++) w[j] = x[NX + j] - predicted[j];
         /* A model that fails in a missing output fails, as it does everywhere. */
         for (int j = 0; j < NY; j++) v[j] = stage->y[j] - output[j];
+        mhe_wrap_state(s, x + NX, w);
+        mhe_wrap_output(s, stage->y, v);
         cost += factors[i + 1] * mhe_stage_cost(s, stage, w, v);
     }
     for (int j = 0; j < NX; j++) offset[j] = trial->x[j] - prior[j];
+    mhe_wrap_state(s, trial->x, offset);
     cost += factors[0] * mhe_prior_cost(s, mhe_stage_at(e, 0), offset);
     trial->cost = cost;
     trial->violation = 0;

@@ -22,9 +22,13 @@ static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *ne
         mhe_f(stage->z, stage->u, stage->step, predicted);
         mhe_h(stage->z, stage->u, output);
     }
-    for (int j = 0; j < NY; j++) v[j] = stage->is_observed[j] ? stage->y[j] - output[j] : 0;
+    for (int j = 0; j < NY; j++) v[j] = stage->y[j] - output[j];
+    mhe_wrap_output(s, stage->y, v);
+    for (int j = 0; j < NY; j++)
+        if (!stage->is_observed[j]) v[j] = 0;
     mhe_correction(s, stage, w);
     for (int j = 0; j < NX; j++) next[j] = predicted[j] + w[j];
+    mhe_wrap_state(s, next, w);
     if (!mhe_all_finite(NX, next)) return INFINITY;
 #if MHE_X_SET
     if (s->project) *events = mhe_stay_inside(e, stage, predicted, next);

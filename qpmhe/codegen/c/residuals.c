@@ -1,0 +1,48 @@
+/* Differences of outputs and of states, a [-] b: a - b up to whole turns of angles. */
+
+#if MHE_OUTPUT_RESIDUAL == 1 || MHE_STATE_RESIDUAL == 1
+/* Turn differences into [-P/2, P/2) for the periods P of angles, 0 for no angle. */
+static void mhe_turn(int n, const real *periods, real *differences)
+{
+    for (int j = 0; j < n; j++)
+        if (periods[j] > 0)
+            differences[j] -= floor(differences[j] / periods[j] + (real)0.5) * periods[j];
+}
+#endif
+
+#if MHE_OUTPUT_RESIDUAL == 2 || MHE_STATE_RESIDUAL == 2
+/* Turn differences a - b into those of the user's function of a and b, where they are others. */
+static void mhe_turn_by(void (*function)(const real *, const real *, real *), int n, const real *a,
+                        real *differences)
+{
+    real b[NX > NY ? NX : NY], values[NX > NY ? NX : NY];
+    for (int j = 0; j < n; j++) b[j] = a[j] - differences[j];
+    function(a, b, values);
+    for (int j = 0; j < n; j++) {
+        const real rounding = (real)0.5 * fabs(differences[j]) + 64 * EPSILON * fabs(a[j]);
+        if (!(fabs(values[j] - differences[j]) <= rounding)) differences[j] = values[j];
+    }
+}
+#endif
+
+/* Turn differences y - b of outputs into y [-] b, in place. */
+static void mhe_wrap_output(const mhe_settings *s, const real *y, real *differences)
+{
+#if MHE_OUTPUT_RESIDUAL == 1
+    mhe_turn(NY, s->output_periods, differences);
+#elif MHE_OUTPUT_RESIDUAL == 2
+    mhe_turn_by(mhe_call_output_residual, NY, y, differences);
+#endif
+    (void)s; (void)y; (void)differences;
+}
+
+/* Turn differences x - b of states into x [-] b, in place. */
+static void mhe_wrap_state(const mhe_settings *s, const real *x, real *differences)
+{
+#if MHE_STATE_RESIDUAL == 1
+    mhe_turn(NX, s->state_periods, differences);
+#elif MHE_STATE_RESIDUAL == 2
+    mhe_turn_by(mhe_call_state_residual, NX, x, differences);
+#endif
+    (void)s; (void)x; (void)differences;
+}
