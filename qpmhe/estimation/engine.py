@@ -20,8 +20,9 @@ from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
 from ..model.residuals import difference
 from ..model.system import System
+from ..model.traces import next_check, warn_of
 from ..observers import Observer
-from .conditions import ConditionReader, Conditions, usual_conditions
+from .conditions import USUAL, ConditionReader, Conditions, usual_conditions
 from .covariance import window_covariances
 from .estimate import Estimate, Status
 from .optimizer import Optimizer
@@ -107,6 +108,8 @@ class PythonEngine:
         self._window = self._fresh_window(initial_state, self._tools)
         self._watch = ObserverWatch(settings.horizon)
         self._known_modes = system.call_modes()  # as found at construction
+        # The time of the next comparison of the trace with the functions that it stands for.
+        self._next_check: float = 0 if system.is_traced else math.inf
         self._undo_point: tuple[Mark, Array | None, tuple[int, int], tuple[Array, ...]]
         self._trajectory: Array | None = None  # of the last estimate
         # The last estimates, each made at its own time: of x(t-N), ..., x(t) for re-initialised
@@ -176,6 +179,8 @@ class PythonEngine:
         self, y: Array, u: Array, dt: float | None, own: Conditions | None, began: float
     ) -> Estimate:
         """Take the sample y(t), u(t), and estimate x(t+1)."""
+        if self._window.time >= self._next_check:
+            self._check_trace(u)
         window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
             window.make_room()  # before the undo point: `undo` cannot reverse it
@@ -199,6 +204,21 @@ class PythonEngine:
         except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
             self.undo()
             raise
+
+    def _check_trace(self, u: Array) -> None:
+        """Compare trace and functions at z(t); take the functions for good where they differ."""
+        window = self._window
+        self._next_check = next_check(window.time, self._settings.horizon)
+        fault = self._system.trace_fault(window.candidate[-1], u)
+        if fault:
+            self.leave_trace()
+            warn_of(fault, 5)
+
+    def leave_trace(self) -> None:
+        """Evaluate the functions as they are written, along the window and from now on."""
+        self._next_check = math.inf
+        self._system.use_functions()
+        self.set(USUAL, None)
 
     def _warn(self) -> None:
         text = self._watch.warning()

@@ -179,7 +179,8 @@ class MovingHorizonEstimator:
             )
         # A copy: this estimator may change how f and h are called (batched, or one by one).
         self._own_system = system.copy(
-            cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix)
+            cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix),
+            traced=True,
         )
         nominal = self.settings.parameters
         if len(nominal) > system.m:
