@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import deque
+from collections.abc import Sequence
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -63,6 +64,15 @@ class Memory(NamedTuple):
     trajectory: Array | None
     watched: tuple[int, int]
     history: list[Array]
+
+
+class Taken(NamedTuple):
+    """A sample as it was taken in."""
+
+    y: Array
+    u: Array
+    dt: float | None
+    own: Conditions | None
 
 
 class PythonEngine:
@@ -392,6 +402,28 @@ class PythonEngine:
     def _use(self, memory: Memory) -> None:
         self._tools, self._window, self._trajectory, self._watch.counts, history = memory
         self._history = deque(history, maxlen=self._history.maxlen)
+
+    def take_over(
+        self, usual: Conditions, time: int, state: Array, covariance: Array | None,
+        samples: Sequence[Taken], trajectory: Array | None, history: list[Array],
+        watched: tuple[int, int],
+    ) -> None:
+        """Continue where another engine stands, whose window starts at a time and state.
+
+        With the observer's covariance there if it has one, the samples since then, the last
+        estimate's trajectory, and the last states that were estimated.
+        """
+        tools = self._tools_for(usual)
+        window = self._fresh_window(state, tools)
+        window.time = time
+        if window._covariances is not None and covariance is not None:
+            window._covariances[0] = covariance
+        with np.errstate(all="ignore"):
+            for one in samples:
+                window.push(*one)
+            if self._reinitialized and samples:
+                window.reinitialize(history[:-1])
+        self.replace(Memory(tools, window, trajectory, watched, history))
 
     def run(self, ys: Array, us: Array | None) -> None:
         """None: samples are taken one at a time only."""

@@ -21,7 +21,7 @@ from .evaluation import Evaluator
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .residuals import Residual, Turns, checked_residual
 from .sets import ConvexSet, SoftSet, equilibrated
-from .traces import ModelTrace, points, warn_of
+from .traces import ModelTrace, Pinned, points, warn_of
 
 if TYPE_CHECKING:
     from .augmentation import Augmentation
@@ -225,7 +225,9 @@ class System:
             self.f, self.h, self.n, self.p, self.m, self.states
         )
         self._symbolic: Any = None
-        # f, h and what belongs to them as they are written, where a trace stands in their place.
+        # The trace as an estimator's copy has found it, and f, h and what belongs to them as they
+        # are written, where it stands in their place.
+        self._pinned: Pinned | None = None
         self._as_written: dict[str, Any] | None = None
         #: Makes the system `timed`; None where there is no model in continuous time.
         self.make_timed: Callable[[], System] | None = None
@@ -384,11 +386,34 @@ class System:
         """
         if self._symbolic is not None or self.tracing is None:
             return self._symbolic
-        return self.tracing.model
+        # Steps of other lengths must be those of the same model.
+        if self._has_other_steps:
+            return None
+        return self.tracing.model if self._pinned is None else self._pinned.model
 
     @symbolic.setter
     def symbolic(self, model: Any) -> None:
         self._symbolic, self.tracing = model, None
+
+    @property
+    def no_symbolic(self) -> str:
+        """Why ``symbolic`` is None, as text; blank where it is not."""
+        if self.symbolic is not None or self.tracing is None:
+            return ""
+        if self._has_other_steps:
+            return (
+                "it takes steps of other lengths, of which only functions of NumPy know, as made "
+                "by qpmhe.noisy_inputs"
+            )
+        found = self.tracing.now if self._pinned is None else self._pinned
+        return "; ".join(
+            f"{name} is not traced: {one.reason}" for name, one in found.found.items() if one.reason
+        )
+
+    @property
+    def _has_other_steps(self) -> bool:
+        """Whether it takes steps of other lengths that the trace knows nothing of."""
+        return self.make_timed is not None and (self.tracing is None or self.tracing.dt is None)
 
     def copy(self, scales: ArrayLike | None = None, traced: bool = False) -> System:
         """The same system for one estimator, which may change how its functions are called.
@@ -402,7 +427,7 @@ class System:
         """
         other = object.__new__(type(self))  # `copy.copy` would make the model again, as pickle does
         other.__dict__.update(self.__dict__)
-        is_traced = other._as_written is not None
+        is_traced = self._as_written is not None
         other.use_functions()
         other.f, other.h = other.f.copy(), other.h.copy()
         other.f_jacobian = other.f_jacobian.copy(other.f)
@@ -431,21 +456,23 @@ class System:
     def _use_trace(self) -> None:
         """Evaluate f and h by their traces, which agree with them, and with given Jacobians."""
         tracing = self.tracing
-        if tracing is None or self.kernel is not None or self._as_written is not None:
+        if tracing is None or self._as_written is not None:
             return
-        found = tracing.confirm(self.scales)
-        names = [name for name, one in found.items() if one.function]
-        names = [name for name in names if self._jacobian_agrees(name, tracing.evaluator())]
+        self._pinned = pinned = tracing.confirm(self.scales)
+        if self.kernel is not None:
+            return
+        names = [name for name, one in pinned.found.items() if one.function]
+        names = [name for name in names if self._jacobian_agrees(name, pinned.evaluator())]
         if not names:
             return
         self._as_written = {name: getattr(self, name) for name in _TRACED}
-        self._evaluate_by(tracing.evaluator(), names)
+        self._evaluate_by(pinned.evaluator(), names)
         make_timed = self.make_timed
-        if make_timed is not None:
+        if make_timed is not None and not self._has_other_steps:
 
             def timed() -> System:
                 made = make_timed()
-                made._evaluate_by(tracing.evaluator(True), names)
+                made._evaluate_by(pinned.evaluator(True), names)
                 return made
 
             self.make_timed = timed
@@ -489,24 +516,24 @@ class System:
 
     def use_functions(self) -> None:
         """Evaluate f and h as they are written from now on, if a trace stands in their place."""
-        written, self._as_written = self._as_written, None
+        written, self._as_written, self._pinned = self._as_written, None, None
         if written is not None:
             self.__dict__.update(written)
             self.__dict__.pop("timed", None)
 
     @property
     def is_traced(self) -> bool:
-        """Whether a trace stands in the place of f or h."""
-        return self._as_written is not None
+        """Whether an estimator's copy may rely on a trace."""
+        return self._pinned is not None and any(one.function for one in self._pinned.found.values())
 
     def trace_fault(self, x: Array, u: Array) -> str:
-        """Which function differs from the trace in its place at a point, and how; or blank.
+        """Which function differs from the trace that this copy relies on at a point, and how.
 
-        Compares where a trace is in use only. Never raises, whatever the functions do.
+        Blank if none does. Never raises, whatever the functions do.
         """
-        if self._as_written is None or self.tracing is None:
+        if self._pinned is None or self.tracing is None:
             return ""
-        wrong = self.tracing.wrong(x, u)
+        wrong = self.tracing.wrong(self._pinned, x, u)
         return "" if wrong is None else f"{wrong[0]} has changed since it was traced: {wrong[1]}"
 
     def explain(self) -> str:
@@ -516,17 +543,15 @@ class System:
         evaluate it in CasADi's virtual machine or in generated C code. One that is not is called
         as it is written.
         """
-        lines = []
-        own = self.copy(traced=True)
-        for name in ("f", "h"):
-            method = own.derivatives[name]
-            what = f"Jacobian: {_METHODS.get(method, method)}."
-            if self.tracing is None or method in ("casadi", "jax"):
-                text = "an expression." if self.symbolic is not None else "not an expression."
-            else:
-                found = self.tracing.found[name]
-                text = "traced." if found.function else f"not traced: {found.reason}."
-            lines.append(f"{name}: {text} {what}")
+        lines, own = [], self.copy(traced=True)
+        for name, method in own.derivatives.items():
+            text = "in CasADi"
+            if own._pinned is not None:
+                found = own._pinned.found[name]
+                text = "traced" if found.function else f"not traced: {found.reason}"
+            lines.append(f"{name}: {text}. Jacobian: {_METHODS.get(method, method)}.")
+        if own._has_other_steps:
+            lines.append(f"No C code: {own.no_symbolic}.")
         return "\n".join(lines)
 
     def set_of(self, name: str) -> ConvexSet | None:
@@ -635,7 +660,7 @@ class System:
     def derivatives(self) -> dict[str, str]:
         """How the Jacobians of f and h are computed."""
         methods = {"f": self.f_jacobian.method, "h": self.h_jacobian.method}
-        if self._as_written is None and self.tracing is not None and self.kernel is None:
+        if self._pinned is None and self.tracing is not None and self.kernel is None:
             own = self.copy(traced=True)
             methods = {"f": own.f_jacobian.method, "h": own.h_jacobian.method}
         return methods

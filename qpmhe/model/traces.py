@@ -15,7 +15,7 @@ from .evaluation import Evaluator, VirtualMachine
 from .expressions import CasadiModel, import_casadi
 from .functions import BatchedFunction
 from .sets import ConvexSet
-from .tracing import Traced, difference, traced
+from .tracing import Traced, difference, expressed
 
 Array = NDArray[np.float64]
 Points = list[tuple[Array, Array]]
@@ -47,6 +47,43 @@ def points(
     return found
 
 
+class Pinned:
+    """f and h as they were traced once.
+
+    Attributes
+    ----------
+    found : dict
+        The traces of ``f`` (the rate, where the model has a step length) and ``h``.
+    model : CasadiModel or None
+        The model, if both functions are traced.
+    """
+
+    def __init__(
+        self, found: dict[str, Traced], n: int, p: int, m: int, dt: float | None,
+        method: str | None,
+    ) -> None:
+        self.found = found
+        self._evaluators: dict[bool, Evaluator] = {}
+        # True of the functions that are traced, with zeros for others.
+        self._partial: CasadiModel | None = None
+        if any(one.function for one in found.values()):
+            ca = import_casadi()
+            x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
+            f, h = (
+                found[name].function or ca.Function(name, [x, u], [ca.DM.zeros(size)])
+                for name, size in (("f", n), ("h", p))
+            )
+            self._partial = CasadiModel(f, h, n, p, m, dt, method)
+        self.model = self._partial if all(one.function for one in found.values()) else None
+
+    def evaluator(self, timed: bool = False) -> Evaluator:
+        """What evaluates the traced functions, with the step's length as last input if timed."""
+        if timed not in self._evaluators:
+            assert self._partial is not None
+            self._evaluators[timed] = Evaluator(VirtualMachine(self._partial, timed))
+        return self._evaluators[timed]
+
+
 class ModelTrace:
     """f (the rate, where there is a step length) and h as expressions, found when first needed.
 
@@ -72,26 +109,37 @@ class ModelTrace:
     ) -> None:
         self._functions = {"f": _of_both(f), "h": _of_both(h)}
         self._n, self._p, self._m, self._states = n, p, m, states
-        self._dt, self._method = dt, method
+        self.dt, self._method = dt, method
         self._lock = threading.RLock()
-        self._found: dict[str, Traced] | None = None
-        self._model: CasadiModel | None = None
-        self._evaluators: dict[bool, Evaluator] = {}
+        self._now: Pinned | None = None
 
     @property
-    def found(self) -> dict[str, Traced]:
-        """The traces of ``f`` and ``h``."""
+    def now(self) -> Pinned:
+        """The traces as they were found last."""
         with self._lock:
-            if self._found is None:
+            if self._now is None:
                 where = points(self._states, self._n, self._m)
-                self._found = {name: self._traced(name, where) for name in ("f", "h")}
-            return self._found
+                self._pin({name: self._traced(name, where) for name in ("f", "h")})
+            assert self._now is not None
+            return self._now
+
+    @property
+    def model(self) -> CasadiModel | None:
+        """The model, if both functions are traced and still agree with their traces."""
+        return self.confirm(None).model
+
+    def _pin(self, found: dict[str, Traced]) -> None:
+        self._now = Pinned(found, self._n, self._p, self._m, self.dt, self._method)
 
     def _traced(self, name: str, where: Points) -> Traced:
         function = self._functions[name]
-        found = traced(function, (self._n, self._m), where, name=name)
+        found = expressed(function, (self._n, self._m), name)
         if found.function is None:
             return found
+        fault = difference(found, function, where)
+        if fault:
+            warn_of(f"{name} cannot be traced: {fault}")
+            return Traced(None, fault)
         size, count = self._n if name == "f" else self._p, found.function.n_instructions()
         if found.function.numel_out() != size:
             return Traced(None, f"it returns shape {found.shape} of symbols; expected ({size},)")
@@ -99,51 +147,22 @@ class ModelTrace:
             return Traced(None, f"it takes {count} operations, more than {_MOST_OPERATIONS}")
         return found
 
-    @property
-    def model(self) -> CasadiModel | None:
-        """The model, if both functions are traced."""
-        with self._lock:
-            if self._model is None and all(one.function for one in self.found.values()):
-                self._model = self.partial_model()
-            return self._model
-
-    def partial_model(self) -> CasadiModel:
-        """A model that is true of the functions that are traced, with zeros for others."""
-        ca, sizes = import_casadi(), {"f": self._n, "h": self._p}
-        x, u = ca.SX.sym("x", self._n), ca.SX.sym("u", self._m)
-        made = {
-            name: one.function or ca.Function(name, [x, u], [ca.DM.zeros(sizes[name])])
-            for name, one in self.found.items()
-        }
-        return CasadiModel(
-            made["f"], made["h"], self._n, self._p, self._m, self._dt, self._method
-        )
-
-    def evaluator(self, timed: bool = False) -> Evaluator:
-        """What evaluates the traced functions, with the step's length as last input if timed."""
-        with self._lock:
-            if timed not in self._evaluators:
-                self._evaluators[timed] = Evaluator(VirtualMachine(self.partial_model(), timed))
-            return self._evaluators[timed]
-
-    def confirm(self, scales: Array | None) -> dict[str, Traced]:
-        """Compare functions and traces again, at points of these magnitudes of the states.
+    def confirm(self, scales: Array | None) -> Pinned:
+        """The traces, compared with the functions again at points of these magnitudes.
 
         Functions that have changed since they were traced are traced again, once.
         """
         where = points(self._states, self._n, self._m, 1.0 if scales is None else scales, True)
         with self._lock:
-            for name, one in dict(self.found).items():
+            for name, one in self.now.found.items():
                 if one.function and difference(one, self._functions[name], where):
                     again = self._traced(name, [*points(self._states, self._n, self._m), *where])
-                    self._replace(name, again)
-                    if again.function is None:
-                        warn_of(f"{name} is not as it was traced: {again.reason}")
-            return self.found
+                    self._pin({**self.now.found, name: again})
+            return self.now
 
-    def wrong(self, x: Array, u: Array) -> tuple[str, str] | None:
+    def wrong(self, pinned: Pinned, x: Array, u: Array) -> tuple[str, str] | None:
         """Which function differs from its trace at a point, and how; None if none does."""
-        for name, one in self.found.items():
+        for name, one in pinned.found.items():
             if one.function is None:
                 continue
             try:
@@ -153,15 +172,6 @@ class ModelTrace:
             if text:
                 return name, text
         return None
-
-    def forget(self) -> None:
-        """Trace the functions anew where they are needed again."""
-        with self._lock:
-            self._found = self._model = None
-            self._evaluators = {}
-
-    def _replace(self, name: str, by: Traced) -> None:
-        self._found, self._model, self._evaluators = {**self.found, name: by}, None, {}
 
 
 def warn_of(fault: str, stacklevel: int = 6) -> None:
