@@ -280,7 +280,7 @@ class _Looped:
         self._delay = settings.delay
         scaled = system.copy(_scales(system, cost, observer))
         self._engines = [
-            PythonEngine(scaled.copy(), observer, cost, settings, state.copy())
+            PythonEngine(scaled.copy(traced=True), observer, cost, settings, state.copy())
             for state in states
         ]
 

@@ -16,7 +16,15 @@ from ..codegen.fingerprint import source_key
 from ..codegen.source import model_files
 from ..errors import CompilationError, EngineWarning, OptionError
 from ..model.augmentation import Augmentation
-from ..model.evaluation import NAMES, RESIDUALS, VALUES, Buffers, Evaluator, interpreted, results_of
+from ..model.evaluation import (
+    NAMES,
+    RESIDUALS,
+    VALUES,
+    Buffers,
+    Evaluator,
+    VirtualMachine,
+    results_of,
+)
 from ..model.expressions import CasadiModel, casadi_model, import_casadi
 from ..model.functions import Trusted
 from ..model.sets import ConvexSet
@@ -87,7 +95,7 @@ def from_casadi(
 
     def made(timed: bool) -> System:
         maker = (
-            partial(interpreted, model, timed) if library is None
+            VirtualMachine(model, timed) if library is None
             else partial(_compiled, model, library, timed)
         )
         evaluator = Evaluator(maker)

@@ -136,7 +136,8 @@ class SmoothModel:
     def __init__(self, system: System, region: Region) -> None:
         self._system, self._region = system, region
         self._graph = self._output_graph = None
-        if system.symbolic is not None:
+        # A trace has been compared at points only, which proves nothing of the function.
+        if system.tracing is None and system.symbolic is not None:
             self._graph = model_graph(system.symbolic)
             self._output_graph = model_graph(system.symbolic, output_only=True)
         self.n, self.p = system.n, system.p

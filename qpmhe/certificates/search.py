@@ -81,7 +81,9 @@ class Search:
         each = expected_seconds(system.n, system.p, kind)
         affordable = _CHOICE * self._deadline.left / (_PROGRAMS * each)
         self._chosen = _far_apart(self.jacobians, int(np.clip(affordable, 1, _MOST_POINTS)))
-        if not self.model.reason and "given" in system.derivatives.values():
+        if not self.model.reason and "given" in (
+            system.f_jacobian.method, system.h_jacobian.method
+        ):
             # What is given may be wrong, and would make the program another one.
             chosen = self.points[self._chosen]
             true = self.model.enclose(chosen, chosen).centre

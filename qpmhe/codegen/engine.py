@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -16,6 +17,8 @@ from ..errors import InvalidInputError
 from ..estimation.conditions import ConditionReader, Conditions, usual_conditions
 from ..estimation.constraints import Constraints
 from ..estimation.covariance import window_covariances
+from ..estimation.engine import PythonEngine
+from ..estimation.engines import EngineChangeError
 from ..estimation.estimate import DroppedRow, Estimate, Status
 from ..estimation.run import Run
 from ..estimation.settings import Settings
@@ -29,8 +32,10 @@ from ..estimation.snapshot import (
 )
 from ..model.residuals import difference
 from ..model.system import System
+from ..model.traces import next_check
 from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
+from .handover import hand_over
 from .layout import CHANGES, SAMPLE_SETS, SIDES, STAGE_FLAGS
 from .library import EstimatorLibrary
 from .sample import SampleRecord
@@ -91,6 +96,8 @@ class CompiledEngine:
         self._call = library.update
         self._observer, self._watch = observer, CompiledWatch(horizon)
         self._time = self._memory["time"]
+        # The time of the next comparison of the trace with the functions that it stands for.
+        self._next_check: float = 0 if system.is_traced else math.inf
 
     def reset(self, initial_state: Array) -> None:
         """Forget all measurements and start at this state."""
@@ -175,6 +182,8 @@ class CompiledEngine:
     ) -> Estimate:
         """Take a sample in, and estimate."""
         time = self._time.item()
+        if time >= self._next_check:
+            self._check_trace(u)
         try:
             self._y[...] = y
             self._inputs[...] = u
@@ -193,6 +202,25 @@ class CompiledEngine:
             if self.time != time:
                 self._library.undo(*self._undoing)
             raise
+
+    def _check_trace(self, u: Array, before: NDArray[Any] | None = None) -> None:
+        """Compare trace and functions at z(t); where they differ, the Python step takes over.
+
+        From an earlier memory, if there is one.
+        """
+        record = self._memory[0]
+        self._next_check = next_check(int(record["time"]), self._sizes[2])
+        fault = self._system.trace_fault(record["z_end"], u)
+        if not fault:
+            return
+        if before is not None:
+            self._memory[...] = before
+        self._system.use_functions()
+        record, state = self._memory[0], self._memory[0]["z_end"].copy()
+        parts = self._system, self._observer, self._given_cost, self._settings
+        engine = PythonEngine(*parts, state)
+        hand_over(record, self._system, self.usual, engine)
+        raise EngineChangeError(engine, fault)
 
     def _collect(self, time: int) -> CompiledEstimate:
         block, numbers = self._block.copy(), self._numbers.tolist()
@@ -227,8 +255,12 @@ class CompiledEngine:
         ys = np.ascontiguousarray(ys)
         us = None if us is None else np.ascontiguousarray(us)
         memory, workspace = self._memory.ctypes.data, self._workspace.ctypes.data
+        before = None if self._next_check == math.inf else self._memory.copy()
+        nothing = np.zeros(0)
         for first in range(0, samples, _PIECE):
             count = min(_PIECE, samples - first)
+            if before is not None:
+                self._check_trace(nothing if us is None else us[first], before)
             began = perf_counter()
             self._library.run(
                 memory, 1, workspace, count, ys[first:].ctypes.data,

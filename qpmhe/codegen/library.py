@@ -33,8 +33,8 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     """Why an estimator has no C form, with the remedy; empty if it has one."""
     if system.symbolic is None:
         return (
-            "the system has no CasADi form; make it with qpmhe.from_casadi. One of noisy_inputs "
-            "never has: take engine='python'."
+            f"the system has no CasADi form ({system.no_symbolic}); change that, make the system "
+            "with qpmhe.from_casadi, or take engine='python'."
         )
     if system.disturbance_matrix is not None:
         return "engine='compiled' does not yet take a disturbance_matrix; take engine='python'."

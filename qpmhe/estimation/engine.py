@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import deque
+from collections.abc import Sequence
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -20,8 +21,9 @@ from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
 from ..model.residuals import difference
 from ..model.system import System
+from ..model.traces import next_check, warn_of
 from ..observers import Observer
-from .conditions import ConditionReader, Conditions, usual_conditions
+from .conditions import USUAL, ConditionReader, Conditions, usual_conditions
 from .covariance import window_covariances
 from .estimate import Estimate, Status
 from .optimizer import Optimizer
@@ -62,6 +64,15 @@ class Memory(NamedTuple):
     trajectory: Array | None
     watched: tuple[int, int]
     history: list[Array]
+
+
+class Taken(NamedTuple):
+    """A sample as it was taken in."""
+
+    y: Array
+    u: Array
+    dt: float | None
+    own: Conditions | None
 
 
 class PythonEngine:
@@ -107,6 +118,8 @@ class PythonEngine:
         self._window = self._fresh_window(initial_state, self._tools)
         self._watch = ObserverWatch(settings.horizon)
         self._known_modes = system.call_modes()  # as found at construction
+        # The time of the next comparison of the trace with the functions that it stands for.
+        self._next_check: float = 0 if system.is_traced else math.inf
         self._undo_point: tuple[Mark, Array | None, tuple[int, int], tuple[Array, ...]]
         self._trajectory: Array | None = None  # of the last estimate
         # The last estimates, each made at its own time: of x(t-N), ..., x(t) for re-initialised
@@ -176,6 +189,8 @@ class PythonEngine:
         self, y: Array, u: Array, dt: float | None, own: Conditions | None, began: float
     ) -> Estimate:
         """Take the sample y(t), u(t), and estimate x(t+1)."""
+        if self._window.time >= self._next_check:
+            self._check_trace(u)
         window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
             window.make_room()  # before the undo point: `undo` cannot reverse it
@@ -199,6 +214,21 @@ class PythonEngine:
         except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
             self.undo()
             raise
+
+    def _check_trace(self, u: Array) -> None:
+        """Compare trace and functions at z(t); take the functions for good where they differ."""
+        window = self._window
+        self._next_check = next_check(window.time, self._settings.horizon)
+        fault = self._system.trace_fault(window.candidate[-1], u)
+        if fault:
+            self.leave_trace()
+            warn_of(fault, 5)
+
+    def leave_trace(self) -> None:
+        """Evaluate the functions as they are written, along the window and from now on."""
+        self._next_check = math.inf
+        self._system.use_functions()
+        self.set(USUAL, None)
 
     def _warn(self) -> None:
         text = self._watch.warning()
@@ -372,6 +402,28 @@ class PythonEngine:
     def _use(self, memory: Memory) -> None:
         self._tools, self._window, self._trajectory, self._watch.counts, history = memory
         self._history = deque(history, maxlen=self._history.maxlen)
+
+    def take_over(
+        self, usual: Conditions, time: int, state: Array, covariance: Array | None,
+        samples: Sequence[Taken], trajectory: Array | None, history: list[Array],
+        watched: tuple[int, int],
+    ) -> None:
+        """Continue where another engine stands, whose window starts at a time and state.
+
+        With the observer's covariance there if it has one, the samples since then, the last
+        estimate's trajectory, and the last states that were estimated.
+        """
+        tools = self._tools_for(usual)
+        window = self._fresh_window(state, tools)
+        window.time = time
+        if window._covariances is not None and covariance is not None:
+            window._covariances[0] = covariance
+        with np.errstate(all="ignore"):
+            for one in samples:
+                window.push(*one)
+            if self._reinitialized and samples:
+                window.reinitialize(history[:-1])
+        self.replace(Memory(tools, window, trajectory, watched, history))
 
     def run(self, ys: Array, us: Array | None) -> None:
         """None: samples are taken one at a time only."""

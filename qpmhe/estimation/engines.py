@@ -82,6 +82,14 @@ class Engine(Protocol):
         """Continue where another estimator stopped."""
 
 
+class EngineChangeError(Exception):
+    """A compiled engine's model has changed: another engine continues, from before the sample."""
+
+    def __init__(self, engine: Engine, reason: str) -> None:
+        super().__init__(reason)
+        self.engine = engine
+
+
 _ENGINES: dict[str, Callable[[System, Observer, Cost, Settings, Array], Engine]] = {
     "python": PythonEngine
 }

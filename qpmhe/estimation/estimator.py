@@ -21,10 +21,11 @@ from ..costs import Cost
 from ..errors import InvalidInputError, ModelError, ObserverWarning, OptionError, ShapeError
 from ..model.sets import ConvexSet
 from ..model.system import System
+from ..model.traces import warn_of
 from ..observers import Observer
 from ..observers.projection import NearestPoint
 from .conditions import ConditionReader, Conditions
-from .engines import engine_for, engine_of_snapshot
+from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
 from .run import Run
 from .settings import Settings
@@ -179,7 +180,8 @@ class MovingHorizonEstimator:
             )
         # A copy: this estimator may change how f and h are called (batched, or one by one).
         self._own_system = system.copy(
-            cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix)
+            cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix),
+            traced=True,
         )
         nominal = self.settings.parameters
         if len(nominal) > system.m:
@@ -348,7 +350,15 @@ class MovingHorizonEstimator:
                 disturbance_weight=disturbance_weight, bounds=bounds,
             )
             own = found if own is None else own.over(found)
+        try:
+            return self._engine.step(y_array, u_array, dt, own, began)
+        except EngineChangeError as change:
+            self._change_engine(change)
         return self._engine.step(y_array, u_array, dt, own, began)
+
+    def _change_engine(self, change: EngineChangeError) -> None:
+        self._engine = change.engine
+        warn_of(str(change), 4)
 
     def set(
         self,
@@ -527,7 +537,11 @@ class MovingHorizonEstimator:
         elif self._inputs:
             self._input(None)
         whole = self._with_parameters(us, len(ys))
-        at_once = None if covariances else self._engine.run(ys, whole)
+        at_once = None
+        try:
+            at_once = None if covariances else self._engine.run(ys, whole)
+        except EngineChangeError as change:
+            self._change_engine(change)
         if at_once is not None:
             return at_once
         start, estimates, collected = self.state.copy(), [], []

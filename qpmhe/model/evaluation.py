@@ -154,57 +154,76 @@ def results_of(model: CasadiModel, count: int, names: tuple[str, ...]) -> dict[s
     return results
 
 
-def interpreted(
-    model: CasadiModel, timed: bool, count: int, names: tuple[str, ...]
-) -> Buffers:
-    """Evaluation by CasADi's virtual machine, mapped over the states."""
-    if names == RESIDUALS:
-        return _interpreted_residuals(model, timed, count)
-    ca = import_casadi()
-    kind = ca.SX if model.f.is_a("SXFunction") and model.h.is_a("SXFunction") else ca.MX
-    x, given = kind.sym("x", model.n), kind.sym("u", model.m + 1)
-    u, dt = given[: model.m], given[model.m]
-    following, output = model.step()(x, u, dt), model.h(x, u)
-    # Transposed: CasADi stores by columns, NumPy by rows.
-    columns = {
-        "f": lambda: following,
-        "h": lambda: output,
-        "f_jacobian": lambda: ca.densify(ca.jacobian(following, x).T),
-        "h_jacobian": lambda: ca.densify(ca.jacobian(output, x).T),
-    }
-    functions = {
-        name: ca.Function("model", [x, given], [columns[name]()]) for name in names
-    }
-    function = ca.Function("model", [x, given], [columns[name]() for name in names])
-    fallible = may_fail(function)
-    if count > 1:
-        function = function.map(count)
-    states, inputs = np.zeros((count, model.n)), np.zeros((count, model.m + timed))
-    results = results_of(model, count, names)
-    all_inputs = inputs if timed else np.full((count, model.m + 1), model.dt or 0.0)
-    run = fixed_call(function, (states, all_inputs), [results[name] for name in names], fallible)
-    again: list[Callable[[], None]] = []
+class VirtualMachine:
+    """Evaluation by CasADi's virtual machine, mapped over the states.
 
-    def evaluate() -> None:
-        if not timed:
-            all_inputs[:, : model.m] = inputs
-        if not run():
-            if not again:
-                again.append(separate_calls(functions, states, all_inputs, results))
-            again[0]()
+    Called with a number of states and the wanted results, it makes buffers. With ``timed``, the
+    step's length is one more input.
+    """
 
-    return states, inputs, results, evaluate
+    def __init__(self, model: CasadiModel, timed: bool) -> None:
+        self._model, self._timed = model, timed
+        self._made: dict[tuple[str, ...], tuple[Any, dict[str, Any], bool]] = {}
 
+    def __call__(self, count: int, names: tuple[str, ...]) -> Buffers:
+        """Make buffers for so many states and these results."""
+        if names == RESIDUALS:
+            return self._residuals(count)
+        model, timed = self._model, self._timed
+        function, functions, fallible = self._functions(names)
+        if count > 1:
+            function = function.map(count)
+        states, inputs = np.zeros((count, model.n)), np.zeros((count, model.m + timed))
+        results = results_of(model, count, names)
+        all_inputs = inputs if timed else np.full((count, model.m + 1), model.dt or 0.0)
+        run = fixed_call(
+            function, (states, all_inputs), [results[name] for name in names], fallible
+        )
+        again: list[Callable[[], None]] = []
 
-def _interpreted_residuals(model: CasadiModel, timed: bool, count: int) -> Buffers:
-    states, inputs, values, evaluate_values = interpreted(model, timed, count, VALUES)
-    results = results_of(model, count, RESIDUALS)
-    trajectory, residuals, n = np.zeros((count + 1, model.n)), results["residuals"], model.n
+        def evaluate() -> None:
+            if not timed:
+                all_inputs[:, : model.m] = inputs
+            if not run():
+                if not again:
+                    again.append(separate_calls(functions, states, all_inputs, results))
+                again[0]()
 
-    def evaluate() -> None:
-        states[...] = trajectory[:-1]
-        evaluate_values()
-        np.subtract(trajectory[1:], values["f"], out=residuals[:, :n])
-        np.subtract(results["y"], values["h"], out=residuals[:, n:])
+        return states, inputs, results, evaluate
 
-    return trajectory, inputs, results, evaluate
+    def _functions(self, names: tuple[str, ...]) -> tuple[Any, dict[str, Any], bool]:
+        """A function of x and (u, dt) to all of these results, and one to each."""
+        if names not in self._made:
+            ca, model = import_casadi(), self._model
+            kind = ca.SX if model.f.is_a("SXFunction") and model.h.is_a("SXFunction") else ca.MX
+            x, given = kind.sym("x", model.n), kind.sym("u", model.m + 1)
+            u, dt = given[: model.m], given[model.m]
+            # Transposed: CasADi stores by columns, NumPy by rows.
+            columns: dict[str, Any] = {}
+            if {"f", "f_jacobian"} & set(names):
+                columns["f"] = following = model.step()(x, u, dt)
+            if {"h", "h_jacobian"} & set(names):
+                columns["h"] = output = model.h(x, u)
+            if "f_jacobian" in names:
+                columns["f_jacobian"] = ca.densify(ca.jacobian(following, x).T)
+            if "h_jacobian" in names:
+                columns["h_jacobian"] = ca.densify(ca.jacobian(output, x).T)
+            functions = {
+                name: ca.Function("model", [x, given], [columns[name]]) for name in names
+            }
+            function = ca.Function("model", [x, given], [columns[name] for name in names])
+            self._made[names] = function, functions, may_fail(function)
+        return self._made[names]
+
+    def _residuals(self, count: int) -> Buffers:
+        states, inputs, values, evaluate_values = self(count, VALUES)
+        results, n = results_of(self._model, count, RESIDUALS), self._model.n
+        trajectory, residuals = np.zeros((count + 1, n)), results["residuals"]
+
+        def evaluate() -> None:
+            states[...] = trajectory[:-1]
+            evaluate_values()
+            np.subtract(trajectory[1:], values["f"], out=residuals[:, :n])
+            np.subtract(results["y"], values["h"], out=residuals[:, n:])
+
+        return trajectory, inputs, results, evaluate

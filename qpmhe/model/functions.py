@@ -279,6 +279,12 @@ class BatchedFunction:
         self._holds_objects = getattr(raw, "dtype", None) == np.object_
         return value.reshape(self.shape) if np.isfinite(value).all() else None
 
+    def evaluated_by(self, function: Trusted) -> BatchedFunction:
+        """The same function, evaluated by other means that take (..., n)."""
+        other = BatchedFunction(self.name, function, self.shape, self._inputs, [])
+        other.mode = "batched"
+        return other
+
     def copy(self) -> BatchedFunction:
         """The same function, whose mode can change independently."""
         return copy(self)

@@ -7,10 +7,13 @@ the trace.
 from __future__ import annotations
 
 import contextlib
+import dis
 import functools
 import itertools
 import math
+import sys
 import threading
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -625,11 +628,59 @@ def _maker(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def make(*arguments: Any, **options: Any) -> Any:
         record = getattr(_tracing, "record", None)
-        if record is None or record.closed:
+        if record is None or record.closed or not _is_called_by(sys._getframe(1), name):
             return function(*arguments, **options)
         return record.made(function, arguments, options)
 
+    name = function.__name__
     return make
+
+
+def _is_called_by(frame: Any, name: str) -> bool:
+    """Whether the Python code of a frame is calling a function of this name itself.
+
+    Not a compiled function that this code calls: it takes an array for what it has asked for,
+    and writes numbers over objects.
+    """
+    code = frame.f_code
+    try:
+        called = _calls.get(code)
+        if called is None:
+            called = _calls[code] = _called_names(code)
+    except Exception:  # without positions, nothing is known
+        return False
+    return called.get(frame.f_lasti) == name
+
+
+_calls: weakref.WeakKeyDictionary[Any, dict[int, str]] = weakref.WeakKeyDictionary()
+
+
+def _called_names(code: Any) -> dict[int, str]:
+    """The name of what is called at each instruction that calls.
+
+    That is the longest name or attribute that begins where the call's text does.
+    """
+    instructions = list(dis.get_instructions(code))
+    ends = [one.offset for one in instructions[1:]] + [len(code.co_code)]
+    names: dict[Any, list[tuple[Any, str]]] = {}
+    for one in instructions:
+        at = one.positions
+        if one.opname.startswith("LOAD_") and isinstance(one.argval, str) and at is not None:
+            names.setdefault((at.lineno, at.col_offset), []).append(
+                ((at.end_lineno, at.end_col_offset), one.argval)
+            )
+    found = {}
+    for one, end in zip(instructions, ends, strict=True):
+        at = one.positions
+        if one.opname.startswith("CALL") and at is not None:
+            within = [
+                name for name in names.get((at.lineno, at.col_offset), [])
+                if name[0] < (at.end_lineno, at.end_col_offset)
+            ]
+            if within:
+                # A frame may stand at the instruction, or at the end of its cache.
+                found.update(dict.fromkeys(range(one.offset, end), max(within)[1]))
+    return found
 
 
 def _of_math(function: Callable[..., Any], ufunc: Any) -> Callable[..., Any]:

@@ -17,9 +17,11 @@ from ..errors import InvalidInputError, ModelError, OptionError, SetError, Shape
 from .constraints import Constraint, ConstraintFunctions, checked_constraints
 from .derivatives import Jacobian
 from .discretize import discretize
+from .evaluation import Evaluator
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .residuals import Residual, Turns, checked_residual
 from .sets import ConvexSet, SoftSet, equilibrated
+from .traces import ModelTrace, Pinned, points, warn_of
 
 if TYPE_CHECKING:
     from .augmentation import Augmentation
@@ -218,8 +220,15 @@ class System:
         self.dt: float | None = None
         #: Evaluates f, h and their Jacobians in one call, where the model can.
         self.kernel: ModelKernel | None = None
-        #: The model as CasADi functions, from which C code is generated.
-        self.symbolic: Any = None
+        #: f and h as expressions, where they have such; None where ``symbolic`` was given.
+        self.tracing: ModelTrace | None = ModelTrace(
+            self.f, self.h, self.n, self.p, self.m, self.states
+        )
+        self._symbolic: Any = None
+        # The trace as an estimator's copy has found it, and f, h and what belongs to them as they
+        # are written, where it stands in their place.
+        self._pinned: Pinned | None = None
+        self._as_written: dict[str, Any] | None = None
         #: Makes the system `timed`; None where there is no model in continuous time.
         self.make_timed: Callable[[], System] | None = None
         #: Makes the system again with inputs among its states, in the language of its functions;
@@ -310,6 +319,9 @@ class System:
         )
         check_inputs(m, rate=batched.takes_input, h=system.h.takes_input)
         system.dt, system.rate_jacobian = length, compared
+        system.tracing = ModelTrace(
+            batched, system.h, n, system.p, m, system.states, length, method
+        )
         if scales is not None:  # not before there is a rate to compare
             system._give_scales(scales)
         system.recipe = (
@@ -365,28 +377,71 @@ class System:
         made._is_timed = True
         return made
 
-    def copy(self, scales: ArrayLike | None = None) -> System:
+    @property
+    def symbolic(self) -> Any:
+        """The model as CasADi functions, from which C code is generated; None if it has none.
+
+        Functions in NumPy are traced when this is first asked for, or an estimator is made: it
+        takes some milliseconds, and 10 to 150 to import CasADi, which a `System` alone never does.
+        """
+        if self._symbolic is not None or self.tracing is None:
+            return self._symbolic
+        # Steps of other lengths must be those of the same model.
+        if self._has_other_steps:
+            return None
+        return self.tracing.model if self._pinned is None else self._pinned.model
+
+    @symbolic.setter
+    def symbolic(self, model: Any) -> None:
+        self._symbolic, self.tracing = model, None
+
+    @property
+    def no_symbolic(self) -> str:
+        """Why ``symbolic`` is None, as text; blank where it is not."""
+        if self.symbolic is not None or self.tracing is None:
+            return ""
+        if self._has_other_steps:
+            return (
+                "it takes steps of other lengths, of which only functions of NumPy know, as made "
+                "by qpmhe.noisy_inputs"
+            )
+        found = self.tracing.now if self._pinned is None else self._pinned
+        return "; ".join(
+            f"{name} is not traced: {one.reason}" for name, one in found.found.items() if one.reason
+        )
+
+    @property
+    def _has_other_steps(self) -> bool:
+        """Whether it takes steps of other lengths that the trace knows nothing of."""
+        return self.make_timed is not None and (self.tracing is None or self.tracing.dt is None)
+
+    def copy(self, scales: ArrayLike | None = None, traced: bool = False) -> System:
         """The same system for one estimator, which may change how its functions are called.
 
         Parameters
         ----------
         scales : (n,) array_like, optional
             As for `use_scales`.
+        traced : bool
+            Whether f, h and their Jacobians are evaluated by their trace, where they have one.
         """
         other = object.__new__(type(self))  # `copy.copy` would make the model again, as pickle does
         other.__dict__.update(self.__dict__)
-        other.f, other.h = self.f.copy(), self.h.copy()
-        other.f_jacobian = self.f_jacobian.copy(other.f)
-        other.h_jacobian = self.h_jacobian.copy(other.h)
+        is_traced = self._as_written is not None
+        other.use_functions()
+        other.f, other.h = other.f.copy(), other.h.copy()
+        other.f_jacobian = other.f_jacobian.copy(other.f)
+        other.h_jacobian = other.h_jacobian.copy(other.h)
         if self.constraints is not None:
             other.constraints = self.constraints.copy()
         if self.rate_jacobian is not None:
             other.rate_jacobian = self.rate_jacobian.copy(self.rate_jacobian.function)
         other.__dict__.pop("timed", None)
-        if self.make_timed is not None:
+        make_timed = other.make_timed
+        if make_timed is not None:
 
             def timed() -> System:
-                made = self.timed.copy(other.scales)
+                made = (make_timed() if is_traced else self.timed).copy(other.scales)
                 made.f_jacobian.follow(other.f_jacobian)
                 made.h_jacobian.follow(other.h_jacobian)
                 return made
@@ -394,7 +449,110 @@ class System:
             other.make_timed = timed
         if scales is not None:
             other.use_scales(scales)
+        if traced:
+            other._use_trace()
         return other
+
+    def _use_trace(self) -> None:
+        """Evaluate f and h by their traces, which agree with them, and with given Jacobians."""
+        tracing = self.tracing
+        if tracing is None or self._as_written is not None:
+            return
+        self._pinned = pinned = tracing.confirm(self.scales)
+        if self.kernel is not None:
+            return
+        names = [name for name, one in pinned.found.items() if one.function]
+        names = [name for name in names if self._jacobian_agrees(name, pinned.evaluator())]
+        if not names:
+            return
+        self._as_written = {name: getattr(self, name) for name in _TRACED}
+        self._evaluate_by(pinned.evaluator(), names)
+        make_timed = self.make_timed
+        if make_timed is not None and not self._has_other_steps:
+
+            def timed() -> System:
+                made = make_timed()
+                made._evaluate_by(pinned.evaluator(True), names)
+                return made
+
+            self.make_timed = timed
+        self.__dict__.pop("timed", None)
+
+    def _evaluate_by(self, evaluator: Evaluator, names: list[str]) -> None:
+        for name in names:
+            value, slope = (
+                Trusted(partial(evaluator.one, one)) for one in (name, f"{name}_jacobian")
+            )
+            function = getattr(self, name).evaluated_by(value)
+            jacobian = getattr(self, f"{name}_jacobian")
+            setattr(self, name, function)
+            setattr(
+                self, f"{name}_jacobian", jacobian.evaluated_by(function, slope, "traced")
+            )
+        if len(names) == 2:
+            self.kernel = evaluator
+
+    def _jacobian_agrees(self, name: str, evaluator: Evaluator) -> bool:
+        """Whether a given Jacobian is the trace's up to rounding; also if none was given."""
+        jacobian = getattr(self, f"{name}_jacobian")
+        if jacobian.method != "given":
+            return True
+        scales, compared = 1.0 if self.scales is None else self.scales, 0
+        for x, u in points(self.states, self.n, self.m, scales, usual=True):
+            try:
+                with np.errstate(all="ignore"):
+                    given = np.asarray(jacobian(x, u), np.float64)
+            except Exception:  # outside its domain
+                continue
+            mine = evaluator.one(f"{name}_jacobian", x, u)
+            if not (np.isfinite(given).all() and np.isfinite(mine).all()):
+                continue
+            size = np.maximum(np.abs(x), scales)
+            row = (np.abs(mine) * size).max(axis=1, keepdims=True)
+            if (np.abs(given - mine) * size > 1e-9 * row).any():
+                return False
+            compared += 1
+        return compared > 0
+
+    def use_functions(self) -> None:
+        """Evaluate f and h as they are written from now on, if a trace stands in their place."""
+        written, self._as_written, self._pinned = self._as_written, None, None
+        if written is not None:
+            self.__dict__.update(written)
+            self.__dict__.pop("timed", None)
+
+    @property
+    def is_traced(self) -> bool:
+        """Whether an estimator's copy may rely on a trace."""
+        return self._pinned is not None and any(one.function for one in self._pinned.found.values())
+
+    def trace_fault(self, x: Array, u: Array) -> str:
+        """Which function differs from the trace that this copy relies on at a point, and how.
+
+        Blank if none does. Never raises, whatever the functions do.
+        """
+        if self._pinned is None or self.tracing is None:
+            return ""
+        wrong = self.tracing.wrong(self._pinned, x, u)
+        return "" if wrong is None else f"{wrong[0]} has changed since it was traced: {wrong[1]}"
+
+    def explain(self) -> str:
+        """How f and h are evaluated, and why not faster, as text.
+
+        A function that is traced is known as an expression: it has exact Jacobians, and estimators
+        evaluate it in CasADi's virtual machine or in generated C code. One that is not is called
+        as it is written.
+        """
+        lines, own = [], self.copy(traced=True)
+        for name, method in own.derivatives.items():
+            text = "in CasADi"
+            if own._pinned is not None:
+                found = own._pinned.found[name]
+                text = "traced" if found.function else f"not traced: {found.reason}"
+            lines.append(f"{name}: {text}. Jacobian: {_METHODS.get(method, method)}.")
+        if own._has_other_steps:
+            lines.append(f"No C code: {own.no_symbolic}.")
+        return "\n".join(lines)
 
     def set_of(self, name: str) -> ConvexSet | None:
         """The set of this name (``states``, ``disturbances`` or ``noises``), hard or soft."""
@@ -471,9 +629,12 @@ class System:
         if len(modes) == 2:
             self.__dict__.pop("timed", None)
         for k, system in enumerate(systems):
-            system.f.mode, system.h.mode = modes[2 * k : 2 * k + 2]
-            system.f_jacobian.use(methods[2 * k])
-            system.h_jacobian.use(methods[2 * k + 1])
+            for j, name in enumerate(("f", "h")):
+                jacobian = getattr(system, f"{name}_jacobian")
+                # Traced here or there, but not in both: what was found there does not matter here.
+                if (methods[2 * k + j] == "traced") == (jacobian.method == "traced"):
+                    getattr(system, name).mode = modes[2 * k + j]
+                    jacobian.use(methods[2 * k + j])
 
     def _check_soft_angles(self) -> None:
         soft, residual = self.soft.get("states"), self.state_residual
@@ -513,7 +674,11 @@ class System:
     @property
     def derivatives(self) -> dict[str, str]:
         """How the Jacobians of f and h are computed."""
-        return {"f": self.f_jacobian.method, "h": self.h_jacobian.method}
+        methods = {"f": self.f_jacobian.method, "h": self.h_jacobian.method}
+        if self._pinned is None and self.tracing is not None and self.kernel is None:
+            own = self.copy(traced=True)
+            methods = {"f": own.f_jacobian.method, "h": own.h_jacobian.method}
+        return methods
 
     def check(self, x: Array, u: Array) -> None:
         """Check that f, h and their Jacobians are finite and of the right shapes at a state.
@@ -532,17 +697,36 @@ class System:
         """
         rate = () if self.rate_jacobian is None else (self.rate_jacobian,)
         own = () if self.constraints is None else (self.constraints,)
-        for function in (self.f, self.h, *rate, self.f_jacobian, self.h_jacobian, *own):
-            try:
-                function.check(x, u)
-            except ModelError:
-                # Not every model is defined without input: one that divides by u is not.
-                if not u.size or u.any():
-                    raise
-                function.check(x, np.full_like(u, 0.5))
+        written = self._as_written or vars(self)
+        for function in (written["f"], written["h"], *rate):
+            _check(function, x, u)
+        fault = self.trace_fault(x, u)
+        if fault:
+            self.use_functions()
+            warn_of(fault)
+        for function in (self.f_jacobian, self.h_jacobian, *own):
+            _check(function, x, u)
 
     def __repr__(self) -> str:
         return f"System(n={self.n}, p={self.p}, m={self.m}, states={self.states})"
+
+
+_TRACED = ("f", "h", "f_jacobian", "h_jacobian", "kernel", "make_timed")
+_METHODS = {
+    "traced": "exact, by its trace", "given": "as given", "casadi": "exact, by CasADi",
+    "jax": "exact, by JAX", "complex step": "by the complex step",
+    "finite differences": "by finite differences",
+}
+
+
+def _check(function: Any, x: Array, u: Array) -> None:
+    try:
+        function.check(x, u)
+    except ModelError:
+        # Not every model is defined without input: one that divides by u is not.
+        if not u.size or u.any():
+            raise
+        function.check(x, np.full_like(u, 0.5))
 
 
 def _made(maker: Function, arguments: dict[str, Any]) -> Any:

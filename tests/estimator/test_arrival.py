@@ -9,6 +9,7 @@ from qpmhe import Status
 
 from .plain import Record, huber, is_minimum, quadratic
 from .test_candidates import GAIN, START, P, Q, R, check_numbers, estimator, record, seen, swing
+from .untraced import untraced
 
 
 class Smoothed(Record):
@@ -232,7 +233,7 @@ def test_a_failed_stage_leaves_a_finite_prior_and_the_promise():
         return swing(x)
 
     mhe = qpmhe.MovingHorizonEstimator(
-        qpmhe.System(fragile, seen, n=2, p=1), qpmhe.Luenberger(GAIN),
+        qpmhe.System(untraced(fragile), seen, n=2, p=1), qpmhe.Luenberger(GAIN),
         qpmhe.QuadraticCost(prior=P, disturbance=Q, noise=R), horizon=4, initial_state=START,
         arrival="smoothed",
     )

@@ -10,6 +10,8 @@ import qpmhe
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.models.batch_reactor import casadi_output, casadi_rate
 
+from .untraced import untraced
+
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 MEMBERS, STEPS = 40, 30
@@ -146,10 +148,11 @@ def test_bad_input():
             *reactor(), members=3, horizon=4, initial_states=[3.0, 0.1], engine="compiled",
             threads=0,
         )
-    plain = qpmhe.models.batch_reactor()
+    _, *parts = qpmhe.models.batch_reactor()[:3]
+    plain = qpmhe.System(untraced(lambda x: x), lambda x: x[..., :1], n=2, p=1)
     with pytest.raises(qpmhe.errors.OptionError, match="from_casadi"):
         qpmhe.BatchEstimator(
-            *plain[:3], members=3, horizon=4, initial_states=[3.0, 0.1], engine="compiled"
+            plain, *parts, members=3, horizon=4, initial_states=[3.0, 0.1], engine="compiled"
         )
 
 

@@ -198,7 +198,8 @@ class OwnLoss(qpmhe.Huber):
 @pytest.mark.parametrize(
     ("remedy", "given"),
     [
-        ("qpmhe.from_casadi", {"system": plain}),
+        ("from_casadi", {"system": lambda: qpmhe.System(
+            lambda x: x if x[0] > 12.0 else 0.9 * x, lambda x: x, n=1, p=1)}),
         ("OwnGain has no C form.*constant gain", {"observer": lambda: OwnGain([0.3])}),
         ("OutputInjection has no C form",
          {"observer": lambda: qpmhe.OutputInjection(lambda z, v: 0.3 * v)}),

@@ -51,7 +51,7 @@ WAYS = {"batched": analytic_batched, "columns": analytic_columns, "looped": anal
 def test_complex_step_is_exact_to_rounding(mode):
     system = system_of(WAYS[mode], 3)
     assert system.f.mode == mode
-    assert system.derivatives["f"] == "complex step"
+    assert system.f_jacobian.method == "complex step"
     points = np.random.default_rng(1).uniform(0.1, 4.0, (20, 3))
     expected = np.array([analytic(x)[1] for x in points])
     singles = [system.f_jacobian(x, NONE) for x in points]
@@ -119,7 +119,7 @@ NOT_COMPLEX = {
 def test_functions_that_break_the_complex_step(case):
     f, jacobian = NOT_COMPLEX[case]
     system = system_of(f)
-    assert system.derivatives["f"] == "finite differences"
+    assert system.f_jacobian.method == "finite differences"
     generator = np.random.default_rng(2)
     points = generator.uniform(0.2, 3.0, (10, 2)) * generator.choice([-1.0, 1.0], (10, 2))
     expected = np.array([jacobian(*x) for x in points])
@@ -158,7 +158,7 @@ def test_finite_differences_keep_their_accuracy_for_large_states(scale):
         lambda x: [math.pow(x[0] / scale, 3) * scale, 2.0 * x[1]],
         states=qpmhe.Box([0.5 * scale, 0.5 * scale], [3.0 * scale, 3.0 * scale]),
     )
-    assert system.derivatives["f"] == "finite differences"
+    assert system.f_jacobian.method == "finite differences"
     x = scale * np.array([1.7, 0.9])
     np.testing.assert_allclose(
         system.f_jacobian(x, NONE), np.diag([3 * 1.7**2, 2.0]), rtol=1e-6, atol=1e-6
@@ -179,7 +179,7 @@ def test_a_broken_complex_step_is_noticed_where_the_derivative_vanishes_at_the_p
 @pytest.mark.parametrize("big", [1e3, 1e6])
 def test_a_row_of_large_units_hides_no_broken_complex_step(big):
     system = system_of(lambda x: np.stack([big * x[..., 0], np.abs(x[..., 1])], axis=-1))
-    assert system.derivatives["f"] == "finite differences"
+    assert system.f_jacobian.method == "finite differences"
     np.testing.assert_allclose(
         system.f_jacobian(np.array([1.0, 2.0]), NONE), [[big, 0.0], [0.0, 1.0]], rtol=1e-6,
         atol=1e-9 * big,
@@ -205,7 +205,7 @@ LINEAR = np.array([[1.0, 0.1], [-0.2, 0.9]])
 )
 def test_the_jacobian_of_a_linear_map_is_its_matrix(f):
     system = system_of(f)
-    rtol = 1e-14 if system.derivatives["f"] == "complex step" else 1e-8
+    rtol = 1e-14 if system.f_jacobian.method == "complex step" else 1e-8
     states = np.random.default_rng(4).standard_normal((3, 2))
     np.testing.assert_allclose(system.f_jacobian(states[0], NONE), LINEAR, rtol=rtol)
     for lead in ((1,), (2,), (3,)):
@@ -215,7 +215,7 @@ def test_the_jacobian_of_a_linear_map_is_its_matrix(f):
 
 def test_linear_maps_need_no_finite_differences():
     for f in (lambda x: LINEAR @ x, lambda x: x @ LINEAR.T, lambda x: [x[1], -x[0]]):
-        assert system_of(f).derivatives["f"] == "complex step"
+        assert system_of(f).f_jacobian.method == "complex step"
 
 
 @pytest.mark.parametrize(
@@ -267,7 +267,7 @@ def test_derivatives_are_taken_at_the_input(f):
 
 def test_functions_without_a_value_at_the_probes_are_differenced():
     system = system_of(lambda x: np.sqrt(x - 10.0))
-    assert system.derivatives["f"] == "finite differences"
+    assert system.f_jacobian.method == "finite differences"
     x = np.array([12.0, 14.0])
     system.check(x, NONE)
     np.testing.assert_allclose(
@@ -280,10 +280,10 @@ def test_the_complex_step_is_given_up_where_it_fails_at_the_initial_state():
     system = system_of(
         lambda x: [math.exp(float(x[0]) - 100.0) if x[0].real > 90.0 else x[0] ** 2, x[1]]
     )
-    assert system.derivatives["f"] == "complex step"
+    assert system.f_jacobian.method == "complex step"
     x = np.array([100.0, 1.0])
     system.check(x, NONE)
-    assert system.derivatives["f"] == "finite differences"
+    assert system.f_jacobian.method == "finite differences"
     np.testing.assert_allclose(system.f_jacobian(x, NONE), np.eye(2), rtol=1e-6, atol=1e-8)
 
 

@@ -7,6 +7,8 @@ import qpmhe
 from qpmhe import Status
 from qpmhe.estimation.limits import LENGTHS
 
+from .untraced import untraced
+
 
 class UnprintableError(Exception):
     def __str__(self):
@@ -60,7 +62,9 @@ def test_the_message_is_of_its_own_step():
 
 def test_what_a_jacobian_raises():
     jacobian = limited(2.0, ValueError("no slope"))
-    mhe = estimator(h_jacobian=lambda x: np.ones((1, 1)) * (jacobian(x)[0] / x[0]))
+    mhe = estimator(
+        h=untraced(lambda x: x), h_jacobian=lambda x: np.ones((1, 1)) * (jacobian(x)[0] / x[0])
+    )
     estimate = last(mhe, 100.0, 1.0)
     assert Status.MODEL_FAILED in estimate.status
     assert "the Jacobian of h raised ValueError: no slope at x = [50." in estimate.message
@@ -126,6 +130,7 @@ def test_what_a_trial_raises():
 def test_what_no_second_call_raises():
     raising = []  # one entry for each call to come that raises
 
+    @untraced
     def h(x):
         if raising:
             raise raising.pop()
@@ -151,7 +156,8 @@ def test_what_a_jacobian_raises_on_the_way():
         return np.eye(1)
 
     mhe = estimator(
-        lambda x: x, None, qpmhe.Luenberger([0.0]), h_jacobian=h_jacobian, max_qps=3
+        lambda x: x, untraced(lambda x: x), qpmhe.Luenberger([0.0]), h_jacobian=h_jacobian,
+        max_qps=3,
     )
     estimate = last(mhe, 0.0)
     assert Status.IMPROVED | Status.MODEL_FAILED in estimate.status

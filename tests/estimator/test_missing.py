@@ -7,6 +7,7 @@ import qpmhe
 from qpmhe import Status
 
 from .plain import Record, spd
+from .untraced import untraced
 
 GENERATOR = np.random.default_rng(1)
 P, Q, R = spd(GENERATOR, 2), spd(GENERATOR, 2), spd(GENERATOR, 2)
@@ -138,7 +139,7 @@ def test_the_model_is_called_once_at_the_candidate_all_the_same(y):
         return swing(x)
 
     mhe = qpmhe.MovingHorizonEstimator(
-        qpmhe.System(counting, seen, n=2, p=2, f_jacobian=qpmhe.System(swing, seen, n=2, p=2)
+        qpmhe.System(untraced(counting), seen, n=2, p=2, f_jacobian=qpmhe.System(swing, seen, n=2, p=2)
                      .f_jacobian.direct),
         qpmhe.Luenberger(GAIN), qpmhe.QuadraticCost(prior=P, disturbance=Q, noise=R),
         horizon=4, initial_state=START,

@@ -180,7 +180,7 @@ def test_finite_differences_have_the_scales_of_the_augmented_state():
     mhe = qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger([0.2, 0.0]), cost, horizon=5, initial_state=[1e-9, 0.0]
     )
-    assert system.derivatives["f"] == "finite differences"
+    assert system.f_jacobian.method == "finite differences"
     y = 1e-9 * np.sin(np.arange(10.0))
     run = mhe.run(y, np.full((10, 1), 1e-6))
     large = qpmhe.MovingHorizonEstimator(

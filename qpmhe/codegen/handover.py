@@ -1,0 +1,61 @@
+"""The window of a compiled estimator, taken over by the Python step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..estimation.conditions import Conditions
+from ..estimation.engine import PythonEngine, Taken
+from ..model.sets import ConvexSet
+from ..model.system import System
+from .layout import SET_NAMES, SIDES
+
+
+def samples_of(record: Any, system: System) -> list[Taken]:
+    """The samples in the window of an ``mhe_estimator``, as the Python step takes them."""
+    length, horizon = int(record["length"]), len(record["stages"])
+    places = (int(record["first"]) + np.arange(length)) % horizon
+    return [
+        Taken(
+            np.where(stage["is_observed"], stage["y"], np.nan), stage["u"][: system.m].copy(),
+            float(stage["step"]) if stage["is_irregular"] else None, _conditions(stage, system),
+        )
+        for stage in record["stages"][places]
+    ]
+
+
+def hand_over(record: Any, system: System, usual: Conditions, engine: PythonEngine) -> None:
+    """Let a new Python engine continue where an ``mhe_estimator`` stands."""
+    horizon, length = len(record["stages"]), int(record["length"])
+    time, newest = int(record["time"]), int(record["newest"])
+    first = record["stages"][int(record["first"])]
+    count = min(time, horizon) + 1
+    history = [record["history"][(newest - k) % (horizon + 1)].copy() for k in range(count)][::-1]
+    engine.take_over(
+        usual, time - length, (first["z"] if length else record["z_end"]).copy(),
+        first["covariance"].copy() if "covariance" in first.dtype.names else None,
+        samples_of(record, system),
+        record["trajectory"][: length + 1].copy() if record["has_trajectory"] else None,
+        history, (int(record["far"]), int(record["dropped"])),
+    )
+
+
+def _conditions(stage: Any, system: System) -> Conditions | None:
+    """What a stage was taken with; None if nothing but what is usual."""
+    found: dict[str, Any] = {}
+    for name, flag in (("noise_weight", "noise"), ("disturbance_weight", "disturbance")):
+        if stage[f"has_own_{flag}"]:
+            found[name] = stage[f"own_{name}"].copy()
+    for letter, name in zip("wv", SET_NAMES, strict=True):
+        one = system.set_of(name)
+        if one is not None and stage[f"has_own_{letter}"]:
+            sides = stage[f"own_{letter}"]
+            lower, upper, row_lower, row_upper = (
+                sides[side][: getattr(one, side).size].copy() for side in SIDES
+            )
+            found[name] = ConvexSet(lower, upper, one.matrix, row_lower, row_upper)
+    if not stage["is_sampled"].all():
+        found["sampled"] = stage["is_sampled"].astype(np.bool_)
+    return Conditions(**found) if found else None

@@ -1,0 +1,197 @@
+"""The trace of a system: its functions as CasADi expressions, and whether they still hold."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import EngineWarning
+from .evaluation import Evaluator, VirtualMachine
+from .expressions import CasadiModel, import_casadi
+from .functions import BatchedFunction
+from .sets import ConvexSet
+from .tracing import Traced, difference, expressed
+
+Array = NDArray[np.float64]
+Points = list[tuple[Array, Array]]
+
+# Magnitudes of points and the least share of them, usual ones first.
+_USUAL = ((1.0, 0.2), (1.0, -1.0), (0.3, -1.0), (3.0, -1.0), (0.1, 0.2), (1.0, 0.2))
+_UNUSUAL = ((10.0, -1.0), (30.0, 0.2), (0.01, -1.0), (1e-3, 0.2), (1e-6, -1.0), (100.0, -1.0),
+            (1e3, 0.2), (1e4, -1.0))
+# The function takes longer in CasADi's virtual machine, and in a compiler, than it is worth.
+_MOST_OPERATIONS = 20_000
+
+
+def points(
+    states: ConvexSet | None, n: int, m: int, scales: Array | float = 1.0, usual: bool = False,
+) -> Points:
+    """Random points (x, u) of several magnitudes, within the bounds of X."""
+    generator = np.random.default_rng(20210829)
+    found: Points = []
+    for scale, least in (*_USUAL, *(() if usual else _UNUSUAL)):
+        for _ in range(2):
+            x = scales * (scale * generator.uniform(least, 1.0, n))
+            if states is not None:
+                low, high = states.lower, states.upper
+                both = np.isfinite(low) & np.isfinite(high)
+                share = generator.uniform(0.0, 1.0, n)
+                with np.errstate(invalid="ignore"):
+                    x = np.where(both, low + share * (high - low), np.clip(x, low, high))
+            found.append((x, min(scale, 100.0) * generator.uniform(least, 1.0, m)))
+    return found
+
+
+class Pinned:
+    """f and h as they were traced once.
+
+    Attributes
+    ----------
+    found : dict
+        The traces of ``f`` (the rate, where the model has a step length) and ``h``.
+    model : CasadiModel or None
+        The model, if both functions are traced.
+    """
+
+    def __init__(
+        self, found: dict[str, Traced], n: int, p: int, m: int, dt: float | None,
+        method: str | None,
+    ) -> None:
+        self.found = found
+        self._evaluators: dict[bool, Evaluator] = {}
+        # True of the functions that are traced, with zeros for others.
+        self._partial: CasadiModel | None = None
+        if any(one.function for one in found.values()):
+            ca = import_casadi()
+            x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
+            f, h = (
+                found[name].function or ca.Function(name, [x, u], [ca.DM.zeros(size)])
+                for name, size in (("f", n), ("h", p))
+            )
+            self._partial = CasadiModel(f, h, n, p, m, dt, method)
+        self.model = self._partial if all(one.function for one in found.values()) else None
+
+    def evaluator(self, timed: bool = False) -> Evaluator:
+        """What evaluates the traced functions, with the step's length as last input if timed."""
+        if timed not in self._evaluators:
+            assert self._partial is not None
+            self._evaluators[timed] = Evaluator(VirtualMachine(self._partial, timed))
+        return self._evaluators[timed]
+
+
+class ModelTrace:
+    """f (the rate, where there is a step length) and h as expressions, found when first needed.
+
+    Finding them takes some milliseconds, and the first time in a process as long as CasADi takes
+    to be imported. All copies of a system share it. Functions that have changed since, as
+    closures can, are traced again.
+
+    Parameters
+    ----------
+    f, h : BatchedFunction
+        The functions.
+    n, p, m : int
+        Numbers of states, outputs and inputs.
+    states : ConvexSet or None
+        X, in which trace and function are compared.
+    dt, method : optional
+        Where f is a rate: the step length, and the discretisation.
+    """
+
+    def __init__(
+        self, f: BatchedFunction, h: BatchedFunction, n: int, p: int, m: int,
+        states: ConvexSet | None, dt: float | None = None, method: str | None = None,
+    ) -> None:
+        self._functions = {"f": _of_both(f), "h": _of_both(h)}
+        self._n, self._p, self._m, self._states = n, p, m, states
+        self.dt, self._method = dt, method
+        self._lock = threading.RLock()
+        self._now: Pinned | None = None
+
+    @property
+    def now(self) -> Pinned:
+        """The traces as they were found last."""
+        with self._lock:
+            if self._now is None:
+                where = points(self._states, self._n, self._m)
+                self._pin({name: self._traced(name, where) for name in ("f", "h")})
+            assert self._now is not None
+            return self._now
+
+    @property
+    def model(self) -> CasadiModel | None:
+        """The model, if both functions are traced and still agree with their traces."""
+        return self.confirm(None).model
+
+    def _pin(self, found: dict[str, Traced]) -> None:
+        self._now = Pinned(found, self._n, self._p, self._m, self.dt, self._method)
+
+    def _traced(self, name: str, where: Points) -> Traced:
+        function = self._functions[name]
+        found = expressed(function, (self._n, self._m), name)
+        if found.function is None:
+            return found
+        fault = difference(found, function, where)
+        if fault:
+            warn_of(f"{name} cannot be traced: {fault}")
+            return Traced(None, fault)
+        size, count = self._n if name == "f" else self._p, found.function.n_instructions()
+        if found.function.numel_out() != size:
+            return Traced(None, f"it returns shape {found.shape} of symbols; expected ({size},)")
+        if count > _MOST_OPERATIONS:
+            return Traced(None, f"it takes {count} operations, more than {_MOST_OPERATIONS}")
+        return found
+
+    def confirm(self, scales: Array | None) -> Pinned:
+        """The traces, compared with the functions again at points of these magnitudes.
+
+        Functions that have changed since they were traced are traced again, once.
+        """
+        where = points(self._states, self._n, self._m, 1.0 if scales is None else scales, True)
+        with self._lock:
+            for name, one in self.now.found.items():
+                if one.function and difference(one, self._functions[name], where):
+                    again = self._traced(name, [*points(self._states, self._n, self._m), *where])
+                    self._pin({**self.now.found, name: again})
+            return self.now
+
+    def wrong(self, pinned: Pinned, x: Array, u: Array) -> tuple[str, str] | None:
+        """Which function differs from its trace at a point, and how; None if none does."""
+        for name, one in pinned.found.items():
+            if one.function is None:
+                continue
+            try:
+                text = difference(one, self._functions[name], [(x, u)])
+            except Exception as error:  # whatever a user's function returns now
+                text = f"it raises {type(error).__name__}"
+            if text:
+                return name, text
+        return None
+
+
+def warn_of(fault: str, stacklevel: int = 6) -> None:
+    """Warn that a trace is given up, and its function evaluated as it is written."""
+    warnings.warn(
+        f"{fault}. It is evaluated as it is written.", EngineWarning, stacklevel=stacklevel
+    )
+
+
+def _of_both(function: BatchedFunction) -> Callable[[Array, Array], Any]:
+    """The user's function as one of x and u."""
+    called = function.function
+    return called if function.takes_input else lambda x, u: called(x)  # noqa: ARG005
+
+
+def next_check(time: int, horizon: int) -> int:
+    """When an estimator that has compared at a time does so again.
+
+    At each sample of the first window, then at powers of two, then at each thousandth.
+    """
+    if time < horizon:
+        return time + 1
+    return min(1 << time.bit_length(), (time // 1000 + 1) * 1000)
