@@ -138,9 +138,9 @@ def test_the_model_is_called_once_at_the_candidate_all_the_same(y):
             calls.append(x.tolist())
         return swing(x)
 
+    jacobian = qpmhe.System(swing, seen, n=2, p=2).f_jacobian.direct
     mhe = qpmhe.MovingHorizonEstimator(
-        qpmhe.System(untraced(counting), seen, n=2, p=2, f_jacobian=qpmhe.System(swing, seen, n=2, p=2)
-                     .f_jacobian.direct),
+        qpmhe.System(untraced(counting), seen, n=2, p=2, f_jacobian=jacobian),
         qpmhe.Luenberger(GAIN), qpmhe.QuadraticCost(prior=P, disturbance=Q, noise=R),
         horizon=4, initial_state=START,
     )

@@ -196,9 +196,10 @@ def test_one_call_of_the_model_advances_all_observers():
         calls.append(x.shape)
         return 0.9 * x
 
-    system = qpmhe.System(untraced(f), lambda x: np.sin(x), n=2, p=2, f_jacobian=lambda x: np.broadcast_to(
-        0.9 * np.eye(2), (*x.shape[:-1], 2, 2)
-    ))
+    system = qpmhe.System(
+        untraced(f), lambda x: np.sin(x), n=2, p=2,
+        f_jacobian=lambda x: np.broadcast_to(0.9 * np.eye(2), (*x.shape[:-1], 2, 2)),
+    )
     cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(2))
     mhe = estimator(system, 0.2 * np.eye(2), cost, 20, max_qps=0)
     for t in range(50):
