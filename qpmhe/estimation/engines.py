@@ -130,8 +130,8 @@ def _at_hand(
     parts = system, observer, cost, settings, initial_state
     make = _ENGINES.get("compiled")
     if make is not None and not settings.needs_python and not python_only():
-        # Whatever is wrong with arguments, the Python engine reports.
-        with suppress(QpmheError, OSError, MemoryError):
+        # Nobody asked for this engine; what is wrong with the arguments, the other reports.
+        with suppress(Exception):
             return make(*parts)
     return PythonEngine(*parts)
 

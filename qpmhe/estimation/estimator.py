@@ -649,6 +649,7 @@ class MovingHorizonEstimator:
         self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
             *saved["arguments"], initial_state=saved["initial_state"], **options
         )
+        self.settings = saved["settings"]
         self.load_state_dict(saved["state"])
 
 

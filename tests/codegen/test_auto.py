@@ -248,6 +248,16 @@ def test_wrong_code_is_not_used_and_not_compiled_again(filled, calls, monkeypatc
 
 
 @needed
+@pytest.mark.parametrize("error", [RuntimeError, OSError, MemoryError, ValueError])
+def test_no_error_of_the_compiled_step_is_raised(error, filled, monkeypatch):
+    def fail(*_):
+        raise error("out of cheese")
+
+    monkeypatch.setattr(library, "planned", fail)
+    assert estimator().engine == "python"
+
+
+@needed
 def test_damaged_and_foreign_files_in_the_cache(filled, tmp_path):
     filled.with_suffix(".sha256").write_text("nonsense")
     assert estimator().engine == "python"
@@ -434,7 +444,7 @@ def test_a_snapshot_pins_the_python_step():
     assert other.engine == "compiled"
     other.load_state_dict(snapshot)
     copy = pickle.loads(pickle.dumps(mhe))
-    assert (other.engine, copy.engine, copy.settings.engine) == ("python",) * 3
+    assert (other.engine, copy.engine, copy.settings) == ("python", "python", mhe.settings)
     wanted = mhe.update([1.0])
     for one in (other, copy):
         found = one.update([1.0])
