@@ -208,8 +208,8 @@ void mhe_set(mhe_estimator *e, mhe_workspace *k, const mhe_settings *settings, i
     for (int i = 0; i < e->length; i++) {
         mhe_stage *stage = mhe_stage_at(e, i);
         mhe_forget(stage, changes);
-        if (parameters)
-            for (int j = 0; j < count; j++) stage->u[NU - count + j] = parameters[j];
+        for (int j = 0; j < NU; j++)
+            if (parameters && j >= NU - count) stage->u[j] = parameters[j - (NU - count)];
         mhe_set_noise_weight(settings, stage);
         mhe_complete_own_sets(settings, stage);
     }
