@@ -79,9 +79,9 @@ class MovingHorizonEstimator:
     engine : {"auto", "python", "compiled"}
         What runs the step. ``compiled`` generates C code for the whole step from a system
         made by `qpmhe.from_casadi`, a quadratic cost and an observer with
-        constant gain, compiles it once and keeps it in a cache on disk; it also solves
-        QPs with active inequalities. Without a C compiler it warns and runs the
-        Python step. ``auto`` takes the compiled step where its library is in the cache, see
+        constant gain or a Kalman filter, compiles it once and keeps it in a cache on
+        disk; it also solves QPs with active inequalities. Without a C compiler it warns and runs
+        the Python step. ``auto`` takes the compiled step where its library is in the cache, see
         `qpmhe.compile`, and else the Python step: it never waits for a compiler, never warns,
         and takes every option. `mhe.engine` says which one runs.
     project_observer : bool
