@@ -22,6 +22,7 @@ from ..model.expressions import CasadiModel, import_casadi
 from ..model.residuals import difference
 from ..model.sets import ConvexSet
 from ..model.system import System
+from ..observers import Sample
 
 if TYPE_CHECKING:
     from .library import EstimatorLibrary
@@ -230,12 +231,16 @@ def estimator_fault(
     )
 
 
-def _with_settings(cost: Cost, settings: NDArray[Any], n: int, p: int) -> Cost:
-    """A cost with the weights and the discount of a library's settings."""
+def _with_settings(
+    cost: Cost, settings: NDArray[Any], n: int, p: int, prior: Array | None = None
+) -> Cost:
+    """A cost with the weights and the discount of a library's settings, and a prior's weight."""
     terms: dict[str, Any] = {
         name: settings[f"{name}_weight"].reshape(size, size)
         for name, size in (("prior", n), ("disturbance", n), ("noise", p))
     }
+    if prior is not None:
+        terms["prior"] = prior
     discount = float(settings["discount"])
     if not isinstance(cost, RobustCost):
         return QuadraticCost(**terms, discount=discount)
@@ -264,13 +269,17 @@ class _Rehearsal:
         state, output = first[0], values["h"][0]
         noise = settings["noise_weight"].reshape(p, p)
         if is_wild:
-            for name in ("prior_weight", "disturbance_weight"):
+            names = ("prior_weight", "disturbance_weight")
+            for name in names[int(library.layout.observer_prior) :]:
                 small = 1e-2 * output @ noise @ output
                 share = small / (state @ settings[name].reshape(n, n) @ state)
                 if 1e-100 < share < 1e100:
                     settings[name] *= share
         self._gain = settings["gain"].reshape(n, p)
-        self._cost = _with_settings(cost, settings, n, p)
+        self._given_cost = cost
+        self._cost = _with_settings(
+            cost, settings, n, p, np.eye(n) if library.layout.observer_prior else None
+        )
         self._own_noise, self._own_disturbance = 2.0 * noise, 0.5 * self._cost.disturbance
         self._start = state * (1 + 0.1 * self._generator.uniform(-1.0, 1.0, n))
         most = _SAMPLES if n <= _MANY_STATES else _FEW_SAMPLES
@@ -284,6 +293,7 @@ class _Rehearsal:
         self._us = generator.uniform(0.2, 1.0, (count, model.m))
         self._steps = np.full(count, model.dt or 0.0)
         self._ys, self._weights = np.zeros((count, p)), np.zeros((count, n + p, n + p))
+        self._own: list[tuple[Array | None, Array | None]] = [(None, None)] * count
         for t in range(count):
             y, special = self._ys[t], t >= _BY_RUN + _BY_MEMBERS and t % 6 == 0
             if special:
@@ -297,7 +307,8 @@ class _Rehearsal:
                 y[t % p] = np.nan
             if t % 11 == 7:
                 y[:] = np.nan
-            own = (self._own_noise, self._own_disturbance) if special else ()
+            own = (self._own_noise, self._own_disturbance) if special else (None, None)
+            self._own[t] = own
             self._weights[t] = self._cost.partial_weight(np.isfinite(y), *own)
             x = interpreter.value("f", x, self._us[t], self._steps[t])
             x = x * (1 + 0.05 * generator.standard_normal(n))
@@ -320,7 +331,7 @@ class _Rehearsal:
         record, last = memory[0], count - 1
         stages = self._window(record)
         fault = self._step_fault(
-            last, stages["z"][0], np.vstack((stages["z"], record["z_end"])),
+            last, record, np.vstack((stages["z"], record["z_end"])),
             record["trajectory"][: len(stages) + 1], log.costs[last], log.candidate_costs[last],
             Status(int(log.flags[last])),
         )
@@ -346,7 +357,7 @@ class _Rehearsal:
             found = out[0]
             length = int(found["length"])
             fault = self._step_fault(
-                t, self._window(record)["z"][0], found["candidate"][: length + 1],
+                t, record, found["candidate"][: length + 1],
                 found["trajectory"][: length + 1], found["cost"], found["candidate_cost"],
                 Status(int(found["status"])),
                 np.hstack((found["disturbances"][:length], found["noises"][:length])),
@@ -358,11 +369,11 @@ class _Rehearsal:
         return record["stages"][at % self._library.layout.horizon]
 
     def _step_fault(
-        self, t: int, prior: Array, candidate: Array, trajectory: Array, cost: float,
+        self, t: int, record: Any, candidate: Array, trajectory: Array, cost: float,
         candidate_cost: float, status: Status, residuals: Array | None = None,
     ) -> str:
-        reference = self._judged(t, prior, candidate, True)
-        best = self._judged(t, prior, trajectory, False)
+        reference = self._judged(t, record, candidate, True)
+        best = self._judged(t, record, trajectory, False)
         for name, told, one in (
             ("the estimate", cost, best), ("the candidate", candidate_cost, reference)
         ):
@@ -404,19 +415,57 @@ class _Rehearsal:
             for xs in trajectories for one in self._along(t, xs, True)[1].values()
         )
 
-    def _judged(self, t: int, prior: Array, xs: Array, is_candidate: bool) -> _Judged:
+    def _judged(self, t: int, record: Any, xs: Array, is_candidate: bool) -> _Judged:
         at, found = self._along(t, xs, False)
+        stages = self._window(record)
+        prior = record["smoothed"] if record["has_smoothed"] else stages["z"][0]
+        gains, cost = np.broadcast_to(self._gain, (len(stages), *self._gain.shape)), self._cost
+        if is_candidate and self._library.layout.observer:
+            gains = self._gains(t, stages, xs)
+        if self._library.layout.observer_prior:
+            weight, _ = self._library.prior_weights(stages["covariance"][0])
+            cost = _with_settings(
+                self._given_cost, self._settings, xs.shape[1], self._ys.shape[1], weight
+            )
         return _Judged(
-            xs, found, self._ys[at], self._weights[at], self._gain, self._system, self._cost,
-            prior, is_candidate,
+            xs, found, self._ys[at], self._weights[at], gains, self._system, cost, prior,
+            is_candidate,
         )
+
+    def _gains(self, t: int, stages: Any, xs: Array) -> Array:
+        """The gains (K, n, p) of the observer at each stage, by Python."""
+        at, found = self._along(t, xs, True)
+        p, library = self._ys.shape[1], self._library
+        gains = np.zeros((len(stages), xs.shape[1], p))
+        for k, (u, step, y, own) in enumerate(zip(
+            self._us[at], self._steps[at], self._ys[at], self._own[at], strict=True
+        )):
+            timed = step != (library.system.dt or 0.0)
+            sample = Sample(
+                library.system.timed if timed else library.system,
+                np.append(u, step) if timed else u,
+                found["f_jacobian"][k], found["h_jacobian"][k],
+                None if np.isfinite(y).all() else np.isfinite(y), own[0],
+                disturbance_weight=own[1],
+            )
+            if library.layout.covariance:
+                sample.covariance = stages["covariance"][k]
+            try:
+                _, posterior = library.observer.correct(xs[k], np.zeros(p), sample)
+                if posterior is not None and not np.isfinite(posterior).all():
+                    gains[k] = np.nan
+                for j in np.flatnonzero(np.isfinite(y)):
+                    gains[k, :, j] += library.observer.correct(xs[k], np.eye(p)[j], sample)[0]
+            except Exception:  # outside of the model's domain
+                gains[k] = np.nan
+        return gains
 
 
 class _Judged:
     """Residuals and J of a trajectory, and how far rounding may move them."""
 
     def __init__(
-        self, xs: Array, found: dict[str, Array], ys: Array, weights: Array, gain: Array,
+        self, xs: Array, found: dict[str, Array], ys: Array, weights: Array, gains: Array,
         system: System, cost: Cost, prior: Array, is_candidate: bool,
     ) -> None:
         n, count, f, h = xs.shape[1], len(ys), found["f"], found["h"]
@@ -430,9 +479,9 @@ class _Judged:
         v, allowed_v = (
             np.where(observed, one[:, n:], 0.0) for one in (self.residuals, self.allowed)
         )
-        correction = v @ gain.T
+        correction = np.einsum("kij,kj->ki", gains, v)
         self._following = f + correction
-        allowed_correction = (allowed_v + ROUNDING * abs(v)) @ abs(gain).T
+        allowed_correction = np.einsum("kij,kj->ki", abs(gains), allowed_v + ROUNDING * abs(v))
         self._allowed_following = self.allowed[:, :n] + allowed_correction
         if is_candidate:
             self.residuals[:, :n], self.allowed[:, :n] = correction, allowed_correction

@@ -20,6 +20,7 @@ from ..estimation.covariance import window_covariances
 from ..estimation.engine import PythonEngine
 from ..estimation.engines import EngineChangeError
 from ..estimation.estimate import DroppedRow, Estimate, Status
+from ..estimation.prior import PriorWeights
 from ..estimation.run import Run
 from ..estimation.settings import Settings
 from ..estimation.snapshot import (
@@ -117,7 +118,7 @@ class CompiledEngine:
     def _tools_for(self, usual: Conditions) -> Tools:
         """What a step uses under these usual conditions."""
         system, cost = usual.applied(self._system, self._given_cost)
-        return Tools(usual, system, cost, self._library.settings_for(system, cost))
+        return Tools(usual, system, cost, self._library.settings_for(system, cost, usual))
 
     @property
     def usual(self) -> Conditions:
@@ -304,8 +305,12 @@ class CompiledEngine:
             if not np.isfinite(residuals).all():
                 raise InvalidInputError("the model has no finite values along the estimate.")
             weights = cost.majorise(residuals, weights)
-            offset = difference(system.state_residual, trajectory[0], stages["z"][0])
-            prior = cost.majorise_prior(offset, cost.initial_weight(None))
+            mean = record["smoothed"] if record["has_smoothed"] else stages["z"][0]
+            weight, _ = PriorWeights(self.system, self._observer, cost)(
+                stages["covariance"][0] if self._library.layout.covariance else None
+            )
+            offset = difference(system.state_residual, trajectory[0], mean)
+            prior = cost.majorise_prior(offset, weight)
             return window_covariances(
                 model,
                 trajectory,
@@ -380,7 +385,11 @@ class CompiledEngine:
             raise ValueError("history does not end where the trajectory does")
         for stage in record["stages"][places]:
             self._check_flags(stage, tools)
+        smoothed = self._settings.arrival == "smoothed" and time > horizon
+        if record["has_smoothed"] != smoothed or not np.isfinite(record["smoothed"]).all():
+            raise ValueError("there must be a smoothed prior once the window has moved on")
         self._check_metric(record)
+        covariances = self._covariances_of(record, places)
         computed, usual = [self._recomputed(memory)], tools.record
         if record["metric_settled"] and not usual["metric_settled"]:
             # Some stages may have been computed before the metric settled.
@@ -392,7 +401,9 @@ class CompiledEngine:
             stage = record["stages"][place]
             disturbance = stage["own_disturbance_weight"] if stage["has_own_disturbance"] else None
             weight = tools.cost.joint_weight(stage["noise_weight"], disturbance)
-            for left, (again, reached) in zip(range(len(computed))[::-1], computed, strict=True):
+            for left, (again, reached, _) in zip(
+                range(len(computed))[::-1], computed, strict=True
+            ):
                 fresh = again[0]["stages"][place]
                 try:
                     self._check_stage(stage, fresh, z[k + 1], reached[k], sizes, weight)
@@ -400,16 +411,19 @@ class CompiledEngine:
                 except InvalidInputError:
                     if not left:
                         raise
+            if covariances is not None and np.isfinite(stage["cost"]):
+                self._check_covariance(covariances[k + 1], computed[0][2][k])
             if linearized == wanted and wanted:
                 self._check_terms(stage, fresh, sizes, np.abs(weight))
             else:
                 stage["terms"] = fresh["terms"]
 
-    def _recomputed(self, memory: NDArray[Any]) -> tuple[NDArray[Any], Array]:
-        """Stages as the model computes them now, and the states behind them."""
-        again, reached = memory.copy(), np.zeros((self._sizes[2], self._sizes[0]))
-        self._library.recompute(again.ctypes.data, reached.ctypes.data)
-        return again, reached
+    def _recomputed(self, memory: NDArray[Any]) -> tuple[NDArray[Any], Array, Array]:
+        """Stages as the model computes them now, and states and covariances behind them."""
+        n, _, horizon = self._sizes
+        again, reached, spread = memory.copy(), np.zeros((horizon, n)), np.zeros((horizon, n, n))
+        self._library.recompute(again.ctypes.data, reached.ctypes.data, spread.ctypes.data)
+        return again, reached, spread
 
     def _check_metric(self, record: Any) -> None:
         """Refuse a metric of the observer that is none."""
@@ -478,6 +492,23 @@ class CompiledEngine:
         )
         if not near(stage["cost"], value, size):
             raise mismatch("cost")
+
+    def _covariances_of(self, record: Any, places: NDArray[np.intp]) -> Array | None:
+        """The observer's covariances (K + 1, n, n) along the window; None if it has none."""
+        if not self._library.layout.covariance:
+            return None
+        found = np.concatenate((
+            record["stages"]["covariance"][places], record["covariance_end"][None]
+        ))
+        if not (np.isfinite(found).all() and np.isfinite(record["last_good_covariance"]).all()):
+            raise ValueError("a covariance is not finite")
+        return found
+
+    def _check_covariance(self, following: Array, reached: Array) -> None:
+        """Compare the observer's covariance behind a stage with what follows from the stage."""
+        deviations = np.sqrt(np.abs(reached.diagonal()))
+        if not near(following, reached, np.outer(deviations, deviations)):
+            raise mismatch("observer")
 
     def _check_terms(self, stage: Any, fresh: Any, sizes: Array, weight: Array) -> None:
         """Compare Jacobians and terms with what the model makes of them now."""

@@ -8,17 +8,21 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import SINGULAR
 from .._linalg import inverse
 from ..costs import Cost
 from ..errors import OptionError
+from ..estimation.conditions import USUAL, Conditions
 from ..estimation.constraints import Rows
 from ..estimation.estimate import DroppedRow, Status
 from ..estimation.limits import c_definitions
+from ..estimation.prior import PriorWeights
 from ..estimation.settings import Infeasible, Settings
 from ..model.residuals import Residual
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
+from ..observers.base import covariance_of
 
 SET_NAMES = ("disturbances", "noises", "states")
 #: Those of which a sample may have other sides.
@@ -43,6 +47,10 @@ _MOST = int(np.iinfo(np.int32).max)
 # From so many states on, LAPACK's calls take less time than loops that a compiler made.
 _LAPACK_STATES = 40
 _POLICIES = get_args(Infeasible)
+# What corrects an observer, in the order of the numbers in C.
+_OBSERVERS = ("gain", "extended", "unscented")
+# In single precision rounding makes eigenvalues of correlations of this size.
+_LEAST_SINGLE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,11 @@ class Layout:
     real: str = "double"
     #: Whether a term of the cost has a loss that is not quadratic.
     loss: bool = False
+    #: What corrects the observer, by its number in C, and whether its covariance is computed.
+    observer: int = 0
+    covariance: bool = False
+    #: Whether the covariance weighs the prior.
+    observer_prior: bool = False
     #: Whether the factorisation calls LAPACK.
     lapack: bool = False
     #: Whether there is a time budget, and a clock to keep it.
@@ -67,18 +80,22 @@ class Layout:
 
     @classmethod
     def of(
-        cls, system: System, cost: Cost, horizon: int, continuous: int, real: str = "double",
-        lapack: bool = False, clock: bool = False,
+        cls, system: System, observer: Observer, cost: Cost, horizon: int, continuous: int,
+        real: str = "double", lapack: bool = False, clock: bool = False,
     ) -> Layout:
-        """The sizes of an estimator of a system. `lapack` allows it where it is quicker."""
-        form = cost.c_form
+        """The sizes and features of an estimator. `lapack` allows it where it is quicker."""
+        own, form = observer.c_form, cost.c_form
+        assert own is not None
         loss = form is not None and any(one.kind != "quadratic" for one in form.losses)
         sets = tuple(
             (one is not None, 0 if one is None else one.matrix.shape[0])
             for one in (getattr(system, name) for name in SET_NAMES)
         )
+        weighs, kind = cost.observer_prior is not None, _OBSERVERS.index(own.kind)
         return cls(
-            system.n, system.p, system.m, horizon, sets, continuous, real, loss=loss,
+            system.n, system.p, system.m, horizon, sets, continuous, real, loss=loss, observer=kind,
+            # The covariance of a constant gain's error has no other use.
+            covariance=own.prior is not None and (kind > 0 or weighs), observer_prior=weighs,
             lapack=lapack and system.n >= _LAPACK_STATES, clock=clock,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
         )
@@ -97,6 +114,8 @@ class Layout:
             "lapack": int(self.lapack),
             "clock": int(self.clock), "clock_text": _CLOCK_TEXT if self.clock else "",
             "output_residual": self.residuals[0], "state_residual": self.residuals[1],
+            "observer": self.observer, "covariance": int(self.covariance),
+            "observer_prior": int(self.observer_prior),
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
@@ -113,6 +132,14 @@ class Layout:
             ("disturbance_weight", r, n * n), ("noise_weight", r, p * p),
             *((f"{name}_loss", loss) for name in TERMS),
             ("output_periods", r, p), ("state_periods", r, n),
+        ]
+        if self.covariance:
+            fields.append(("covariances", _struct([
+                ("initial", r, n * n), ("disturbance", r, n * n), ("noise", r, p * p),
+                ("f_jacobian", r, n * n), ("h_jacobian", r, p * n), ("minimum", r),
+                ("maximum", r), ("least", r), ("spread", r), ("typical", r, n),
+            ])))
+        fields += [
             ("discount", r), ("sample_time", r), ("tolerance", r),
             ("solver_tolerance", r),
         ]
@@ -120,7 +147,7 @@ class Layout:
         fields += [(name, r, self.metric_size) for name in ("metric", "metric_weight")]
         options = (
             "metric_settled", "project", "max_qps", "max_iterations", "infeasible",
-            "start_at_best", "reinitialize", "delay",
+            "start_at_best", "reinitialize", "smooth", "delay",
         )
         fields += [(name, np.int32) for name in options]
         if self.clock:
@@ -201,28 +228,43 @@ class Layout:
                 if there
             ),
             ("cost", r), *((flag, np.int32) for flag in STAGE_FLAGS), ("is_observed", np.uint8, p),
-            ("is_sampled", np.uint8, p), ("terms", terms),
+            ("is_sampled", np.uint8, p), *self._if_covariance("covariance"), ("terms", terms),
         ])
         return _struct([
             ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
             ("length", np.int32), ("newest", np.int32), ("has_trajectory", np.int32),
-            ("far", np.int32), ("dropped", np.int32),
+            ("has_smoothed", np.int32), ("far", np.int32), ("dropped", np.int32),
             ("metric_settled", np.int32), ("metric", r, self.metric_size),
-            ("last_good", r, n), ("z_end", r, n),
+            ("smoothed", r, n), ("last_good", r, n), ("z_end", r, n),
+            *self._if_covariance("last_good_covariance", "covariance_end"),
             ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
             ("stages", stage, count),
         ])
 
+    def _if_covariance(self, *names: str) -> list[Any]:
+        n = self.nx
+        return [(name, self.number, (n, n)) for name in names if self.covariance]
+
 
 def settings_record(
-    layout: Layout, system: System, observer: Observer, cost: Cost, settings: Settings
+    layout: Layout, system: System, observer: Observer, cost: Cost, settings: Settings,
+    usual: Conditions = USUAL,
 ) -> NDArray[Any]:
-    """The estimator's data and options as one ``mhe_settings``."""
+    """The estimator's data and options as one ``mhe_settings``.
+
+    System and cost are those of the usual conditions.
+    """
     # What single precision cannot hold becomes infinite, and is refused below.
     with np.errstate(over="ignore", under="ignore"):
-        record = _filled(layout, system, observer, cost, settings)
-    for name in ("gain", "prior_weight", "disturbance_weight", "noise_weight"):
-        if not np.isfinite(record[name]).all():
+        record = _filled(layout, system, observer, cost, settings, usual)
+    given = [(name, record[name]) for name in (
+        "gain", "prior_weight", "disturbance_weight", "noise_weight"
+    )]
+    if layout.covariance:
+        own = record["covariances"]
+        given += [(f"observer's {name}", own[name]) for name in own.dtype.names or ()]
+    for name, numbers in given:
+        if not np.isfinite(numbers).all():
             raise OptionError(
                 f"{name.replace('_', ' ')} has entries beyond what real={layout.real!r} holds; "
                 "take 'double', or other units."
@@ -231,17 +273,35 @@ def settings_record(
 
 
 def _filled(
-    layout: Layout, system: System, observer: Observer, cost: Cost, settings: Settings
+    layout: Layout, system: System, observer: Observer, cost: Cost, settings: Settings,
+    usual: Conditions,
 ) -> NDArray[Any]:
     record = np.zeros((), layout.settings_type())
-    gain, filter_gain, form = observer.constant_gain, observer.filter_gain, cost.c_form
-    assert gain is not None
-    assert filter_gain is not None
+    own, form, single = observer.c_form, cost.c_form, layout.real == "float"
+    assert own is not None
     assert form is not None
-    record["gain"], record["filter_gain"] = gain.ravel(), filter_gain.ravel()
+    prior_weights = PriorWeights(system, observer, cost)
+    for name in ("gain", "filter_gain"):
+        _fill(record, name, getattr(own, name))
+    if layout.covariance:
+        part = record["covariances"]
+        assert own.disturbance is not None
+        assert own.noise is not None
+        disturbance = covariance_of(usual.disturbance_weight, own.disturbance)
+        for name, matrix in (
+            ("initial", own.prior), ("disturbance", system.state_covariance(disturbance)),
+            ("noise", covariance_of(usual.noise_weight, own.noise)),
+            ("f_jacobian", own.f_jacobian), ("h_jacobian", own.h_jacobian),
+            ("typical", prior_weights.typical),
+        ):
+            _fill(part, name, matrix)
+        part["spread"] = own.spread
+        part["least"] = _LEAST_SINGLE if single else SINGULAR
+        rule = cost.observer_prior
+        part["minimum"], part["maximum"] = (rule and rule.bounds) or (0.0, 0.0)
     record["discount"] = form.discount
     for name, loss in zip(TERMS, form.losses, strict=True):
-        record[f"{name}_weight"] = getattr(form, name).ravel()
+        _fill(record, f"{name}_weight", getattr(form, name))
         part = record[f"{name}_loss"]
         part["kind"], part["parameter"] = LOSSES.index(loss.kind), loss.parameter
         part["per_component"] = loss.per_component
@@ -250,12 +310,12 @@ def _filled(
             periods = record[f"{name}_periods"]
             periods[residual.components] = residual.periods
     record["sample_time"] = system.dt or 0.0
-    single = layout.real == "float"
     # Single precision distinguishes less.
     record["tolerance"] = max(settings.tolerance, 1e-6 if single else 0.0)
     record["solver_tolerance"] = max(settings.solver_tolerance, 1e-4 if single else 0.0)
     initial = cost.initial_weight(observer.initial_covariance())
-    weights = form.disturbance, form.noise, initial
+    _, regular = prior_weights(observer.initial_covariance())
+    weights = form.disturbance, form.noise, regular
     for name, weight in zip(SET_NAMES, weights, strict=True):
         one: ConvexSet | None = getattr(system, name)
         if one is None:
@@ -270,9 +330,9 @@ def _filled(
         part["rows"][: one.matrix.size] = one.matrix.ravel()
         part["row_lower"][:rows], part["row_upper"][:rows] = one.row_lower, one.row_upper
     if system.states is not None:
-        own = observer.metric
-        record["metric"] = inverse(initial if own is None else own).ravel()
-        record["metric_weight"], record["metric_settled"] = initial.ravel(), own is not None
+        metric = observer.metric
+        record["metric"] = inverse(initial if metric is None else metric).ravel()
+        record["metric_weight"], record["metric_settled"] = initial.ravel(), metric is not None
     record["project"] = settings.project_observer
     record["max_qps"] = min(settings.qp_limit, _MOST)
     most = settings.max_solver_iterations
@@ -280,6 +340,7 @@ def _filled(
     record["infeasible"] = _POLICIES.index(settings.infeasible)
     record["start_at_best"] = settings.warm_start
     record["reinitialize"] = settings.candidate == "reinitialized"
+    record["smooth"] = settings.arrival == "smoothed"
     record["delay"] = settings.delay
     if layout.clock:
         record["time_budget"] = settings.time_budget
@@ -288,6 +349,12 @@ def _filled(
 
 def _kind(residual: Residual | None) -> int:
     return 0 if residual is None else 2 if residual.periods is None else 1
+
+
+def _fill(record: NDArray[Any], name: str, value: NDArray[np.float64] | None) -> None:
+    """Fill a field where there is something to fill in."""
+    if value is not None:
+        record[name] = value.ravel()
 
 
 def _struct(fields: list[Any]) -> np.dtype[Any]:

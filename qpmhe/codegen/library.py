@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from ..costs import Cost, RobustCost
 from ..errors import CompilationError, OptionError
+from ..estimation.conditions import Conditions
 from ..estimation.estimate import Status
+from ..estimation.prior import PriorWeights
 from ..estimation.settings import Settings
 from ..model.expressions import CasadiModel
 from ..model.system import System
@@ -60,14 +62,18 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             f"engine='compiled' does not have {' and '.join(system.extensions)}; take "
             "engine='python'."
         )
-    if observer.constant_gain is None or observer.filter_gain is None:
+    form = observer.c_form
+    if form is None:
         return (
-            f"{type(observer).__name__} has no C form; take an observer with constant gain "
-            "(Luenberger, SteadyStateKalman, HighGain)."
+            f"{type(observer).__name__} has no C form; take an observer of qpmhe's own "
+            "(Luenberger, HighGain, SteadyStateKalman, ExtendedKalman, UnscentedKalman)."
+        )
+    if cost.observer_prior is not None and form.prior is None:
+        return (
+            f"the covariance of {type(observer).__name__} has no C form, and the prior's weight "
+            "comes from it; take a constant weight."
         )
     if cost.c_form is None:
-        if cost.quadratic and cost.observer_prior is not None:
-            return "a prior weight from the observer has no C form; take a constant one."
         return _without_form(cost)
     covariance = observer.initial_covariance()
     if (
@@ -78,16 +84,11 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             f"engine='compiled' does not yet project {type(observer).__name__} onto X, by its "
             "covariance; take engine='python', or leave states out."
         )
-    size = _window_size(system, cost, settings.horizon)
+    size = _window_size(system, observer, cost, settings.horizon)
     if size > _MOST_BYTES:
         return (
             f"a horizon of {settings.horizon} with {system.n} states needs {size:.3g} bytes for "
             f"its window, more than the {_MOST_BYTES:.3g} of one structure; take a shorter one."
-        )
-    if settings.arrival != "observer":
-        return (
-            f"arrival={settings.arrival!r} has no C form; take engine='python', or leave "
-            "arrival out."
         )
     if settings.backend not in ("auto", "banded"):
         return (
@@ -107,13 +108,14 @@ def _without_form(cost: Cost) -> str:
                     f"{type(loss).__name__}, the loss of {name}, has no C form; take Quadratic, "
                     "Huber or Power, or engine='python'."
                 )
-        return "a prior weight from the observer has no C form; take a constant one."
     return f"{type(cost).__name__} has no C form; take a QuadraticCost or a RobustCost."
 
 
-def _window_size(system: System, cost: Cost, horizon: int) -> int:
+def _window_size(system: System, observer: Observer, cost: Cost, horizon: int) -> int:
     """Bytes of an estimator's memory, in double precision."""
-    one, two = (Layout.of(system, cost, count, 0).estimator_type().itemsize for count in (1, 2))
+    one, two = (
+        Layout.of(system, observer, cost, count, 0).estimator_type().itemsize for count in (1, 2)
+    )
     return one + (horizon - 1) * (two - one)
 
 
@@ -159,7 +161,7 @@ def planned(
     assert system.symbolic is not None
     model = symbolic_model(system)
     layout = Layout.of(
-        system, cost, settings.horizon, CONTINUOUS[model.method], real, lapack,
+        system, observer, cost, settings.horizon, CONTINUOUS[model.method], real, lapack,
         settings.time_budget is not None,
     )
     return layout, settings_record(layout, system, observer, cost, settings)
@@ -236,7 +238,8 @@ class EstimatorLibrary:
         self.layout, self.settings = layout, record = planned(
             system, observer, cost, settings, lapack=True
         )
-        self._observer, self._options = observer, settings
+        self.system, self.observer, self._options = system, observer, settings
+        self.prior_weights = PriorWeights(system, observer, cost)
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
         model = symbolic_model(system)
@@ -264,9 +267,9 @@ class EstimatorLibrary:
         self.path = Path(found._name)
         self._bind(found)
 
-    def settings_for(self, system: System, cost: Cost) -> NDArray[Any]:
-        """``mhe_settings`` with the sets and weights of these."""
-        record = settings_record(self.layout, system, self._observer, cost, self._options)
+    def settings_for(self, system: System, cost: Cost, usual: Conditions) -> NDArray[Any]:
+        """``mhe_settings`` with the sets and weights of these, which are the usual conditions."""
+        record = settings_record(self.layout, system, self.observer, cost, self._options, usual)
         self._set_clock(record)
         return record
 
@@ -292,7 +295,7 @@ class EstimatorLibrary:
             function.restype = None
         self.amend.argtypes = [pointer, pointer, integer, pointer, pointer]
         self.reset.argtypes = [pointer, pointer, pointer]
-        self.recompute.argtypes = [pointer, pointer]
+        self.recompute.argtypes = [pointer, pointer, pointer]
         self.undo.argtypes = [pointer, pointer]
         self.set.argtypes = [
             pointer, pointer, pointer, ctypes.c_int32, pointer, ctypes.c_int32, pointer

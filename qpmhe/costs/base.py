@@ -70,14 +70,15 @@ class CostForm(NamedTuple):
     Parameters
     ----------
     prior, disturbance, noise : array
-        Weights of the initial error (n, n), of w (n, n) and of v (p, p).
+        Weights of the initial error (n, n), of w (n, n) and of v (p, p). The first is None
+        where the observer's covariance gives it.
     discount : float
         gamma.
     losses : tuple of LossForm
         The functions of the three quadratic forms, in the same order.
     """
 
-    prior: Array
+    prior: Array | None
     disturbance: Array
     noise: Array
     discount: float

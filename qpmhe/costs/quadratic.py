@@ -84,12 +84,11 @@ class QuadraticCost(Cost):
 
     @property
     def c_form(self) -> CostForm | None:
-        """The weights, unless the prior's varies or a derived class computes another cost."""
-        if isinstance(self.prior, ObserverPrior) or type(self) is not QuadraticCost:
+        """The weights, unless a derived class computes another cost."""
+        if type(self) is not QuadraticCost or self.disturbance_factor is not None:
             return None
-        if self.disturbance_factor is not None:
-            return None
-        return CostForm(self.prior, self.disturbance, self.noise, self.discount)
+        prior = None if isinstance(self.prior, ObserverPrior) else self.prior
+        return CostForm(prior, self.disturbance, self.noise, self.discount)
 
     @property
     def constants(self) -> CostConstants | None:

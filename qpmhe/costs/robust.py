@@ -62,12 +62,13 @@ class RobustCost(Cost):
         prior, disturbance, noise = (
             loss.c_form for loss in (self.prior_loss, self.disturbance_loss, self.noise_loss)
         )
-        if type(self) is not RobustCost or isinstance(self.prior, ObserverPrior):
+        if type(self) is not RobustCost:
             return None
         if prior is None or disturbance is None or noise is None:
             return None
         losses = prior, disturbance, noise
-        return CostForm(self.prior, self.disturbance, self.noise, self.discount, losses)
+        weight = None if isinstance(self.prior, ObserverPrior) else self.prior
+        return CostForm(weight, self.disturbance, self.noise, self.discount, losses)
 
     @property
     def constants(self) -> CostConstants | None:

@@ -80,9 +80,9 @@ class MovingHorizonEstimator:
     engine : {"auto", "python", "compiled"}
         What runs the step. ``compiled`` generates C code for the whole step from a system
         made by `qpmhe.from_casadi`, a quadratic cost and an observer with
-        constant gain, compiles it once and keeps it in a cache on disk; it also solves
-        QPs with active inequalities. Without a C compiler it warns and runs the
-        Python step. ``auto`` takes the compiled step where its library is in the cache, see
+        constant gain or a Kalman filter, compiles it once and keeps it in a cache on
+        disk; it also solves QPs with active inequalities. Without a C compiler it warns and runs
+        the Python step. ``auto`` takes the compiled step where its library is in the cache, see
         `qpmhe.compile`, and else the Python step: it never waits for a compiler, never warns,
         and takes every option. `mhe.engine` says which one runs.
     project_observer : bool
@@ -613,7 +613,8 @@ class MovingHorizonEstimator:
         It computes every stored stage again and compares the results. With ``engine="auto"`` the
         estimator goes on with the engine that the snapshot was taken with.
         """
-        pinned, own = state.get("engine", "python") if isinstance(state, dict) else None, self.engine
+        own = self.engine
+        pinned = state.get("engine", "python") if isinstance(state, dict) else None
         # Whole or, if interrupted, not at all.
         if self.settings.engine == "auto" and isinstance(pinned, str) and pinned != own:
             engine = engine_of_snapshot(

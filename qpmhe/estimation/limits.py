@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from ..observers.base import SAME_COVARIANCE
+
 #: Step lengths, tried in turn after the full step: the first for a step that leaves a set by
 #: the solver's tolerance, the last short enough for any useful direction of descent.
 LENGTHS = (0.9999, 0.5, 0.25, 0.125, 0.0625, 0.015625, 0.00390625)
@@ -44,7 +46,13 @@ FAR = 10.0
 #: A larger measurement counts as missing: its square would not be finite.
 LARGEST = 1e150
 
-_SINGLE = {"ROUNDING": 1e-6, "NEARLY": 1e-3, "FEASIBLE": 1e-5, "LARGEST": 1e15}
+#: A variance of the observer's below the first share of the typical one is none; in the prior's
+#: weight it counts as the second share.
+NO_VARIANCE, KNOWN = 1e-30, 1e-16
+
+_SINGLE = {
+    "ROUNDING": 1e-6, "NEARLY": 1e-3, "FEASIBLE": 1e-5, "LARGEST": 1e15, "SAME_COVARIANCE": 1e-4,
+}
 
 
 def c_definitions(prefix: str, real: str) -> str:
@@ -52,6 +60,7 @@ def c_definitions(prefix: str, real: str) -> str:
     values = {
         "ROUNDING": ROUNDING, "NEARLY": NEARLY, "STALLED": STALLED, "BEYOND": BEYOND,
         "FEASIBLE": FEASIBLE, "LARGEST": LARGEST, "FAR": FAR, "NEARER": NEARER,
+        "NO_VARIANCE": NO_VARIANCE, "KNOWN": KNOWN, "SAME_COVARIANCE": SAME_COVARIANCE,
     }
     if real == "float":
         values |= _SINGLE

@@ -20,6 +20,7 @@ from ..observers import Observer
 from .constraints import Constraints
 from .estimate import DroppedRow
 from .limits import FEASIBLE
+from .prior import PriorWeights
 from .softened import Penalties, WindowPenalties
 from .stages import read_only
 from .window import Window
@@ -28,9 +29,6 @@ Array = NDArray[np.float64]
 
 # Rounding of a residual, as a share of the numbers that it is computed from.
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
-
-# A variance below this share of the typical one is none; it counts as the second.
-_NO_VARIANCE, _KNOWN = 1e-30, 1e-16
 
 
 @dataclass(slots=True)
@@ -77,13 +75,8 @@ class Formulation:
         self.discounted = cost.discount < 1.0
         self.wraps = not (system.output_residual is None and system.state_residual is None)
         covariance = observer.initial_covariance()
-        # Typical variances of the states, where an observer's may be zero.
-        self._typical: Array | None = None
-        if covariance is not None and (cost.space is not None or not covariance.diagonal().all()):
-            scales = system.scales
-            self._typical = (
-                cost.prior_variances(covariance) if scales is None else scales * scales
-            )
+        #: The weights of the initial error, for the observer's covariance.
+        self.prior_weights = PriorWeights(system, observer, cost)
         #: Weight of the initial error of the first window.
         self.prior_weight: Array
         self.prior_weight, regular = self.prior_weights(covariance)
@@ -97,24 +90,6 @@ class Formulation:
         self.penalties: Penalties | None = penalties if penalties else None
         #: Whether trials have values of nonlinear constraints, or penalties.
         self.extended = self.functions is not None or self.penalties is not None
-
-    def prior_weights(self, covariance: Array | None) -> tuple[Array, Array]:
-        """The prior's weight for an observer's covariance, and one to judge its distance by.
-
-        A state that is known exactly has a large weight in the first, and the weight of its typical
-        magnitude in the second.
-        """
-        typical = self._typical
-        if typical is not None and covariance is not None and self.observer_prior is not None:
-            known = covariance.diagonal() <= _NO_VARIANCE * typical
-            if known.any():
-                nearly, regular = (
-                    covariance + np.diag(np.where(known, one, 0.0))
-                    for one in (_KNOWN * typical, typical)
-                )
-                return self.cost.initial_weight(nearly), self.cost.initial_weight(regular)
-        weight = self.cost.initial_weight(covariance)
-        return weight, weight
 
     def problem(self, window: Window) -> Problem:
         """The problem of the present window."""

@@ -14,8 +14,8 @@ from ..errors import ShapeError
 from ..model.sets import ConvexSet
 from ..model.system import System
 
-# Two inversions of a covariance change its correlations by no more.
-_ROUNDING = 1e-9
+#: Two inversions of a covariance change its correlations by no more.
+SAME_COVARIANCE = 1e-9
 
 
 @dataclass(slots=True)
@@ -48,6 +48,35 @@ class Sample:
     covariance: Array | None = None
     disturbance_weight: Array | None = None
     states: ConvexSet | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ObserverForm:
+    """What the step in C computes an observer by.
+
+    Parameters
+    ----------
+    kind : {"gain", "extended", "unscented"}
+        What corrects: a constant gain, an extended or an unscented Kalman filter.
+    gain, filter_gain : (n, p) array or None
+        The constant gain, and that of the measurement update.
+    prior, disturbance, noise : (n, n), (r, r) and (p, p) array or None
+        Covariances of the initial error, of w and of v, of an observer with a covariance.
+    f_jacobian, h_jacobian : (n, n) and (p, n) array or None
+        The constant Jacobians by which the covariance of a constant gain's error proceeds.
+    spread : float
+        Distance of sigma points from the state, in standard deviations.
+    """
+
+    kind: str
+    gain: Array | None = None
+    filter_gain: Array | None = None
+    prior: Array | None = None
+    disturbance: Array | None = None
+    noise: Array | None = None
+    f_jacobian: Array | None = None
+    h_jacobian: Array | None = None
+    spread: float = 0.0
 
 
 class Observer(ABC):
@@ -114,6 +143,14 @@ class Observer(ABC):
             return None
         return np.zeros_like(gain)
 
+    @property
+    def c_form(self) -> ObserverForm | None:
+        """What the step in C needs of the observer; None for one that it cannot compute."""
+        gain, filter_gain = self.constant_gain, self.filter_gain
+        if gain is None or filter_gain is None:
+            return None
+        return ObserverForm("gain", gain, filter_gain)
+
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array] | None:
         """The estimate of x(t) that has used y(t), and its covariance; None if there is none.
 
@@ -157,6 +194,12 @@ class KalmanType(Observer):
         """P(0)."""
         return self._prior
 
+    def _form(self, kind: str) -> ObserverForm:
+        """The observer's C form, with its covariances."""
+        return ObserverForm(
+            kind, prior=self._prior, disturbance=self._disturbance, noise=self._noise
+        )
+
     def _noise_of(self, sample: Sample) -> Array:
         """The covariance of this sample's noise."""
         return covariance_of(sample.noise_weight, self._noise)
@@ -176,5 +219,5 @@ def covariance_of(weight: Array | None, usual: Array) -> Array:
         return usual
     covariance = inverse(weight)
     deviations = np.sqrt(usual.diagonal())
-    near = np.abs(covariance - usual) <= _ROUNDING * np.multiply.outer(deviations, deviations)
+    near = np.abs(covariance - usual) <= SAME_COVARIANCE * np.multiply.outer(deviations, deviations)
     return usual if near.all() else covariance

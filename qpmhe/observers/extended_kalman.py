@@ -6,7 +6,7 @@ import numpy as np
 
 from .._checks import Array
 from .._linalg import solve
-from .base import KalmanType, Sample
+from .base import KalmanType, ObserverForm, Sample
 
 
 class ExtendedKalman(KalmanType):
@@ -41,6 +41,11 @@ class ExtendedKalman(KalmanType):
     """
 
     needs_jacobians = True
+
+    @property
+    def c_form(self) -> ObserverForm | None:
+        """The covariances, unless a derived class may compute otherwise."""
+        return self._form("extended") if type(self) is ExtendedKalman else None
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""

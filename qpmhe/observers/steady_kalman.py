@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -9,7 +11,7 @@ from .._checks import Array, positive_definite, positive_semidefinite
 from .._linalg import solve
 from ..errors import ShapeError
 from ..model.system import System, checked_system
-from .base import Observer, Sample, covariance_of
+from .base import Observer, ObserverForm, Sample, covariance_of
 from .design import linearize, stationary
 
 
@@ -120,6 +122,17 @@ class SteadyStateKalman(Observer):
         """The gain of `filter`, unless a derived class filters in another way."""
         own = type(self).filter is SteadyStateKalman.filter
         return self._filter_gain if own and self.constant_gain is not None else None
+
+    @property
+    def c_form(self) -> ObserverForm | None:
+        """The gains, and the covariances unless a derived class may compute others."""
+        form = super().c_form
+        if form is None or type(self) is not SteadyStateKalman:
+            return form
+        return replace(
+            form, prior=self._prior, disturbance=self._own, noise=self._noise,
+            f_jacobian=self._a, h_jacobian=self._c,
+        )
 
     @property
     def kappa(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +12,7 @@ from .._checks import Array, positive
 from .._linalg import cholesky, solve
 from ..model.residuals import difference
 from ..model.sets import ConvexSet
-from .base import KalmanType, Sample
+from .base import KalmanType, ObserverForm, Sample
 
 # A sigma point is drawn back into the state set, but not closer to z than this share.
 _CLOSEST = 1e-3
@@ -79,6 +80,13 @@ class UnscentedKalman(KalmanType):
     ) -> None:
         super().__init__(prior=prior, disturbance=disturbance, noise=noise)
         self._spread = positive("spread", spread)
+
+    @property
+    def c_form(self) -> ObserverForm | None:
+        """The covariances and the spread, unless a derived class may compute otherwise."""
+        if type(self) is not UnscentedKalman:
+            return None
+        return replace(self._form("unscented"), spread=self._spread)
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""

@@ -316,6 +316,67 @@ def _rover(outputs: bool, states: bool, functions: bool = False, **sets: Any) ->
     )
 
 
+def _observed(make: Callable[..., qpmhe.Observer], weight: Any = None, **options: Any) -> Case:
+    """The system with inputs, and an observer with a covariance.
+
+    ``weight`` is the prior's, left out for the observer's own; options replace covariances.
+    """
+    base = _with_inputs()
+    covariances = {
+        "prior": spd(4, 3), "disturbance": 0.05 * spd(5, 3), "noise": 0.05 * spd(6, 2)
+    } | options
+    cost = qpmhe.QuadraticCost(
+        prior=qpmhe.ObserverPrior() if weight is None else weight,
+        disturbance=base.cost.disturbance, noise=base.cost.noise, discount=base.cost.discount,
+    )
+    return replace(base, observer=make(**covariances), cost=cost)
+
+
+def _reactor_extended() -> Case:
+    base = _reactor()
+    observer = qpmhe.ExtendedKalman(
+        prior=np.eye(2), disturbance=0.01 * np.eye(2), noise=[[0.01]]
+    )
+    cost = qpmhe.QuadraticCost(
+        prior=qpmhe.ObserverPrior(), disturbance=base.cost.disturbance, noise=base.cost.noise
+    )
+    return replace(base, observer=observer, cost=cost)
+
+
+def _steady() -> Case:
+    base = _with_inputs()
+    observer = qpmhe.SteadyStateKalman(
+        base.system, base.start, [0.3, 0.2], disturbance=0.05 * spd(5, 3), noise=0.05 * spd(6, 2),
+        prior=spd(4, 3),
+    )
+    cost = qpmhe.QuadraticCost(
+        prior=qpmhe.ObserverPrior(0.5, 20.0), disturbance=base.cost.disturbance,
+        noise=base.cost.noise,
+    )
+    return replace(base, observer=observer, cost=cost)
+
+
+def _failing() -> Case:
+    """A model that is not defined below zero, where measurements lead the observer at times."""
+    import casadi
+
+    system = qpmhe.from_casadi(
+        lambda x: [x[0] - 0.1 * casadi.sqrt(x[0]) + 0.05 * x[1], 0.9 * x[1] + 0.1],
+        lambda x: [x[0] + 0.1 * casadi.sqrt(x[1])], n=2, compiled=False,
+    )
+    start, options = np.array([1.0, 1.0]), {"disturbance": 0.01, "noise": 0.02}
+    samples = list(recorded(system, start, **options))
+    for t in (6, 7, 15):
+        samples[t] = {"y": samples[t]["y"] - 12.0}
+    cost = qpmhe.QuadraticCost(
+        prior=qpmhe.ObserverPrior(), disturbance=100.0 * np.eye(2), noise=[[100.0]]
+    )
+    observer = qpmhe.ExtendedKalman(
+        prior=0.1 * np.eye(2), disturbance=0.01 * np.eye(2), noise=[[0.01]]
+    )
+    return Case(system, observer, cost, start, tuple(samples))
+
+
 #: Each is made when it is asked for; `case` keeps it.
 CASES: dict[str, Callable[[], Case]] = {
     "reactor": _reactor,
@@ -440,6 +501,72 @@ CASES: dict[str, Callable[[], Case]] = {
         with_conditions(case("tank")).with_options(infeasible="keep_candidate", warm_start=True)
     ),
     "tank in time": lambda: case("tank conditions").with_options(time_budget=1e6),
+    "smoothed": lambda: case("inputs").with_options(arrival="smoothed", horizon=4),
+    "smoothed with gaps": lambda: case("smoothed").with_gaps().with_options(
+        candidate="reinitialized"
+    ),
+    "extended": lambda: _weighed(_observed(qpmhe.ExtendedKalman, spd(1, 3))),
+    "extended observer": lambda: case("extended").with_gaps().with_options(max_qps=0),
+    "extended prior": lambda: _weighed(_observed(qpmhe.ExtendedKalman).with_gaps()),
+    "extended prior smoothed": lambda: case("extended prior").with_options(
+        arrival="smoothed", warm_start=True, delay=1
+    ),
+    "extended prior reinitialized": lambda: case("extended prior").with_options(
+        candidate="reinitialized", horizon=2
+    ),
+    "extended prior bounded": lambda: _observed(
+        qpmhe.ExtendedKalman, qpmhe.ObserverPrior(0.8, 6.0)
+    ).with_gaps(),
+    "extended prior loosely bounded": lambda: _observed(
+        qpmhe.ExtendedKalman, qpmhe.ObserverPrior(1e-6, 1e9)
+    ),
+    # Some covariances are then singular up to rounding, and the weights as large as can be.
+    "extended singular": lambda: replace(_observed(
+        qpmhe.ExtendedKalman, prior=np.diag([1.0, 0.0, 0.5]), disturbance=np.diag([0.02, 0.0, 0.0])
+    ), tolerance=1e-7),
+    "extended irregular": lambda: _reactor_extended().with_gaps(),
+    "extended irregular reinitialized": lambda: case("extended irregular").with_options(
+        candidate="reinitialized", warm_start=True
+    ),
+    "extended failing": _failing,
+    "extended failing reinitialized": lambda: _failing().with_options(candidate="reinitialized"),
+    "extended conditions": lambda: with_changes(with_conditions(case("extended prior"))),
+    "extended conditions reinitialized": lambda: with_changes(
+        with_conditions(_reactor_extended().with_gaps())
+    ).with_options(candidate="reinitialized", warm_start=True),
+    "steady conditions": lambda: with_changes(with_conditions(_steady().with_gaps())),
+    "smoothed changes": lambda: with_changes(case("smoothed")),
+    "unscented": lambda: _weighed(_observed(qpmhe.UnscentedKalman, spd(1, 3))),
+    "unscented prior": lambda: _weighed(_observed(qpmhe.UnscentedKalman).with_gaps()),
+    "unscented prior reinitialized": lambda: with_changes(with_conditions(
+        case("unscented prior").with_options(candidate="reinitialized", max_qps=1)
+    )),
+    "unscented observer": lambda: case("unscented").with_gaps().with_options(max_qps=0),
+    "unscented irregular": lambda: replace(
+        case("extended irregular"),
+        observer=qpmhe.UnscentedKalman(
+            prior=0.01 * np.eye(2), disturbance=0.001 * np.eye(2), noise=[[0.01]], spread=1.2
+        ),
+    ),
+    # A covariance that is singular up to rounding has a root only up to that.
+    "unscented singular": lambda: replace(_observed(
+        qpmhe.UnscentedKalman, spd(1, 3), prior=np.diag([1.0, 0.0, 0.5]),
+        disturbance=np.diag([0.02, 0.0, 0.0]),
+    ), tolerance=1e-7),
+    "unscented failing": lambda: replace(
+        _failing(), observer=qpmhe.UnscentedKalman(
+            prior=0.1 * np.eye(2), disturbance=0.01 * np.eye(2), noise=[[0.01]]
+        )
+    ),
+    "steady prior": _steady,
+    "steady prior with gaps": lambda: _weighed(_steady().with_gaps()),
+    "extended huber": lambda: replace(
+        case("huber"), observer=case("extended prior").observer,
+        cost=qpmhe.RobustCost(
+            prior=qpmhe.ObserverPrior(), disturbance=10 * spd(2, 3),
+            noise=qpmhe.Huber(np.diag([20.0, 50.0]), 1.0),
+        ),
+    ).with_gaps(),
 }
 
 

@@ -294,15 +294,3 @@ def test_the_promise_holds_in_sets(infeasible, candidate):
             assert system.states.violation(estimate.trajectory) <= 1e-8
             assert system.disturbances.violation(estimate.disturbances) <= 1e-8
     assert improved > 20
-
-
-def test_the_compiled_step_refuses_it_by_name():
-    ca = pytest.importorskip("casadi")
-    system = qpmhe.from_casadi(
-        lambda x: ca.vertcat(x[0] + 0.2 * x[1], 0.9 * x[1]), lambda x: x[0], n=2, compiled=False
-    )
-    with pytest.raises(qpmhe.errors.OptionError, match=r"arrival='smoothed' has no C form"):
-        qpmhe.MovingHorizonEstimator(
-            system, qpmhe.Luenberger(GAIN), qpmhe.QuadraticCost(prior=P, disturbance=Q, noise=R),
-            horizon=4, initial_state=START, engine="compiled", arrival="smoothed",
-        )

@@ -180,6 +180,20 @@ class OwnGain(qpmhe.Luenberger):
         return 2.0 * super().correct(z, v, sample)[0], None
 
 
+class OwnFilter(qpmhe.ExtendedKalman):
+    """Filters by something else."""
+
+    def filter(self, z, v, sample):
+        return z + v, np.eye(z.size)
+
+
+class OwnSteady(qpmhe.SteadyStateKalman):
+    """Starts with another covariance."""
+
+    def initial_covariance(self):
+        return 2.0 * super().initial_covariance()
+
+
 class OwnCost(qpmhe.QuadraticCost):
     """May weigh in another way."""
 
@@ -200,16 +214,17 @@ class OwnLoss(qpmhe.Huber):
     [
         ("from_casadi", {"system": lambda: qpmhe.System(
             lambda x: x if x[0] > 12.0 else 0.9 * x, lambda x: x, n=1, p=1)}),
-        ("OwnGain has no C form.*constant gain", {"observer": lambda: OwnGain([0.3])}),
+        ("OwnGain has no C form; take an observer of qpmhe", {"observer": lambda: OwnGain([0.3])}),
         ("OutputInjection has no C form",
          {"observer": lambda: qpmhe.OutputInjection(lambda z, v: 0.3 * v)}),
         ("OwnLoss, the loss of noise, has no C form; take Quadratic, Huber or Power",
          {"cost": lambda: qpmhe.RobustCost(**(ONES | {"noise": OwnLoss(1.0)}))}),
         ("OwnRobustCost has no C form", {"cost": lambda: OwnRobustCost(**ONES)}),
         ("OwnCost has no C form; take a QuadraticCost", {"cost": lambda: OwnCost(**ONES)}),
-        ("take a constant one",
+        ("OwnFilter has no C form", {"observer": lambda: OwnFilter(**ONES)}),
+        ("covariance of OwnSteady has no C form.*take a constant weight",
          {"cost": lambda: qpmhe.QuadraticCost(**(ONES | {"prior": qpmhe.ObserverPrior()})),
-          "observer": lambda: qpmhe.SteadyStateKalman(
+          "observer": lambda: OwnSteady(
               plain(), [0.0], disturbance=[[1.0]], noise=[[1.0]])}),
         ("engine='compiled' does not yet project SteadyStateKalman onto X, by its covariance; take "
          "engine='python', or leave states out", {

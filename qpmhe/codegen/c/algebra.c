@@ -72,6 +72,13 @@ static void mhe_multiply(int m, int k, int n, const real *A, const real *B, real
     }
 }
 
+/* out = A B' for A (m, k) and B (n, k). */
+static void mhe_multiply_transposed(int m, int k, int n, const real *A, const real *B, real *out)
+{
+    for (int i = 0; i < m; i++)
+        for (int j = 0; j < n; j++) out[i * n + j] = mhe_dot(k, A + i * k, B + j * k);
+}
+
 /* out += A' B for A (k, m) and B (k, n). */
 static void mhe_add_product(int k, int m, int n, const real *A, const real *B, real *out)
 {
@@ -138,6 +145,84 @@ static int mhe_invert(int n, real *M, real *out)
     mhe_solve_for(n, M, n, out);
     mhe_symmetrise(n, out);
     return 1;
+}
+
+/* Whether all eigenvalues of a symmetric matrix are above low and below high. */
+static int mhe_eigenvalues_within(int n, const real *M, real low, real high, real *scratch)
+{
+    for (int i = 0; i < n * n; i++) scratch[i] = M[i];
+    for (int i = 0; i < n; i++) scratch[i * n + i] -= low;
+    if (!mhe_decompose(n, scratch)) return 0;
+    if (!isfinite(high)) return 1;
+    for (int i = 0; i < n * n; i++) scratch[i] = -M[i];
+    for (int i = 0; i < n; i++) scratch[i * n + i] += high;
+    return mhe_decompose(n, scratch);
+}
+
+/* Sweeps of rotations: they converge quadratically, so that this many never are needed. */
+#define MHE_SWEEPS 30
+
+/* Eigenvalues on the diagonal of a symmetric M, which is overwritten, and eigenvectors in the rows
+ * of V, by cyclic Jacobi rotations. */
+static void mhe_eigen(int n, real *M, real *V)
+{
+    for (int i = 0; i < n * n; i++) V[i] = 0;
+    for (int i = 0; i < n; i++) V[i * n + i] = 1;
+    for (int sweep = 0; sweep < MHE_SWEEPS; sweep++) {
+        int rotations = 0;
+        for (int p = 0; p < n; p++)
+            for (int q = p + 1; q < n; q++) {
+                const real apart = M[q * n + q] - M[p * n + p], off = M[p * n + q];
+                const real size = fabs(M[p * n + p]) + fabs(M[q * n + q]);
+                if (!(fabs(off) > (real)0.1 * EPSILON * size)) continue;
+                rotations++;
+                const real ratio = apart / (2 * off);
+                const real tangent =
+                    (ratio < 0 ? -1 : 1) / (fabs(ratio) + sqrt(1 + ratio * ratio));
+                const real cosine = 1 / sqrt(1 + tangent * tangent), sine = tangent * cosine;
+                for (int j = 0; j < n; j++) {
+                    const real a = M[p * n + j], b = M[q * n + j];
+                    M[p * n + j] = cosine * a - sine * b;
+                    M[q * n + j] = sine * a + cosine * b;
+                }
+                for (int j = 0; j < n; j++) {
+                    const real a = M[j * n + p], b = M[j * n + q];
+                    M[j * n + p] = cosine * a - sine * b;
+                    M[j * n + q] = sine * a + cosine * b;
+                }
+                for (int j = 0; j < n; j++) {
+                    const real a = V[p * n + j], b = V[q * n + j];
+                    V[p * n + j] = cosine * a - sine * b;
+                    V[q * n + j] = sine * a + cosine * b;
+                }
+                M[p * n + q] = M[q * n + p] = 0;
+            }
+        if (!rotations) return;
+    }
+}
+
+/* A lower triangular S with S S' = M, positive semidefinite, by columns: row j of `out` is column
+ * j of S. Pivots of the size of rounding give columns of zeros. */
+static void mhe_root(int n, const real *M, real *out)
+{
+    for (int strict = 1; strict >= 0; strict--) {
+        int failed = 0;
+        for (int i = 0; i < n * n; i++) out[i] = 0;
+        for (int j = 0; j < n && !failed; j++) {
+            real *column = out + j * n;
+            for (int i = j; i < n; i++) {
+                real sum = M[j * n + i];
+                for (int k = 0; k < j; k++) sum -= out[k * n + j] * out[k * n + i];
+                column[i] = sum;
+            }
+            const real pivot = column[j];
+            const real least = strict ? 0 : (real)n * EPSILON * M[j * n + j];
+            if (strict) failed = !(pivot > 0);
+            const real scale = pivot > least ? 1 / sqrt(pivot) : isnan(pivot) ? pivot : 0;
+            for (int i = j; i < n; i++) column[i] *= scale;
+        }
+        if (!failed) return;
+    }
 }
 
 #if defined(__GNUC__)

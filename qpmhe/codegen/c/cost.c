@@ -101,17 +101,10 @@ static real mhe_stage_cost(const mhe_settings *s, const mhe_stage *stage, const 
            mhe_lost(&s->noise_loss, NY, stage->noise_weight, v);
 }
 
-/* The weight of the prior at the window's first stage. */
-static const real *mhe_prior_weight(const mhe_settings *s, const mhe_stage *first)
-{
-    (void)first;
-    return s->prior_weight;
-}
-
 /* Gamma of an offset from the prior. */
-static real mhe_prior_cost(const mhe_settings *s, const mhe_stage *first, const real *offset)
+static real mhe_prior_cost(const mhe_settings *s, const mhe_workspace *k, const real *offset)
 {
-    return mhe_lost(&s->prior_loss, NX, mhe_prior_weight(s, first), offset);
+    return mhe_lost(&s->prior_loss, NX, k->prior.weight, offset);
 }
 
 #if MHE_LAPACK

@@ -49,10 +49,18 @@ typedef $real mhe_real;
 /* Whether outputs, states have angles (1), or a function for their differences (2). */
 #define MHE_OUTPUT_RESIDUAL $output_residual
 #define MHE_STATE_RESIDUAL $state_residual
+#define MHE_OBSERVER $observer   /* MHE_GAIN, MHE_EXTENDED, ... */
+#define MHE_COVARIANCE $covariance /* whether the observer's covariance is computed */
+#define MHE_OBSERVER_PRIOR $observer_prior /* whether it weighs the prior */
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
 $limits
+
+/* What corrects the observer: a constant gain, an extended or an unscented Kalman filter. */
+#define MHE_GAIN 0
+#define MHE_EXTENDED 1
+#define MHE_UNSCENTED 2
 
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
@@ -117,6 +125,20 @@ typedef struct {
 } mhe_x_set;
 
 /* Matrices are stored by rows. Weights are inverse covariances. */
+#if MHE_COVARIANCE
+typedef struct {
+    mhe_real initial[MHE_NX * MHE_NX]; /* of the initial error */
+    mhe_real disturbance[MHE_NX * MHE_NX], noise[MHE_NY * MHE_NY];
+    /* Jacobians of a constant gain's error. */
+    mhe_real f_jacobian[MHE_NX * MHE_NX], h_jacobian[MHE_NY * MHE_NX];
+    /* The prior's weight: eigenvalues are clipped to these bounds, or where both are 0 those of
+     * the correlations count as `least` at least. */
+    mhe_real minimum, maximum, least;
+    mhe_real spread;          /* of sigma points, in standard deviations */
+    mhe_real typical[MHE_NX]; /* variances where states may be known exactly, else 0 */
+} mhe_covariances;
+#endif
+
 typedef struct {
     mhe_real gain[MHE_NX * MHE_NY];
     mhe_real filter_gain[MHE_NX * MHE_NY]; /* of the observer's own measurement update */
@@ -125,6 +147,9 @@ typedef struct {
     mhe_real noise_weight[MHE_NY * MHE_NY];
     mhe_loss prior_loss, disturbance_loss, noise_loss;
     mhe_real output_periods[MHE_NY], state_periods[MHE_NX]; /* of angles; 0 for no angle */
+#if MHE_COVARIANCE
+    mhe_covariances covariances; /* of the observer */
+#endif
     mhe_real discount;         /* factor on a stage's cost for each step of age */
     mhe_real sample_time;      /* of the rate; 0 where f is a map */
     mhe_real tolerance;        /* relative decrease of the cost that counts as converged */
@@ -143,6 +168,7 @@ typedef struct {
     int32_t infeasible;        /* MHE_DROP_ROWS or MHE_KEEP_CANDIDATE */
     int32_t start_at_best;     /* start at the shifted previous estimate where it is better */
     int32_t reinitialize;      /* observer restarted at the estimate of the window's start */
+    int32_t smooth;            /* prior at the previous estimate of the window's first state */
     int32_t delay;             /* of the delayed estimates that mhe_run writes */
 #if MHE_CLOCK
     double time_budget;        /* seconds from the start of a step, after which no QP begins */
@@ -176,6 +202,9 @@ typedef struct {
     mhe_real cost;                 /* infinite where the model could not be evaluated */
     int32_t has_own_noise, has_own_disturbance, has_own_w, has_own_v, is_irregular, is_complete;
     uint8_t is_observed[MHE_NY], is_sampled[MHE_NY];
+#if MHE_COVARIANCE
+    mhe_real covariance[MHE_NX * MHE_NX]; /* of the observer's error at z */
+#endif
     mhe_terms terms;
 } mhe_stage;
 
@@ -184,11 +213,16 @@ typedef struct {
     int64_t time;                  /* samples taken */
     int32_t first, length;         /* the window in the ring of stages */
     int32_t newest, has_trajectory;
+    int32_t has_smoothed;          /* whether there is a smoothed prior */
     int32_t far, dropped;          /* samples running with a far observer, with rows dropped */
     int32_t metric_settled;        /* whether the metric below is for good */
     mhe_real metric[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)]; /* of the observer, as a covariance */
+    mhe_real smoothed[MHE_NX];     /* the prior in place of the window's first z */
     mhe_real last_good[MHE_NX];    /* of the stages that have left the window */
     mhe_real z_end[MHE_NX];        /* the observer's state behind the last stage */
+#if MHE_COVARIANCE
+    mhe_real last_good_covariance[MHE_NX * MHE_NX], covariance_end[MHE_NX * MHE_NX];
+#endif
     mhe_real history[(MHE_HORIZON + 1) * MHE_NX]; /* ring of estimates of x(t), newest last */
     mhe_real trajectory[(MHE_HORIZON + 1) * MHE_NX];
     mhe_stage stages[MHE_HORIZON];
@@ -230,11 +264,19 @@ typedef struct {
     mhe_side sides[2];
 } mhe_rows;
 
+/* The prior of the present window: its mean, its weight, and one to judge distances by. */
+typedef struct {
+    const mhe_real *mean, *weight, *distance_weight;
+    mhe_real own_weight[MHE_OBSERVER_PRIOR ? MHE_NX * MHE_NX : 1];
+    mhe_real own_distance[MHE_OBSERVER_PRIOR ? MHE_NX * MHE_NX : 1];
+} mhe_prior;
+
 typedef struct {
     mhe_trial trials[4], bent;
     mhe_terms terms[MHE_HORIZON];
     const mhe_terms *at[MHE_HORIZON]; /* the terms of the present QP */
     mhe_real factors[MHE_HORIZON + 1]; /* discounts: of the prior, then of each stage */
+    mhe_prior prior;
     mhe_real panels[(MHE_HORIZON + 1) * MHE_NX * MHE_PANEL_WIDTH];
     mhe_real inverse_pivots[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real gradient[(MHE_HORIZON + 1) * MHE_NX], step[(MHE_HORIZON + 1) * MHE_NX];
@@ -300,8 +342,9 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *workspac
              int64_t samples, const mhe_real *y, const mhe_real *u, const mhe_log *log);
 
 /* Compute the stages of the window again, each from its own state and sample, to check an
- * estimator that was saved. `reached`: MHE_HORIZON states, the one behind each stage. */
-void mhe_recompute(mhe_estimator *estimator, mhe_real *reached);
+ * estimator that was saved. `reached`: MHE_HORIZON states, the one behind each stage;
+ * `covariances`: the same of the observer's, if it has them. */
+void mhe_recompute(mhe_estimator *estimator, mhe_real *reached, mhe_real *covariances);
 
 #if MHE_LAPACK
 /* Before all else: dpotrf, dtrsm, dsyrk and dgemm, by Fortran's convention with 32-bit integers. */

@@ -20,10 +20,10 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     const int count = e->length;
     const real *factors = k->factors;
     real prior_scale[NX];
-    mhe_set_scale(&s->prior_loss, NX, mhe_prior_weight(s, mhe_stage_at(e, 0)), offset, prior_scale);
+    mhe_set_scale(&s->prior_loss, NX, k->prior.weight, offset, prior_scale);
     for (int i = 0; i <= count; i++) {
         real *panel = k->panels + i * NX * WIDTH, *g = k->gradient + i * NX;
-        const real *weight = i == 0 ? mhe_prior_weight(s, mhe_stage_at(e, 0))
+        const real *weight = i == 0 ? k->prior.weight
                                     : mhe_disturbance_weight(s, mhe_stage_at(e, i - 1));
         const real *scale = i == 0 ? prior_scale : k->at[i - 1]->disturbance_scale;
         const real factor = mhe_floored(factors[i]);

@@ -1,14 +1,247 @@
-/* The observer: its correction, and its own measurement update. */
+/* The observer: its correction, its own measurement update, and its covariance. */
 
-/* L(z, v) of a stage, from its residual v. */
-static void mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *out)
+#if MHE_COVARIANCE
+/* The outputs of a stage that are there, with their fitting errors and noise covariance. */
+typedef struct {
+    int count, at[NY];
+    real v[NY], noise[NY * NY];
+} mhe_seen;
+
+/* The covariance of a sample's own weight. One that only rounding makes other than the usual one
+ * is the usual one. NaN where the weight has no inverse. */
+static void mhe_covariance_of(int n, const real *weight, const real *usual, real *scratch,
+                              real *out)
 {
+    int near = 1;
+    for (int i = 0; i < n * n; i++) scratch[i] = weight[i];
+    if (!mhe_invert(n, scratch, out)) {
+        for (int i = 0; i < n * n; i++) out[i] = NAN;
+        return;
+    }
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < n; j++) {
+            const real size = sqrt(usual[i * n + i]) * sqrt(usual[j * n + j]);
+            const real change = fabs(out[i * n + j] - usual[i * n + j]);
+            if (!(change <= MHE_SAME_COVARIANCE * size)) near = 0;
+        }
+    if (near) memcpy(out, usual, sizeof(real) * (size_t)(n * n));
+}
+
+static void mhe_see(const mhe_settings *s, const mhe_stage *stage, mhe_seen *seen)
+{
+    const real *noise = s->covariances.noise;
+    real own[NY * NY], scratch[NY * NY];
+    if (stage->has_own_noise) {
+        mhe_covariance_of(NY, stage->own_noise_weight, noise, scratch, own);
+        noise = own;
+    }
+    seen->count = 0;
+    for (int i = 0; i < NY; i++)
+        if (stage->is_observed[i]) seen->at[seen->count++] = i;
+    for (int i = 0; i < seen->count; i++) {
+        seen->v[i] = stage->v[seen->at[i]];
+        for (int j = 0; j < seen->count; j++)
+            seen->noise[i * seen->count + j] = noise[seen->at[i] * NY + seen->at[j]];
+    }
+}
+
+/* Add K R K' + Q to a covariance; the rows of `gain` are the columns of K. */
+static void mhe_add_noise(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
+                          const real *gain, real *P)
+{
+    const real *Q = s->covariances.disturbance;
+    real weighted[NY * NX], own[NX * NX], scratch[NX * NX];
+    if (stage->has_own_disturbance) {
+        mhe_covariance_of(NX, stage->own_disturbance_weight, Q, scratch, own);
+        Q = own;
+    }
+    mhe_multiply(seen->count, seen->count, NX, seen->noise, gain, weighted);
+    mhe_add_product(seen->count, NX, NX, gain, weighted, P);
+    for (int i = 0; i < NX * NX; i++) P[i] += Q[i];
+    mhe_symmetrise(NX, P);
+}
+
+/* out = K v */
+static void mhe_gained(const mhe_seen *seen, const real *gain, real *out)
+{
+    for (int j = 0; j < NX; j++) out[j] = 0;
+    for (int i = 0; i < seen->count; i++)
+        for (int j = 0; j < NX; j++) out[j] += gain[i * NX + j] * seen->v[i];
+}
+#endif
+
+#if MHE_COVARIANCE && MHE_OBSERVER != MHE_UNSCENTED
+/* Joseph's form of P(t+1) = (A - K C) P (A - K C)' + K R K' + Q, with the outputs' rows of C. */
+static void mhe_propagate(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
+                          const real *A, const real *C, const real *gain, real *following)
+{
+    real closed[NX * NX], product[NX * NX];
+    for (int j = 0; j < NX; j++)
+        for (int l = 0; l < NX; l++) {
+            real sum = A[j * NX + l];
+            for (int i = 0; i < seen->count; i++) sum -= gain[i * NX + j] * C[i * NX + l];
+            closed[j * NX + l] = sum;
+        }
+    mhe_multiply(NX, NX, NX, closed, stage->covariance, product);
+    mhe_multiply_transposed(NX, NX, NX, product, closed, following);
+    mhe_add_noise(s, stage, seen, gain, following);
+}
+
+/* The rows of C of the outputs that are there. */
+static void mhe_rows_of(const mhe_seen *seen, const real *C, real *rows)
+{
+    for (int i = 0; i < seen->count; i++)
+        memcpy(rows + i * NX, C + seen->at[i] * NX, sizeof(real) * NX);
+}
+#endif
+
+#if MHE_OBSERVER == MHE_EXTENDED
+/* The columns of K = A P C' (C P C' + R)^-1 as rows, or of the measurement update's P C' (...)^-1
+ * where there is no A; NaN where there is no gain. C: rows of the outputs that are there. */
+static void mhe_kalman_gain(const mhe_stage *stage, const mhe_seen *seen, const real *A,
+                            const real *C, real *gain)
+{
+    real cross[NY * NX], innovation[NY * NY];
+    mhe_multiply(seen->count, NX, NX, C, stage->covariance, cross);
+    mhe_multiply_transposed(seen->count, NX, seen->count, cross, C, innovation);
+    for (int i = 0; i < seen->count * seen->count; i++) innovation[i] += seen->noise[i];
+    if (A)
+        mhe_multiply_transposed(seen->count, NX, NX, cross, A, gain);
+    else
+        memcpy(gain, cross, sizeof(real) * (size_t)(seen->count * NX));
+    if (mhe_decompose(seen->count, innovation))
+        mhe_solve_for(seen->count, innovation, NX, gain);
+    else
+        for (int i = 0; i < seen->count * NX; i++) gain[i] = NAN;
+}
+#endif
+
+#if MHE_OBSERVER == MHE_UNSCENTED
+/* Deviations of the sigma points from z come in pairs, along the columns of a root of P. */
+#define POINTS (2 * NX)
+
+static void mhe_sigma_points(const mhe_settings *s, const mhe_stage *stage, real *moves)
+{
+    mhe_root(NX, stage->covariance, moves);
+    for (int i = 0; i < NX * NX; i++) {
+        moves[i] *= s->covariances.spread;
+        moves[NX * NX + i] = -moves[i];
+    }
+}
+
+/* The root of a sigma point's weight, which goes into the deviations: sums become products. */
+static real mhe_sigma_root(const mhe_settings *s)
+{
+    return 1 / (sqrt((real)2) * s->covariances.spread);
+}
+
+/* Deviations of the outputs that are there, at each sigma point. */
+static void mhe_sigma_outputs(const mhe_settings *s, const mhe_stage *stage,
+                              const mhe_seen *seen, const real *moves, real *rows)
+{
+    real at[NX], middle[NY], output[NY];
+    mhe_h(stage->z, stage->u, middle);
+    for (int k = 0; k < POINTS; k++) {
+        for (int j = 0; j < NX; j++) at[j] = stage->z[j] + moves[k * NX + j];
+        mhe_h(at, stage->u, output);
+        for (int i = 0; i < seen->count; i++)
+            rows[k * seen->count + i] =
+                (output[seen->at[i]] - middle[seen->at[i]]) * mhe_sigma_root(s);
+    }
+}
+
+/* The columns of the gain of least mean square error as rows, from deviations of the outputs and of
+ * what is estimated; what it leaves of the latter takes their place. */
+static void mhe_sigma_gain(const mhe_seen *seen, const real *rows, real *ahead, real *gain)
+{
+    real innovation[NY * NY];
+    memcpy(innovation, seen->noise, sizeof(real) * (size_t)(seen->count * seen->count));
+    mhe_add_product(POINTS, seen->count, seen->count, rows, rows, innovation);
+    for (int i = 0; i < seen->count * NX; i++) gain[i] = 0;
+    mhe_add_product(POINTS, seen->count, NX, rows, ahead, gain);
+    if (mhe_decompose(seen->count, innovation))
+        mhe_solve_for(seen->count, innovation, NX, gain);
+    else
+        for (int i = 0; i < seen->count * NX; i++) gain[i] = NAN;
+    for (int k = 0; k < POINTS; k++)
+        for (int i = 0; i < seen->count; i++)
+            for (int j = 0; j < NX; j++)
+                ahead[k * NX + j] -= rows[k * seen->count + i] * gain[i * NX + j];
+}
+#endif
+
+/* L(z, v) of a stage, from its residual v, and the covariance of the next step. */
+static void mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *out,
+                           real *following)
+{
+#if MHE_OBSERVER == MHE_EXTENDED
+    const mhe_terms *t = &stage->terms;
+    mhe_seen seen;
+    real gain[NY * NX], rows[NY * NX];
+    mhe_see(s, stage, &seen);
+    mhe_rows_of(&seen, t->h_jacobian, rows);
+    mhe_kalman_gain(stage, &seen, t->f_jacobian, rows, gain);
+    mhe_gained(&seen, gain, out);
+    mhe_propagate(s, stage, &seen, t->f_jacobian, rows, gain, following);
+#elif MHE_OBSERVER == MHE_UNSCENTED
+    mhe_seen seen;
+    real gain[NY * NX], moves[POINTS * NX], ahead[POINTS * NX], rows[POINTS * NY];
+    real at[NX], middle[NX];
+    mhe_see(s, stage, &seen);
+    mhe_sigma_points(s, stage, moves);
+    mhe_f(stage->z, stage->u, stage->step, middle);
+    for (int k = 0; k < POINTS; k++) {
+        real *next = ahead + k * NX;
+        for (int j = 0; j < NX; j++) at[j] = stage->z[j] + moves[k * NX + j];
+        mhe_f(at, stage->u, stage->step, next);
+        for (int j = 0; j < NX; j++) next[j] = (next[j] - middle[j]) * mhe_sigma_root(s);
+    }
+    mhe_sigma_outputs(s, stage, &seen, moves, rows);
+    mhe_sigma_gain(&seen, rows, ahead, gain);
+    mhe_gained(&seen, gain, out);
+    for (int i = 0; i < NX * NX; i++) following[i] = 0;
+    mhe_add_product(POINTS, NX, NX, ahead, ahead, following);
+    mhe_add_noise(s, stage, &seen, gain, following);
+#else
     for (int j = 0; j < NX; j++) out[j] = mhe_dot(NY, s->gain + j * NY, stage->v);
+#if MHE_COVARIANCE
+    mhe_seen seen;
+    real gain[NY * NX], rows[NY * NX];
+    mhe_see(s, stage, &seen);
+    mhe_rows_of(&seen, s->covariances.h_jacobian, rows);
+    for (int i = 0; i < seen.count; i++)
+        for (int j = 0; j < NX; j++) gain[i * NX + j] = s->gain[j * NY + seen.at[i]];
+    mhe_propagate(s, stage, &seen, s->covariances.f_jacobian, rows, gain, following);
+#else
+    (void)following;
+#endif
+#endif
 }
 
 /* The observer's estimate of x(t) that has used y(t). */
 static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out)
 {
+#if MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED
+    mhe_seen seen;
+    real gain[NY * NX];
+    mhe_see(s, stage, &seen);
+#if MHE_OBSERVER == MHE_EXTENDED
+    real rows[NY * NX];
+    mhe_rows_of(&seen, stage->terms.h_jacobian, rows);
+    mhe_kalman_gain(stage, &seen, 0, rows, gain);
+#else
+    real moves[POINTS * NX], rows[POINTS * NY];
+    mhe_sigma_points(s, stage, moves);
+    mhe_sigma_outputs(s, stage, &seen, moves, rows);
+    for (int i = 0; i < POINTS * NX; i++) moves[i] *= mhe_sigma_root(s);
+    mhe_sigma_gain(&seen, rows, moves, gain);
+#endif
+    mhe_gained(&seen, gain, out);
+    for (int j = 0; j < NX; j++) out[j] += stage->z[j];
+    if (!isfinite(stage->cost) || !mhe_all_finite(NX, out))
+        memcpy(out, stage->z, sizeof stage->z);
+#else
     for (int j = 0; j < NX; j++)
         out[j] = stage->z[j] + mhe_dot(NY, s->filter_gain + j * NY, stage->v);
+#endif
 }

@@ -115,7 +115,7 @@ static int mhe_solve_free(mhe_estimator *e, mhe_workspace *k, const real *offset
 static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
                         const mhe_trial *around, int nearest, int again)
 {
-    const real *prior = mhe_stage_at(e, 0)->z;
+    const real *prior = k->prior.mean;
     real offset[NX];
     for (int j = 0; j < NX; j++) offset[j] = around->x[j] - prior[j];
     mhe_wrap_state(e->settings, around->x, offset);
@@ -391,6 +391,7 @@ static void mhe_set_candidate(mhe_estimator *e, mhe_workspace *k, mhe_trial *tri
     }
     /* No cost is NaN, but 0 times infinity is where a discount underflows. */
     if (isnan(trial->cost)) trial->cost = INFINITY;
+    trial->cost += mhe_move_prior(e, k);
     memcpy(trial->x + count * NX, e->z_end, sizeof e->z_end);
 #if CONSTRAINED
     memset(k->left_out, 0, sizeof k->left_out);
@@ -409,6 +410,7 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
         factor *= s->discount;
     }
     k->factors[0] = factor;
+    mhe_set_prior(e, k);
     memset(o, 0, sizeof *o);
 #if CONSTRAINED
     memset(k->rows.place, 0, sizeof k->rows.place);

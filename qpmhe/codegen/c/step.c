@@ -7,13 +7,13 @@ static void mhe_remember(mhe_estimator *e, const real *state)
 }
 
 /* Count consecutive samples in which the observer was far from the estimate, or rows dropped. */
-static void mhe_watch(mhe_estimator *e, mhe_outcome *o)
+static void mhe_watch(mhe_estimator *e, const mhe_workspace *k, mhe_outcome *o)
 {
     real offset[NX];
     for (int j = 0; j < NX; j++)
         offset[j] = o->best->x[e->length * NX + j] - o->candidate->x[e->length * NX + j];
     mhe_wrap_state(e->settings, o->best->x + e->length * NX, offset);
-    const int far = mhe_form(NX, mhe_prior_weight(e->settings, mhe_stage_at(e, 0)), offset) > MHE_FAR * MHE_FAR;
+    const int far = mhe_form(NX, k->prior.distance_weight, offset) > MHE_FAR * MHE_FAR;
     e->far = far ? e->far + (e->far < INT32_MAX) : 0;
     e->dropped = o->rows_dropped ? e->dropped + (e->dropped < INT32_MAX) : 0;
     if (e->far >= MHE_HORIZON) o->events |= MHE_OBSERVER_FAR;
@@ -32,7 +32,7 @@ static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
         o->events &= ~MHE_NO_DECREASE; /* the model failed, not the solver */
         if (!(o->events & MHE_MODEL_FAILED)) o->events |= MHE_FAILED_STAGE;
     }
-    mhe_watch(e, o);
+    mhe_watch(e, k, o);
     memcpy(e->trajectory, o->best->x, size);
     e->has_trajectory = 1;
     if (!isfinite(newest->cost) && o->best != o->candidate)
@@ -54,6 +54,10 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
 {
     const int before = e->has_trajectory ? e->length : -1;
     mhe_begin(e, k);
+    if (e->settings->smooth && e->has_trajectory && e->length == MHE_HORIZON) {
+        memcpy(e->smoothed, e->trajectory + NX, sizeof e->smoothed);
+        e->has_smoothed = 1;
+    }
     int events = mhe_push(e, sample);
     if (e->settings->reinitialize) {
         /* The ring of estimates reaches back to that of the window's first state. */
@@ -115,6 +119,10 @@ void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
 #endif
     memcpy(e->last_good, e->z_end, sizeof e->last_good);
     memcpy(e->history, e->z_end, sizeof e->z_end);
+#if MHE_COVARIANCE
+    memcpy(e->last_good_covariance, settings->covariances.initial, sizeof e->covariance_end);
+    memcpy(e->covariance_end, settings->covariances.initial, sizeof e->covariance_end);
+#endif
 }
 
 static mhe_sample mhe_usual_sample(const real *y, const real *u)
@@ -243,16 +251,26 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64
     }
 }
 
-void mhe_recompute(mhe_estimator *e, mhe_real *reached)
+void mhe_recompute(mhe_estimator *e, real *reached, real *covariances)
 {
     for (int i = 0; i < e->length; i++) {
-        real *next = i + 1 < e->length ? mhe_stage_at(e, i + 1)->z : e->z_end, kept[NX];
+        real *next = mhe_next_state(e, i), kept[NX];
         memcpy(kept, next, sizeof kept);
+#if MHE_COVARIANCE
+        real *following = mhe_next_covariance(e, i), kept_covariance[NX * NX];
+        memcpy(kept_covariance, following, sizeof kept_covariance);
+#endif
         mhe_set_noise_weight(e->settings, mhe_stage_at(e, i));
         mhe_complete_own_sets(e->settings, mhe_stage_at(e, i));
         mhe_enter(e, i);
         memcpy(reached + i * NX, next, sizeof kept);
         memcpy(next, kept, sizeof kept);
+#if MHE_COVARIANCE
+        memcpy(covariances + i * NX * NX, following, sizeof kept_covariance);
+        memcpy(following, kept_covariance, sizeof kept_covariance);
+#else
+        (void)covariances;
+#endif
     }
 }
 

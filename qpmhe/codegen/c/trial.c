@@ -6,7 +6,7 @@
 static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
 {
     const mhe_settings *s = e->settings;
-    const real *prior = mhe_stage_at(e, 0)->z, *factors = k->factors;
+    const real *prior = k->prior.mean, *factors = k->factors;
     real offset[NX], cost = 0;
     for (int i = 0; i < e->length; i++) {
         const mhe_stage *stage = mhe_stage_at(e, i);
@@ -28,7 +28,7 @@ static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *tr
     }
     for (int j = 0; j < NX; j++) offset[j] = trial->x[j] - prior[j];
     mhe_wrap_state(s, trial->x, offset);
-    cost += factors[0] * mhe_prior_cost(s, mhe_stage_at(e, 0), offset);
+    cost += factors[0] * mhe_prior_cost(s, k, offset);
     trial->cost = cost;
     trial->violation = 0;
     if (!isfinite(cost)) {

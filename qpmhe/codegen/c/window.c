@@ -6,9 +6,26 @@ static mhe_stage *mhe_stage_at(mhe_estimator *e, int i)
     return e->stages + (k < MHE_HORIZON ? k : k - MHE_HORIZON);
 }
 
-/* Evaluate the stage at its z and step the observer to `next`; the cost, or infinity. `events` gets
- * bits of the status. */
-static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *next, int *events)
+/* The observer behind stage i of the window: its state, and its covariance if it has one. */
+static real *mhe_next_state(mhe_estimator *e, int i)
+{
+    return i + 1 < e->length ? mhe_stage_at(e, i + 1)->z : e->z_end;
+}
+
+static real *mhe_next_covariance(mhe_estimator *e, int i)
+{
+#if MHE_COVARIANCE
+    return i + 1 < e->length ? mhe_stage_at(e, i + 1)->covariance : e->covariance_end;
+#else
+    (void)e; (void)i;
+    return 0;
+#endif
+}
+
+/* Evaluate the stage at its z and step the observer to `next`, its covariance to `following`; the
+ * cost, or infinity. `events` gets bits of the status. */
+static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *next,
+                        real *following, int *events)
 {
     const mhe_settings *s = e->settings;
     real *v = stage->v, *w = stage->w, predicted[NX], output[NY];
@@ -26,10 +43,11 @@ static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *ne
     mhe_wrap_output(s, stage->y, v);
     for (int j = 0; j < NY; j++)
         if (!stage->is_observed[j]) v[j] = 0;
-    mhe_correction(s, stage, w);
+    mhe_correction(s, stage, w, following);
     for (int j = 0; j < NX; j++) next[j] = predicted[j] + w[j];
     mhe_wrap_state(s, next, w);
     if (!mhe_all_finite(NX, next)) return INFINITY;
+    if (MHE_COVARIANCE && !mhe_all_finite(NX * NX, following)) return INFINITY;
 #if MHE_X_SET
     if (s->project) *events = mhe_stay_inside(e, stage, predicted, next);
 #else
@@ -46,10 +64,10 @@ static int mhe_enter(mhe_estimator *e, int i)
     const mhe_settings *s = e->settings;
     mhe_stage *stage = mhe_stage_at(e, i);
     mhe_terms *t = &stage->terms;
-    const int linear = s->max_qps > 0;
-    real *next = i + 1 < e->length ? mhe_stage_at(e, i + 1)->z : e->z_end;
+    const int linear = s->max_qps > 0, derived = linear || MHE_OBSERVER == MHE_EXTENDED;
+    real *next = mhe_next_state(e, i), *following = mhe_next_covariance(e, i);
     int events = 0;
-    stage->cost = mhe_advance(e, stage, linear, next, &events);
+    stage->cost = mhe_advance(e, stage, derived, next, following, &events);
     const int held = !isfinite(stage->cost);
     if (held) {
         /* z(i) is where the model does not work: go on where it last did. */
@@ -57,6 +75,10 @@ static int mhe_enter(mhe_estimator *e, int i)
         while (good >= 0 && !isfinite(mhe_stage_at(e, good)->cost)) good--;
         memcpy(next, good >= 0 ? mhe_stage_at(e, good)->z : e->last_good,
                sizeof e->last_good);
+#if MHE_COVARIANCE
+        memcpy(following, good >= 0 ? mhe_stage_at(e, good)->covariance : e->last_good_covariance,
+               sizeof e->last_good_covariance);
+#endif
         memset(stage->w, 0, sizeof stage->w);
         memset(stage->v, 0, sizeof stage->v);
     }
@@ -86,13 +108,21 @@ static int mhe_push(mhe_estimator *e, const mhe_sample *sample)
     const mhe_settings *s = e->settings;
     if (e->length == MHE_HORIZON) {
         const mhe_stage *leaving = mhe_stage_at(e, 0);
-        if (isfinite(leaving->cost)) memcpy(e->last_good, leaving->z, sizeof e->last_good);
+        if (isfinite(leaving->cost)) {
+            memcpy(e->last_good, leaving->z, sizeof e->last_good);
+#if MHE_COVARIANCE
+            memcpy(e->last_good_covariance, leaving->covariance, sizeof leaving->covariance);
+#endif
+        }
         e->first = e->first + 1 < MHE_HORIZON ? e->first + 1 : 0;
     } else {
         e->length++;
     }
     mhe_stage *stage = mhe_stage_at(e, e->length - 1);
     memcpy(stage->z, e->z_end, sizeof stage->z);
+#if MHE_COVARIANCE
+    memcpy(stage->covariance, e->covariance_end, sizeof stage->covariance);
+#endif
     for (int j = 0; j < NU; j++) stage->u[j] = sample->u[j];
     mhe_take_conditions(s, stage, sample);
     mhe_set_noise_weight(s, stage);

@@ -1,0 +1,106 @@
+/* The prior of a window: its mean, and its weight from the observer's covariance. */
+
+#if MHE_OBSERVER_PRIOR
+/* A variance below it counts as it, so that the weight and its square do not overflow. */
+#define LEAST_VARIANCE (sizeof(real) == 8 ? (real)3.0549363634996047e-151 : (real)1e-24)
+
+/* Correlations with eigenvalues above so many times the least are inverted without them. */
+#define WELL_CONDITIONED 100
+
+/* out = the sum of value_i v_i v_i' for the eigenvectors in the rows of V. */
+static void mhe_compose(const real *values, const real *V, real *out)
+{
+    real scaled[NX * NX];
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++) {
+            scaled[i * NX + j] = values[i] * V[i * NX + j];
+            out[i * NX + j] = 0;
+        }
+    mhe_add_product(NX, NX, NX, V, scaled, out);
+    mhe_symmetrise(NX, out);
+}
+
+/* out = the inverse of M, of which each eigenvalue is between low and high, or made so. M is
+ * overwritten. */
+static void mhe_bounded_inverse(real *M, real low, real high, int is_clear, real *out)
+{
+    real V[NX * NX], values[NX];
+    if (is_clear && mhe_invert(NX, M, out)) return;
+    mhe_eigen(NX, M, V);
+    for (int i = 0; i < NX; i++) {
+        const real value = M[i * NX + i];
+        values[i] = 1 / (value > low ? value < high ? value : high : low);
+    }
+    mhe_compose(values, V, out);
+}
+
+/* The weight of the prior from a covariance, which is overwritten. */
+static void mhe_weight_of(const mhe_covariances *o, real *P, real *out)
+{
+    real scratch[NX * NX], deviations[NX];
+    if (o->maximum > 0) {
+        const real low = 1 / o->maximum, high = 1 / o->minimum;
+        const int is_clear = mhe_eigenvalues_within(NX, P, low, high, scratch);
+        mhe_bounded_inverse(P, low, high, is_clear, out);
+        return;
+    }
+    for (int j = 0; j < NX; j++) deviations[j] = sqrt(mhe_max(P[j * NX + j], LEAST_VARIANCE));
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++) P[i * NX + j] /= deviations[i] * deviations[j];
+    const int is_clear =
+        mhe_eigenvalues_within(NX, P, WELL_CONDITIONED * o->least, INFINITY, scratch);
+    mhe_bounded_inverse(P, o->least, INFINITY, is_clear, out);
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++) out[i * NX + j] /= deviations[i] * deviations[j];
+}
+
+/* The weight with the variances of some states increased. */
+static void mhe_weight_plus(const mhe_covariances *o, const real *covariance, const real *added,
+                            real factor, real *out)
+{
+    real P[NX * NX];
+    memcpy(P, covariance, sizeof P);
+    for (int j = 0; j < NX; j++) P[j * NX + j] += factor * added[j];
+    mhe_weight_of(o, P, out);
+}
+#endif
+
+/* The prior of the present window, before the candidate's cost is known. */
+static void mhe_set_prior(mhe_estimator *e, mhe_workspace *k)
+{
+    const mhe_stage *first = mhe_stage_at(e, 0);
+    mhe_prior *prior = &k->prior;
+    prior->mean = first->z;
+    prior->weight = prior->distance_weight = e->settings->prior_weight;
+#if MHE_OBSERVER_PRIOR
+    const mhe_covariances *o = &e->settings->covariances;
+    real known[NX];
+    int count = 0;
+    for (int j = 0; j < NX; j++) {
+        const int is_known =
+            o->typical[j] > 0 && first->covariance[j * NX + j] <= MHE_NO_VARIANCE * o->typical[j];
+        known[j] = is_known ? o->typical[j] : 0;
+        count += is_known;
+    }
+    prior->weight = prior->distance_weight = prior->own_weight;
+    mhe_weight_plus(o, first->covariance, known, MHE_KNOWN, prior->own_weight);
+    if (count) {
+        /* A state that is known exactly is judged by its typical magnitude. */
+        mhe_weight_plus(o, first->covariance, known, 1, prior->own_distance);
+        prior->distance_weight = prior->own_distance;
+    }
+#endif
+}
+
+/* Take the smoothed prior in place of the observer's state, unless the candidate has no finite
+ * cost about it; by how much the candidate's cost rises. */
+static real mhe_move_prior(mhe_estimator *e, mhe_workspace *k)
+{
+    real offset[NX];
+    if (!e->has_smoothed) return 0;
+    for (int j = 0; j < NX; j++) offset[j] = mhe_stage_at(e, 0)->z[j] - e->smoothed[j];
+    const real cost = mhe_prior_cost(e->settings, k, offset);
+    if (!isfinite(cost)) return 0;
+    k->prior.mean = e->smoothed;
+    return k->factors[0] * cost;
+}
