@@ -13,6 +13,7 @@ from .._checks import dimension, need, positive
 from ..model.augmentation import Augmentation
 from ..model.functions import Trusted, takes_input
 from ..model.system import System, SystemOptions, checked_set, probe_points, timed_options
+from ..model.traces import ModelTrace
 from .jax_programs import Programs
 
 Array = NDArray[np.float64]
@@ -116,6 +117,10 @@ def from_jax(
     probes = probe_points(checked_set("states", options.get("states"), n), n, m)
     programs = Programs(f, h, n, p, m, method, length is not None, probes)
     system = _assembled(_Model(programs, length), m, options)
+    sources = {name: programs.as_numpy(name) for name in ("f", "h")}
+    system.tracing = ModelTrace(
+        system.f, system.h, n, p, m, system.states, length, method, sources
+    )
     if length is not None:
         system.dt = length
         system.make_timed = partial(

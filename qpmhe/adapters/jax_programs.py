@@ -15,6 +15,8 @@ from .._checks import need
 from ..errors import InvalidInputError, ModelError
 from ..model.discretize import discretize
 from ..model.functions import Probes, check_inputs, takes_input
+from ..model.operations import without_symbols
+from .jax_expressions import numpy_function
 from .jax_indices import check_indices
 
 Array = NDArray[np.float64]
@@ -48,6 +50,7 @@ class Programs:
         jax, concatenate = self._jax, self._jax.numpy.concatenate
         rate, output = self._checked("f", f, n, probes), self._checked("h", h, p, probes)
         check_inputs(m, f=takes_input("f", f, m), h=takes_input("h", h, m))
+        self._functions = {"f": rate, "h": output}
         step = discretize(rate, None, method)[0]
         if method == "rk4":
             step = partial(_runge_kutta, jax, rate)
@@ -87,6 +90,26 @@ class Programs:
         self.value = self._compiled(
             lambda *point: [value(*(block[0] for block in point))], 1, [(n,), (p,)]
         )
+
+    def as_numpy(self, name: str) -> Function:
+        """The model's f (the rate, with a step length) or h as a function of x and u of NumPy.
+
+        Raises what JAX or `numpy_function` raises where it is none.
+        """
+        made: list[Function] = []
+
+        def evaluate(x: Array, u: Array) -> Any:
+            if not made:
+                arguments = [
+                    self._jax.ShapeDtypeStruct((size,), np.float64) for size in (self.n, self.m)
+                ]
+                with self._double(True):
+                    program = self._jax.make_jaxpr(self._functions[name])(*arguments)
+                made.append(numpy_function(program))
+            with self._double(True):
+                return made[0](x, u)
+
+        return without_symbols(evaluate)
 
     def of_batch(self, slopes: int, room: int) -> Program:
         """The program of f and h over so many states, or that of A and C."""

@@ -43,8 +43,8 @@ _NUMBERS_ONLY = {"bitwise_and", "bitwise_or", "bitwise_xor", "invert"}
 _tracing = threading.local()
 
 
-def _of_the_machinery(method: Form) -> Form:
-    """A method within which NumPy is NumPy again: see `numpy_on_symbols`."""
+def without_symbols(method: Form) -> Form:
+    """A function or method within which NumPy is itself again: see `numpy_on_symbols`."""
 
     @functools.wraps(method)
     def call(*arguments: Any, **options: Any) -> Any:
@@ -65,7 +65,7 @@ class ExpressionRecord(Record):
         super().__init__()
         self.casadi = casadi
 
-    @_of_the_machinery
+    @without_symbols
     def symbols(self, column: Any) -> SymbolArray:
         """An array (size,) of the entries of a column."""
         entries = self.casadi.densify(column).elements()
@@ -86,13 +86,13 @@ class ExpressionRecord(Record):
         number: Any = value
         return self.casadi.SX(float(number))
 
-    @_of_the_machinery
+    @without_symbols
     def column(self, values: Any) -> Any:
         """A dense column of the entries of an array, row by row."""
         entries = [self.expression(one) for one in _objects(values).ravel()]
         return self.casadi.densify(self.casadi.vertcat(self.casadi.SX(0, 1), *entries))
 
-    @_of_the_machinery
+    @without_symbols
     def operate(self, ufunc: Any, operands: tuple[Any, ...]) -> Any:
         """See `Record.operate`."""
         name = ufunc.__name__
@@ -114,7 +114,7 @@ class ExpressionRecord(Record):
         logical = name in _LOGICAL or (name == "positive" and all(truths))
         return self.symbol(form(*(self.expression(one) for one in operands)), logical)
 
-    @_of_the_machinery
+    @without_symbols
     def apply(
         self, ufunc: Any, method: str, inputs: tuple[Any, ...], options: dict[str, Any]
     ) -> Any:
@@ -160,7 +160,7 @@ class ExpressionRecord(Record):
         form = _FUNCTIONS.get(function)
         if form is not None:
             try:
-                return _of_the_machinery(form)(self, *args, **kwargs)
+                return without_symbols(form)(self, *args, **kwargs)
             except TypeError as error:  # arguments that are rarely given
                 raise self.refuse(f"numpy.{function.__name__} with such arguments") from error
         # NumPy's own code, which comes back here for each elementwise function.
@@ -171,7 +171,7 @@ class ExpressionRecord(Record):
         )
         return self.finished(value)
 
-    @_of_the_machinery
+    @without_symbols
     def made(
         self, function: Callable[..., Any], arguments: tuple[Any, ...], options: dict[str, Any]
     ) -> Any:
@@ -206,7 +206,7 @@ class ExpressionRecord(Record):
             return {key: self._in_arrays(one) for key, one in value.items()}
         return value
 
-    @_of_the_machinery
+    @without_symbols
     def finished(self, value: Any) -> Any:
         """What goes back to the function: arrays of this trace, and symbols alone."""
         if isinstance(value, (tuple, list)):
@@ -272,7 +272,7 @@ class ExpressionRecord(Record):
             )
         return self.finished(np.moveaxis(found, -1, axis))
 
-    @_of_the_machinery
+    @without_symbols
     def product(self, left: Any, right: Any) -> Any:
         """A matrix product."""
         a, b = _objects(left), _objects(right)
@@ -286,7 +286,7 @@ class ExpressionRecord(Record):
         shape = (*a.shape[:-1], *b.shape[1:])
         return self.from_matrix(found, shape)
 
-    @_of_the_machinery
+    @without_symbols
     def matrix(self, values: Any) -> Any:
         """A CasADi matrix of a 2-d array, sparse if it is of numbers."""
         array = _objects(values)
@@ -294,13 +294,13 @@ class ExpressionRecord(Record):
             return self.casadi.sparsify(self.casadi.DM(array.astype(np.float64)))
         return self.casadi.reshape(self.column(array.T), *array.shape)
 
-    @_of_the_machinery
+    @without_symbols
     def from_matrix(self, matrix: Any, shape: tuple[int, ...]) -> Any:
         """An array of this shape with the entries of a CasADi matrix, or one symbol."""
         entries = self.symbols(self.casadi.vec(matrix.T))
         return self.finished(plain(entries).reshape(shape))
 
-    @_of_the_machinery
+    @without_symbols
     def choice(self, condition: Any, chosen: Any, other: Any) -> Any:
         """One or the other, entry by entry."""
         def choose(truth: Any, a: Any, b: Any) -> Any:

@@ -228,6 +228,7 @@ class System:
         # The trace as an estimator's copy has found it, and f, h and what belongs to them as they
         # are written, where it stands in their place.
         self._pinned: Pinned | None = None
+        self._pins = False
         self._as_written: dict[str, Any] | None = None
         #: Makes the system `timed`; None where there is no model in continuous time.
         self.make_timed: Callable[[], System] | None = None
@@ -389,6 +390,8 @@ class System:
         # Steps of other lengths must be those of the same model.
         if self._has_other_steps:
             return None
+        if self._pins and self._pinned is None:
+            self._pinned = self.tracing.confirm(self.scales)
         return self.tracing.model if self._pinned is None else self._pinned.model
 
     @symbolic.setter
@@ -456,11 +459,10 @@ class System:
     def _use_trace(self) -> None:
         """Evaluate f and h by their traces, which agree with them, and with given Jacobians."""
         tracing = self.tracing
-        if tracing is None or self._as_written is not None:
+        self._pins = True
+        if tracing is None or self.kernel is not None:  # the latter has exact Jacobians
             return
         self._pinned = pinned = tracing.confirm(self.scales)
-        if self.kernel is not None:
-            return
         names = [name for name, one in pinned.found.items() if one.function]
         names = [name for name in names if self._jacobian_agrees(name, pinned.evaluator())]
         if not names:
@@ -517,6 +519,7 @@ class System:
     def use_functions(self) -> None:
         """Evaluate f and h as they are written from now on, if a trace stands in their place."""
         written, self._as_written, self._pinned = self._as_written, None, None
+        self._pins = False
         if written is not None:
             self.__dict__.update(written)
             self.__dict__.pop("timed", None)
@@ -546,8 +549,8 @@ class System:
         lines, own = [], self.copy(traced=True)
         for name, method in own.derivatives.items():
             text = "in CasADi"
-            if own._pinned is not None:
-                found = own._pinned.found[name]
+            if own.tracing is not None:
+                found = (own._pinned or own.tracing.now).found[name]
                 text = "traced" if found.function else f"not traced: {found.reason}"
             lines.append(f"{name}: {text}. Jacobian: {_METHODS.get(method, method)}.")
         if own._has_other_steps:

@@ -101,12 +101,18 @@ class ModelTrace:
         X, in which trace and function are compared.
     dt, method : optional
         Where f is a rate: the step length, and the discretisation.
+    sources : dict, optional
+        Functions of x and u, named ``f`` and ``h``, to be traced in place of those above, which
+        they are to agree with: f then is the step where there is a step length, and its source
+        the rate.
     """
 
     def __init__(
         self, f: BatchedFunction, h: BatchedFunction, n: int, p: int, m: int,
         states: ConvexSet | None, dt: float | None = None, method: str | None = None,
+        sources: dict[str, Callable[[Array, Array], Any]] | None = None,
     ) -> None:
+        self._sources = sources
         self._functions = {"f": _of_both(f), "h": _of_both(h)}
         self._n, self._p, self._m, self._states = n, p, m, states
         self.dt, self._method = dt, method
@@ -133,10 +139,11 @@ class ModelTrace:
 
     def _traced(self, name: str, where: Points) -> Traced:
         function = self._functions[name]
-        found = expressed(function, (self._n, self._m), name)
+        source = function if self._sources is None else self._sources[name]
+        found = expressed(source, (self._n, self._m), name)
         if found.function is None:
             return found
-        fault = difference(found, function, where)
+        fault = self._difference(name, found, where)
         if fault:
             warn_of(f"{name} cannot be traced: {fault}")
             return Traced(None, fault)
@@ -147,6 +154,16 @@ class ModelTrace:
             return Traced(None, f"it takes {count} operations, more than {_MOST_OPERATIONS}")
         return found
 
+    def _difference(self, name: str, found: Traced, where: Points) -> str:
+        """Where a trace differs from its function; blank where it does not."""
+        if name == "f" and self._sources is not None and self.dt is not None:
+            ca, n = import_casadi(), self._n
+            x, u = ca.SX.sym("x", n), ca.SX.sym("u", self._m)
+            model = CasadiModel(found.function, None, n, 0, self._m, self.dt, self._method)
+            stepped = ca.Function("f", [x, u], [ca.densify(model.step()(x, u, self.dt))])
+            found = Traced(stepped, "", (n,))
+        return difference(found, self._functions[name], where)
+
     def confirm(self, scales: Array | None) -> Pinned:
         """The traces, compared with the functions again at points of these magnitudes.
 
@@ -155,7 +172,7 @@ class ModelTrace:
         where = points(self._states, self._n, self._m, 1.0 if scales is None else scales, True)
         with self._lock:
             for name, one in self.now.found.items():
-                if one.function and difference(one, self._functions[name], where):
+                if one.function and self._difference(name, one, where):
                     again = self._traced(name, [*points(self._states, self._n, self._m), *where])
                     self._pin({**self.now.found, name: again})
             return self.now
@@ -166,7 +183,7 @@ class ModelTrace:
             if one.function is None:
                 continue
             try:
-                text = difference(one, self._functions[name], [(x, u)])
+                text = self._difference(name, one, [(x, u)])
             except Exception as error:  # whatever a user's function returns now
                 text = f"it raises {type(error).__name__}"
             if text:

@@ -10,7 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .operations import ExpressionRecord, numpy_on_symbols
-from .symbols import Record, Symbol, SymbolArray, in_arrays, place, plain, run, wrapped
+from .symbols import (
+    NotTraceableError,
+    Record,
+    Symbol,
+    SymbolArray,
+    in_arrays,
+    place,
+    plain,
+    run,
+    wrapped,
+)
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.uint64]
@@ -239,6 +249,8 @@ def expressed(function: Callable[..., Any], sizes: Sequence[int], name: str = "t
 
 def _failure(error: BaseException) -> str:
     """What a function raised on symbols, and where."""
+    if isinstance(error, NotTraceableError):
+        return str(error)
     frames = [one for one, _ in traceback.walk_tb(error.__traceback__)]
     where = place(frames[-1]) if frames else ""
     text = f"raises {type(error).__name__} on symbols: {error}"
