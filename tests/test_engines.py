@@ -33,6 +33,10 @@ def make(**options):
 def asks_for_python():
     return make(engine="python")
 
+def traced():
+    system = qpmhe.System(lambda x: [0.9 * x[0], 0.8 * np.sin(x[1])], lambda x: x[:1], n=2, p=1)
+    return (system, *make()[1:])
+
 def with_a_branch():
     system = qpmhe.System(lambda x: [0.9 * x[0], 0.8 * float(x[1])], lambda x: x[:1], n=2, p=1)
     return (system, *make()[1:])
@@ -163,14 +167,17 @@ def test_doctor_says_what_there_is_and_what_each_model_runs(here):
     assert code == 0
     for name in qpmhe.models.catalogue():
         assert name in output
-    models = "model.py:make", "model.py:asks_for_python", "model.py:with_a_branch", "nothing"
+    models = [f"model.py:{name}" for name in ("make", "asks_for_python", "traced", "with_a_branch")]
+    models.append("nothing")
     code, output = command("doctor", *models)
     assert code == 0
     for text in (
         f"Python {sys.version.split()[0]}", np.__version__, "right with -O", "1 steps",
         "model.py:make 2 CasADi python its library is not in the cache; qpmhe.compile makes it.",
         "model.py:asks_for_python 2 CasADi python it asks for engine='python'.",
-        "model.py:with_a_branch 2 NumPy python", "nothing none model 'nothing' is not known",
+        "model.py:traced 2 traced python its library is not in the cache",
+        "model.py:with_a_branch 2 as written python the system has no CasADi form (f is not traced",
+        "nothing none model 'nothing' is not known",
     ):
         assert text in output, text
     command("compile", "model.py:make")

@@ -65,7 +65,9 @@ def _row(model: str) -> tuple[str, ...]:
     engine, reason = codegen.engine_choice(
         system, estimator.observer, estimator.cost, estimator.settings
     )
-    form = "NumPy" if system.symbolic is None else "CasADi"
+    form = "as written"
+    if system.symbolic is not None:
+        form = "CasADi" if system.tracing is None else "traced"
     color = "green" if engine == "compiled" else "default"
     return escape(model), str(system.n), form, f"[{color}]{engine}[/]", escape(reason)
 

@@ -613,10 +613,10 @@ class MovingHorizonEstimator:
         It computes every stored stage again and compares the results. With ``engine="auto"`` the
         estimator goes on with the engine that the snapshot was taken with.
         """
-        own = self.engine
         pinned = state.get("engine", "python") if isinstance(state, dict) else None
+        is_other = isinstance(pinned, str) and pinned != self.engine
         # Whole or, if interrupted, not at all.
-        if self.settings.engine == "auto" and isinstance(pinned, str) and pinned != own:
+        if is_other and self.settings.engine == "auto":
             engine = engine_of_snapshot(
                 pinned, self._own_system, self.observer, self.cost, self.settings,
                 self._initial_state,

@@ -42,7 +42,8 @@ class Run:
         Covariances of the estimates of x(1), ..., x(T), if requested; NaN where the model
         could not be linearised.
     engine : str
-        What ran the steps: ``python`` or ``compiled``.
+        What ran the steps: ``python``, ``compiled``, or ``compiled, then python`` where a model
+        has changed since it was compiled.
 
     Attributes
     ----------
@@ -106,7 +107,7 @@ class Run:
             ).reshape(-1, n),
             flags=np.array([e.status.value for e in estimates], dtype=np.intp),
             covariances=covariances,
-            engine=estimates[0].engine if estimates else "python",
+            engine=", then ".join(dict.fromkeys(one.engine for one in estimates)) or "python",
         )
 
     @cached_property

@@ -41,7 +41,8 @@ class Summary:
     Attributes
     ----------
     engine : str
-        What ran the steps: ``python`` or ``compiled``. An estimation that resumes keeps it.
+        What ran the steps: ``python``, ``compiled``, or ``compiled, then python`` where the model
+        has changed meanwhile. An estimation that resumes keeps it.
     samples, before : int
         Samples of this run, and of the earlier run that it resumed.
     improved, incomplete : int
@@ -473,6 +474,8 @@ class _Session:
 
     def _finished(self) -> Summary:
         reader, summary = self._reader, self._summary
+        if self._mhe.engine != summary.engine:
+            summary.engine += f", then {self._mhe.engine}"
         summary.held, summary.repeated = reader.held, reader.repeated
         if summary.failed:
             stale = (
