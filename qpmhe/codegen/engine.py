@@ -37,7 +37,7 @@ from ..model.traces import next_check
 from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
 from .handover import hand_over
-from .layout import CHANGES, SAMPLE_SETS, SIDES, STAGE_FLAGS
+from .layout import CHANGES, SET_NAMES, SIDES, STAGE_FLAGS
 from .library import EstimatorLibrary
 from .sample import SampleRecord
 
@@ -451,7 +451,7 @@ class CompiledEngine:
         for kind in ("noise", "disturbance"):
             if flags[f"has_own_{kind}"]:
                 saved[f"{kind}_weight"] = stage[f"own_{kind}_weight"]
-        for letter, name in zip("wv", SAMPLE_SETS, strict=True):
+        for letter, name in zip("wvx", SET_NAMES, strict=True):
             if flags[f"has_own_{letter}"]:
                 sides, built = stage[f"own_{letter}"], self._system.set_of(name)
                 if built is None:
@@ -469,7 +469,7 @@ class CompiledEngine:
         weight = fresh["noise_weight"]
         if not near(stage["noise_weight"], weight, np.abs(weight).max()):
             raise mismatch("weight of the stages' cost")
-        for letter in "wv":
+        for letter in "wvx":
             if stage[f"has_own_{letter}"]:  # all but the sides is computed
                 stage[f"own_{letter}"] = fresh[f"own_{letter}"]
         if np.isfinite(stage["cost"]) != np.isfinite(fresh["cost"]):

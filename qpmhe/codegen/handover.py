@@ -10,7 +10,7 @@ from ..estimation.conditions import Conditions
 from ..estimation.engine import PythonEngine, Taken
 from ..model.sets import ConvexSet
 from ..model.system import System
-from .layout import SAMPLE_SETS, SIDES
+from .layout import SET_NAMES, SIDES
 
 
 def samples_of(record: Any, system: System) -> list[Taken]:
@@ -48,7 +48,7 @@ def _conditions(stage: Any, system: System) -> Conditions | None:
     for name, flag in (("noise_weight", "noise"), ("disturbance_weight", "disturbance")):
         if stage[f"has_own_{flag}"]:
             found[name] = stage[f"own_{name}"].copy()
-    for letter, name in zip("wvx", SAMPLE_SETS, strict=False):
+    for letter, name in zip("wvx", SET_NAMES, strict=True):
         one = system.set_of(name)
         if one is not None and stage[f"has_own_{letter}"]:
             sides = stage[f"own_{letter}"]

@@ -25,8 +25,6 @@ from ..observers import Observer
 from ..observers.base import covariance_of
 
 SET_NAMES = ("disturbances", "noises", "states")
-#: Those of which a sample may have other sides.
-SAMPLE_SETS = SET_NAMES[:2]
 # Terms of the cost, and their losses in the order of their numbers in C.
 TERMS = ("prior", "disturbance", "noise")
 LOSSES = ("quadratic", "huber", "power")
@@ -35,10 +33,11 @@ LOSSES = ("quadratic", "huber", "power")
 SIDES = ("lower", "upper", "row_lower", "row_upper")
 #: Flags of a stage.
 STAGE_FLAGS = (
-    "has_own_noise", "has_own_disturbance", "has_own_w", "has_own_v", "is_irregular", "is_complete"
+    "has_own_noise", "has_own_disturbance", "has_own_w", "has_own_v", "has_own_x", "is_irregular",
+    "is_complete",
 )
 #: What mhe_set changes, in the order of its bits.
-CHANGES = ("noise_weight", "disturbance_weight", *SAMPLE_SETS)
+CHANGES = ("noise_weight", "disturbance_weight", *SET_NAMES)
 
 _CLOCK_TEXT = """
  *
@@ -178,7 +177,7 @@ class Layout:
 
     def sample_type(self) -> np.dtype[Any]:
         """``mhe_sample``."""
-        pointers = ("y", "u", "noise_weight", "disturbance_weight", *SAMPLE_SETS, "sampled")
+        pointers = ("y", "u", "noise_weight", "disturbance_weight", *SET_NAMES, "sampled")
         return _struct([*((name, np.uintp) for name in pointers), ("step", self.number)])
 
     @property
@@ -224,7 +223,7 @@ class Layout:
             ("own_disturbance_weight", r, (n, n)),
             *(
                 (f"own_{letter}", self.set_type(name))
-                for letter, name, (there, _) in zip("wv", SAMPLE_SETS, self.sets[:2], strict=True)
+                for letter, name, (there, _) in zip("wvx", SET_NAMES, self.sets, strict=True)
                 if there
             ),
             ("cost", r), *((flag, np.int32) for flag in STAGE_FLAGS), ("is_observed", np.uint8, p),

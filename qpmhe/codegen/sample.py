@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..estimation.conditions import Conditions
 from ..model.sets import ConvexSet
-from .layout import SAMPLE_SETS, SIDES, Layout
+from .layout import SET_NAMES, SIDES, Layout
 
 
 class SampleRecord:
@@ -29,7 +29,7 @@ class SampleRecord:
         self._arrays: dict[str, Any] = {
             "noise_weight": np.zeros((p, p)), "disturbance_weight": np.zeros((n, n)),
             "sampled": np.zeros(p, np.uint8),
-            **{name: np.zeros(1, layout.set_type(name)) for name in SAMPLE_SETS},
+            **{name: np.zeros(1, layout.set_type(name)) for name in SET_NAMES},
         }
         self._addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
 

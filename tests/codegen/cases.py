@@ -500,6 +500,27 @@ CASES: dict[str, Callable[[], Case]] = {
     "tank kept": lambda: with_changes(
         with_conditions(case("tank")).with_options(infeasible="keep_candidate", warm_start=True)
     ),
+    "states, conditions": lambda: with_changes(
+        with_conditions(case("inputs and states")).with_options(max_qps=None)
+    ),
+    "states in a box, conditions": lambda: with_changes(
+        with_conditions(case("states in a box").with_gaps())
+    ),
+    "states, conditions observer": lambda: with_changes(
+        with_conditions(case("states in both")).with_options(max_qps=0)
+    ),
+    "states, conditions reinitialized": lambda: with_changes(with_conditions(
+        case("states in a polytope").with_options(candidate="reinitialized", warm_start=True)
+    )),
+    "states not projected, conditions": lambda: with_changes(with_conditions(
+        case("states not projected")
+    )),
+    "noise-free conditions": lambda: with_changes(with_conditions(
+        case("noise-free in states")
+    )),
+    "conditions of one sample": lambda: with_changes(with_conditions(
+        case("inputs and states")
+    )).with_options(horizon=1),
     "tank in time": lambda: case("tank conditions").with_options(time_budget=1e6),
     "smoothed": lambda: case("inputs").with_options(arrival="smoothed", horizon=4),
     "smoothed with gaps": lambda: case("smoothed").with_gaps().with_options(

@@ -14,10 +14,15 @@ if TYPE_CHECKING:
 
 
 def narrowed(one: qpmhe.ConvexSet, lower: float, upper: float) -> qpmhe.ConvexSet:
-    """The set with its sides multiplied by these factors."""
-    return one.with_sides(
-        lower * one.lower, upper * one.upper, lower * one.row_lower, upper * one.row_upper
-    )
+    """The set with its sides so many times as far from its middle; of one side, from 0."""
+    sides = []
+    for low, high in ((one.lower, one.upper), (one.row_lower, one.row_upper)):
+        with np.errstate(invalid="ignore"):
+            one_side = np.where(np.isfinite(low), abs(low), abs(high))
+            half = np.where(np.isfinite(high - low), 0.5 * (high - low), one_side)
+            half[~np.isfinite(half)] = 0.0
+        sides += [low + (1.0 - lower) * half, high - (1.0 - upper) * half]
+    return one.with_sides(*sides)
 
 
 def weights(one: Case, t: int) -> dict[str, np.ndarray]:

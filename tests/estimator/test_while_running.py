@@ -41,7 +41,10 @@ OPTIONS = {
 if find_compiler() is not None:
     OPTIONS |= {
         f"{name}, in C": OPTIONS[name] | {"engine": "compiled"}
-        for name in ("plain", "two", "observer alone", "reinitialized", "discount")
+        for name in (
+            "plain", "two", "observer alone", "reinitialized", "discount", "sets",
+            "sets, reinitialized",
+        )
     }
 every = pytest.mark.parametrize("name", OPTIONS)
 # The sets are narrow: rows are dropped for long, and a start may lie outside.
@@ -317,6 +320,9 @@ def test_set_gives_the_estimator_that_was_made_with_the_values(name, change):
     made = changed(options, changes, initial_state=estimate.candidate[0], prior=prior)
     if metric is not None:
         made._engine._window.metric.state = metric
+    if window is None:
+        for field in ("metric", "metric_settled"):
+            made._engine._memory[field] = mhe._engine._memory[field]
     for (y, u), own in record[8:12]:
         own = {k: v for k, v in own.items() if k == "bounds" or k not in changes}
         own["bounds"] = {

@@ -1,6 +1,6 @@
 /* What a sample comes with in place of the usual: weights, sides of sets, sensors, a step's length. */
 
-#if MHE_W_SET || MHE_V_SET
+#if MHE_W_SET || MHE_V_SET || MHE_X_SET
 /* A miss of a row counts as a share of its width, or of a standard deviation if that is less. */
 static void mhe_set_scales(int count, const real *lower, const real *upper, const real *deviation,
                            real *scale)
@@ -31,6 +31,9 @@ static void mhe_complete_own_sets(const mhe_settings *s, mhe_stage *stage)
 #if MHE_V_SET
     if (stage->has_own_v) TAKE_SIDES(stage->own_v, s->noises, NY, MHE_V_ROWS);
 #endif
+#if MHE_X_SET
+    if (stage->has_own_x) TAKE_SIDES(stage->own_x, s->states, NX, MHE_X_ROWS);
+#endif
     (void)s; (void)stage;
 }
 
@@ -45,6 +48,12 @@ static const mhe_w_set *mhe_w_set_at(const mhe_settings *s, const mhe_stage *sta
 static const mhe_v_set *mhe_v_set_at(const mhe_settings *s, const mhe_stage *stage)
 {
     return stage->has_own_v ? &stage->own_v : &s->noises;
+}
+#endif
+#if MHE_X_SET
+static const mhe_x_set *mhe_x_set_at(const mhe_settings *s, const mhe_stage *stage)
+{
+    return stage->has_own_x ? &stage->own_x : &s->states;
 }
 #endif
 
@@ -68,6 +77,10 @@ static void mhe_take_conditions(const mhe_settings *s, mhe_stage *stage, const m
     stage->has_own_v = sample->noises != 0;
     if (stage->has_own_v) stage->own_v = *sample->noises;
 #endif
+#if MHE_X_SET
+    stage->has_own_x = sample->states != 0;
+    if (stage->has_own_x) stage->own_x = *sample->states;
+#endif
     mhe_complete_own_sets(s, stage);
     for (int j = 0; j < NY; j++) {
         const real y = sample->y[j];
@@ -85,6 +98,7 @@ static void mhe_forget(mhe_stage *stage, int32_t changes)
     if (changes & MHE_DISTURBANCE_WEIGHT) stage->has_own_disturbance = 0;
     if (changes & MHE_DISTURBANCES) stage->has_own_w = 0;
     if (changes & MHE_NOISES) stage->has_own_v = 0;
+    if (changes & MHE_STATES) stage->has_own_x = 0;
 }
 
 /* Whether a component that was sampled is missing. */

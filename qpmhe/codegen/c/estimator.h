@@ -85,7 +85,8 @@ enum { MHE_LOWER = 1, MHE_UPPER = 2 };
 
 /* What mhe_set changes, as bits. */
 enum {
-    MHE_NOISE_WEIGHT = 1, MHE_DISTURBANCE_WEIGHT = 2, MHE_DISTURBANCES = 4, MHE_NOISES = 8
+    MHE_NOISE_WEIGHT = 1, MHE_DISTURBANCE_WEIGHT = 2, MHE_DISTURBANCES = 4, MHE_NOISES = 8,
+    MHE_STATES = 16
 };
 
 /* A convex set: lower <= s <= upper, row_lower <= rows s <= row_upper. A miss of an inequality
@@ -199,8 +200,12 @@ typedef struct {
 #if MHE_V_SET
     mhe_v_set own_v;
 #endif
+#if MHE_X_SET
+    mhe_x_set own_x;
+#endif
     mhe_real cost;                 /* infinite where the model could not be evaluated */
-    int32_t has_own_noise, has_own_disturbance, has_own_w, has_own_v, is_irregular, is_complete;
+    int32_t has_own_noise, has_own_disturbance, has_own_w, has_own_v, has_own_x;
+    int32_t is_irregular, is_complete;
     uint8_t is_observed[MHE_NY], is_sampled[MHE_NY];
 #if MHE_COVARIANCE
     mhe_real covariance[MHE_NX * MHE_NX]; /* of the observer's error at z */
@@ -298,6 +303,7 @@ typedef struct {
      * read where the settings have no such set. */
     const mhe_w_set *disturbances;
     const mhe_v_set *noises;
+    const mhe_x_set *states; /* of x(t), and of x(t+1) until the next sample comes */
     const uint8_t *sampled;        /* 1 for each component of y that was sampled: others are not
                                     * missing, but have no measurement at this time */
     mhe_real step;                 /* length of the step from t to t+1 */

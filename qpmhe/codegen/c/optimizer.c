@@ -34,11 +34,11 @@ static real mhe_target(const mhe_outcome *o)
 }
 
 /* Clip a trial to the bounds of X. */
-static void mhe_clip_trial(const mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
+static void mhe_clip_trial(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
 {
 #if MHE_X_SET
-    const mhe_x_set *set = &e->settings->states;
     for (int i = 0; i <= e->length; i++) {
+        const mhe_x_set *set = mhe_x_set_at(e->settings, mhe_stage_of_state(e, i));
         const uint8_t *out = k->left_out + i * ROWS + W_COUNT + V_COUNT;
         real *x = trial->x + i * NX;
         for (int j = 0; j < NX; j++) {

@@ -395,14 +395,41 @@ static int mhe_settle(const mhe_settings *s, const real *K, const mhe_terms *t, 
     return 1;
 }
 
+/* X of the state behind a stage: that of the next sample, if it has come. */
+static const mhe_x_set *mhe_x_set_behind(const mhe_estimator *e, const mhe_stage *stage)
+{
+    const int at = (int)(stage - e->stages), newest = (e->first + e->length - 1) % MHE_HORIZON;
+    return mhe_x_set_at(e->settings, e->stages + (at == newest ? at : (at + 1) % MHE_HORIZON));
+}
+
 /* Keep the observer's next state in X; bits of the status. The stage's Jacobians are there as long
  * as the metric has not settled. */
 static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const real *predicted, real *next)
 {
     const mhe_settings *s = e->settings;
+    const mhe_x_set *set = mhe_x_set_behind(e, stage);
     if (!e->metric_settled) e->metric_settled = mhe_settle(s, s->gain, &stage->terms, e->metric);
-    if (mhe_is_inside(&s->states, next)) return 0;
-    return mhe_keep_inside(&s->states, e->metric, predicted, next, stage->w);
+    if (mhe_is_inside(set, next)) return 0;
+    return mhe_keep_inside(set, e->metric, predicted, next, stage->w);
+}
+
+/* Put a state of the observer into a set to which no correction leads. */
+static void mhe_put_inside(const mhe_estimator *e, const mhe_x_set *set, real *state)
+{
+    real point[NX];
+    if (!e->settings->project || mhe_is_inside(set, state)) return;
+    mhe_project(set, e->metric, state, point);
+    memcpy(state, point, sizeof point);
+}
+
+static int mhe_has_sides_of(const mhe_x_set *one, const mhe_x_set *other)
+{
+    int same = 1;
+    for (int j = 0; j < NX; j++)
+        same &= one->lower[j] == other->lower[j] && one->upper[j] == other->upper[j];
+    for (int r = 0; r < MHE_X_ROWS; r++)
+        same &= one->row_lower[r] == other->row_lower[r] && one->row_upper[r] == other->row_upper[r];
+    return same;
 }
 
 #endif

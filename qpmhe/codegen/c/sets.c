@@ -35,12 +35,17 @@ static void mhe_distances(int n, int count, const real *q, const real *lower, co
 /* Stages that have rows: behind the last sample, there is a state. */
 static int mhe_row_stages(const mhe_estimator *e) { return e->length + MHE_X_SET; }
 
+/* The stage whose X state i has to be in: the state behind the last sample has that sample's. */
+static mhe_stage *mhe_stage_of_state(mhe_estimator *e, int i)
+{
+    return mhe_stage_at(e, i < e->length ? i : i - 1);
+}
+
 /* The scales of all rows of stage i. */
 static void mhe_stage_scales(mhe_estimator *e, int i, real *scale)
 {
     const mhe_settings *s = e->settings;
-    /* The state behind the last sample has rows of X alone. */
-    const mhe_stage *stage = mhe_stage_at(e, i < e->length ? i : i - 1);
+    const mhe_stage *stage = mhe_stage_of_state(e, i);
 #if MHE_W_SET
     const mhe_w_set *W = mhe_w_set_at(s, stage);
     for (int j = 0; j < NX; j++) scale[j] = W->scale[j];
@@ -54,8 +59,9 @@ static void mhe_stage_scales(mhe_estimator *e, int i, real *scale)
     scale += V_COUNT;
 #endif
 #if MHE_X_SET
-    for (int j = 0; j < NX; j++) scale[j] = s->states.scale[j];
-    for (int j = 0; j < MHE_X_ROWS; j++) scale[NX + j] = s->states.row_scale[j];
+    const mhe_x_set *X = mhe_x_set_at(s, stage);
+    for (int j = 0; j < NX; j++) scale[j] = X->scale[j];
+    for (int j = 0; j < MHE_X_ROWS; j++) scale[NX + j] = X->row_scale[j];
 #endif
     (void)stage;
 }
@@ -65,15 +71,15 @@ static void mhe_stage_distances(mhe_estimator *e, int i, const real *x, const re
                                 const real *v, real *low, real *high)
 {
     const mhe_settings *s = e->settings;
+    const mhe_stage *stage = mhe_stage_of_state(e, i);
 #if MHE_X_SET
-    DISTANCES(s->states, NX, MHE_X_ROWS, x + i * NX, 0, low + W_COUNT + V_COUNT,
+    DISTANCES(*mhe_x_set_at(s, stage), NX, MHE_X_ROWS, x + i * NX, 0, low + W_COUNT + V_COUNT,
               high + W_COUNT + V_COUNT);
     if (i == e->length) {
         for (int r = 0; r < W_COUNT + V_COUNT; r++) low[r] = -INFINITY, high[r] = INFINITY;
         return;
     }
 #endif
-    const mhe_stage *stage = mhe_stage_at(e, i);
 #if MHE_W_SET
     DISTANCES(*mhe_w_set_at(s, stage), NX, MHE_W_ROWS, w + i * NX, 0, low, high);
 #endif
@@ -86,9 +92,10 @@ static void mhe_stage_distances(mhe_estimator *e, int i, const real *x, const re
 
 /* The largest miss among rows of one set, in their scales. `sizes`: of the numbers whose
  * differences the rows are of, for rounding. `missed` gets the sides that are, but for
- * components without width, which are not dropped. */
-static real mhe_missed(int n, int count, const real *low, const real *high, const real *rows,
-                       const real *scale, const real *row_scale, const real *sizes,
+ * components without width in the usual set, which are not dropped. */
+static real mhe_missed(int n, int count, const real *low, const real *high, const real *lower,
+                       const real *upper, const real *rows, const real *scale,
+                       const real *row_scale, const real *sizes,
                        const uint8_t *left_out, uint8_t *missed)
 {
     real worst = 0;
@@ -103,7 +110,7 @@ static real mhe_missed(int n, int count, const real *low, const real *high, cons
             for (int j = 0; j < n; j++) size += fabs(rows[(r - n) * n + j] * sizes[j]);
         const real miss = (side == MHE_LOWER ? low[r] : -high[r]) - 8 * EPSILON * size;
         const real share = miss / (r < n ? scale[r] : row_scale[r - n]);
-        const int fixed = r < n && low[r] == high[r];
+        const int fixed = r < n && lower[r] == upper[r];
         if (isnan(share)) return INFINITY;
         worst = mhe_max(share, worst);
         if (missed && !fixed && share > MHE_FEASIBLE) missed[r] = (uint8_t)side;
@@ -111,9 +118,9 @@ static real mhe_missed(int n, int count, const real *low, const real *high, cons
     return worst;
 }
 
-#define MISSED(set, n, count, low, high, sizes, left_out, missed) \
-    mhe_missed(n, count, low, high, (set).rows, (set).scale, (set).row_scale, sizes, left_out, \
-               missed)
+#define MISSED(set, usual, n, count, low, high, sizes, left_out, missed) \
+    mhe_missed(n, count, low, high, (usual).lower, (usual).upper, (set).rows, (set).scale, \
+               (set).row_scale, sizes, left_out, missed)
 
 /* The largest miss of a trial in the rows' scales, without the sides that are left out. */
 static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const uint8_t *left_out,
@@ -124,22 +131,23 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const uint8_
     for (int i = 0; i < mhe_row_stages(e); i++) {
         const uint8_t *out = left_out ? left_out + i * ROWS : 0;
         uint8_t *in = missed ? missed + i * ROWS : 0;
+        const mhe_stage *stage = mhe_stage_of_state(e, i);
         mhe_stage_distances(e, i, trial->x, trial->w, trial->v, low, high);
 #if MHE_X_SET
-        worst = mhe_max(worst, MISSED(e->settings->states, NX, MHE_X_ROWS, low + W_COUNT + V_COUNT,
-                                      high + W_COUNT + V_COUNT, trial->x + i * NX,
+        worst = mhe_max(worst, MISSED(*mhe_x_set_at(s, stage), s->states, NX, MHE_X_ROWS,
+                                      low + W_COUNT + V_COUNT, high + W_COUNT + V_COUNT,
+                                      trial->x + i * NX,
                                       out ? out + W_COUNT + V_COUNT : 0,
                                       in ? in + W_COUNT + V_COUNT : 0));
         if (i == e->length) break;
 #endif
-        const mhe_stage *stage = mhe_stage_at(e, i);
 #if MHE_W_SET
-        worst = mhe_max(worst, MISSED(*mhe_w_set_at(s, stage), NX, MHE_W_ROWS, low, high,
-                                      trial->x + (i + 1) * NX, out, in));
+        worst = mhe_max(worst, MISSED(*mhe_w_set_at(s, stage), s->disturbances, NX, MHE_W_ROWS,
+                                      low, high, trial->x + (i + 1) * NX, out, in));
 #endif
 #if MHE_V_SET
-        worst = mhe_max(worst, MISSED(*mhe_v_set_at(s, stage), NY, MHE_V_ROWS, low + W_COUNT,
-                                      high + W_COUNT, stage->y,
+        worst = mhe_max(worst, MISSED(*mhe_v_set_at(s, stage), s->noises, NY, MHE_V_ROWS,
+                                      low + W_COUNT, high + W_COUNT, stage->y,
                                       out ? out + W_COUNT : 0, in ? in + W_COUNT : 0));
 #endif
     }

@@ -149,9 +149,14 @@ void mhe_update(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u
 }
 
 /* Copy what a step changes: the stage that the new sample overwrites, and all that is not a stage.
- * Only an observer that is re-initialised goes through the other stages again. */
+ * Only an observer that is re-initialised goes through the other stages again, and one that comes into
+ * another X through the newest. */
 static void mhe_keep(mhe_estimator *to, const mhe_estimator *from, int overwritten)
 {
+#if MHE_X_SET
+    const int newest = (overwritten + MHE_HORIZON - 1) % MHE_HORIZON;
+    to->stages[newest] = from->stages[newest];
+#endif
     memcpy(to, from, offsetof(mhe_estimator, stages));
     if (from->settings->reinitialize)
         memcpy(to->stages, from->stages, sizeof to->stages);
@@ -221,6 +226,14 @@ void mhe_set(mhe_estimator *e, mhe_workspace *k, const mhe_settings *settings, i
         mhe_set_noise_weight(settings, stage);
         mhe_complete_own_sets(settings, stage);
     }
+#if MHE_X_SET
+    if (e->length)
+        mhe_put_inside(e, mhe_x_set_at(settings, mhe_stage_at(e, 0)), mhe_stage_at(e, 0)->z);
+    else {
+        mhe_put_inside(e, &settings->states, e->z_end);
+        memcpy(e->history + e->newest * NX, e->z_end, sizeof e->z_end);
+    }
+#endif
     if (e->length) mhe_estimate_again(e, k, mhe_replay(e, 0), out);
 }
 
@@ -254,14 +267,16 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64
 void mhe_recompute(mhe_estimator *e, real *reached, real *covariances)
 {
     for (int i = 0; i < e->length; i++) {
+        mhe_set_noise_weight(e->settings, mhe_stage_at(e, i));
+        mhe_complete_own_sets(e->settings, mhe_stage_at(e, i));
+    }
+    for (int i = 0; i < e->length; i++) {
         real *next = mhe_next_state(e, i), kept[NX];
         memcpy(kept, next, sizeof kept);
 #if MHE_COVARIANCE
         real *following = mhe_next_covariance(e, i), kept_covariance[NX * NX];
         memcpy(kept_covariance, following, sizeof kept_covariance);
 #endif
-        mhe_set_noise_weight(e->settings, mhe_stage_at(e, i));
-        mhe_complete_own_sets(e->settings, mhe_stage_at(e, i));
         mhe_enter(e, i);
         memcpy(reached + i * NX, next, sizeof kept);
         memcpy(next, kept, sizeof kept);

@@ -102,10 +102,41 @@ static int mhe_replay(mhe_estimator *e, int i)
     return outcome;
 }
 
+#if MHE_X_SET
+/* Put z(t) into the X that comes with its sample, where it is another than that of the last sample; bits
+ * of the status. */
+static int mhe_move_state(mhe_estimator *e, const mhe_sample *sample)
+{
+    const mhe_settings *s = e->settings;
+    mhe_stage *newest = e->length ? mhe_stage_at(e, e->length - 1) : 0;
+    const mhe_x_set *before = newest ? mhe_x_set_at(s, newest) : &s->states;
+    const mhe_x_set *after = sample->states ? sample->states : &s->states;
+    if (!s->project || mhe_has_sides_of(before, after)) return 0;
+    mhe_x_set set = *after;
+    TAKE_SIDES(set, s->states, NX, MHE_X_ROWS);
+    if (!newest || !isfinite(newest->cost)) {
+        mhe_put_inside(e, &set, e->z_end);
+        return 0;
+    }
+    const mhe_x_set own = newest->own_x;
+    const int32_t has_own = newest->has_own_x;
+    newest->own_x = set;
+    newest->has_own_x = 1;
+    const int events = mhe_enter(e, e->length - 1);
+    newest->own_x = own;
+    newest->has_own_x = has_own;
+    return events & (MHE_OBSERVER_PROJECTED | MHE_PREDICTION_OUTSIDE | MHE_METRIC_SINGULAR);
+}
+#endif
+
 /* Take a sample in; bits of the status. */
 static int mhe_push(mhe_estimator *e, const mhe_sample *sample)
 {
     const mhe_settings *s = e->settings;
+    int events = 0;
+#if MHE_X_SET
+    events = mhe_move_state(e, sample);
+#endif
     if (e->length == MHE_HORIZON) {
         const mhe_stage *leaving = mhe_stage_at(e, 0);
         if (isfinite(leaving->cost)) {
@@ -126,7 +157,7 @@ static int mhe_push(mhe_estimator *e, const mhe_sample *sample)
     for (int j = 0; j < NU; j++) stage->u[j] = sample->u[j];
     mhe_take_conditions(s, stage, sample);
     mhe_set_noise_weight(s, stage);
-    const int outcome = mhe_enter(e, e->length - 1);
+    events |= mhe_enter(e, e->length - 1);
     e->time++;
-    return outcome;
+    return events;
 }
