@@ -434,6 +434,8 @@ class _Judged:
         self._following = f + correction
         allowed_correction = (allowed_v + ROUNDING * abs(v)) @ abs(gain).T
         self._allowed_following = self.allowed[:, :n] + allowed_correction
+        if system.turns is not None:
+            self._following = system.turns(self._following)
         if is_candidate:
             self.residuals[:, :n], self.allowed[:, :n] = correction, allowed_correction
             if system.state_residual is not None:

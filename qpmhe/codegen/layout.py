@@ -64,6 +64,8 @@ class Layout:
     clock: bool = False
     #: How outputs and states differ: 0 plainly, 1 by angles, 2 by functions.
     residuals: tuple[int, int] = (0, 0)
+    #: Whether the set of states bounds angles.
+    turns: bool = False
 
     @classmethod
     def of(
@@ -81,6 +83,7 @@ class Layout:
             system.n, system.p, system.m, horizon, sets, continuous, real, loss=loss,
             lapack=lapack and system.n >= _LAPACK_STATES, clock=clock,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
+            turns=system.turns is not None,
         )
 
     @property
@@ -97,6 +100,7 @@ class Layout:
             "lapack": int(self.lapack),
             "clock": int(self.clock), "clock_text": _CLOCK_TEXT if self.clock else "",
             "output_residual": self.residuals[0], "state_residual": self.residuals[1],
+            "turns": int(self.turns),
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
@@ -112,7 +116,7 @@ class Layout:
             ("gain", r, n * p), ("filter_gain", r, n * p), ("prior_weight", r, n * n),
             ("disturbance_weight", r, n * n), ("noise_weight", r, p * p),
             *((f"{name}_loss", loss) for name in TERMS),
-            ("output_periods", r, p), ("state_periods", r, n),
+            ("output_periods", r, p), ("state_periods", r, n), ("turn_middle", r, n),
             ("discount", r), ("sample_time", r), ("tolerance", r),
             ("solver_tolerance", r),
         ]
@@ -249,6 +253,7 @@ def _filled(
         if residual is not None and residual.periods is not None:
             periods = record[f"{name}_periods"]
             periods[residual.components] = residual.periods
+    record["turn_middle"] = np.inf if system.turns is None else system.turns.middle
     record["sample_time"] = system.dt or 0.0
     single = layout.real == "float"
     # Single precision distinguishes less.

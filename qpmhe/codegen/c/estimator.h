@@ -49,6 +49,7 @@ typedef $real mhe_real;
 /* Whether outputs, states have angles (1), or a function for their differences (2). */
 #define MHE_OUTPUT_RESIDUAL $output_residual
 #define MHE_STATE_RESIDUAL $state_residual
+#define MHE_TURNS $turns  /* whether the set of states bounds angles */
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
@@ -125,6 +126,7 @@ typedef struct {
     mhe_real noise_weight[MHE_NY * MHE_NY];
     mhe_loss prior_loss, disturbance_loss, noise_loss;
     mhe_real output_periods[MHE_NY], state_periods[MHE_NX]; /* of angles; 0 for no angle */
+    mhe_real turn_middle[MHE_NX]; /* of an angle's bounds; infinite where there are none */
     mhe_real discount;         /* factor on a stage's cost for each step of age */
     mhe_real sample_time;      /* of the rate; 0 where f is a map */
     mhe_real tolerance;        /* relative decrease of the cost that counts as converged */

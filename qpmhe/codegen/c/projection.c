@@ -402,7 +402,9 @@ static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const real *predi
     const mhe_settings *s = e->settings;
     if (!e->metric_settled) e->metric_settled = mhe_settle(s, s->gain, &stage->terms, e->metric);
     if (mhe_is_inside(&s->states, next)) return 0;
-    return mhe_keep_inside(&s->states, e->metric, predicted, next, stage->w);
+    const int events = mhe_keep_inside(&s->states, e->metric, predicted, next, stage->w);
+    mhe_wrap_state(s, next, stage->w);
+    return events;
 }
 
 #endif

@@ -29,6 +29,8 @@ static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *ne
     mhe_correction(s, stage, w);
     for (int j = 0; j < NX; j++) next[j] = predicted[j] + w[j];
     mhe_wrap_state(s, next, w);
+    mhe_enter_turn(s, next);
+    mhe_enter_turn(s, predicted);
     if (!mhe_all_finite(NX, next)) return INFINITY;
 #if MHE_X_SET
     if (s->project) *events = mhe_stay_inside(e, stage, predicted, next);
