@@ -483,6 +483,8 @@ class _Judged:
         self._following = f + correction
         allowed_correction = np.einsum("kij,kj->ki", abs(gains), allowed_v + ROUNDING * abs(v))
         self._allowed_following = self.allowed[:, :n] + allowed_correction
+        if system.turns is not None:
+            self._following = system.turns(self._following)
         if is_candidate:
             self.residuals[:, :n], self.allowed[:, :n] = correction, allowed_correction
             if system.state_residual is not None:

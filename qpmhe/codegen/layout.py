@@ -76,6 +76,8 @@ class Layout:
     clock: bool = False
     #: How outputs and states differ: 0 plainly, 1 by angles, 2 by functions.
     residuals: tuple[int, int] = (0, 0)
+    #: Whether the set of states bounds angles.
+    turns: bool = False
 
     @classmethod
     def of(
@@ -97,6 +99,7 @@ class Layout:
             covariance=own.prior is not None and (kind > 0 or weighs), observer_prior=weighs,
             lapack=lapack and system.n >= _LAPACK_STATES, clock=clock,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
+            turns=system.turns is not None,
         )
 
     @property
@@ -115,6 +118,7 @@ class Layout:
             "output_residual": self.residuals[0], "state_residual": self.residuals[1],
             "observer": self.observer, "covariance": int(self.covariance),
             "observer_prior": int(self.observer_prior),
+            "turns": int(self.turns),
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
@@ -130,7 +134,7 @@ class Layout:
             ("gain", r, n * p), ("filter_gain", r, n * p), ("prior_weight", r, n * n),
             ("disturbance_weight", r, n * n), ("noise_weight", r, p * p),
             *((f"{name}_loss", loss) for name in TERMS),
-            ("output_periods", r, p), ("state_periods", r, n),
+            ("output_periods", r, p), ("state_periods", r, n), ("turn_middle", r, n),
         ]
         if self.covariance:
             fields.append(("covariances", _struct([
@@ -308,6 +312,7 @@ def _filled(
         if residual is not None and residual.periods is not None:
             periods = record[f"{name}_periods"]
             periods[residual.components] = residual.periods
+    record["turn_middle"] = np.inf if system.turns is None else system.turns.middle
     record["sample_time"] = system.dt or 0.0
     # Single precision distinguishes less.
     record["tolerance"] = max(settings.tolerance, 1e-6 if single else 0.0)

@@ -52,11 +52,6 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
                 f"{name}, a function, has no C form ({residual.expression.reason}); take "
                 "qpmhe.angles, or engine='python'."
             )
-    if system.turns is not None:
-        return (
-            "engine='compiled' does not yet take bounds of states that are angles; take "
-            "engine='python', or leave these bounds out."
-        )
     if system.extensions:
         return (
             f"engine='compiled' does not have {' and '.join(system.extensions)}; take "

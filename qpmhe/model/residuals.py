@@ -382,6 +382,11 @@ class Turns:
     def __bool__(self) -> bool:
         return bool(self._bounded.any())
 
+    @property
+    def middle(self) -> Array:
+        """The middle of the bounds of each angle; infinity for components without."""
+        return np.where(self._bounded, self._middle, np.inf)
+
     def sides(self, lower: Array, upper: Array) -> tuple[Array, Array]:
         """Other bounds of the states, moved by whole turns into this turn.
 

@@ -377,6 +377,39 @@ def _failing() -> Case:
     return Case(system, observer, cost, start, tuple(samples))
 
 
+def _compass(functions: bool = False) -> Case:
+    """A ship whose heading, in degrees, is bounded across the seam."""
+    import casadi as ca
+
+    def wrapped(angle):
+        return angle - 360.0 * ca.floor(angle / 360.0 + 0.5)
+
+    def turned(a, b):
+        d = a - b
+        return np.stack(((d[..., 0] + 180.0) % 360.0 - 180.0, d[..., 1]), axis=-1)
+
+    angle = turned if functions else qpmhe.angles([0], 360.0)
+    system = qpmhe.from_casadi(
+        lambda x: ca.vertcat(wrapped(x[0] + x[1]), 0.8 * x[1] - 0.1 * ca.sin(x[0] * ca.pi / 45)),
+        lambda x: ca.vertcat(wrapped(x[0]), x[1] ** 2), n=2, compiled=False,
+        states=qpmhe.Box([175.0, -4.0], [185.0, 2.0]), output_residual=angle, state_residual=angle,
+    )
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=np.diag([9.0, 1.0]), disturbance=np.diag([0.5, 0.5]), noise=np.diag([16.0, 4.0])
+    )
+    generator, x, samples = np.random.default_rng(11), np.array([178.0, 1.0]), []
+    for _ in range(2 * STEPS):
+        y = system.h(x, np.zeros(0)) + generator.normal(0.0, [4.0, 1.0])
+        samples.append({"y": np.array([wrapped(y[0]), y[1]])})
+        x = system.f(x, np.zeros(0)) + generator.normal(0.0, [0.7, 0.7])
+        x = np.clip([x[0] % 360.0, x[1]], [175.0, -4.0], [185.0, 2.0])
+    gain = [[0.5, 0.0], [0.1, 0.0]]
+    return Case(
+        system, qpmhe.Luenberger(gain), cost, np.array([-179.0, 0.0]), tuple(samples),
+        {"horizon": 5, "max_qps": None},
+    )
+
+
 #: Each is made when it is asked for; `case` keeps it.
 CASES: dict[str, Callable[[], Case]] = {
     "reactor": _reactor,
@@ -395,6 +428,10 @@ CASES: dict[str, Callable[[], Case]] = {
     "angles of both": lambda: _rover(True, True).with_gaps(),
     "residual functions": lambda: _rover(True, True, True).with_gaps().with_options(
         warm_start=True
+    ),
+    "angles across the seam": lambda: _compass(),
+    "functions across the seam": lambda: _compass(True).with_gaps().with_options(
+        candidate="reinitialized", warm_start=True
     ),
     "angles in sets": lambda: _rover(
         True, True,

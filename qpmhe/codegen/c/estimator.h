@@ -52,6 +52,7 @@ typedef $real mhe_real;
 #define MHE_OBSERVER $observer   /* MHE_GAIN, MHE_EXTENDED, ... */
 #define MHE_COVARIANCE $covariance /* whether the observer's covariance is computed */
 #define MHE_OBSERVER_PRIOR $observer_prior /* whether it weighs the prior */
+#define MHE_TURNS $turns  /* whether the set of states bounds angles */
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
@@ -148,6 +149,7 @@ typedef struct {
     mhe_real noise_weight[MHE_NY * MHE_NY];
     mhe_loss prior_loss, disturbance_loss, noise_loss;
     mhe_real output_periods[MHE_NY], state_periods[MHE_NX]; /* of angles; 0 for no angle */
+    mhe_real turn_middle[MHE_NX]; /* of an angle's bounds; infinite where there are none */
 #if MHE_COVARIANCE
     mhe_covariances covariances; /* of the observer */
 #endif

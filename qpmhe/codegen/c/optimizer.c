@@ -33,7 +33,7 @@ static real mhe_target(const mhe_outcome *o)
     return isfinite(cost) ? cost - MHE_ROUNDING * cost : INFINITY;
 }
 
-/* Clip a trial to the bounds of X. */
+/* Clip a trial to the bounds of X, in the turns of its angles. */
 static void mhe_clip_trial(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
 {
 #if MHE_X_SET
@@ -41,6 +41,7 @@ static void mhe_clip_trial(mhe_estimator *e, const mhe_workspace *k, mhe_trial *
         const mhe_x_set *set = mhe_x_set_at(e->settings, mhe_stage_of_state(e, i));
         const uint8_t *out = k->left_out + i * ROWS + W_COUNT + V_COUNT;
         real *x = trial->x + i * NX;
+        mhe_enter_turn(e->settings, x);
         for (int j = 0; j < NX; j++) {
             if (x[j] < set->lower[j] && !(out[j] & MHE_LOWER)) x[j] = set->lower[j];
             if (x[j] > set->upper[j] && !(out[j] & MHE_UPPER)) x[j] = set->upper[j];

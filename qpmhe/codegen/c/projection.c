@@ -410,7 +410,9 @@ static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const real *predi
     const mhe_x_set *set = mhe_x_set_behind(e, stage);
     if (!e->metric_settled) e->metric_settled = mhe_settle(s, s->gain, &stage->terms, e->metric);
     if (mhe_is_inside(set, next)) return 0;
-    return mhe_keep_inside(set, e->metric, predicted, next, stage->w);
+    const int events = mhe_keep_inside(set, e->metric, predicted, next, stage->w);
+    mhe_wrap_state(s, next, stage->w);
+    return events;
 }
 
 /* Put a state of the observer into a set to which no correction leads. */

@@ -46,3 +46,19 @@ static void mhe_wrap_state(const mhe_settings *s, const real *x, real *differenc
 #endif
     (void)s; (void)x; (void)differences;
 }
+
+/* Move the angles of a state that X bounds by whole turns, to around the middle of their bounds. */
+static void mhe_enter_turn(const mhe_settings *s, real *x)
+{
+#if MHE_TURNS
+    real middle[NX], apart[NX], turned[NX];
+    for (int j = 0; j < NX; j++) {
+        middle[j] = isfinite(s->turn_middle[j]) ? s->turn_middle[j] : x[j];
+        apart[j] = turned[j] = x[j] - middle[j];
+    }
+    mhe_wrap_state(s, x, turned);
+    for (int j = 0; j < NX; j++)
+        if (turned[j] != apart[j]) x[j] = middle[j] + turned[j];
+#endif
+    (void)s; (void)x;
+}

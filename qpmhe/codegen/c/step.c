@@ -43,9 +43,10 @@ static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 static void mhe_filtered(mhe_estimator *e, const mhe_outcome *o, real *out)
 {
     const mhe_stage *newest = mhe_stage_at(e, e->length - 1);
-    if (o->best == o->candidate)
+    if (o->best == o->candidate) {
         mhe_filter(e->settings, newest, out);
-    else
+        mhe_enter_turn(e->settings, out);
+    } else
         memcpy(out, o->best->x + (e->length - 1) * NX, sizeof(real) * NX);
 }
 
@@ -111,11 +112,15 @@ void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
     memset(e, 0, sizeof *e);
     e->settings = settings;
     memcpy(e->z_end, x0, sizeof e->z_end);
+    mhe_enter_turn(settings, e->z_end);
 #if MHE_X_SET
     memcpy(e->metric, settings->metric, sizeof e->metric);
     e->metric_settled = settings->metric_settled;
-    if (!mhe_is_inside(&settings->states, x0))
-        mhe_project(&settings->states, settings->metric, x0, e->z_end);
+    real inside[NX];
+    if (!mhe_is_inside(&settings->states, e->z_end)) {
+        mhe_project(&settings->states, settings->metric, e->z_end, inside);
+        memcpy(e->z_end, inside, sizeof inside);
+    }
 #endif
     memcpy(e->last_good, e->z_end, sizeof e->last_good);
     memcpy(e->history, e->z_end, sizeof e->z_end);

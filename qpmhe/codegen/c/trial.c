@@ -18,6 +18,7 @@ static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *tr
         const mhe_w_set *set = &s->disturbances;
         for (int j = 0; j < NX; j++)
             if (set->lower[j] == set->upper[j]) x[NX + j] = predicted[j] + set->lower[j];
+        mhe_enter_turn(s, x + NX);
 #endif
         for (int j = 0; j < NX; j++) w[j] = x[NX + j] - predicted[j];
         /* A model that fails in a missing output fails, as it does everywhere. */

@@ -46,6 +46,8 @@ static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *ne
     mhe_correction(s, stage, w, following);
     for (int j = 0; j < NX; j++) next[j] = predicted[j] + w[j];
     mhe_wrap_state(s, next, w);
+    mhe_enter_turn(s, next);
+    mhe_enter_turn(s, predicted);
     if (!mhe_all_finite(NX, next)) return INFINITY;
     if (MHE_COVARIANCE && !mhe_all_finite(NX * NX, following)) return INFINITY;
 #if MHE_X_SET
