@@ -283,7 +283,7 @@ def test_a_casadi_model_runs_in_the_compiled_step():
         estimator(constant, engine=engine, solver_tolerance=1e-12).run(ys)
         for engine in ("python", "compiled")
     ]
-    np.testing.assert_allclose(runs[1].states, runs[0].states, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(runs[1].states, runs[0].states, rtol=1e-5)
     assert (runs[1].costs <= runs[1].candidate_costs).all()
     with pytest.raises(qpmhe.errors.OptionError, match=r"no CasADi form.*noisy_inputs"):
         estimator(qpmhe.noisy_inputs(model), engine="compiled")

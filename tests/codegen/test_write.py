@@ -315,7 +315,10 @@ def test_compiles_without_warnings(which, tmp_path):
         n, p = SIZES[(index + turn) % 3]
         sets = {
             name: MADE[one](size)
-            for name, one, size in zip(("disturbances", "noises"), which, (n, p), strict=True)
+            for name, one, size in zip(
+                ("disturbances", "noises", "states"), (*which, (index + turn) % 3), (n, p, n),
+                strict=True,
+            )
         }
         mhe = estimator(model(kind, n, p, m, method, **sets), horizon=1 + index % 3)
         real = ("double", "float")[(index + turn) % 2]
@@ -336,6 +339,14 @@ CASES = {
     "Runge-Kutta": ({"method": "rk4", "n": 4}, {"candidate": "reinitialized"}),
     "matrices": ({"kind": "MX", "method": "rk4", "m": 1}, {"horizon": 1, "max_qps": 2}),
     "observer": ({"m": 1}, {"max_qps": 0}),
+    "states": ({"m": 1, "states": box(3, 0.15)}, {"max_qps": 2}),
+    "states, observer": ({"m": 1, "states": polytope(3, 0.2)}, {"max_qps": 0}),
+    "states of an ODE": (
+        {"m": 1, "method": "rk4", "states": polytope(3, 0.2)}, {"candidate": "reinitialized"}
+    ),
+    "noise-free": (
+        {"disturbances": qpmhe.Box([-1.0, 0.01, -1.0], [1.0, 0.01, 1.0])}, {"max_qps": 2}
+    ),
 }
 
 
@@ -488,10 +499,14 @@ def test_late_beyond_the_window(time, with_sets):
     assert np.array_equal(numbers[-size:], numbers[-2 * size - 1 : -size - 1])  # as it was
 
 
-@pytest.mark.parametrize("sets", [False, True])
+@pytest.mark.parametrize("sets", ["", "disturbances and noises", "states"])
 def test_single_precision_is_close(sets, tmp_path):
     options = {"tolerance": 1e-6}
-    mhe = constrained(**options) if sets else estimator(model(m=1), max_qps=5, **options)
+    if sets == "disturbances and noises":
+        mhe = constrained(**options)
+    else:
+        states = {"states": polytope(3, 0.2)} if sets else {}
+        mhe = estimator(model(m=1, **states), max_qps=5, **options)
     program = compiled(mhe, tmp_path, real="float")
     commands, expected = record(mhe, 12, spread=0.06)
     for one, other in zip(play(program, mhe, commands), expected, strict=True):
@@ -658,8 +673,6 @@ def without_form(case):
         )
     elif case == "QuadraticCost":
         parts[2] = OwnCost(**weights, noise=1.0)
-    elif case == "widen":
-        parts[0] = model(p=1, disturbances=qpmhe.Box([-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]))
     elif case == "backend='auto'":
         options["backend"] = "osqp"
     return qpmhe.MovingHorizonEstimator(
@@ -668,7 +681,7 @@ def without_form(case):
 
 
 @pytest.mark.parametrize("remedy", [
-    "from_casadi", "constant gain", "QuadraticCost", "widen", "backend='auto'",
+    "from_casadi", "constant gain", "QuadraticCost", "backend='auto'",
 ])
 def test_what_has_no_c_form_tells_the_remedy(remedy, tmp_path):
     with pytest.raises(OptionError, match=remedy):

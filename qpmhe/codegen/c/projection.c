@@ -102,10 +102,11 @@ static void mhe_start_nearest(mhe_nearest *n, const mhe_x_set *set, const real *
 /* b := gram^-1 b for the active sides; whether gram is positive definite. */
 static int mhe_solve_active(mhe_nearest *n, real *b)
 {
-    for (int i = 0; i < n->count; i++)
-        for (int j = 0; j < n->count; j++) n->factor[i * n->count + j] = n->gram[i * NX + j];
-    if (!mhe_decompose(n->count, n->factor)) return 0;
-    mhe_solve_for(n->count, n->factor, 1, b);
+    const int count = n->count;
+    for (int i = 0; i < count; i++)
+        for (int j = 0; j < count; j++) n->factor[i * count + j] = n->gram[i * NX + j];
+    if (!mhe_decompose(count, n->factor)) return 0;
+    mhe_solve_for(count, n->factor, 1, b);
     return 1;
 }
 
@@ -166,12 +167,17 @@ static int mhe_join(mhe_nearest *n, int side, real missed)
         if (blocking < 0) break;
         mhe_leave(n, blocking);
     }
-    const int last = n->count++;
+    const int last = n->count;
+    if (last >= NX) return 0;
+    n->count++;
     n->active[last] = side;
     n->is_active[side] = 1;
     n->multipliers[last] = own;
     memcpy(n->spread + last * NX, spread, sizeof spread);
-    for (int i = 0; i < last; i++) n->gram[last * NX + i] = n->gram[i * NX + last] = column[i];
+    for (int i = 0; i < last; i++) {
+        n->gram[last * NX + i] = column[i];
+        n->gram[i * NX + last] = column[i];
+    }
     n->gram[last * NX + last] = variance;
     return 1;
 }
@@ -367,7 +373,7 @@ static int mhe_settle(const mhe_settings *s, const real *K, const mhe_terms *t, 
             for (int j = 0; j < NX; j++) moves |= A[i * NX + j] != (i == j);
             if (moves) moving[count++] = i;
         }
-        if (count == 0 || count == NX) return 0;
+        if (count == 0 || count >= NX) return 0;
     }
     for (int r = 0; r < count; r++)
         for (int c = 0; c < count; c++)

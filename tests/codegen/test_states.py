@@ -1,0 +1,115 @@
+"""The compiled step with a set of states, on problems where that set is what keeps it stable."""
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.codegen.compiler import find_compiler
+
+casadi = pytest.importorskip("casadi")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+
+
+def runs(system, observer, cost, ys, us=None, **options):
+    """The runs of both engines."""
+    return [
+        qpmhe.MovingHorizonEstimator(system, observer, cost, engine=engine, **options).run(ys, us)
+        for engine in ("python", "compiled")
+    ]
+
+
+def same(expected, found, **tolerance):
+    for name in ("states", "filtered", "costs", "candidate_costs"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(expected, name), err_msg=name, **tolerance
+        )
+    np.testing.assert_array_equal(found.flags, expected.flags)
+
+
+@pytest.mark.parametrize(("metric", "growth"), [(np.eye(2), 1.2), (None, 0.0)])
+def test_a_wrong_metric_destabilises_and_the_lyapunov_metric_does_not(metric, growth):
+    closed, gain = np.array([[1.2, 1.0], [-1.0, -0.5]]), np.array([[1.0], [0.0]])
+    a = closed + gain @ np.array([[1.0, 0.0]])
+    system = qpmhe.from_casadi(
+        lambda x: [a[0, 0] * x[0] + a[0, 1] * x[1], a[1, 0] * x[0] + a[1, 1] * x[1]],
+        lambda x: [x[0]], n=2, compiled=False, states=qpmhe.Box([0.0, 0.0], [np.inf, np.inf]),
+    )
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(1))
+    _, found = runs(
+        system, qpmhe.Luenberger(gain, metric=metric), cost, np.zeros((60, 1)), horizon=4,
+        initial_state=[1.0, 0.0], max_qps=0,
+    )
+    sizes = np.linalg.norm(found.states, axis=1)
+    np.testing.assert_allclose(sizes[-1], growth**60, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("times", [1.0, 3.0, 5.0])
+@pytest.mark.parametrize("max_qps", [0, 1])
+def test_a_reactor_that_only_the_projection_brings_back(times, max_qps):
+    """The stirred tank: the observer runs away from too much concentration."""
+    example = qpmhe.models.cstr()
+
+    def rate(x, u):
+        reaction = 7.2e10 * casadi.exp(-8750.0 / x[1]) * x[0]
+        return [
+            1.0 - x[0] - reaction,
+            350.0 - x[1] + 5e4 / 239.0 * reaction + 5e4 / 23900.0 * (u[0] - x[1]),
+        ]
+
+    system = qpmhe.from_casadi(
+        rate, lambda x: [x[1]], n=2, m=1, dt=0.05, method="rk4", compiled=False,
+        states=example.system.states,
+    )
+    scenario = example.scenario
+    record = scenario.simulate(2, 80)
+    truth = np.array(scenario.initial_state)
+    start = truth + times * (np.array(scenario.initial_estimate) - truth)
+    start = np.clip(start, system.states.lower, system.states.upper)
+    expected, found = runs(
+        system, example.observer, example.cost, record.measurements, record.inputs, horizon=10,
+        initial_state=start, max_qps=max_qps, solver_tolerance=1e-12,
+    )
+    if max_qps == 0 or times == 1.0:
+        same(expected, found, rtol=1e-7, atol=1e-9)
+    else:
+        # The model explodes at first, with costs of 1e46: there, solvers of QPs do not agree.
+        np.testing.assert_allclose(found.candidate_costs, expected.candidate_costs, rtol=1e-6)
+        np.testing.assert_allclose(found.states[40:], expected.states[40:], rtol=1e-9)
+        assert (found.costs <= found.candidate_costs).all()
+    error = np.abs(found.states - record.states)[-20:].mean(axis=0)
+    assert (error < [0.02, 1.0]).all()
+
+
+@pytest.mark.parametrize("gain", [0.001, 0.003, 0.01])
+def test_a_textbook_reactor_whose_observer_leaves_for_negative_concentrations(gain):
+    """A <-> B + C, 2B <-> C, of which the total pressure is measured."""
+
+    def rate(x):
+        first, second = 0.5 * x[0] - 0.05 * x[1] * x[2], 0.2 * x[1] * x[1] - 0.01 * x[2]
+        return [-first, first - 2.0 * second, first + second]
+
+    def made(states):
+        return qpmhe.from_casadi(
+            rate, lambda x: [32.84 * (x[0] + x[1] + x[2])], n=3, dt=0.25, method="rk4",
+            compiled=False, states=states,
+        )
+
+    rng, x, ys, truth = np.random.default_rng(1), np.array([0.5, 0.05, 0.0]), [], []
+    system = made(qpmhe.Box([0.0] * 3, [np.inf] * 3))
+    for _ in range(80):
+        truth.append(x)
+        ys.append([32.84 * x.sum() + 0.25 * rng.standard_normal()])
+        x = np.maximum(system.f(x, np.zeros(0)) + 1e-3 * rng.standard_normal(3), 0.0)
+    cost = qpmhe.QuadraticCost(
+        prior=np.eye(3) / 0.25, disturbance=np.eye(3) * 1e6, noise=[[1.0 / 0.0625]]
+    )
+    options = {"horizon": 10, "initial_state": [1.0, 0.0, 4.0], "solver_tolerance": 1e-12}
+    observer = qpmhe.Luenberger([gain] * 3)
+    expected, found = runs(system, observer, cost, np.array(ys), max_qps=0, **options)
+    same(expected, found, rtol=1e-8, atol=1e-9)
+    assert (found.states >= 0.0).all()
+    assert np.abs(found.states[60:80] - truth[60:]).max() < 2.0
+    expected, found = runs(system, observer, cost, np.array(ys), max_qps=2, **options)
+    assert (found.costs <= found.candidate_costs).all()
+    assert np.abs(found.states[60:80] - truth[60:]).max() < 0.5
+    np.testing.assert_allclose(found.states, expected.states, atol=1e-4)
