@@ -30,15 +30,18 @@ def hand_over(record: Any, system: System, usual: Conditions, engine: PythonEngi
     """Let a new Python engine continue where an ``mhe_estimator`` stands."""
     horizon, length = len(record["stages"]), int(record["length"])
     time, newest = int(record["time"]), int(record["newest"])
-    first = record["stages"][int(record["first"])]
+    names, first = record.dtype.names, record["stages"][int(record["first"])]
+    covariance = None
+    if "covariance_end" in names:
+        covariance = (first["covariance"] if length else record["covariance_end"]).copy()
     count = min(time, horizon) + 1
     history = [record["history"][(newest - k) % (horizon + 1)].copy() for k in range(count)][::-1]
     engine.take_over(
         usual, time - length, (first["z"] if length else record["z_end"]).copy(),
-        first["covariance"].copy() if "covariance" in first.dtype.names else None,
-        samples_of(record, system),
+        covariance, samples_of(record, system),
         record["trajectory"][: length + 1].copy() if record["has_trajectory"] else None,
         history, (int(record["far"]), int(record["dropped"])),
+        record["smoothed"].copy() if record["has_smoothed"] else None,
     )
 
 

@@ -406,16 +406,16 @@ class PythonEngine:
     def take_over(
         self, usual: Conditions, time: int, state: Array, covariance: Array | None,
         samples: Sequence[Taken], trajectory: Array | None, history: list[Array],
-        watched: tuple[int, int],
+        watched: tuple[int, int], smoothed: Array | None,
     ) -> None:
         """Continue where another engine stands, whose window starts at a time and state.
 
         With the observer's covariance there if it has one, the samples since then, the last
-        estimate's trajectory, and the last states that were estimated.
+        estimate's trajectory, the last states that were estimated, and the smoothed prior.
         """
         tools = self._tools_for(usual)
         window = self._fresh_window(state, tools)
-        window.time = time
+        window.time, window.smoothed_prior = time, smoothed
         if window._covariances is not None and covariance is not None:
             window._covariances[0] = covariance
         with np.errstate(all="ignore"):

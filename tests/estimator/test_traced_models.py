@@ -105,11 +105,16 @@ class Plant:
         return qpmhe.System(self.f, self.h, n=2, p=1, **options)
 
 
-def estimator(system, engine="python", **options):
+def estimator(system, engine="python", kalman=False, **options):
     options = {"horizon": 5, "initial_state": [1.0, -1.0], "max_qps": 2} | options
+    observer, prior = qpmhe.Luenberger([0.4, 0.1]), np.eye(2)
+    if kalman:
+        observer, prior = qpmhe.ExtendedKalman(
+            prior=np.eye(2), disturbance=0.1 * np.eye(2), noise=0.25
+        ), qpmhe.ObserverPrior()
     return qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([0.4, 0.1]),
-        qpmhe.QuadraticCost(prior=1.0 * np.eye(2), disturbance=10.0 * np.eye(2), noise=4.0),
+        system, observer,
+        qpmhe.QuadraticCost(prior=prior, disturbance=10.0 * np.eye(2), noise=4.0),
         engine=engine, **options,
     )
 
@@ -183,36 +188,43 @@ def test_a_warning_as_an_error_takes_no_sample(engine):
     assert estimate.cost == pytest.approx(by_hand, rel=1e-12)
 
 
-def test_what_a_compiled_estimator_hands_over_is_all_it_knew():
-    cases = {"plain": {}, "reinitialized": {"candidate": "reinitialized"}, "delay": {"delay": 2}}
-    for options in cases.values():
-        plant, generator = Plant(), np.random.default_rng(3)
-        system = plant.system(
-            disturbances=qpmhe.Box([-3.0, -3.0], [3.0, 3.0]), noises=qpmhe.Box([-9.0], [9.0])
-        )
-        pair = [estimator(system, engine, **options) for engine in ENGINES]
-        ys = generator.normal(size=30)
-        for t, y in enumerate(ys):
-            own = {}
-            if t % 5 == 2:
-                own["noise_weight"] = [[7.0]]
-            if t % 7 == 3:
-                own["bounds"] = {"disturbances": qpmhe.Box([-2.0, -2.5], [2.0, 2.5])}
-            y = None if t % 11 == 5 else y
-            if t == 20:
-                # As if its trace had failed, without any difference.
-                compiled = pair[1]._engine
-                compiled._system.trace_fault = lambda x, u: "no difference"
-                compiled._next_check = 0
-                with pytest.warns(EngineWarning, match="no difference"):
-                    found = [mhe.update(y, **own) for mhe in pair]
-                continue
+HANDED_OVER = {
+    "plain": {}, "reinitialized": {"candidate": "reinitialized"}, "delay": {"delay": 2},
+    "warm start": {"warm_start": True}, "smoothed": {"arrival": "smoothed"},
+    "EKF": {"kalman": True}, "smoothed EKF": {"kalman": True, "arrival": "smoothed"},
+}
+
+
+@pytest.mark.parametrize("when", [3, 20])
+@pytest.mark.parametrize("case", HANDED_OVER)
+def test_what_a_compiled_estimator_hands_over_is_all_it_knew(case, when):
+    plant, generator = Plant(), np.random.default_rng(3)
+    system = plant.system(
+        disturbances=qpmhe.Box([-3.0, -3.0], [3.0, 3.0]), noises=qpmhe.Box([-9.0], [9.0])
+    )
+    pair = [estimator(system, engine, **HANDED_OVER[case]) for engine in ENGINES]
+    for t, y in enumerate(generator.normal(size=30)):
+        own = {}
+        if t % 5 == 2:
+            own["noise_weight"] = [[7.0]]
+        if t % 7 == 3:
+            own["bounds"] = {"disturbances": qpmhe.Box([-2.0, -2.5], [2.0, 2.5])}
+        y = None if t % 11 == 5 else y
+        if t == when:
+            # As if its trace had failed, without any difference.
+            compiled = pair[1]._engine
+            compiled._system.trace_fault = lambda x, u: "no difference"
+            compiled._next_check = 0
+            with pytest.warns(EngineWarning, match="no difference"):
+                pair[1].update(y, **own)
+            pair[0].update(y, **own)
+        else:
             found = [mhe.update(y, **own) for mhe in pair]
-        assert pair[1].engine == "python"
-        np.testing.assert_allclose(found[1].trajectory, found[0].trajectory, atol=1e-9)
-        assert found[1].cost == pytest.approx(found[0].cost, rel=1e-9)
-        if options.get("delay"):
-            np.testing.assert_allclose(found[1].delayed, found[0].delayed, atol=1e-9)
+            np.testing.assert_allclose(found[1].trajectory, found[0].trajectory, atol=1e-8)
+            assert found[1].cost == pytest.approx(found[0].cost, rel=1e-8)
+            if "delay" in case and t > 3:
+                np.testing.assert_allclose(found[1].delayed, found[0].delayed, atol=1e-8)
+    assert pair[1].engine == "python"
 
 
 def test_a_new_estimator_traces_a_changed_model_again():
