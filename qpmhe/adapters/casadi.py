@@ -80,7 +80,7 @@ def from_casadi(
     ModelError, SetError, OptionError
         If a function, size, set or option does not fit; the message names it.
     InvalidInputError
-        If CasADi is not installed.
+        If n is missing.
     CompilationError
         If ``compiled`` is True and compilation fails.
     """

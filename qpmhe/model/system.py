@@ -98,9 +98,11 @@ class System:
     m : int
         Number of known inputs; 0 for none.
     f_jacobian, h_jacobian : callable, optional
-        Derivatives with respect to x, of shapes (n, n) and (p, n), same arguments. Left out,
-        they are computed: by the complex step where the function allows it, else by
-        differences, central ones or, at a bound of X, inward ones; see ``derivatives``.
+        Derivatives with respect to x, of shapes (n, n) and (p, n), same arguments. Left out, or
+        where they are the same up to rounding, estimators take the exact ones of the function's
+        trace, see `explain`. Of a function that cannot be traced they are computed: by the
+        complex step where the function allows it, else by differences, central ones or, at a
+        bound of X, inward ones; see ``derivatives``.
     states, disturbances, noises : Box or Polytope, optional
         The sets X, W and V; the whole space if left out. Soft ones are made by
         `ConvexSet.soften`; the observer is not projected onto a soft X.
@@ -148,7 +150,7 @@ class System:
     >>> A = np.array([[1.0, 0.1], [0.0, 1.0]])
     >>> system = qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1)
     >>> system.derivatives
-    {'f': 'complex step', 'h': 'complex step'}
+    {'f': 'traced', 'h': 'traced'}
     """
 
     def __init__(
@@ -544,7 +546,15 @@ class System:
 
         A function that is traced is known as an expression: it has exact Jacobians, and estimators
         evaluate it in CasADi's virtual machine or in generated C code. One that is not is called
-        as it is written.
+        as it is written; the text says what it asks for, in which line.
+
+        Examples
+        --------
+        >>> import qpmhe
+        >>> system = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=1, p=1)
+        >>> print(system.explain())
+        f: traced. Jacobian: exact, by its trace.
+        h: traced. Jacobian: exact, by its trace.
         """
         lines, own = [], self.copy(traced=True)
         for name, method in own.derivatives.items():
@@ -676,7 +686,7 @@ class System:
 
     @property
     def derivatives(self) -> dict[str, str]:
-        """How the Jacobians of f and h are computed."""
+        """How an estimator computes the Jacobians of f and h."""
         methods = {"f": self.f_jacobian.method, "h": self.h_jacobian.method}
         if self._pinned is None and self.tracing is not None and self.kernel is None:
             own = self.copy(traced=True)

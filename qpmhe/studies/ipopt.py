@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from .._checks import Array, need
+from .._checks import Array
 from ..costs import QuadraticCost
 from ..errors import InvalidInputError
 from ..estimation.estimate import Estimate, Status
 from ..estimation.problem import Formulation
 from ..estimation.window import Window
+from ..model.expressions import import_casadi
 from ..model.residuals import Angles, Residual
 from ..model.system import System
 from ..observers import Observer
@@ -33,7 +34,7 @@ class IpoptEstimator:
         h: Callable[[Any], Any], horizon: int, initial_state: Array,
         max_iterations: int | None = None, tolerance: float = 1e-8,
     ) -> None:
-        self._casadi = need("casadi", "Ipopt, which is part of CasADi,", "casadi")
+        self._casadi = import_casadi()
         if system.m or cost.observer_prior is not None:
             raise InvalidInputError(
                 "the comparison with Ipopt takes systems without inputs and constant prior weights."
