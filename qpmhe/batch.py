@@ -17,10 +17,12 @@ from ._checks import dimension, numbers
 from .costs import Cost
 from .errors import InvalidInputError, OptionError, ShapeError, UnknownOptionError
 from .estimation.engine import PythonEngine
+from .estimation.engines import ModelChangedError
 from .estimation.estimate import Status
 from .estimation.estimator import MovingHorizonEstimator, check_start
 from .estimation.settings import Settings
 from .model.system import System, checked_system
+from .model.traces import warn_of
 from .observers import Observer
 
 if TYPE_CHECKING:
@@ -125,8 +127,20 @@ class BatchEstimator:
         if self.settings.engine == "compiled":
             from .codegen.members import CompiledMembers  # late: most programs do without it
 
-            return CompiledMembers(*parts, states, self._threads)
+            system = self.system.copy(_scales(self.system, self.cost, self.observer), traced=True)
+            return CompiledMembers(system, *parts[1:], states, self._threads)
         return _Looped(*parts, states)
+
+    def _leave_compiled(self, error: Exception) -> None:
+        """Let the Python step take over, with the functions as they are written."""
+        assert not isinstance(self._engine, _Looped)
+        settings = replace(self.settings, engine="python")
+        looped = _Looped(
+            self.system, self.observer, self.cost, settings, self.states, traced=False
+        )
+        self._engine.hand_over(looped.engines)
+        self._engine, self.settings = looped, settings
+        warn_of(str(error), 4)
 
     @property
     def engine(self) -> str:
@@ -206,9 +220,13 @@ class BatchEstimator:
     def _step(self, y: Array, u: Array) -> BatchEstimate:
         if isinstance(self._engine, _Looped):
             return self._engine.step(y, u)
-        return BatchEstimate(
-            **self._engine.step(y, u), delay=self.settings.delay, engine=self.engine
-        )
+        try:
+            return BatchEstimate(
+                **self._engine.step(y, u), delay=self.settings.delay, engine=self.engine
+            )
+        except ModelChangedError as error:
+            self._leave_compiled(error)
+        return self._step(y, u)
 
     def run(self, Y: ArrayLike, U: ArrayLike | None = None) -> BatchRun:
         """Take whole records, starting at the present states.
@@ -236,7 +254,10 @@ class BatchEstimator:
         shape, n = ys.shape[:2], self.system.n
         us = _inputs(U, (*shape, self.system.m), "run(Y, U)")
         if not isinstance(self._engine, _Looped):
-            return BatchRun(**self._engine.run(ys, us), engine=self.engine)
+            try:
+                return BatchRun(**self._engine.run(ys, us), engine=self.engine)
+            except ModelChangedError as error:
+                self._leave_compiled(error)
         found = BatchRun(
             states=np.empty((shape[0], shape[1] + 1, n)), filtered=np.empty((*shape, n)),
             delayed=np.full((*shape, n), np.nan), costs=np.empty(shape),
@@ -275,37 +296,38 @@ class _Looped:
     """Engines of single estimators that take turns."""
 
     def __init__(
-        self, system: System, observer: Observer, cost: Cost, settings: Settings, states: Array
+        self, system: System, observer: Observer, cost: Cost, settings: Settings, states: Array,
+        traced: bool = True,
     ) -> None:
         self._delay = settings.delay
         scaled = system.copy(_scales(system, cost, observer))
-        self._engines = [
-            PythonEngine(scaled.copy(traced=True), observer, cost, settings, state.copy())
+        self.engines = [
+            PythonEngine(scaled.copy(traced=traced), observer, cost, settings, state.copy())
             for state in states
         ]
 
     @property
     def states(self) -> Array:
-        return np.array([engine.state for engine in self._engines])
+        return np.array([engine.state for engine in self.engines])
 
     @property
     def time(self) -> int:
-        return self._engines[0].time
+        return self.engines[0].time
 
     def state_dict(self) -> list[dict[str, Any]]:
-        return [engine.state_dict() for engine in self._engines]
+        return [engine.state_dict() for engine in self.engines]
 
     def load_state_dict(self, state: list[dict[str, Any]]) -> None:
-        for engine, own in zip(self._engines, state, strict=True):
+        for engine, own in zip(self.engines, state, strict=True):
             engine.load_state_dict(own)
 
     def reset(self, states: Array) -> None:
-        before = [engine.memory for engine in self._engines]
+        before = [engine.memory for engine in self.engines]
         try:
-            for engine, state in zip(self._engines, states, strict=True):
+            for engine, state in zip(self.engines, states, strict=True):
                 engine.reset(state)
         except BaseException:  # an interrupt: all members or none
-            for engine, memory in zip(self._engines, before, strict=True):
+            for engine, memory in zip(self.engines, before, strict=True):
                 engine.replace(memory)
             raise
 
@@ -314,7 +336,7 @@ class _Looped:
         try:
             found = [
                 engine.step(y[k], u[k], None, None, perf_counter())
-                for k, engine in enumerate(self._engines)
+                for k, engine in enumerate(self.engines)
             ]
             return BatchEstimate(
                 found[0].time,
@@ -328,7 +350,7 @@ class _Looped:
                 self._delay,
             )
         except BaseException:
-            for engine in self._engines:
+            for engine in self.engines:
                 if engine.time > time:
                     engine.undo()
             raise

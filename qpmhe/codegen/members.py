@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from threading import Event
@@ -13,16 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
+from ..estimation.conditions import usual_conditions
+from ..estimation.engine import PythonEngine
+from ..estimation.engines import ModelChangedError
 from ..estimation.settings import Settings
 from ..model.system import System
+from ..model.traces import next_check
 from ..observers import Observer
 from .estimate import WATCHED, CompiledWatch
+from .handover import hand_over
 from .library import EstimatorLibrary
 
 Array = NDArray[np.float64]
 
 # Fewer members than this are not worth waking a thread for.
 _LEAST = 16
+# Members at whose states a model is compared with its trace.
+_COMPARED = 4
 
 
 class CompiledMembers:
@@ -33,6 +41,7 @@ class CompiledMembers:
         threads: int | None,
     ) -> None:
         self._library = library = EstimatorLibrary(system, observer, cost, settings)
+        self._system, self._settings = system, settings
         self._m, self._horizon = system.m, settings.horizon
         self._watch = CompiledWatch(settings.horizon)
         count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -46,6 +55,8 @@ class CompiledMembers:
     def reset(self, states: Array) -> None:
         """Forget all samples and start at these states."""
         self._memory = self._library.estimators(states)
+        # The time of the next comparison of the trace with the functions that it stands for.
+        self._next_check: float = 0 if self._system.is_traced else math.inf
 
     @property
     def time(self) -> int:
@@ -63,6 +74,21 @@ class CompiledMembers:
         self._memory = state["memory"].copy().view(self._memory.dtype)
         self._memory["settings"] = self._library.settings.ctypes.data
 
+    def hand_over(self, engines: Sequence[PythonEngine]) -> None:
+        """Let new Python engines, one for each member, continue where these members stand."""
+        usual = usual_conditions(self._settings)
+        for record, engine in zip(self._memory, engines, strict=True):
+            hand_over(record, self._system, usual, engine)
+
+    def _check_trace(self, u: Array) -> None:
+        """Compare trace and functions at z(t) of some members; raise where they differ."""
+        self._next_check = next_check(self.time, self._horizon)
+        count = len(self._memory)
+        for k in np.linspace(0, count - 1, min(count, _COMPARED)).astype(int):
+            fault = self._system.trace_fault(self._memory["z_end"][k], u[k])
+            if fault:
+                raise ModelChangedError(fault)
+
     @property
     def states(self) -> Array:
         """The current estimates (K, n)."""
@@ -73,6 +99,8 @@ class CompiledMembers:
     def step(self, y: Array, u: Array) -> dict[str, Any]:
         """Take a sample of each member in, and estimate."""
         ys, us = np.ascontiguousarray(y), np.ascontiguousarray(u)
+        if self._memory["time"][0] >= self._next_check:
+            self._check_trace(us)
         found = np.empty(len(ys), self._library.estimate_type)
 
         def work(part: slice, workspace: NDArray[np.uint8]) -> None:
@@ -98,6 +126,7 @@ class CompiledMembers:
         """Take records (K, T, p) and (K, T, m) in without leaving C."""
         ys, us, start = np.ascontiguousarray(y), np.ascontiguousarray(u), self.states
         samples, dropped = ys.shape[1], self._memory["dropped"].copy()
+        before = None if self._next_check == math.inf or not samples else self._memory.copy()
         log = self._library.log(ys.shape[:2])
 
         def work(part: slice, workspace: NDArray[np.uint8]) -> None:
@@ -107,7 +136,15 @@ class CompiledMembers:
                 log.pointers(part.start),
             )
 
+        if before is not None:
+            self._check_trace(us[:, 0])
         self._share(work)
+        if before is not None:
+            try:
+                self._check_trace(us[:, -1])
+            except ModelChangedError:
+                self._memory[...] = before
+                raise
         self._watch.warn(*log.watched(self._horizon, dropped), 3)
         return {
             "states": np.concatenate((start[:, None], log.states), axis=1),

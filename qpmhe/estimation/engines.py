@@ -90,6 +90,10 @@ class EngineChangeError(Exception):
         self.engine = engine
 
 
+class ModelChangedError(Exception):
+    """The functions differ from what was compiled; all members of a batch are as before."""
+
+
 _ENGINES: dict[str, Callable[[System, Observer, Cost, Settings, Array], Engine]] = {
     "python": PythonEngine
 }

@@ -78,13 +78,11 @@ class MovingHorizonEstimator:
         The sequence of QPs has converged when a QP that was solved to its own tolerance
         lowers J by less than this share of J.
     engine : {"auto", "python", "compiled"}
-        What runs the step. ``compiled`` generates C code for the whole step from a system
-        made by `qpmhe.from_casadi`, a quadratic cost and an observer with
-        constant gain or a Kalman filter, compiles it once and keeps it in a cache on
-        disk; it also solves QPs with active inequalities. Without a C compiler it warns and runs
-        the Python step. ``auto`` takes the compiled step where its library is in the cache, see
-        `qpmhe.compile`, and else the Python step: it never waits for a compiler, never warns,
-        and takes every option. `mhe.engine` says which one runs.
+        What runs the step. ``compiled`` generates C code for the whole step, compiles it once
+        and keeps it in a cache on disk. It refuses by name what has no C form; without a C
+        compiler it warns and runs the Python step. ``auto`` takes the compiled step where its
+        library is in the cache, see `qpmhe.compile`, and else the Python step: it never waits
+        for a compiler, never warns, and takes every option. `engine` says which one runs.
     project_observer : bool
         Whether the observer's state is projected onto X after each step, in the observer's own
         metric: `Observer.metric`, the inverse of its covariance, or the Lyapunov matrix of its

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.codegen.compiler import find_compiler
+from qpmhe.codegen.members import CompiledMembers
 from qpmhe.errors import EngineWarning, ModelError
 
 ZOO = qpmhe.models.catalogue()
@@ -395,3 +397,53 @@ def test_a_system_alone_imports_no_casadi():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert answer.stdout.split() == ["False", "traced", "True"]
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("call", ["update", "run", "during a run"])
+def test_a_batch_goes_on_in_python_where_a_closure_has_changed(call, monkeypatch):
+    """Each member as a single estimator, and no sample is lost."""
+    plant, ys = Plant(), np.random.default_rng(0).normal(size=(6, 60))
+    start = np.array([[1.0, -1.0]]) + 0.1 * np.arange(6)[:, None]
+    singles = [estimator(plant.system(), "compiled", initial_state=one) for one in start]
+    batch = qpmhe.BatchEstimator(
+        plant.system(), singles[0].observer, singles[0].cost, members=6, initial_states=start,
+        horizon=5, max_qps=2, engine="compiled",
+    )
+
+    def go_on(mhe, records):
+        if call != "update":
+            return mhe.run(records)
+        for t in range(40):
+            found = mhe.update(records[..., t])
+        return found
+
+    update_all(batch, ys[:, :20].T)  # compared at the same times as single estimators
+    for one, own in zip(singles, ys, strict=True):
+        update_all(one, own[:20])
+    assert batch.engine == "compiled"
+    if call == "during a run":
+        plain = CompiledMembers._share
+
+        def share(self, work):
+            plain(self, work)
+            plant.gain = 0.3
+
+        monkeypatch.setattr(CompiledMembers, "_share", share)
+    else:
+        plant.gain = 0.3
+    with pytest.warns(EngineWarning, match="f has changed since it was traced"):
+        found = go_on(batch, ys[:, 20:])
+    assert (found.engine, batch.engine, batch.mode) == ("python", "python", "looped")
+    assert batch.time == 60
+    np.testing.assert_array_equal(
+        found.states if call == "update" else found.states[:, -1], batch.states
+    )
+    for k, one in enumerate(singles):
+        with pytest.warns(EngineWarning, match="f has changed since it was traced"):
+            go_on(one, ys[k, 20:])
+        np.testing.assert_allclose(batch.states[k], one.state, rtol=1e-9, atol=1e-12)
+    found = batch.update(ys[:, 0])
+    assert (found.costs <= found.candidate_costs).all()
+    batch.reset()
+    assert batch.time == 0
