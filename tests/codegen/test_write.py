@@ -278,7 +278,8 @@ def record(mhe, steps=14, seed=0, spread=0.1, special=True):
         expected.append(mhe.update(y[mask > 0], u if m else None, **options))
         if special and t % 8 == 6:
             commands.append((4, np.zeros(p), 1.5))
-            usual = mhe.present[1].noise
+            usual = mhe.usual.noise_weight
+            usual = mhe.cost.noise if usual is None else usual
             expected.append(mhe.set(noise_weight=1.5 * usual))
         if special and t % 6 == 4:
             late = rng.uniform(-0.3, 0.3, p)

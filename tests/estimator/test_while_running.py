@@ -43,7 +43,7 @@ if find_compiler() is not None:
         f"{name}, in C": OPTIONS[name] | {"engine": "compiled"}
         for name in (
             "plain", "two", "observer alone", "reinitialized", "discount", "sets",
-            "sets, reinitialized",
+            "sets, reinitialized", "kalman", "unscented", "robust",
         )
     }
 every = pytest.mark.parametrize("name", OPTIONS)
@@ -309,7 +309,13 @@ def test_set_gives_the_estimator_that_was_made_with_the_values(name, change):
     for one in record[:12]:
         before = feed(mhe, one)
     window = getattr(mhe._engine, "_window", None)  # of the Python step
-    prior = None if window is None else window.prior_covariance
+    if window is not None:
+        prior = window.prior_covariance
+    elif "kalman" in options:
+        memory = mhe._engine._memory[0]
+        prior = memory["stages"]["covariance"][memory["first"]]
+    else:
+        prior = None
     prior = None if prior is None else prior.copy()
     metric = None if window is None or window.metric is None else window.metric.state
     estimate, first = mhe.set(**changes), before.candidate[0]
@@ -610,11 +616,12 @@ def test_a_batch_has_no_parameters():
 
 @pytest.mark.parametrize(
     "changes",
-    [{"noise_weight": 2.0}, {"disturbance_weight": 3.0},
+    [{"noise_weight": 2.0}, {"disturbance_weight": 4.0},
      {"bounds": {"noises": qpmhe.Box(-0.5, 0.5)}}],
     ids=lambda changes: next(iter(changes)),
 )
-def test_the_written_code_has_the_present_weights_and_bounds(changes, tmp_path):
+@pytest.mark.parametrize("kalman", [False, True])
+def test_the_written_code_has_the_present_weights_and_bounds(changes, kalman, tmp_path):
     ca = pytest.importorskip("casadi")
 
     def made(noise=1.0, disturbance=1.0, noises=None):
@@ -623,8 +630,13 @@ def test_the_written_code_has_the_present_weights_and_bounds(changes, tmp_path):
             noises=noises or qpmhe.Box(-1.0, 1.0),
         )
         cost = qpmhe.QuadraticCost(prior=1.0, disturbance=disturbance, noise=noise)
+        observer = qpmhe.Luenberger([0.2])
+        if kalman:
+            observer = qpmhe.ExtendedKalman(
+                prior=1.0, disturbance=1.0 / disturbance, noise=1.0 / noise
+            )
         return qpmhe.MovingHorizonEstimator(
-            system, qpmhe.Luenberger([0.2]), cost, horizon=3, initial_state=[0.0]
+            system, observer, cost, horizon=3, initial_state=[0.0]
         )
 
     def written(mhe):
