@@ -129,7 +129,7 @@ def generated(
     system: System, observer: Observer, cost: Cost, settings: Settings, name: str = "mhe",
     real: str = "double", usual: Conditions = USUAL,
 ) -> dict[str, str]:
-    """Header and source of an estimator with these usual conditions, by the names of their files."""
+    """Header and source of an estimator, by the names of their files."""
     layout, record = planned(system, observer, cost, settings, real, usual=usual)
     return estimator_files(symbolic_model(system), layout, record, name)
 
