@@ -742,6 +742,17 @@ def test_matrix_expressions(case, tmp_path):
     check(play(program, mhe, commands), expected, 1e-9)
 
 
+def test_a_time_budget_needs_a_clock(tmp_path):
+    """Without one, all QPs are solved."""
+    system = model(noises=box(2, 0.5))
+    mhe = estimator(system, max_qps=3, time_budget=1e-9)
+    compiled(mhe, tmp_path, [*STRICT, "-O2"])
+    program = compiled(mhe, tmp_path, [*WATCHED, *STRICT])
+    commands, expected = record(estimator(system, max_qps=3), 12)
+    check(play(program, mhe, commands), expected, 1e-5)
+    assert "clock" in (tmp_path / "mhe.h").read_text()
+
+
 def test_what_does_not_fit_into_c_is_refused(tmp_path):
     def made(n, horizon):
         system = qpmhe.from_casadi(lambda x: 0.9 * x, lambda x: x[0], n=n)
