@@ -103,8 +103,10 @@ def write(
     if real not in ("double", "float"):
         raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")
     flag("fmu", fmu)
-    system, cost = estimator.present
-    files = generated(system, estimator.observer, cost, estimator.settings, name, real)
+    files = generated(
+        estimator.system, estimator.observer, estimator.cost, estimator.settings, name, real,
+        estimator.usual,
+    )
     try:
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..costs import Cost, RobustCost
 from ..errors import CompilationError, OptionError
-from ..estimation.conditions import Conditions
+from ..estimation.conditions import USUAL, Conditions
 from ..estimation.estimate import Status
 from ..estimation.prior import PriorWeights
 from ..estimation.settings import Settings
@@ -127,10 +127,10 @@ def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:
 
 def generated(
     system: System, observer: Observer, cost: Cost, settings: Settings, name: str = "mhe",
-    real: str = "double", lapack: bool = False,
+    real: str = "double", usual: Conditions = USUAL,
 ) -> dict[str, str]:
     """Header and source of an estimator, by the names of their files."""
-    layout, record = planned(system, observer, cost, settings, real, lapack)
+    layout, record = planned(system, observer, cost, settings, real, usual=usual)
     return estimator_files(symbolic_model(system), layout, record, name)
 
 
@@ -147,9 +147,10 @@ def symbolic_model(system: System) -> CasadiModel:
 
 def planned(
     system: System, observer: Observer, cost: Cost, settings: Settings, real: str = "double",
-    lapack: bool = False,
+    lapack: bool = False, usual: Conditions = USUAL,
 ) -> tuple[Layout, NDArray[Any]]:
     """Layout and settings of an estimator's C code; raises if it has no C form."""
+    system, cost = usual.applied(system, cost)
     reason = uncovered(system, observer, cost, settings)
     if reason:
         raise OptionError(f"no C code for this estimator: {reason}")
@@ -159,7 +160,7 @@ def planned(
         system, observer, cost, settings.horizon, CONTINUOUS[model.method], real, lapack,
         settings.time_budget is not None,
     )
-    return layout, settings_record(layout, system, observer, cost, settings)
+    return layout, settings_record(layout, system, observer, cost, settings, usual)
 
 
 def lapack_functions() -> Any:

@@ -267,9 +267,9 @@ class MovingHorizonEstimator:
         return usual.has_bounds or any(one is not None for one in weights)
 
     @property
-    def present(self) -> tuple[System, Cost]:
-        """The system with its present sets, and the cost with its present weights."""
-        return self._engine.usual.applied(self.system, self.cost)
+    def usual(self) -> Conditions:
+        """What `set` has changed, and the parameters."""
+        return self._engine.usual
 
     def update(
         self,

@@ -555,6 +555,13 @@ CASES: dict[str, Callable[[], Case]] = {
     "noise-free conditions": lambda: with_changes(with_conditions(
         case("noise-free in states")
     )),
+    "parameters alone": lambda: with_changes(with_conditions(
+        with_parameters(case("inputs"), 0.2, -0.1)
+    )),
+    "angles, conditions": lambda: with_changes(with_conditions(case("angles of both"))),
+    "angles across the seam, conditions": lambda: with_changes(with_conditions(
+        case("angles across the seam")
+    )),
     "conditions of one sample": lambda: with_changes(with_conditions(
         case("inputs and states")
     )).with_options(horizon=1),

@@ -35,6 +35,22 @@ def test_a_sample_that_is_undone_leaves_nothing(name):
             mhe.set(**one.changes[t])
 
 
+@pytest.mark.parametrize(
+    "name", ["inputs conditions", "tank conditions", "states, conditions", "extended conditions"]
+)
+def test_the_same_covariances(name):
+    one = case(name)
+    pair = [one.estimator(engine) for engine in ("python", "compiled")]
+    for t, sample in enumerate(one.samples):
+        for mhe in pair:
+            mhe.update(**sample)
+            if t in one.changes:
+                mhe.set(**one.changes[t])
+        if t % 4 == 2:
+            expected, found = (mhe.covariances() for mhe in pair)
+            np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-8 * abs(expected).max())
+
+
 class Clock:
     """A clock in place of the C step's, which goes on by one at each look."""
 

@@ -278,7 +278,8 @@ def record(mhe, steps=14, seed=0, spread=0.1, special=True):
         expected.append(mhe.update(y[mask > 0], u if m else None, **options))
         if special and t % 8 == 6:
             commands.append((4, np.zeros(p), 1.5))
-            usual = mhe.present[1].noise
+            usual = mhe.usual.noise_weight
+            usual = mhe.cost.noise if usual is None else usual
             expected.append(mhe.set(noise_weight=1.5 * usual))
         if special and t % 6 == 4:
             late = rng.uniform(-0.3, 0.3, p)
@@ -739,6 +740,17 @@ def test_matrix_expressions(case, tmp_path):
     program = compiled(mhe, tmp_path, [*WATCHED, *STRICT])
     commands, expected = record(mhe, 6)
     check(play(program, mhe, commands), expected, 1e-9)
+
+
+def test_a_time_budget_needs_a_clock(tmp_path):
+    """Without one, all QPs are solved."""
+    system = model(noises=box(2, 0.5))
+    mhe = estimator(system, max_qps=3, time_budget=1e-9)
+    compiled(mhe, tmp_path, [*STRICT, "-O2"])
+    program = compiled(mhe, tmp_path, [*WATCHED, *STRICT])
+    commands, expected = record(estimator(system, max_qps=3), 12)
+    check(play(program, mhe, commands), expected, 1e-5)
+    assert "clock" in (tmp_path / "mhe.h").read_text()
 
 
 def test_what_does_not_fit_into_c_is_refused(tmp_path):
