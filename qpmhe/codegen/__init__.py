@@ -49,8 +49,8 @@ def write(
     estimator : MovingHorizonEstimator
         What to write: a system made with `qpmhe.from_casadi` that has no set of states, an
         observer of constant gain or an extended Kalman filter, a `QuadraticCost` or a
-        `RobustCost` with the losses `Quadratic`, `Huber` and `Power`. Its measurements so far are
-        not written.
+        `RobustCost`, whose losses may be your own if their methods have no branch on a value. Its
+        measurements so far are not written.
     directory : str or path
         Where; made if need be.
     name : str

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .._checks import SINGULAR
 from .._linalg import inverse
-from ..costs import Cost
+from ..costs import Cost, LossForm
 from ..errors import OptionError
 from ..estimation.conditions import USUAL, Conditions
 from ..estimation.constraints import Rows
@@ -25,7 +25,8 @@ from ..observers import Observer
 from ..observers.base import covariance_of
 
 SET_NAMES = ("disturbances", "noises", "states")
-# Terms of the cost, and their losses in the order of their numbers in C.
+# Terms of the cost, and their losses in the order of their numbers in C; behind these come the
+# users' own, one for each term.
 TERMS = ("prior", "disturbance", "noise")
 LOSSES = ("quadratic", "huber", "power")
 
@@ -70,6 +71,8 @@ class Layout:
     covariance: bool = False
     #: Whether the covariance weighs the prior.
     observer_prior: bool = False
+    #: Which terms have a user's loss, in the order of `TERMS`, as bits.
+    own_losses: int = 0
     #: Whether the factorisation calls LAPACK.
     lapack: bool = False
     #: Whether there is a time budget, and a clock to keep it.
@@ -87,14 +90,16 @@ class Layout:
         """The sizes and features of an estimator. `lapack` allows it where it is quicker."""
         own, form = observer.c_form, cost.c_form
         assert own is not None
-        loss = form is not None and any(one.kind != "quadratic" for one in form.losses)
+        losses = () if form is None else form.losses
         sets = tuple(
             (one is not None, 0 if one is None else one.matrix.shape[0])
             for one in (getattr(system, name) for name in SET_NAMES)
         )
         weighs, kind = cost.observer_prior is not None, _OBSERVERS.index(own.kind)
         return cls(
-            system.n, system.p, system.m, horizon, sets, continuous, real, loss=loss, observer=kind,
+            system.n, system.p, system.m, horizon, sets, continuous, real, observer=kind,
+            loss=any(one.kind != "quadratic" for one in losses),
+            own_losses=sum((one.kind == "own") << k for k, one in enumerate(losses)),
             # The covariance of a constant gain's error has no other use.
             covariance=own.prior is not None and (kind > 0 or weighs), observer_prior=weighs,
             lapack=lapack and system.n >= _LAPACK_STATES, clock=clock,
@@ -113,6 +118,7 @@ class Layout:
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
             "continuous": self.continuous, "real": self.real, "loss": int(self.loss),
+            "own_losses": self.own_losses,
             "lapack": int(self.lapack),
             "clock": int(self.clock), "clock_text": _CLOCK_TEXT if self.clock else "",
             "output_residual": self.residuals[0], "state_residual": self.residuals[1],
@@ -306,7 +312,7 @@ def _filled(
     for name, loss in zip(TERMS, form.losses, strict=True):
         _fill(record, f"{name}_weight", getattr(form, name))
         part = record[f"{name}_loss"]
-        part["kind"], part["parameter"] = LOSSES.index(loss.kind), loss.parameter
+        part["kind"], part["parameter"] = _loss_number(name, loss), loss.parameter
         part["per_component"] = loss.per_component
     for name, residual in (("output", system.output_residual), ("state", system.state_residual)):
         if residual is not None and residual.periods is not None:
@@ -349,6 +355,10 @@ def _filled(
     if layout.clock:
         record["time_budget"] = settings.time_budget
     return record
+
+
+def _loss_number(term: str, loss: LossForm) -> int:
+    return LOSSES.index(loss.kind) if loss.kind in LOSSES else len(LOSSES) + TERMS.index(term)
 
 
 def _kind(residual: Residual | None) -> int:

@@ -23,6 +23,7 @@ from .comparison import Interpreter, estimator_fault
 from .compiler import NotCachedError, cached_library, compiled_library
 from .fingerprint import source_key
 from .layout import TERMS, Layout, settings_record
+from .losses import loss_function
 from .source import CONTINUOUS, MAIN, estimator_files, template
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
@@ -68,8 +69,9 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             f"the covariance of {type(observer).__name__} has no C form, and the prior's weight "
             "comes from it; take a constant weight."
         )
-    if cost.c_form is None:
-        return _without_form(cost)
+    reason = _without_form(cost)
+    if reason:
+        return reason
     covariance = observer.initial_covariance()
     if (
         system.states is not None and settings.project_observer and covariance is not None
@@ -94,16 +96,22 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
 
 
 def _without_form(cost: Cost) -> str:
-    """Which part of a cost has no C form, with the remedy."""
+    """Which part of a cost has no C form, with the remedy; empty if all have one."""
     if type(cost) is RobustCost:
         for name in TERMS:
             loss = getattr(cost, f"{name}_loss")
-            if loss.c_form is None:
+            form = loss.c_form
+            reason = "it has a cost of its own" if form is None else ""
+            if form is not None and form.kind == "own":
+                reason = loss_function(form).reason
+            if reason:
                 return (
-                    f"{type(loss).__name__}, the loss of {name}, has no C form; take Quadratic, "
-                    "Huber or Power, or engine='python'."
+                    f"{type(loss).__name__}, the loss of {name}, has no C form ({reason}); take "
+                    "Quadratic, Huber or Power, or engine='python'."
                 )
-    return f"{type(cost).__name__} has no C form; take a QuadraticCost or a RobustCost."
+    if cost.c_form is None:
+        return f"{type(cost).__name__} has no C form; take a QuadraticCost or a RobustCost."
+    return ""
 
 
 def _window_size(system: System, observer: Observer, cost: Cost, horizon: int) -> int:
@@ -131,18 +139,23 @@ def generated(
 ) -> dict[str, str]:
     """Header and source of an estimator, by the names of their files."""
     layout, record = planned(system, observer, cost, settings, real, usual=usual)
-    return estimator_files(symbolic_model(system), layout, record, name)
+    return estimator_files(symbolic_model(system, cost), layout, record, name)
 
 
-def symbolic_model(system: System) -> CasadiModel:
+def symbolic_model(system: System, cost: Cost) -> CasadiModel:
     """The model of a system that has a C form, with all that is generated from CasADi."""
     model: CasadiModel = system.symbolic
-    residuals = {
+    form = cost.c_form
+    functions: dict[str, Any] = {
         name: residual.expression.function
         for name in ("output_residual", "state_residual")
         if (residual := getattr(system, name)) is not None and residual.periods is None
     }
-    return replace(model, **residuals) if residuals else model
+    if form is not None and any(one.kind == "own" for one in form.losses):
+        functions["losses"] = tuple(
+            loss_function(one).function if one.kind == "own" else None for one in form.losses
+        )
+    return replace(model, **functions) if functions else model
 
 
 def planned(
@@ -155,7 +168,7 @@ def planned(
     if reason:
         raise OptionError(f"no C code for this estimator: {reason}")
     assert system.symbolic is not None
-    model = symbolic_model(system)
+    model = symbolic_model(system, cost)
     layout = Layout.of(
         system, observer, cost, settings.horizon, CONTINUOUS[model.method], real, lapack,
         settings.time_budget is not None,
@@ -238,7 +251,7 @@ class EstimatorLibrary:
         self.prior_weights = PriorWeights(system, observer, cost)
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
-        model = symbolic_model(system)
+        model = symbolic_model(system, cost)
         made: list[Interpreter] = []  # only where there is something to check
 
         @np.errstate(all="ignore")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .._version import __version__
 from ..errors import CompilationError
 from ..model.expressions import CasadiModel, import_casadi
-from .layout import Layout
+from .layout import TERMS, Layout
 
 #: The file that holds a whole estimator.
 MAIN = "mhe.c"
@@ -83,6 +83,14 @@ def model_source(model: CasadiModel) -> str:
         named = _named(ca, function, name, size, size)
         generator.add(named)
         calls.append(_call(f"mhe_call_{which}", name, named))
+    for which, function in zip(TERMS, model.losses, strict=True):
+        if function is None:
+            continue
+        q, nothing = ca.SX.sym("q"), ca.SX.sym("nothing", 0)
+        name = f"mhe_casadi_{which}_loss"
+        named = ca.Function(name, [q, nothing], function.call([q]))
+        generator.add(named)
+        calls.append(_call(f"mhe_call_{which}_loss", name, named))
     code = _bare(generator.dump())
     if "#error" in code:
         line = next(line for line in code.splitlines() if "#error" in line)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
+from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass
@@ -51,17 +52,20 @@ class LossForm(NamedTuple):
 
     Parameters
     ----------
-    kind : {"quadratic", "huber", "power"}
+    kind : {"quadratic", "huber", "power", "own"}
         Which function of the quadratic form.
     parameter : float
         Its threshold or exponent.
     per_component : bool
         Whether it is applied to each component and added.
+    function : callable or None
+        Of a user's "own" loss: forms q (K,) to rho(q) and rho'(q), (2, K).
     """
 
     kind: str = "quadratic"
     parameter: float = 0.0
     per_component: bool = False
+    function: Callable[[Array], Array] | None = None
 
 
 class CostForm(NamedTuple):

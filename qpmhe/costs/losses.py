@@ -48,8 +48,16 @@ class Loss(ABC):
 
     @property
     def c_form(self) -> LossForm | None:
-        """What the step in C needs of the loss; None for one that it cannot compute."""
-        return None
+        """What the step in C needs of the loss; None of one with a `cost` of its own."""
+        names = ("cost", "majorise")
+        if any(getattr(type(self), name) is not getattr(Loss, name) for name in names) or any(
+            name in vars(self) for name in names
+        ):
+            return None
+        return LossForm("own", 0.0, self.per_component, self._value_and_slope)
+
+    def _value_and_slope(self, q: Array) -> Array:
+        return np.stack((self._value(q), self._slope(q)))
 
     @abstractmethod
     def _value(self, q: Array) -> Array:
@@ -103,7 +111,7 @@ class Quadratic(Loss):
     @property
     def c_form(self) -> LossForm | None:
         """See `Loss.c_form`."""
-        return LossForm() if type(self) is Quadratic else None
+        return LossForm() if type(self) is Quadratic else super().c_form
 
     def _value(self, q: Array) -> Array:
         return q
@@ -142,9 +150,9 @@ class Huber(Loss):
 
     @property
     def c_form(self) -> LossForm | None:
-        """See `Loss.c_form`; None of a derived class, which may compute another loss."""
+        """See `Loss.c_form`; a derived class may compute another loss."""
         if type(self) is not Huber:
-            return None
+            return super().c_form
         return LossForm("huber", self.threshold, self.per_component)
 
     def _value(self, q: Array) -> Array:
@@ -183,9 +191,9 @@ class Power(Loss):
 
     @property
     def c_form(self) -> LossForm | None:
-        """See `Loss.c_form`; None of a derived class, which may compute another loss."""
+        """See `Loss.c_form`; a derived class may compute another loss."""
         if type(self) is not Power:
-            return None
+            return super().c_form
         return LossForm("power", self.exponent, self.per_component)
 
     def _value(self, q: Array) -> Array:

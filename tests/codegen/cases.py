@@ -150,6 +150,26 @@ def _robust(prior: Any = None, disturbance: Any = None, noise: Any = None, **opt
     return with_outliers(replace(usual, cost=qpmhe.RobustCost(**terms, **options)))
 
 
+class PseudoHuber(qpmhe.Loss):
+    """Quadratic near zero, and linear far away."""
+
+    def _value(self, q: np.ndarray) -> np.ndarray:
+        return 2.0 * (np.sqrt(1.0 + q) - 1.0)
+
+    def _slope(self, q: np.ndarray) -> np.ndarray:
+        return 1.0 / np.sqrt(1.0 + q)
+
+
+class Heavier(qpmhe.Huber):
+    """Another multiple of Huber's loss for each threshold."""
+
+    def _value(self, q: np.ndarray) -> np.ndarray:
+        return self.threshold * super()._value(q)
+
+    def _slope(self, q: np.ndarray) -> np.ndarray:
+        return self.threshold * super()._slope(q)
+
+
 def _weighed(one: Case) -> Case:
     """The case with another noise weight at some samples."""
     p = one.system.p
@@ -515,6 +535,11 @@ CASES: dict[str, Callable[[], Case]] = {
     "inputs and states reinitialized": lambda: case("inputs and states").with_options(
         candidate="reinitialized", max_qps=1
     ),
+    "own losses": lambda: _robust(PseudoHuber, Heavier, PseudoHuber).with_gaps(),
+    "own losses per component": lambda: _robust(
+        functools.partial(Heavier, threshold=0.4, per_component=True), _huber(0.2),
+        functools.partial(PseudoHuber, per_component=True), discount=0.95,
+    ).with_options(max_qps=4, warm_start=True),
     "mixed losses": lambda: _weighed(
         _robust(_huber(1.0), _power(1.5, True), _huber(2.0, True)).with_gaps()
     ).with_options(max_qps=4, candidate="reinitialized", warm_start=True),

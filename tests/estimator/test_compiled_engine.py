@@ -202,11 +202,28 @@ class OwnRobustCost(qpmhe.RobustCost):
     """May weigh in another way."""
 
 
-class OwnLoss(qpmhe.Huber):
-    """Loses something else."""
+class Whole(qpmhe.Huber):
+    """Has a cost of its own."""
+
+    def cost(self, s, weight):
+        return 2.0 * super().cost(s, weight)
+
+
+class Branching(qpmhe.Huber):
+    """Asks for the value of the form."""
 
     def _value(self, q):
-        return 2.0 * super()._value(q)
+        return np.array([one if one < 1.0 else 2.0 * one for one in q])
+
+
+class Together(qpmhe.Huber):
+    """Loses less where others lose more."""
+
+    def _value(self, q):
+        return q / (1.0 + q.sum())
+
+
+LOSSES = {Whole: "cost of its own", Branching: "", Together: "depends on others"}
 
 
 @pytest.mark.parametrize(
@@ -217,8 +234,10 @@ class OwnLoss(qpmhe.Huber):
         ("OwnGain has no C form; take an observer of qpmhe", {"observer": lambda: OwnGain([0.3])}),
         ("OutputInjection has no C form",
          {"observer": lambda: qpmhe.OutputInjection(lambda z, v: 0.3 * v)}),
-        ("OwnLoss, the loss of noise, has no C form; take Quadratic, Huber or Power",
-         {"cost": lambda: qpmhe.RobustCost(**(ONES | {"noise": OwnLoss(1.0)}))}),
+        *((rf"{kind.__name__}, the loss of noise, has no C form \(.*{why}.*\); take Quadratic, "
+           "Huber or Power",
+           {"cost": lambda kind=kind: qpmhe.RobustCost(**(ONES | {"noise": kind(1.0)}))})
+          for kind, why in LOSSES.items()),
         ("OwnRobustCost has no C form", {"cost": lambda: OwnRobustCost(**ONES)}),
         ("OwnCost has no C form; take a QuadraticCost", {"cost": lambda: OwnCost(**ONES)}),
         ("OwnFilter has no C form", {"observer": lambda: OwnFilter(**ONES)}),

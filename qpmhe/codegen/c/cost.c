@@ -32,11 +32,35 @@ static const real *mhe_disturbance_weight(const mhe_settings *s, const mhe_stage
     return stage->has_own_disturbance ? stage->own_disturbance_weight : s->disturbance_weight;
 }
 
+#if MHE_OWN_LOSSES
+/* rho(q) and rho'(q) of a user's loss. */
+static void mhe_own_loss(const mhe_loss *loss, real q, real *value, real *slope)
+{
+    *value = *slope = NAN;
+#if MHE_OWN_LOSSES & 1
+    if (loss->kind == MHE_OWN_PRIOR) mhe_call_prior_loss(&q, 0, value, slope);
+#endif
+#if MHE_OWN_LOSSES & 2
+    if (loss->kind == MHE_OWN_DISTURBANCE) mhe_call_disturbance_loss(&q, 0, value, slope);
+#endif
+#if MHE_OWN_LOSSES & 4
+    if (loss->kind == MHE_OWN_NOISE) mhe_call_noise_loss(&q, 0, value, slope);
+#endif
+}
+#endif
+
 #if MHE_LOSS
 /* rho(q). */
 static real mhe_loss_value(const mhe_loss *loss, real q)
 {
     const real k = loss->parameter;
+#if MHE_OWN_LOSSES
+    real value, slope;
+    if (loss->kind >= MHE_OWN_PRIOR) {
+        mhe_own_loss(loss, q, &value, &slope);
+        return value;
+    }
+#endif
     if (loss->kind == MHE_HUBER) return q <= k * k ? q : 2 * k * sqrt(q) - k * k;
     if (loss->kind == MHE_POWER) return pow(q, k / 2);
     return q;
@@ -46,6 +70,13 @@ static real mhe_loss_value(const mhe_loss *loss, real q)
 static real mhe_loss_slope(const mhe_loss *loss, real q)
 {
     const real k = loss->parameter;
+#if MHE_OWN_LOSSES
+    real value, slope;
+    if (loss->kind >= MHE_OWN_PRIOR) {
+        mhe_own_loss(loss, q, &value, &slope);
+        return slope;
+    }
+#endif
     if (loss->kind == MHE_HUBER) return q <= k * k ? 1 : k / sqrt(q);
     /* The power's own slope may be infinite at 0. */
     if (loss->kind == MHE_POWER) return k / 2 * pow(mhe_max((real)1e-8, q), k / 2 - 1);

@@ -43,6 +43,7 @@ typedef $real mhe_real;
 #define MHE_W_ROWS $w_rows  /* general inequalities in each */
 #define MHE_V_ROWS $v_rows
 #define MHE_LOSS $loss    /* whether a term of the cost has a loss that is not quadratic */
+#define MHE_OWN_LOSSES $own_losses /* users' functions: 1 of the prior, 2 of w, 4 of v */
 #define MHE_LAPACK $lapack /* 1: needs mhe_set_lapack */
 #define MHE_CLOCK $clock /* whether time_budget is kept */
 #define MHE_X_ROWS $x_rows
@@ -109,7 +110,10 @@ typedef struct {
     mhe_real deviation[MHE_NY], row_deviation[MHE_SIZE(MHE_V_ROWS)];
 } mhe_v_set;
 
-enum { MHE_QUADRATIC = 0, MHE_HUBER = 1, MHE_POWER = 2 };
+enum {
+    MHE_QUADRATIC = 0, MHE_HUBER = 1, MHE_POWER = 2,
+    MHE_OWN_PRIOR = 3, MHE_OWN_DISTURBANCE = 4, MHE_OWN_NOISE = 5 /* the user's function */
+};
 
 /* A term of the cost: a convex function of the quadratic form s'W s, or the sum of that of each
  * W[j][j] s[j]^2. */
