@@ -96,12 +96,14 @@ class Layout:
             for one in (getattr(system, name) for name in SET_NAMES)
         )
         weighs, kind = cost.observer_prior is not None, _OBSERVERS.index(own.kind)
+        projects = system.states is not None and observer.metric is None
         return cls(
             system.n, system.p, system.m, horizon, sets, continuous, real, observer=kind,
             loss=any(one.kind != "quadratic" for one in losses),
             own_losses=sum((one.kind == "own") << k for k, one in enumerate(losses)),
             # The covariance of a constant gain's error has no other use.
-            covariance=own.prior is not None and (kind > 0 or weighs), observer_prior=weighs,
+            covariance=own.prior is not None and (kind > 0 or weighs or projects),
+            observer_prior=weighs,
             lapack=lapack and system.n >= _LAPACK_STATES, clock=clock,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
             turns=system.turns is not None,
@@ -342,7 +344,8 @@ def _filled(
     if system.states is not None:
         metric = observer.metric
         record["metric"] = inverse(initial if metric is None else metric).ravel()
-        record["metric_weight"], record["metric_settled"] = initial.ravel(), metric is not None
+        record["metric_weight"] = initial.ravel()
+        record["metric_settled"] = metric is not None or layout.covariance
     record["project"] = settings.project_observer
     record["max_qps"] = min(settings.qp_limit, _MOST)
     most = settings.max_solver_iterations

@@ -72,15 +72,6 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     reason = _without_form(cost)
     if reason:
         return reason
-    covariance = observer.initial_covariance()
-    if (
-        system.states is not None and settings.project_observer and covariance is not None
-        and observer.metric is None
-    ):
-        return (
-            f"engine='compiled' does not yet project {type(observer).__name__} onto X, by its "
-            "covariance; take engine='python', or leave states out."
-        )
     size = _window_size(system, observer, cost, settings.horizon)
     if size > _MOST_BYTES:
         return (

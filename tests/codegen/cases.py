@@ -223,6 +223,24 @@ def _in_states(states: qpmhe.model.sets.ConvexSet, start: Any = (0.1, 4.5), **se
     return Case(system, observer, cost, np.array(start), samples, options)
 
 
+def _kalman_in_states(
+    make: Callable[..., qpmhe.Observer], states: qpmhe.model.sets.ConvexSet, weight: Any = None,
+    **options: Any,
+) -> Case:
+    """The reaction in a set of states, and an observer with a covariance."""
+    one = _in_states(states)
+    if make is qpmhe.SteadyStateKalman:
+        observer = make(one.system, [2.0, 1.5], disturbance=0.1 * np.eye(2), noise=[[0.01]])
+    else:
+        covariances = {"prior": 36.0 * np.eye(2), "disturbance": 1e-3 * np.eye(2)} | options
+        observer = make(**covariances, noise=[[0.01]])
+    cost = qpmhe.QuadraticCost(
+        prior=qpmhe.ObserverPrior() if weight is None else weight, disturbance=1e3 * np.eye(2),
+        noise=[[100.0]],
+    )
+    return replace(one, observer=observer, cost=cost)
+
+
 def _inputs_in(**sets: Any) -> Case:
     """The case with inputs in sets."""
     one = replace(case("inputs"), system=with_inputs(**sets))
@@ -485,6 +503,33 @@ CASES: dict[str, Callable[[], Case]] = {
     "states in a polytope": lambda: _in_states(WEDGE),
     "states in a polytope with gaps": lambda: case("states in a polytope").with_gaps().with_options(
         candidate="reinitialized"
+    ),
+    "extended in states": lambda: _kalman_in_states(qpmhe.ExtendedKalman, POSITIVE).with_options(
+        max_qps=1
+    ),
+    "extended in states observer": lambda: _kalman_in_states(
+        qpmhe.ExtendedKalman, WEDGE
+    ).with_gaps().with_options(max_qps=0),
+    "extended singular in states": lambda: _kalman_in_states(
+        qpmhe.ExtendedKalman, WEDGE, np.eye(2), prior=np.diag([1.0, 0.0]),
+        disturbance=np.diag([1e-3, 0.0]),
+    ).with_options(arrival="smoothed"),
+    "unscented in states": lambda: _kalman_in_states(
+        qpmhe.UnscentedKalman, POSITIVE, np.eye(2)
+    ).with_gaps(),
+    "unscented in states observer": lambda: _kalman_in_states(
+        qpmhe.UnscentedKalman, WEDGE
+    ).with_options(max_qps=0, candidate="reinitialized"),
+    "steady in states": lambda: _kalman_in_states(
+        qpmhe.SteadyStateKalman, WEDGE, np.eye(2)
+    ).with_gaps(),
+    "steady in states observer": lambda: case("steady in states").with_options(max_qps=0),
+    "unscented with angles": lambda: replace(
+        _rover(True, True), observer=qpmhe.UnscentedKalman(
+            prior=np.diag([0.5, 0.5, 0.4, 0.1]) ** 2,
+            disturbance=np.diag([0.1, 0.1, 0.03, 0.02]) ** 2,
+            noise=np.diag([0.2, 5.73, 0.1]) ** 2,
+        ),
     ),
     "states in both": lambda: _in_states(
         qpmhe.Box([0.0, 0.0], [np.inf, 4.0]) & qpmhe.Polytope([[1.0, 1.0]], [4.2]),

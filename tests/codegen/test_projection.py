@@ -43,9 +43,9 @@ class CProjection:
         sets = (False, 0), (False, 0), (True, rows)
         layout = Layout(n, 1, 0, 1, sets, 0)
         self.settings = np.zeros((), layout.settings_type())
-        files, structure = estimator_files(system.symbolic, layout, self.settings)
+        files = estimator_files(system.symbolic, layout, self.settings)
         files["mhe.c"] += HOOK
-        self.library, self.n = compiled_library(files, "mhe.c", structure + HOOK), n
+        self.library, self.n = compiled_library(files, "mhe.c"), n
 
     def _call(self, function, *arrays):
         kept = [np.ascontiguousarray(one) for one in arrays]

@@ -80,36 +80,62 @@ def test_a_reactor_that_only_the_projection_brings_back(times, max_qps):
     assert (error < [0.02, 1.0]).all()
 
 
-@pytest.mark.parametrize("gain", [0.001, 0.003, 0.01])
-def test_a_textbook_reactor_whose_observer_leaves_for_negative_concentrations(gain):
-    """A <-> B + C, 2B <-> C, of which the total pressure is measured."""
+def textbook_reactor(seed=1):
+    """A <-> B + C, 2B <-> C, of which the total pressure is measured, with a record."""
 
     def rate(x):
         first, second = 0.5 * x[0] - 0.05 * x[1] * x[2], 0.2 * x[1] * x[1] - 0.01 * x[2]
         return [-first, first - 2.0 * second, first + second]
 
-    def made(states):
-        return qpmhe.from_casadi(
-            rate, lambda x: [32.84 * (x[0] + x[1] + x[2])], n=3, dt=0.25, method="rk4",
-            compiled=False, states=states,
-        )
-
-    rng, x, ys, truth = np.random.default_rng(1), np.array([0.5, 0.05, 0.0]), [], []
-    system = made(qpmhe.Box([0.0] * 3, [np.inf] * 3))
+    system = qpmhe.from_casadi(
+        rate, lambda x: [32.84 * (x[0] + x[1] + x[2])], n=3, dt=0.25, method="rk4",
+        compiled=False, states=qpmhe.Box([0.0] * 3, [np.inf] * 3),
+    )
+    rng, x, ys, truth = np.random.default_rng(seed), np.array([0.5, 0.05, 0.0]), [], []
     for _ in range(80):
         truth.append(x)
         ys.append([32.84 * x.sum() + 0.25 * rng.standard_normal()])
         x = np.maximum(system.f(x, np.zeros(0)) + 1e-3 * rng.standard_normal(3), 0.0)
+    return system, np.array(ys), np.array(truth)
+
+
+WRONG = {"horizon": 10, "initial_state": [1.0, 0.0, 4.0], "solver_tolerance": 1e-12}
+
+
+@pytest.mark.parametrize("gain", [0.001, 0.003, 0.01])
+def test_a_textbook_reactor_whose_observer_leaves_for_negative_concentrations(gain):
+    system, ys, truth = textbook_reactor()
     cost = qpmhe.QuadraticCost(
         prior=np.eye(3) / 0.25, disturbance=np.eye(3) * 1e6, noise=[[1.0 / 0.0625]]
     )
-    options = {"horizon": 10, "initial_state": [1.0, 0.0, 4.0], "solver_tolerance": 1e-12}
     observer = qpmhe.Luenberger([gain] * 3)
-    expected, found = runs(system, observer, cost, np.array(ys), max_qps=0, **options)
+    expected, found = runs(system, observer, cost, ys, max_qps=0, **WRONG)
     same(expected, found, rtol=1e-8, atol=1e-9)
     assert (found.states >= 0.0).all()
     assert np.abs(found.states[60:80] - truth[60:]).max() < 2.0
-    expected, found = runs(system, observer, cost, np.array(ys), max_qps=2, **options)
+    expected, found = runs(system, observer, cost, ys, max_qps=2, **WRONG)
     assert (found.costs <= found.candidate_costs).all()
     assert np.abs(found.states[60:80] - truth[60:]).max() < 0.5
     np.testing.assert_allclose(found.states, expected.states, atol=1e-4)
+
+
+@pytest.mark.parametrize(("max_qps", "project"), [(0, False), (0, True), (2, True)])
+def test_an_extended_kalman_filter_that_settles_where_there_is_nothing(max_qps, project):
+    system, ys, truth = textbook_reactor()
+    cost = qpmhe.QuadraticCost(
+        prior=qpmhe.ObserverPrior(), disturbance=np.eye(3) * 1e6, noise=[[1.0 / 0.0625]]
+    )
+    observer = qpmhe.ExtendedKalman(
+        prior=0.25 * np.eye(3), disturbance=1e-6 * np.eye(3), noise=[[0.0625]]
+    )
+    expected, found = runs(
+        system, observer, cost, ys, max_qps=max_qps, project_observer=project, **WRONG
+    )
+    if max_qps == 0:
+        same(expected, found, rtol=1e-7, atol=1e-8)
+    else:
+        np.testing.assert_allclose(found.states, expected.states, atol=1e-4)
+        assert (found.costs <= found.candidate_costs).all()
+    error = np.abs(found.states[60:80] - truth[60:]).max()
+    # Without the projection it settles at negative pressures.
+    assert error < 0.02 if project else error > 0.5

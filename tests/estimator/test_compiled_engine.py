@@ -245,11 +245,6 @@ LOSSES = {Whole: "cost of its own", Branching: "", Together: "depends on others"
          {"cost": lambda: qpmhe.QuadraticCost(**(ONES | {"prior": qpmhe.ObserverPrior()})),
           "observer": lambda: OwnSteady(
               plain(), [0.0], disturbance=[[1.0]], noise=[[1.0]])}),
-        ("engine='compiled' does not yet project SteadyStateKalman onto X, by its covariance; take "
-         "engine='python', or leave states out", {
-             "system": lambda: symbolic(states=qpmhe.Box(0.0, 1.0)),
-             "observer": lambda: qpmhe.SteadyStateKalman(
-                 plain(), [0.0], disturbance=[[1.0]], noise=[[1.0]])}),
         ("not by 'osqp'; take backend='auto'", {"backend": "osqp"}),
     ],
 )

@@ -45,18 +45,23 @@ static void mhe_see(const mhe_settings *s, const mhe_stage *stage, mhe_seen *see
     }
 }
 
-/* Add K R K' + Q to a covariance; the rows of `gain` are the columns of K. */
-static void mhe_add_noise(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
-                          const real *gain, real *P)
+/* Add K R K' to a covariance; the rows of `gain` are the columns of K. */
+static void mhe_add_noise(const mhe_seen *seen, const real *gain, real *P)
+{
+    real weighted[NY * NX];
+    mhe_multiply(seen->count, seen->count, NX, seen->noise, gain, weighted);
+    mhe_add_product(seen->count, NX, NX, gain, weighted, P);
+}
+
+/* Add Q to a covariance. */
+static void mhe_add_disturbance(const mhe_settings *s, const mhe_stage *stage, real *P)
 {
     const real *Q = s->covariances.disturbance;
-    real weighted[NY * NX], own[NX * NX], scratch[NX * NX];
+    real own[NX * NX], scratch[NX * NX];
     if (stage->has_own_disturbance) {
         mhe_covariance_of(NX, stage->own_disturbance_weight, Q, scratch, own);
         Q = own;
     }
-    mhe_multiply(seen->count, seen->count, NX, seen->noise, gain, weighted);
-    mhe_add_product(seen->count, NX, NX, gain, weighted, P);
     for (int i = 0; i < NX * NX; i++) P[i] += Q[i];
     mhe_symmetrise(NX, P);
 }
@@ -71,20 +76,21 @@ static void mhe_gained(const mhe_seen *seen, const real *gain, real *out)
 #endif
 
 #if MHE_COVARIANCE && MHE_OBSERVER != MHE_UNSCENTED
-/* Joseph's form of P(t+1) = (A - K C) P (A - K C)' + K R K' + Q, with the outputs' rows of C. */
-static void mhe_propagate(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
-                          const real *A, const real *C, const real *gain, real *following)
+/* Joseph's form of (A - K C) P (A - K C)' + K R K', with the outputs' rows of C; A is the identity
+ * where there is none. */
+static void mhe_propagate(const mhe_stage *stage, const mhe_seen *seen, const real *A,
+                          const real *C, const real *gain, real *following)
 {
     real closed[NX * NX], product[NX * NX];
     for (int j = 0; j < NX; j++)
         for (int l = 0; l < NX; l++) {
-            real sum = A[j * NX + l];
+            real sum = A ? A[j * NX + l] : j == l;
             for (int i = 0; i < seen->count; i++) sum -= gain[i * NX + j] * C[i * NX + l];
             closed[j * NX + l] = sum;
         }
     mhe_multiply(NX, NX, NX, closed, stage->covariance, product);
     mhe_multiply_transposed(NX, NX, NX, product, closed, following);
-    mhe_add_noise(s, stage, seen, gain, following);
+    mhe_add_noise(seen, gain, following);
 }
 
 /* The rows of C of the outputs that are there. */
@@ -117,36 +123,79 @@ static void mhe_kalman_gain(const mhe_stage *stage, const mhe_seen *seen, const 
 #endif
 
 #if MHE_OBSERVER == MHE_UNSCENTED
-/* Deviations of the sigma points from z come in pairs, along the columns of a root of P. */
+/* Sigma points: deviations from z, in pairs along the columns of a root of P, and for each pair the
+ * root of its weight, which goes into deviations: sums become products. */
 #define POINTS (2 * NX)
 
-static void mhe_sigma_points(const mhe_settings *s, const mhe_stage *stage, real *moves)
+/* One is drawn back into the bounds of X, but not closer to z than this share. */
+#define CLOSEST ((real)1e-3)
+
+typedef struct {
+    real moves[POINTS * NX], roots[NX];
+} mhe_sigma;
+
+#if MHE_X_SET
+/* Draw a pair of sigma points z + d and z - d nearer to z, to stay in the bounds of X; by how much.
+ * Where z is on a bound both are inside of it: a sum of products ignores their sign. */
+static real mhe_draw_inside(const mhe_x_set *set, const real *z, real *one, real *other)
 {
+    real allowed[2], signs[2] = {1, -1};
+    for (int side = 0; side < 2; side++) {
+        allowed[side] = INFINITY;
+        for (int j = 0; j < NX; j++) {
+            const real move = signs[side] * one[j];
+            const real room = move > 0 ? set->upper[j] - z[j] : z[j] - set->lower[j];
+            if (move != 0 && room / fabs(move) < allowed[side]) allowed[side] = room / fabs(move);
+        }
+    }
+    const int inwards = allowed[0] >= allowed[1] ? 1 : -1;
+    const real farther = inwards > 0 ? allowed[0] : allowed[1];
+    real share = inwards > 0 ? allowed[1] : allowed[0];
+    if (share < CLOSEST && farther >= CLOSEST) {
+        share = farther;
+        signs[0] = signs[1] = inwards;
+    }
+    share = share < CLOSEST ? CLOSEST : share < 1 ? share : 1;
+    for (int j = 0; j < NX; j++) {
+        const real move = one[j] * share;
+        one[j] = signs[0] * move;
+        other[j] = signs[1] * move;
+    }
+    return share;
+}
+#endif
+
+static void mhe_sigma_points(const mhe_settings *s, const mhe_stage *stage, mhe_sigma *sigma)
+{
+    real *moves = sigma->moves;
     mhe_root(NX, stage->covariance, moves);
     for (int i = 0; i < NX * NX; i++) {
         moves[i] *= s->covariances.spread;
         moves[NX * NX + i] = -moves[i];
     }
-}
-
-/* The root of a sigma point's weight, which goes into the deviations: sums become products. */
-static real mhe_sigma_root(const mhe_settings *s)
-{
-    return 1 / (sqrt((real)2) * s->covariances.spread);
+    for (int k = 0; k < NX; k++) {
+        real share = 1;
+#if MHE_X_SET
+        share = mhe_draw_inside(mhe_x_set_at(s, stage), stage->z, moves + k * NX,
+                                moves + (NX + k) * NX);
+#endif
+        sigma->roots[k] = 1 / (sqrt((real)2) * s->covariances.spread * share);
+    }
 }
 
 /* Deviations of the outputs that are there, at each sigma point. */
 static void mhe_sigma_outputs(const mhe_settings *s, const mhe_stage *stage,
-                              const mhe_seen *seen, const real *moves, real *rows)
+                              const mhe_seen *seen, const mhe_sigma *sigma, real *rows)
 {
-    real at[NX], middle[NY], output[NY];
+    real at[NX], middle[NY], output[NY], change[NY];
     mhe_h(stage->z, stage->u, middle);
     for (int k = 0; k < POINTS; k++) {
-        for (int j = 0; j < NX; j++) at[j] = stage->z[j] + moves[k * NX + j];
+        for (int j = 0; j < NX; j++) at[j] = stage->z[j] + sigma->moves[k * NX + j];
         mhe_h(at, stage->u, output);
+        for (int j = 0; j < NY; j++) change[j] = output[j] - middle[j];
+        mhe_wrap_output(s, output, change);
         for (int i = 0; i < seen->count; i++)
-            rows[k * seen->count + i] =
-                (output[seen->at[i]] - middle[seen->at[i]]) * mhe_sigma_root(s);
+            rows[k * seen->count + i] = change[seen->at[i]] * sigma->roots[k % NX];
     }
 }
 
@@ -182,26 +231,31 @@ static void mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *
     mhe_rows_of(&seen, t->h_jacobian, rows);
     mhe_kalman_gain(stage, &seen, t->f_jacobian, rows, gain);
     mhe_gained(&seen, gain, out);
-    mhe_propagate(s, stage, &seen, t->f_jacobian, rows, gain, following);
+    mhe_propagate(stage, &seen, t->f_jacobian, rows, gain, following);
+    mhe_add_disturbance(s, stage, following);
 #elif MHE_OBSERVER == MHE_UNSCENTED
     mhe_seen seen;
-    real gain[NY * NX], moves[POINTS * NX], ahead[POINTS * NX], rows[POINTS * NY];
-    real at[NX], middle[NX];
+    mhe_sigma sigma;
+    real gain[NY * NX], ahead[POINTS * NX], rows[POINTS * NY];
+    real at[NX], middle[NX], next[NX];
     mhe_see(s, stage, &seen);
-    mhe_sigma_points(s, stage, moves);
+    mhe_sigma_points(s, stage, &sigma);
     mhe_f(stage->z, stage->u, stage->step, middle);
     for (int k = 0; k < POINTS; k++) {
-        real *next = ahead + k * NX;
-        for (int j = 0; j < NX; j++) at[j] = stage->z[j] + moves[k * NX + j];
+        real *change = ahead + k * NX;
+        for (int j = 0; j < NX; j++) at[j] = stage->z[j] + sigma.moves[k * NX + j];
         mhe_f(at, stage->u, stage->step, next);
-        for (int j = 0; j < NX; j++) next[j] = (next[j] - middle[j]) * mhe_sigma_root(s);
+        for (int j = 0; j < NX; j++) change[j] = next[j] - middle[j];
+        mhe_wrap_state(s, next, change);
+        for (int j = 0; j < NX; j++) change[j] *= sigma.roots[k % NX];
     }
-    mhe_sigma_outputs(s, stage, &seen, moves, rows);
+    mhe_sigma_outputs(s, stage, &seen, &sigma, rows);
     mhe_sigma_gain(&seen, rows, ahead, gain);
     mhe_gained(&seen, gain, out);
     for (int i = 0; i < NX * NX; i++) following[i] = 0;
     mhe_add_product(POINTS, NX, NX, ahead, ahead, following);
-    mhe_add_noise(s, stage, &seen, gain, following);
+    mhe_add_noise(&seen, gain, following);
+    mhe_add_disturbance(s, stage, following);
 #else
     for (int j = 0; j < NX; j++) out[j] = mhe_dot(NY, s->gain + j * NY, stage->v);
 #if MHE_COVARIANCE
@@ -211,15 +265,16 @@ static void mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *
     mhe_rows_of(&seen, s->covariances.h_jacobian, rows);
     for (int i = 0; i < seen.count; i++)
         for (int j = 0; j < NX; j++) gain[i * NX + j] = s->gain[j * NY + seen.at[i]];
-    mhe_propagate(s, stage, &seen, s->covariances.f_jacobian, rows, gain, following);
+    mhe_propagate(stage, &seen, s->covariances.f_jacobian, rows, gain, following);
+    mhe_add_disturbance(s, stage, following);
 #else
     (void)following;
 #endif
 #endif
 }
 
-/* The observer's estimate of x(t) that has used y(t). */
-static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out)
+/* The observer's estimate of x(t) that has used y(t), and its covariance if asked for. */
+static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out, real *covariance)
 {
 #if MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED
     mhe_seen seen;
@@ -229,12 +284,19 @@ static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out)
     real rows[NY * NX];
     mhe_rows_of(&seen, stage->terms.h_jacobian, rows);
     mhe_kalman_gain(stage, &seen, 0, rows, gain);
+    if (covariance) mhe_propagate(stage, &seen, 0, rows, gain, covariance);
 #else
-    real moves[POINTS * NX], rows[POINTS * NY];
-    mhe_sigma_points(s, stage, moves);
-    mhe_sigma_outputs(s, stage, &seen, moves, rows);
-    for (int i = 0; i < POINTS * NX; i++) moves[i] *= mhe_sigma_root(s);
-    mhe_sigma_gain(&seen, rows, moves, gain);
+    mhe_sigma sigma;
+    real rows[POINTS * NY];
+    mhe_sigma_points(s, stage, &sigma);
+    mhe_sigma_outputs(s, stage, &seen, &sigma, rows);
+    for (int i = 0; i < POINTS * NX; i++) sigma.moves[i] *= sigma.roots[i / NX % NX];
+    mhe_sigma_gain(&seen, rows, sigma.moves, gain);
+    if (covariance) {
+        for (int i = 0; i < NX * NX; i++) covariance[i] = 0;
+        mhe_add_product(POINTS, NX, NX, sigma.moves, sigma.moves, covariance);
+        mhe_add_noise(&seen, gain, covariance);
+    }
 #endif
     mhe_gained(&seen, gain, out);
     for (int j = 0; j < NX; j++) out[j] += stage->z[j];
@@ -243,5 +305,17 @@ static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out)
 #else
     for (int j = 0; j < NX; j++)
         out[j] = stage->z[j] + mhe_dot(NY, s->filter_gain + j * NY, stage->v);
+#if MHE_COVARIANCE
+    mhe_seen seen;
+    real gain[NY * NX], rows[NY * NX];
+    if (!covariance) return;
+    mhe_see(s, stage, &seen);
+    mhe_rows_of(&seen, s->covariances.h_jacobian, rows);
+    for (int i = 0; i < seen.count; i++)
+        for (int j = 0; j < NX; j++) gain[i * NX + j] = s->filter_gain[j * NY + seen.at[i]];
+    mhe_propagate(stage, &seen, 0, rows, gain, covariance);
+#else
+    (void)covariance;
+#endif
 #endif
 }

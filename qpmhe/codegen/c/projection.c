@@ -408,25 +408,34 @@ static const mhe_x_set *mhe_x_set_behind(const mhe_estimator *e, const mhe_stage
     return mhe_x_set_at(e->settings, e->stages + (at == newest ? at : (at + 1) % MHE_HORIZON));
 }
 
+/* The metric in which the observer is projected, as a covariance: its own if it has one. */
+static const real *mhe_metric(const mhe_estimator *e, const real *covariance)
+{
+    return MHE_COVARIANCE ? covariance : e->metric;
+}
+
 /* Keep the observer's next state in X; bits of the status. The stage's Jacobians are there as long
  * as the metric has not settled. */
-static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const real *predicted, real *next)
+static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const real *predicted, real *next,
+                           const real *covariance)
 {
     const mhe_settings *s = e->settings;
     const mhe_x_set *set = mhe_x_set_behind(e, stage);
     if (!e->metric_settled) e->metric_settled = mhe_settle(s, s->gain, &stage->terms, e->metric);
     if (mhe_is_inside(set, next)) return 0;
-    const int events = mhe_keep_inside(set, e->metric, predicted, next, stage->w);
+    const int events =
+        mhe_keep_inside(set, mhe_metric(e, covariance), predicted, next, stage->w);
     mhe_wrap_state(s, next, stage->w);
     return events;
 }
 
 /* Put a state of the observer into a set to which no correction leads. */
-static void mhe_put_inside(const mhe_estimator *e, const mhe_x_set *set, real *state)
+static void mhe_put_inside(const mhe_estimator *e, const mhe_x_set *set, const real *covariance,
+                           real *state)
 {
     real point[NX];
     if (!e->settings->project || mhe_is_inside(set, state)) return;
-    mhe_project(set, e->metric, state, point);
+    mhe_project(set, mhe_metric(e, covariance), state, point);
     memcpy(state, point, sizeof point);
 }
 

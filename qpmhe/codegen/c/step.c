@@ -44,8 +44,16 @@ static void mhe_filtered(mhe_estimator *e, const mhe_outcome *o, real *out)
 {
     const mhe_stage *newest = mhe_stage_at(e, e->length - 1);
     if (o->best == o->candidate) {
-        mhe_filter(e->settings, newest, out);
+#if MHE_X_SET && MHE_COVARIANCE
+        real covariance[NX * NX];
+        mhe_filter(e->settings, newest, out, covariance);
         mhe_enter_turn(e->settings, out);
+        if (isfinite(newest->cost))
+            mhe_put_inside(e, mhe_x_set_at(e->settings, newest), covariance, out);
+#else
+        mhe_filter(e->settings, newest, out, 0);
+        mhe_enter_turn(e->settings, out);
+#endif
     } else
         memcpy(out, o->best->x + (e->length - 1) * NX, sizeof(real) * NX);
 }
@@ -232,12 +240,10 @@ void mhe_set(mhe_estimator *e, mhe_workspace *k, const mhe_settings *settings, i
         mhe_complete_own_sets(settings, stage);
     }
 #if MHE_X_SET
-    if (e->length)
-        mhe_put_inside(e, mhe_x_set_at(settings, mhe_stage_at(e, 0)), mhe_stage_at(e, 0)->z);
-    else {
-        mhe_put_inside(e, &settings->states, e->z_end);
-        memcpy(e->history + e->newest * NX, e->z_end, sizeof e->z_end);
-    }
+    /* The window's first state, or the only one there is. */
+    mhe_put_inside(e, e->length ? mhe_x_set_at(settings, mhe_stage_at(e, 0)) : &settings->states,
+                   mhe_next_covariance(e, -1), mhe_next_state(e, -1));
+    if (!e->length) memcpy(e->history + e->newest * NX, e->z_end, sizeof e->z_end);
 #endif
     if (e->length) mhe_estimate_again(e, k, mhe_replay(e, 0), out);
 }

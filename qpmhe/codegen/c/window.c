@@ -51,7 +51,7 @@ static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *ne
     if (!mhe_all_finite(NX, next)) return INFINITY;
     if (MHE_COVARIANCE && !mhe_all_finite(NX * NX, following)) return INFINITY;
 #if MHE_X_SET
-    if (s->project) *events = mhe_stay_inside(e, stage, predicted, next);
+    if (s->project) *events = mhe_stay_inside(e, stage, predicted, next, following);
 #else
     (void)events;
 #endif
@@ -117,7 +117,7 @@ static int mhe_move_state(mhe_estimator *e, const mhe_sample *sample)
     mhe_x_set set = *after;
     TAKE_SIDES(set, s->states, NX, MHE_X_ROWS);
     if (!newest || !isfinite(newest->cost)) {
-        mhe_put_inside(e, &set, e->z_end);
+        mhe_put_inside(e, &set, mhe_next_covariance(e, e->length - 1), e->z_end);
         return 0;
     }
     const mhe_x_set own = newest->own_x;
