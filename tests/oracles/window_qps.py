@@ -147,11 +147,11 @@ class CSolver:
         )
         sets = tuple((one is not None, one or 0) for one in general)
         self.layout = Layout(n, p, 0, horizon, sets, 0, real)
-        files, structure = estimator_files(
+        files = estimator_files(
             system.symbolic, self.layout, np.zeros((), self.layout.settings_type())
         )
         files["mhe.c"] += HOOK
-        self._library = compiled_library(files, "mhe.c", structure + HOOK)
+        self._library = compiled_library(files, "mhe.c")
         sizes = np.zeros(4, np.int64)
         self._library.mhe_sizes(ctypes.c_void_p(sizes.ctypes.data))
         self._memory = [np.zeros(int(size), np.uint8) for size in sizes[:2]]
