@@ -16,7 +16,7 @@ from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from .conditions import Conditions
 from .estimate import DroppedRow
-from .limits import FEASIBLE
+from .limits import FEASIBLE, IN_RANGE
 from .snapshot import SET_NAMES
 
 Array = NDArray[np.float64]
@@ -27,9 +27,6 @@ _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
 # A row is the combination of others if less than this share of it is not.
 _DEPENDENT = 1e-9
-
-# A correction is in the range of the disturbances if less than this share of it is not.
-_IN_RANGE = 1e-12
 
 
 class Rows:
@@ -373,7 +370,7 @@ class Directions:
     def has(self, differences: Array) -> bool:
         """Whether the cost's directions of all d (K, n) are noise-free, up to rounding."""
         missed = np.abs(differences @ self._shown)
-        return bool((missed <= _IN_RANGE * (np.abs(differences) @ self._sizes)).all())
+        return bool((missed <= IN_RANGE * (np.abs(differences) @ self._sizes)).all())
 
 
 def _off(normal: Array, scale: Array) -> Array:
