@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import check_problem, positive_definite
-from .._linalg import inverse
 from ..costs import Cost
 from ..errors import InvalidInputError
 from ..estimation.conditions import ConditionReader, Conditions, usual_conditions
-from ..estimation.constraints import Constraints
 from ..estimation.covariance import window_covariances
 from ..estimation.engine import PythonEngine
 from ..estimation.engines import EngineChangeError
@@ -37,7 +35,7 @@ from ..model.traces import next_check
 from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
 from .handover import hand_over
-from .layout import CHANGES, SET_NAMES, SIDES, STAGE_FLAGS
+from .layout import CHANGES, SET_NAMES, STAGE_FLAGS
 from .library import EstimatorLibrary
 from .sample import SampleRecord
 
@@ -69,7 +67,10 @@ class CompiledEngine:
         self._library = library = EstimatorLibrary(system, observer, cost, settings)
         self._system, self._given_cost, self._settings = system, cost, settings
         self._reader = ConditionReader(system, cost)
-        self._tools = Tools(usual_conditions(settings), system, cost, library.settings)
+        self._directions = directions = library.directions
+        self._tools = Tools(usual_conditions(settings), system, directions.cost, library.settings)
+        space = directions.cost.space
+        self._to_disturbances = None if space is None else space.to_disturbances
         n, p, m, horizon = system.n, system.p, system.m, settings.horizon
         self._sizes, self._delay = (n, p, horizon), settings.delay
         self._workspace = library.workspace()
@@ -82,7 +83,9 @@ class CompiledEngine:
         self._numbers = self._out.view(np.int32)[2 * reals + 2 : 2 * reals + 8]
         self._before = np.empty_like(self._memory)  # before the last step
         # A sample as usual, and one with something of its own.
-        self._plain, self._own = (SampleRecord(library.layout, self._y, self._u) for _ in range(2))
+        self._plain, self._own = (
+            SampleRecord(library.layout, directions, self._y, self._u) for _ in range(2)
+        )
         memory, before, workspace, usual, special, out = (
             ctypes.c_void_p(array.ctypes.data)
             for array in (
@@ -117,7 +120,7 @@ class CompiledEngine:
 
     def _tools_for(self, usual: Conditions) -> Tools:
         """What a step uses under these usual conditions."""
-        system, cost = usual.applied(self._system, self._given_cost)
+        system, cost = usual.applied(self._system, self._directions.cost)
         return Tools(usual, system, cost, self._library.settings_for(system, cost, usual))
 
     @property
@@ -220,7 +223,7 @@ class CompiledEngine:
         record, state = self._memory[0], self._memory[0]["z_end"].copy()
         parts = self._system, self._observer, self._given_cost, self._settings
         engine = PythonEngine(*parts, state)
-        hand_over(record, self._system, self.usual, engine)
+        hand_over(record, self._directions, self.usual, engine)
         raise EngineChangeError(engine, fault)
 
     def _collect(self, time: int) -> CompiledEstimate:
@@ -229,7 +232,9 @@ class CompiledEngine:
         if numbers[1] & _ROWS_DROPPED:
             sides = self._out[0]["dropped"][: numbers[0] + 1]
             dropped = self._library.layout.dropped_rows(sides, time + 1 - numbers[0])
-        return CompiledEstimate(block, numbers, time, self._sizes, self._delay, dropped)
+        return CompiledEstimate(
+            block, numbers, time, self._sizes, self._delay, dropped, self._to_disturbances
+        )
 
     def amend(self, time: int, y: Array) -> Estimate:
         """Put a late measurement in its place, and estimate again."""
@@ -322,9 +327,8 @@ class CompiledEngine:
 
     def _basis(self) -> Array:
         """The directions (n, k) in which there are disturbances."""
-        system, cost = self._tools.system, self._tools.cost
-        covariance = inverse(cost.initial_weight(self._observer.initial_covariance()))
-        return Constraints(system, cost, covariance).basis
+        tools = self._tools
+        return self._directions.constraints_of(tools.system, tools.cost).basis
 
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt from measurements so far, as plain arrays and numbers."""
@@ -399,8 +403,10 @@ class CompiledEngine:
         sizes, wanted = np.abs(z).max(axis=0), self._settings.qp_limit > 0
         for k, place in enumerate(places):
             stage = record["stages"][place]
-            disturbance = stage["own_disturbance_weight"] if stage["has_own_disturbance"] else None
-            weight = tools.cost.joint_weight(stage["noise_weight"], disturbance)
+            weight = tools.cost.joint_weight(stage["noise_weight"], None)
+            if stage["has_own_disturbance"]:
+                n = self._sizes[0]
+                weight[:n, :n] = stage["own_disturbance_weight"].reshape(n, n)
             for left, (again, reached, _) in zip(
                 range(len(computed))[::-1], computed, strict=True
             ):
@@ -448,17 +454,17 @@ class CompiledEngine:
         ):
             raise ValueError("a step's length is impossible")
         saved: dict[str, Any] = {}
-        for kind in ("noise", "disturbance"):
-            if flags[f"has_own_{kind}"]:
-                saved[f"{kind}_weight"] = stage[f"own_{kind}_weight"]
+        directions = self._directions
+        if flags["has_own_noise"]:
+            saved["noise_weight"] = stage["own_noise_weight"]
+        if flags["has_own_disturbance"]:
+            saved["disturbance_weight"] = directions.weight_of_w(stage["own_disturbance_weight"])
         for letter, name in zip("wvx", SET_NAMES, strict=True):
             if flags[f"has_own_{letter}"]:
                 sides, built = stage[f"own_{letter}"], self._system.set_of(name)
                 if built is None:
                     raise mismatch(f"set of {name}")
-                saved[name] = {
-                    side: sides[side][: getattr(built, side).size].copy() for side in SIDES
-                }
+                saved[name] = directions.read_sides(name, sides, built)
         self._reader.load(saved, tools.usual)
 
     def _check_stage(

@@ -37,22 +37,26 @@ class CompiledWatch(ObserverWatch):
 class CompiledEstimate(Estimate):
     """An estimate whose arrays are views of one block, made when they are asked for."""
 
-    __slots__ = ("_block", "_delay", "_numbers", "_sizes")
+    __slots__ = ("_block", "_delay", "_numbers", "_sizes", "_to_disturbances")
 
     engine = "compiled"
 
     def __init__(
         self, block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int], delay: int,
-        dropped: tuple[DroppedRow, ...] = (),
+        dropped: tuple[DroppedRow, ...] = (), to_disturbances: Array | None = None,
     ) -> None:
         self._block, self._numbers, self.time = block, numbers, time
         self._sizes, self._delay, self.dropped = sizes, delay, dropped
+        self._to_disturbances = to_disturbances
         n = sizes[0]
         end = 2 + (numbers[0] + 1) * n
         self.state = block[end - n : end]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        arguments = self._block, self._numbers, self.time, self._sizes, self._delay, self.dropped
+        arguments = (
+            self._block, self._numbers, self.time, self._sizes, self._delay, self.dropped,
+            self._to_disturbances,
+        )
         return _restored, (arguments, self.step_time)
 
     def _rows(self, start: int, rows: int, width: int) -> Array:
@@ -83,7 +87,8 @@ class CompiledEstimate(Estimate):
     def disturbances(self) -> Array:
         """w(i) along the trajectory."""
         n, _, horizon = self._sizes
-        return self._rows(2 + 2 * (horizon + 1) * n, self._numbers[0], n)
+        d = self._rows(2 + 2 * (horizon + 1) * n, self._numbers[0], n)
+        return d if self._to_disturbances is None else d @ self._to_disturbances.T
 
     @property
     def noises(self) -> Array:

@@ -9,24 +9,25 @@ import numpy as np
 from ..estimation.conditions import Conditions
 from ..estimation.engine import PythonEngine, Taken
 from ..model.sets import ConvexSet
-from ..model.system import System
-from .layout import SET_NAMES, SIDES
+from .directions import Directions
+from .layout import SET_NAMES
 
 
-def samples_of(record: Any, system: System) -> list[Taken]:
+def samples_of(record: Any, directions: Directions) -> list[Taken]:
     """The samples in the window of an ``mhe_estimator``, as the Python step takes them."""
     length, horizon = int(record["length"]), len(record["stages"])
+    m = directions.system.m
     places = (int(record["first"]) + np.arange(length)) % horizon
     return [
         Taken(
-            np.where(stage["is_observed"], stage["y"], np.nan), stage["u"][: system.m].copy(),
-            float(stage["step"]) if stage["is_irregular"] else None, _conditions(stage, system),
+            np.where(stage["is_observed"], stage["y"], np.nan), stage["u"][:m].copy(),
+            float(stage["step"]) if stage["is_irregular"] else None, _conditions(stage, directions),
         )
         for stage in record["stages"][places]
     ]
 
 
-def hand_over(record: Any, system: System, usual: Conditions, engine: PythonEngine) -> None:
+def hand_over(record: Any, directions: Directions, usual: Conditions, engine: PythonEngine) -> None:
     """Let a new Python engine continue where an ``mhe_estimator`` stands."""
     horizon, length = len(record["stages"]), int(record["length"])
     time, newest = int(record["time"]), int(record["newest"])
@@ -38,27 +39,26 @@ def hand_over(record: Any, system: System, usual: Conditions, engine: PythonEngi
     history = [record["history"][(newest - k) % (horizon + 1)].copy() for k in range(count)][::-1]
     engine.take_over(
         usual, time - length, (first["z"] if length else record["z_end"]).copy(),
-        covariance, samples_of(record, system),
+        covariance, samples_of(record, directions),
         record["trajectory"][: length + 1].copy() if record["has_trajectory"] else None,
         history, (int(record["far"]), int(record["dropped"])),
         record["smoothed"].copy() if record["has_smoothed"] else None,
     )
 
 
-def _conditions(stage: Any, system: System) -> Conditions | None:
+def _conditions(stage: Any, directions: Directions) -> Conditions | None:
     """What a stage was taken with; None if nothing but what is usual."""
     found: dict[str, Any] = {}
-    for name, flag in (("noise_weight", "noise"), ("disturbance_weight", "disturbance")):
-        if stage[f"has_own_{flag}"]:
-            found[name] = stage[f"own_{name}"].copy()
+    if stage["has_own_noise"]:
+        found["noise_weight"] = stage["own_noise_weight"].copy()
+    if stage["has_own_disturbance"]:
+        weight = stage["own_disturbance_weight"]
+        found["disturbance_weight"] = np.array(directions.weight_of_w(weight))
     for letter, name in zip("wvx", SET_NAMES, strict=True):
-        one = system.set_of(name)
+        one = directions.system.set_of(name)
         if one is not None and stage[f"has_own_{letter}"]:
-            sides = stage[f"own_{letter}"]
-            lower, upper, row_lower, row_upper = (
-                sides[side][: getattr(one, side).size].copy() for side in SIDES
-            )
-            found[name] = ConvexSet(lower, upper, one.matrix, row_lower, row_upper)
+            sides = directions.read_sides(name, stage[f"own_{letter}"], one)
+            found[name] = ConvexSet(matrix=one.matrix, **sides)
     if not stage["is_sampled"].all():
         found["sampled"] = stage["is_sampled"].astype(np.bool_)
     return Conditions(**found) if found else None

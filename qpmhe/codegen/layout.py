@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -10,10 +11,10 @@ from numpy.typing import NDArray
 
 from .._checks import SINGULAR
 from .._linalg import inverse
-from ..costs import Cost, LossForm
+from ..costs import Cost, LossForm, Subspace
 from ..errors import OptionError
 from ..estimation.conditions import USUAL, Conditions
-from ..estimation.constraints import Rows
+from ..estimation.constraints import Constraints, Rows
 from ..estimation.estimate import DroppedRow, Status
 from ..estimation.limits import c_definitions
 from ..estimation.prior import PriorWeights
@@ -21,8 +22,8 @@ from ..estimation.settings import Infeasible, Settings
 from ..model.residuals import Residual
 from ..model.sets import ConvexSet
 from ..model.system import System
-from ..observers import Observer
 from ..observers.base import covariance_of
+from .directions import Directions
 
 SET_NAMES = ("disturbances", "noises", "states")
 # Terms of the cost, and their losses in the order of their numbers in C; behind these come the
@@ -30,8 +31,6 @@ SET_NAMES = ("disturbances", "noises", "states")
 TERMS = ("prior", "disturbance", "noise")
 LOSSES = ("quadratic", "huber", "power")
 
-#: Sides of a set.
-SIDES = ("lower", "upper", "row_lower", "row_upper")
 #: Flags of a stage.
 STAGE_FLAGS = (
     "has_own_noise", "has_own_disturbance", "has_own_w", "has_own_v", "has_own_x", "is_irregular",
@@ -81,13 +80,17 @@ class Layout:
     residuals: tuple[int, int] = (0, 0)
     #: Whether the set of states bounds angles.
     turns: bool = False
+    #: Directions without a disturbance, and the numbers of W's rows in `DroppedRow` then.
+    quiet: int = 0
+    numbers: tuple[int, ...] | None = None
 
     @classmethod
     def of(
-        cls, system: System, observer: Observer, cost: Cost, horizon: int, continuous: int,
-        real: str = "double", lapack: bool = False, clock: bool = False,
+        cls, directions: Directions, horizon: int, continuous: int, real: str = "double",
+        lapack: bool = False, clock: bool = False,
     ) -> Layout:
         """The sizes and features of an estimator. `lapack` allows it where it is quicker."""
+        system, observer, cost = directions.system, directions.observer, directions.cost
         own, form = observer.c_form, cost.c_form
         assert own is not None
         losses = () if form is None else form.losses
@@ -95,6 +98,11 @@ class Layout:
             (one is not None, 0 if one is None else one.matrix.shape[0])
             for one in (getattr(system, name) for name in SET_NAMES)
         )
+        numbers: tuple[int, ...] | None = None
+        if cost.space is not None:
+            rows = directions.rows
+            numbers = () if rows is None else tuple(rows.numbers.tolist())
+            sets = ((rows is not None, len(numbers)), *sets[1:])
         weighs, kind = cost.observer_prior is not None, _OBSERVERS.index(own.kind)
         projects = system.states is not None and observer.metric is None
         return cls(
@@ -106,7 +114,7 @@ class Layout:
             observer_prior=weighs,
             lapack=lapack and system.n >= _LAPACK_STATES, clock=clock,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
-            turns=system.turns is not None,
+            turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
         )
 
     @property
@@ -126,7 +134,7 @@ class Layout:
             "output_residual": self.residuals[0], "state_residual": self.residuals[1],
             "observer": self.observer, "covariance": int(self.covariance),
             "observer_prior": int(self.observer_prior),
-            "turns": int(self.turns),
+            "turns": int(self.turns), "quiet": self.quiet,
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
@@ -155,6 +163,11 @@ class Layout:
             ("solver_tolerance", r),
         ]
         fields += [(name, self.set_type(name)) for name in SET_NAMES]
+        if self.quiet:
+            fields += [
+                ("keep", r, n * n), ("shift", r, n), ("candidate_keep", r, n * n),
+                ("quiet", r, self.quiet * n),
+            ]
         fields += [(name, r, self.metric_size) for name in ("metric", "metric_weight")]
         options = (
             "metric_settled", "project", "max_qps", "max_iterations", "infeasible",
@@ -184,7 +197,7 @@ class Layout:
         return _struct([
             ("lower", r, size), ("upper", r, size), ("scale", r, size), ("rows", r, space * size),
             ("row_lower", r, space), ("row_upper", r, space), ("row_scale", r, space),
-            ("deviation", r, size), ("row_deviation", r, space),
+            ("deviation", r, size), ("row_deviation", r, space), ("row_fixed", np.uint8, space),
         ])
 
     def sample_type(self) -> np.dtype[Any]:
@@ -212,8 +225,13 @@ class Layout:
         found, start = [], 0
         for name, count in zip(SET_NAMES, self.set_rows, strict=True):
             part = sides[:, start : start + count]
+            numbers: Sequence[int] = range(count)
+            if name == "disturbances" and self.numbers is not None:
+                numbers = [-1] * self.nx + list(self.numbers)  # no bounds of components
             found += [
-                DroppedRow(name, int(r), ("lower", "upper")[part[k, r] - 1], first + int(k))
+                DroppedRow(
+                    name, int(numbers[r]), ("lower", "upper")[part[k, r] - 1], first + int(k)
+                )
                 for k, r in np.argwhere(part)
             ]
             start += count
@@ -258,16 +276,16 @@ class Layout:
 
 
 def settings_record(
-    layout: Layout, system: System, observer: Observer, cost: Cost, settings: Settings,
+    layout: Layout, directions: Directions, system: System, cost: Cost, settings: Settings,
     usual: Conditions = USUAL,
 ) -> NDArray[Any]:
     """The estimator's data and options as one ``mhe_settings``.
 
-    System and cost are those of the usual conditions.
+    System and cost, which is that of d, are those of the usual conditions.
     """
     # What single precision cannot hold becomes infinite, and is refused below.
     with np.errstate(over="ignore", under="ignore"):
-        record = _filled(layout, system, observer, cost, settings, usual)
+        record = _filled(layout, directions, system, cost, settings, usual)
     given = [(name, record[name]) for name in (
         "gain", "prior_weight", "disturbance_weight", "noise_weight"
     )]
@@ -284,10 +302,10 @@ def settings_record(
 
 
 def _filled(
-    layout: Layout, system: System, observer: Observer, cost: Cost, settings: Settings,
+    layout: Layout, directions: Directions, system: System, cost: Cost, settings: Settings,
     usual: Conditions,
 ) -> NDArray[Any]:
-    record = np.zeros((), layout.settings_type())
+    record, observer = np.zeros((), layout.settings_type()), directions.observer
     own, form, single = observer.c_form, cost.c_form, layout.real == "float"
     assert own is not None
     assert form is not None
@@ -330,6 +348,9 @@ def _filled(
     weights = form.disturbance, form.noise, regular
     for name, weight in zip(SET_NAMES, weights, strict=True):
         one: ConvexSet | None = getattr(system, name)
+        if name == "disturbances" and cost.space is not None:
+            _fill_directions(record, directions.constraints_of(system, cost), cost.space)
+            continue
         if one is None:
             continue
         part, scaled = record[name], Rows(name, one, inverse(weight))
@@ -362,6 +383,27 @@ def _filled(
 
 def _loss_number(term: str, loss: LossForm) -> int:
     return LOSSES.index(loss.kind) if loss.kind in LOSSES else len(LOSSES) + TERMS.index(term)
+
+
+def _fill_directions(record: Any, constraints: Constraints, space: Subspace) -> None:
+    """Fill in the rows on d and the noise-free directions."""
+    part, rows = record["disturbances"], constraints.disturbances
+    directions = constraints.directions
+    part["lower"], part["upper"] = -np.inf, np.inf
+    for kind in ("scale", "deviation", "row_scale", "row_deviation"):
+        part[kind] = 1.0
+    if rows is not None:
+        part["rows"][: rows.matrix.size] = rows.matrix.ravel()
+        for name, values in (
+            ("lower", rows.lower), ("upper", rows.upper), ("scale", rows.scale),
+            ("deviation", rows.deviation), ("fixed", rows.fixed),
+        ):
+            part[f"row_{name}"][: values.size] = values
+    if directions is not None:
+        keep, shift = directions.roll_out(of_candidate=False)
+        record["keep"], record["shift"] = keep.ravel(), shift
+        record["candidate_keep"] = directions.candidate_projection.ravel()
+        record["quiet"][: space.noise_free.size] = space.noise_free.T.ravel()
 
 
 def _kind(residual: Residual | None) -> int:

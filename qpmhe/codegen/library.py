@@ -21,6 +21,7 @@ from ..model.system import System
 from ..observers import Observer
 from .comparison import Interpreter, estimator_fault
 from .compiler import NotCachedError, cached_library, compiled_library
+from .directions import Directions
 from .fingerprint import source_key
 from .layout import TERMS, Layout, settings_record
 from .losses import loss_function
@@ -38,13 +39,6 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         return (
             f"the system has no CasADi form ({system.no_symbolic}); change that, make the system "
             "with qpmhe.from_casadi, or take engine='python'."
-        )
-    if system.disturbance_matrix is not None:
-        return "engine='compiled' does not yet take a disturbance_matrix; take engine='python'."
-    if cost.disturbance_factor is not None:
-        return (
-            "engine='compiled' does not yet take a singular covariance of the disturbance; take "
-            "engine='python'."
         )
     for name in ("output_residual", "state_residual"):
         residual = getattr(system, name)
@@ -72,6 +66,13 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     reason = _without_form(cost)
     if reason:
         return reason
+    assert cost.c_form is not None
+    is_robust = cost.c_form.losses[TERMS.index("disturbance")].kind != "quadratic"
+    if is_robust and cost.directions(system.disturbance_matrix) is not None:
+        return (
+            "a loss of the disturbance has no C form where disturbances have fewer directions than "
+            "the state; take Quadratic for it, or engine='python'."
+        )
     size = _window_size(system, observer, cost, settings.horizon)
     if size > _MOST_BYTES:
         return (
@@ -107,8 +108,9 @@ def _without_form(cost: Cost) -> str:
 
 def _window_size(system: System, observer: Observer, cost: Cost, horizon: int) -> int:
     """Bytes of an estimator's memory, in double precision."""
+    directions = Directions(system, observer, cost)
     one, two = (
-        Layout.of(system, observer, cost, count, 0).estimator_type().itemsize for count in (1, 2)
+        Layout.of(directions, count, 0).estimator_type().itemsize for count in (1, 2)
     )
     return one + (horizon - 1) * (two - one)
 
@@ -160,11 +162,14 @@ def planned(
         raise OptionError(f"no C code for this estimator: {reason}")
     assert system.symbolic is not None
     model = symbolic_model(system, cost)
+    directions = Directions(system, observer, cost)
     layout = Layout.of(
-        system, observer, cost, settings.horizon, CONTINUOUS[model.method], real, lapack,
+        directions, settings.horizon, CONTINUOUS[model.method], real, lapack,
         settings.time_budget is not None,
     )
-    return layout, settings_record(layout, system, observer, cost, settings, usual)
+    return layout, settings_record(
+        layout, directions, system, directions.cost, settings, usual
+    )
 
 
 def lapack_functions() -> Any:
@@ -239,7 +244,9 @@ class EstimatorLibrary:
             system, observer, cost, settings, lapack=True
         )
         self.system, self.observer, self._options = system, observer, settings
-        self.prior_weights = PriorWeights(system, observer, cost)
+        #: How the user's disturbances are those of C.
+        self.directions = Directions(system, observer, cost)
+        self.prior_weights = PriorWeights(system, observer, self.directions.cost)
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
         model = symbolic_model(system, cost)
@@ -269,7 +276,7 @@ class EstimatorLibrary:
 
     def settings_for(self, system: System, cost: Cost, usual: Conditions) -> NDArray[Any]:
         """``mhe_settings`` with the sets and weights of these, which are the usual conditions."""
-        record = settings_record(self.layout, system, self.observer, cost, self._options, usual)
+        record = settings_record(self.layout, self.directions, system, cost, self._options, usual)
         self._set_clock(record)
         return record
 

@@ -78,7 +78,7 @@ class CompiledMembers:
         """Let new Python engines, one for each member, continue where these members stand."""
         usual = usual_conditions(self._settings)
         for record, engine in zip(self._memory, engines, strict=True):
-            hand_over(record, self._system, usual, engine)
+            hand_over(record, self._library.directions, usual, engine)
 
     def _check_trace(self, u: Array) -> None:
         """Compare trace and functions at z(t) of some members; raise where they differ."""

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ..estimation.conditions import Conditions
 from ..model.sets import ConvexSet
-from .layout import SET_NAMES, SIDES, Layout
+from .directions import Directions
+from .layout import SET_NAMES, Layout
 
 
 class SampleRecord:
@@ -21,10 +22,12 @@ class SampleRecord:
         The structure, with pointers to the arrays of this object.
     """
 
-    def __init__(self, layout: Layout, y: NDArray[Any], u: NDArray[Any]) -> None:
+    def __init__(
+        self, layout: Layout, directions: Directions, y: NDArray[Any], u: NDArray[Any]
+    ) -> None:
         n, p = layout.nx, layout.ny
         self.record = np.zeros(1, layout.sample_type())
-        self._fields, self._kept = self.record[0], (y, u)
+        self._fields, self._kept, self._directions = self.record[0], (y, u), directions
         self._fields["y"], self._fields["u"] = y.ctypes.data, u.ctypes.data
         self._arrays: dict[str, Any] = {
             "noise_weight": np.zeros((p, p)), "disturbance_weight": np.zeros((n, n)),
@@ -43,14 +46,9 @@ class SampleRecord:
                 fields[name] = 0
                 continue
             if isinstance(value, ConvexSet):
-                fill_sides(array[0], value)
+                self._directions.write_sides(name, array[0], value)
+            elif name == "disturbance_weight":
+                array[...] = self._directions.weight_of_d(value)
             else:
                 array[...] = value
             fields[name] = self._addresses[name]
-
-
-def fill_sides(sides: Any, one: ConvexSet) -> None:
-    """Write the sides of a set into ``mhe_w_set`` or ``mhe_v_set``."""
-    for side in SIDES:
-        values = getattr(one, side)
-        sides[side][: values.size] = values

@@ -191,6 +191,8 @@ class Cost(ABC):
     #: The directions of the disturbances, of a `LiftedCost`; None for all.
     space: Subspace | None = None
 
+    #: Smaller eigenvalues of the correlations in an observer's covariance count as this.
+    least_correlation: float = SINGULAR
 
     def __init__(
         self, prior: Array | ObserverPrior, disturbance: Array, noise: Array, discount: float
@@ -327,7 +329,7 @@ class Cost(ABC):
         """The weight of the initial error, given the observer's covariance of it if it has one."""
         if self.observer_prior is None or covariance is None:
             return np.asarray(self.prior)
-        return self.observer_prior.weight(covariance)
+        return self.observer_prior.weight(covariance, self.least_correlation)
 
     def check_weights(  # noqa: B027 - most costs take any weight
         self, noise: Array | None, disturbance: Array | None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .._checks import Array
-from .base import Cost, CostConstants, quadratic_form
+from .base import Cost, CostConstants, CostForm, quadratic_form
 from .subspace import Subspace
 
 # Rounding of 1 / s in a prior's weight is as large as the error of s in place of an eigenvalue 0.
@@ -27,6 +27,8 @@ class LiftedCost(Cost):
         The directions of the disturbances.
     """
 
+    least_correlation = _LEAST
+
     def __init__(self, cost: Cost, space: Subspace) -> None:
         self._cost, self.quadratic = cost, cost.quadratic
         self.space: Subspace = space
@@ -36,6 +38,14 @@ class LiftedCost(Cost):
         weight = self._lifted(cost.disturbance)
         assert weight is not None
         super().__init__(cost.prior, weight, cost.noise, cost.discount)
+
+    @property
+    def c_form(self) -> CostForm | None:
+        """The user's with the weight of d; None where the loss of w is not quadratic."""
+        form = self._cost.c_form
+        if form is None or form.losses[1].kind != "quadratic":
+            return None
+        return form._replace(disturbance=self.disturbance, noise=self.noise)
 
     @property
     def constants(self) -> CostConstants | None:
@@ -62,12 +72,6 @@ class LiftedCost(Cost):
         """The user's weights (..., s + p, s + p), from those of d and v."""
         lowered: Array = self._range.T @ weights @ self._range
         return lowered
-
-    def initial_weight(self, covariance: Array | None) -> Array:
-        """As any cost's, more exact where a covariance is singular; see `Cost.initial_weight`."""
-        if self.observer_prior is None or covariance is None:
-            return super().initial_weight(covariance)
-        return self.observer_prior.weight(covariance, _LEAST)
 
     def prior_cost(self, offset: Array, weight: Array) -> float:
         """The user's; see `Cost.prior_cost`."""

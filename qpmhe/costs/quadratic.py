@@ -85,7 +85,7 @@ class QuadraticCost(Cost):
     @property
     def c_form(self) -> CostForm | None:
         """The weights, unless a derived class computes another cost."""
-        if type(self) is not QuadraticCost or self.disturbance_factor is not None:
+        if type(self) is not QuadraticCost:
             return None
         prior = None if isinstance(self.prior, ObserverPrior) else self.prior
         return CostForm(prior, self.disturbance, self.noise, self.discount)

@@ -16,7 +16,7 @@ from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from .conditions import Conditions
 from .estimate import DroppedRow
-from .limits import FEASIBLE
+from .limits import FEASIBLE, IN_RANGE
 from .snapshot import SET_NAMES
 
 Array = NDArray[np.float64]
@@ -27,9 +27,6 @@ _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
 # A row is the combination of others if less than this share of it is not.
 _DEPENDENT = 1e-9
-
-# A correction is in the range of the disturbances if less than this share of it is not.
-_IN_RANGE = 1e-12
 
 
 class Rows:
@@ -58,18 +55,20 @@ class Rows:
         Rows that are never dropped: the components that have no width.
     numbers : (r,) array
         As in `DroppedRow`.
+    kept : bool array or None
+        Of rows that were mapped: which are left of those of the set.
     """
 
     __slots__ = (
-        "_columns", "_kept", "_magnitudes", "bounds", "components", "deviation", "fixed", "lower",
-        "matrix", "name", "numbers", "scale", "upper",
+        "_columns", "_magnitudes", "bounds", "components", "deviation", "fixed", "kept",
+        "lower", "matrix", "name", "numbers", "scale", "upper",
     )
 
     def __init__(self, name: str, convex_set: ConvexSet, covariance: Array) -> None:
         d, components = convex_set.dimension, convex_set.bounded_components
         self.name, self.components, self.bounds = name, components, components.size
         self.matrix: Array = np.vstack((np.eye(d)[components], convex_set.matrix))
-        self._kept: Mask | None = None
+        self.kept: Mask | None = None
         self.deviation = np.sqrt(np.einsum("ri,ij,rj->r", self.matrix, covariance, self.matrix))
         self.lower, self.upper = self._sides(convex_set)
         self.scale: Array = self._scale()
@@ -86,10 +85,10 @@ class Rows:
     def _sides(self, convex_set: ConvexSet) -> tuple[Array, Array]:
         lower = np.append(convex_set.lower[self.components], convex_set.row_lower)
         upper = np.append(convex_set.upper[self.components], convex_set.row_upper)
-        if self._kept is None:
+        if self.kept is None:
             return lower, upper
-        noise_free = np.zeros(len(self.matrix) - int(self._kept.sum()))
-        return np.append(lower[self._kept], noise_free), np.append(upper[self._kept], noise_free)
+        noise_free = np.zeros(len(self.matrix) - int(self.kept.sum()))
+        return np.append(lower[self.kept], noise_free), np.append(upper[self.kept], noise_free)
 
     def _scale(self) -> Array:
         width, deviation = self.upper - self.lower, self.deviation
@@ -149,7 +148,7 @@ class Rows:
         """The rows on d, where s = T d, without some; and behind them N' d = 0, noise-free."""
         other, kept, nothing = copy(self), ~left_out, np.zeros(noise_free.shape[1])
         matrix = self.matrix if through is None else self.matrix @ through
-        other._kept, other.matrix = kept, np.vstack((matrix[kept], noise_free.T))
+        other.kept, other.matrix = kept, np.vstack((matrix[kept], noise_free.T))
         other.lower = np.append(self.lower[kept], nothing)
         other.upper = np.append(self.upper[kept], nothing)
         # A row on a disturbance without variance has no deviation; N has a variance of 1.
@@ -373,7 +372,7 @@ class Directions:
     def has(self, differences: Array) -> bool:
         """Whether the cost's directions of all d (K, n) are noise-free, up to rounding."""
         missed = np.abs(differences @ self._shown)
-        return bool((missed <= _IN_RANGE * (np.abs(differences) @ self._sizes)).all())
+        return bool((missed <= IN_RANGE * (np.abs(differences) @ self._sizes)).all())
 
 
 def _off(normal: Array, scale: Array) -> Array:

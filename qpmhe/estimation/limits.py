@@ -43,6 +43,9 @@ FEASIBLE = 5e-9
 #: An observer more than this many standard deviations of the prior from an estimate is far.
 FAR = 10.0
 
+#: A correction is in the range of the disturbances if less than this share of it is not.
+IN_RANGE = 1e-12
+
 #: A larger measurement counts as missing: its square would not be finite.
 LARGEST = 1e150
 
@@ -52,6 +55,7 @@ NO_VARIANCE, KNOWN = 1e-30, 1e-16
 
 _SINGLE = {
     "ROUNDING": 1e-6, "NEARLY": 1e-3, "FEASIBLE": 1e-5, "LARGEST": 1e15, "SAME_COVARIANCE": 1e-4,
+    "IN_RANGE": 1e-4,
 }
 
 
@@ -61,6 +65,7 @@ def c_definitions(prefix: str, real: str) -> str:
         "ROUNDING": ROUNDING, "NEARLY": NEARLY, "STALLED": STALLED, "BEYOND": BEYOND,
         "FEASIBLE": FEASIBLE, "LARGEST": LARGEST, "FAR": FAR, "NEARER": NEARER,
         "NO_VARIANCE": NO_VARIANCE, "KNOWN": KNOWN, "SAME_COVARIANCE": SAME_COVARIANCE,
+        "IN_RANGE": IN_RANGE,
     }
     if real == "float":
         values |= _SINGLE

@@ -448,6 +448,57 @@ def _compass(functions: bool = False) -> Case:
     )
 
 
+def _fewer(gain: Any = None, **options: Any) -> Case:
+    """The system with inputs, with two disturbances on its three states; G is dense."""
+    matrix = np.array([[1.0, 0.2], [0.5, -1.0], [0.3, 0.8]])
+    system = with_inputs(disturbance_matrix=matrix, **options)
+    cost = qpmhe.QuadraticCost(prior=spd(1, 3), disturbance=10 * spd(2, 2), noise=spd(3, 2))
+    start = np.array([0.5, 0.5, 0.2])
+    # Corrections within the range of G, where no other gain is given.
+    gain = matrix @ [[0.2, 0.05], [-0.05, 0.2]] if gain is None else gain
+    samples = recorded(with_inputs(), start)
+    return Case(system, qpmhe.Luenberger(gain), cost, start, samples).with_options(
+        solver_tolerance=1e-10
+    )
+
+
+def _fewer_extended() -> Case:
+    """An extended Kalman filter whose covariance weighs the prior, for two disturbances."""
+    one = _fewer()
+    observer = qpmhe.ExtendedKalman(
+        prior=0.3 * np.eye(3), disturbance=0.05 * spd(2, 2), noise=0.05 * np.eye(2)
+    )
+    cost = qpmhe.QuadraticCost(
+        prior=qpmhe.ObserverPrior(), disturbance=one.cost.disturbance, noise=one.cost.noise
+    )
+    return replace(one, observer=observer, cost=cost)
+
+
+def _singular() -> Case:
+    """A covariance of the disturbance of rank one."""
+    one = case("inputs")
+    direction = np.array([1.0, -0.5, 2.0])
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=np.linalg.inv(spd(1, 3)), disturbance=0.05 * np.outer(direction, direction),
+        noise=np.linalg.inv(spd(3, 2)),
+    )
+    return replace(one, cost=cost).with_options(solver_tolerance=1e-10, max_qps=3)
+
+
+def _with_own_w(one: Case) -> Case:
+    """The case with weights and sides of the disturbance at some samples."""
+    samples = list(one.samples)
+    for t in range(3, len(samples), 4):
+        samples[t] = samples[t] | {"disturbance_weight": 5.0 * spd(t, 2)}
+    if one.system.disturbances is not None:
+        for t in range(5, len(samples), 6):
+            narrow = {"disturbances": qpmhe.Box([-0.02, -0.03], [0.02, 0.02])}
+            samples[t] = samples[t] | {"bounds": narrow}
+    return replace(one, samples=tuple(samples))
+
+
+OTHER_GAIN = [[0.2, 0.0], [0.1, 0.05], [0.0, 0.2]]
+
 #: Each is made when it is asked for; `case` keeps it.
 CASES: dict[str, Callable[[], Case]] = {
     "reactor": _reactor,
@@ -476,6 +527,23 @@ CASES: dict[str, Callable[[], Case]] = {
         disturbances=qpmhe.Box([-0.4, -0.4, -0.03, -0.02], [0.4, 0.4, 0.03, 0.02]),
         noises=qpmhe.Polytope([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0]], [20.0, 0.2]),
     ).with_options(max_qps=None),
+    "fewer disturbances": lambda: _fewer(),
+    "fewer disturbances observer": lambda: _fewer().with_options(max_qps=0),
+    "fewer disturbances out of range": lambda: _fewer(OTHER_GAIN).with_gaps().with_options(
+        warm_start=True
+    ),
+    "fewer disturbances in sets": lambda: _fewer(
+        OTHER_GAIN, disturbances=qpmhe.Box([-0.05, -0.08], [0.1, 0.06]),
+        noises=qpmhe.Box([-0.4, -0.4], [0.4, 0.4]),
+    ).with_options(max_qps=None),
+    "fewer disturbances reinitialized": lambda: _with_own_w(_fewer(
+        OTHER_GAIN, disturbances=qpmhe.Box([-0.05, -0.08], [0.1, 0.06]),
+    )).with_options(candidate="reinitialized", max_qps=None),
+    "fewer disturbances extended": lambda: _with_own_w(_fewer_extended().with_gaps()),
+    "one fixed of two disturbances": lambda: _fewer(
+        OTHER_GAIN, disturbances=qpmhe.Box([0.01, -np.inf], [0.01, np.inf])
+    ).with_options(max_qps=None),
+    "singular covariance": lambda: _singular().with_gaps(),
     "huber": lambda: _robust(noise=_huber(1.345)),
     "huber with gaps": lambda: _weighed(case("huber").with_gaps()),
     "huber in sets": lambda: _boxed(case("huber")),

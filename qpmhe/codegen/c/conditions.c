@@ -16,6 +16,7 @@ static void mhe_set_scales(int count, const real *lower, const real *upper, cons
         memcpy((own).rows, (set).rows, sizeof (own).rows); \
         memcpy((own).deviation, (set).deviation, sizeof (own).deviation); \
         memcpy((own).row_deviation, (set).row_deviation, sizeof (own).row_deviation); \
+        memcpy((own).row_fixed, (set).row_fixed, sizeof (own).row_fixed); \
         mhe_set_scales(n, (own).lower, (own).upper, (own).deviation, (own).scale); \
         mhe_set_scales(count, (own).row_lower, (own).row_upper, (own).row_deviation, \
                        (own).row_scale); \

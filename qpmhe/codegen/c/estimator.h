@@ -54,6 +54,7 @@ typedef $real mhe_real;
 #define MHE_COVARIANCE $covariance /* whether the observer's covariance is computed */
 #define MHE_OBSERVER_PRIOR $observer_prior /* whether it weighs the prior */
 #define MHE_TURNS $turns  /* whether the set of states bounds angles */
+#define MHE_QUIET $quiet /* directions of x(t+1) - f without a disturbance */
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
@@ -100,6 +101,7 @@ typedef struct {
     mhe_real row_lower[MHE_SIZE(MHE_W_ROWS)], row_upper[MHE_SIZE(MHE_W_ROWS)];
     mhe_real row_scale[MHE_SIZE(MHE_W_ROWS)];
     mhe_real deviation[MHE_NX], row_deviation[MHE_SIZE(MHE_W_ROWS)];
+    uint8_t row_fixed[MHE_SIZE(MHE_W_ROWS)]; /* rows that are never dropped */
 } mhe_w_set;
 
 typedef struct {
@@ -108,6 +110,7 @@ typedef struct {
     mhe_real row_lower[MHE_SIZE(MHE_V_ROWS)], row_upper[MHE_SIZE(MHE_V_ROWS)];
     mhe_real row_scale[MHE_SIZE(MHE_V_ROWS)];
     mhe_real deviation[MHE_NY], row_deviation[MHE_SIZE(MHE_V_ROWS)];
+    uint8_t row_fixed[MHE_SIZE(MHE_V_ROWS)];
 } mhe_v_set;
 
 enum {
@@ -128,6 +131,7 @@ typedef struct {
     mhe_real row_lower[MHE_SIZE(MHE_X_ROWS)], row_upper[MHE_SIZE(MHE_X_ROWS)];
     mhe_real row_scale[MHE_SIZE(MHE_X_ROWS)];
     mhe_real deviation[MHE_NX], row_deviation[MHE_SIZE(MHE_X_ROWS)];
+    uint8_t row_fixed[MHE_SIZE(MHE_X_ROWS)];
 } mhe_x_set;
 
 /* Matrices are stored by rows. Weights are inverse covariances. */
@@ -164,6 +168,11 @@ typedef struct {
     mhe_w_set disturbances;
     mhe_v_set noises;
     mhe_x_set states;
+#if MHE_QUIET
+    /* x(i+1) = f + keep (x(i+1) - f) + shift; of the candidate, along the rows of `quiet` alone. */
+    mhe_real keep[MHE_NX * MHE_NX], shift[MHE_NX];
+    mhe_real candidate_keep[MHE_NX * MHE_NX], quiet[MHE_QUIET * MHE_NX];
+#endif
     /* The observer's metric: as a covariance, before it has settled or for good; and the weight in the
      * Lyapunov equation by which it settles. */
     mhe_real metric[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)];

@@ -60,6 +60,12 @@ static void mhe_add_disturbance(const mhe_settings *s, const mhe_stage *stage, r
     real own[NX * NX], scratch[NX * NX];
     if (stage->has_own_disturbance) {
         mhe_covariance_of(NX, stage->own_disturbance_weight, Q, scratch, own);
+#if MHE_QUIET
+        mhe_multiply(NX, NX, NX, s->candidate_keep, own, scratch);
+        for (int i = 0; i < NX; i++)
+            for (int j = 0; j < NX; j++)
+                own[i * NX + j] = mhe_dot(NX, scratch + i * NX, s->candidate_keep + j * NX);
+#endif
         Q = own;
     }
     for (int i = 0; i < NX * NX; i++) P[i] += Q[i];

@@ -343,6 +343,19 @@ static void mhe_search(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int b
 }
 
 #if CONSTRAINED
+/* The candidate's disturbances: its corrections, as far as they are in directions that have some. */
+static const real *mhe_candidate_disturbances(const mhe_estimator *e, mhe_workspace *k)
+{
+    const real *w = k->trials->w;
+#if MHE_QUIET
+    for (int i = 0; i < e->length; i++)
+        mhe_times(NX, e->settings->candidate_keep, w + i * NX, k->bent.w + i * NX);
+    w = k->bent.w;
+#endif
+    (void)e;
+    return w;
+}
+
 /* The sequence from a candidate outside of the sets. */
 static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
 {
@@ -366,11 +379,12 @@ static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     o->best = o->candidate;
     if (e->settings->infeasible == MHE_KEEP_CANDIDATE || mhe_is_late(k, o)) return;
     o->events &= ~(MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED);
-    mhe_violation(e, o->candidate, 0, k->left_out);
-    o->candidate->violation = mhe_violation(e, o->candidate, k->left_out, 0);
+    const real *w = mhe_candidate_disturbances(e, k);
+    mhe_violation(e, o->candidate, w, 0, k->left_out);
+    o->candidate->violation = mhe_violation(e, o->candidate, w, k->left_out, 0);
     mhe_search(e, k, o, start, limit > o->qps + 1 ? limit - o->qps : 1);
     memset(k->left_out, 0, sizeof k->left_out);
-    if (o->best == o->candidate || !(mhe_violation(e, o->best, 0, k->left_out) > MHE_FEASIBLE))
+    if (o->best == o->candidate || !(mhe_violation(e, o->best, o->best->w, 0, k->left_out) > MHE_FEASIBLE))
         return;
     o->rows_dropped = 1;
     o->events |= MHE_ROWS_DROPPED;
@@ -396,9 +410,51 @@ static void mhe_set_candidate(mhe_estimator *e, mhe_workspace *k, mhe_trial *tri
     memcpy(trial->x + count * NX, e->z_end, sizeof e->z_end);
 #if CONSTRAINED
     memset(k->left_out, 0, sizeof k->left_out);
-    trial->violation = mhe_violation(e, trial, 0, 0);
+    trial->violation = mhe_violation(e, trial, mhe_candidate_disturbances(e, k), 0, 0);
 #endif
 }
+
+#if MHE_QUIET
+/* Whether the candidate has a correction in a direction without disturbances: it has no cost then,
+ * and its J is that of its roll-out. */
+static int mhe_roll_candidate_out(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
+{
+    int is_quiet = 1;
+    for (int i = 0; i < e->length; i++)
+        for (int q = 0; q < MHE_QUIET; q++) {
+            const real *direction = e->settings->quiet + q * NX, *w = o->candidate->w + i * NX;
+            real share = 0, size = 0;
+            for (int j = 0; j < NX; j++) {
+                share += direction[j] * w[j];
+                size += fabs(direction[j] * w[j]);
+            }
+            if (!(fabs(share) <= MHE_IN_RANGE * size)) is_quiet = 0;
+        }
+    if (is_quiet || !isfinite(o->candidate->cost)) return 0;
+    memcpy(o->spare->x, o->candidate->x, sizeof o->spare->x);
+    mhe_judge(e, k, o->spare, 1);
+    o->candidate->cost = o->spare->cost;
+    if (!isfinite(o->candidate->cost)) o->events |= MHE_MODEL_FAILED;
+    return 1;
+}
+
+/* Search on from the trajectory of which the candidate's cost is, after a search in vain: no step
+ * from the candidate itself need lower this cost, however short. */
+static void mhe_search_from_rolled_out(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
+{
+    const int left = e->settings->max_qps - o->qps;
+    memcpy(o->spare->x, o->candidate->x, sizeof o->spare->x);
+    mhe_evaluate(e, k, o->spare);
+    const real before = o->spare->cost;
+    if (!isfinite(before) || left <= 0) return;
+    mhe_take(k, o);
+    o->events &= ~(MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED);
+    mhe_search(e, k, o, -1, left);
+    if (o->best->cost < before) return;
+    o->spare = o->best;
+    o->best = o->candidate;
+}
+#endif
 
 /* Solve the window's problem as it stands. `before`: stages of the window that the kept
  * trajectory belongs to, -1 if there is none. */
@@ -420,6 +476,9 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     o->spare = k->trials + 1;
     o->other = k->trials + 2;
     mhe_set_candidate(e, k, o->candidate);
+#if MHE_QUIET
+    const int rolled_out = mhe_roll_candidate_out(e, k, o);
+#endif
 #if CONSTRAINED
     const int feasible = o->candidate->violation <= MHE_FEASIBLE;
     if (!feasible) o->events |= MHE_CANDIDATE_OUTSIDE;
@@ -430,5 +489,9 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
         o->events |= MHE_NO_QPS;
     else
         mhe_search(e, k, o, s->start_at_best ? before : -1, s->max_qps);
+#if MHE_QUIET /* implies CONSTRAINED */
+    if (rolled_out && feasible && s->max_qps > 0 && o->best == o->candidate)
+        mhe_search_from_rolled_out(e, k, o);
+#endif
     o->events |= o->best != o->candidate ? MHE_IMPROVED : MHE_CANDIDATE;
 }

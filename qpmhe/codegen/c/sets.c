@@ -92,10 +92,10 @@ static void mhe_stage_distances(mhe_estimator *e, int i, const real *x, const re
 
 /* The largest miss among rows of one set, in their scales. `sizes`: of the numbers whose
  * differences the rows are of, for rounding. `missed` gets the sides that are, but for
- * components without width in the usual set, which are not dropped. */
+ * components without width in the usual set and other rows that are not dropped. */
 static real mhe_missed(int n, int count, const real *low, const real *high, const real *lower,
-                       const real *upper, const real *rows, const real *scale,
-                       const real *row_scale, const real *sizes,
+                       const real *upper, const uint8_t *row_fixed, const real *rows,
+                       const real *scale, const real *row_scale, const real *sizes,
                        const uint8_t *left_out, uint8_t *missed)
 {
     real worst = 0;
@@ -110,7 +110,7 @@ static real mhe_missed(int n, int count, const real *low, const real *high, cons
             for (int j = 0; j < n; j++) size += fabs(rows[(r - n) * n + j] * sizes[j]);
         const real miss = (side == MHE_LOWER ? low[r] : -high[r]) - 8 * EPSILON * size;
         const real share = miss / (r < n ? scale[r] : row_scale[r - n]);
-        const int fixed = r < n && lower[r] == upper[r];
+        const int fixed = r < n ? lower[r] == upper[r] : row_fixed[r - n];
         if (isnan(share)) return INFINITY;
         worst = mhe_max(share, worst);
         if (missed && !fixed && share > MHE_FEASIBLE) missed[r] = (uint8_t)side;
@@ -119,12 +119,13 @@ static real mhe_missed(int n, int count, const real *low, const real *high, cons
 }
 
 #define MISSED(set, usual, n, count, low, high, sizes, left_out, missed) \
-    mhe_missed(n, count, low, high, (usual).lower, (usual).upper, (set).rows, (set).scale, \
-               (set).row_scale, sizes, left_out, missed)
+    mhe_missed(n, count, low, high, (usual).lower, (usual).upper, (usual).row_fixed, \
+               (set).rows, (set).scale, (set).row_scale, sizes, left_out, missed)
 
-/* The largest miss of a trial in the rows' scales, without the sides that are left out. */
-static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const uint8_t *left_out,
-                          uint8_t *missed)
+/* The largest miss of a trial with disturbances w in the rows' scales, without the sides that are
+ * left out. */
+static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const real *w,
+                          const uint8_t *left_out, uint8_t *missed)
 {
     real worst = 0, low[ROWS], high[ROWS];
     const mhe_settings *s = e->settings;
@@ -132,7 +133,7 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const uint8_
         const uint8_t *out = left_out ? left_out + i * ROWS : 0;
         uint8_t *in = missed ? missed + i * ROWS : 0;
         const mhe_stage *stage = mhe_stage_of_state(e, i);
-        mhe_stage_distances(e, i, trial->x, trial->w, trial->v, low, high);
+        mhe_stage_distances(e, i, trial->x, w, trial->v, low, high);
 #if MHE_X_SET
         worst = mhe_max(worst, MISSED(*mhe_x_set_at(s, stage), s->states, NX, MHE_X_ROWS,
                                       low + W_COUNT + V_COUNT, high + W_COUNT + V_COUNT,

@@ -1,9 +1,22 @@
 /* A trajectory, judged by the true model. */
 
+#if MHE_QUIET
+/* Make next = predicted + keep (next - predicted) + shift; `shift` may be a null pointer. */
+static void mhe_follow(const mhe_settings *s, const real *predicted, const real *keep,
+                       const real *shift, real *next)
+{
+    real ahead[NX];
+    for (int j = 0; j < NX; j++) ahead[j] = next[j] - predicted[j];
+    mhe_wrap_state(s, next, ahead);
+    for (int j = 0; j < NX; j++)
+        next[j] = predicted[j] + mhe_dot(NX, keep + j * NX, ahead) + (shift ? shift[j] : 0);
+}
+#endif
+
 /* Judge the trajectory of a trial by the true model: infinite cost where the model is not
- * finite or a row is missed. Where a component of W has no width, the trial first becomes what the
- * model makes of it. */
-static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
+ * finite or a row is missed. Where there is no disturbance, the trial first becomes what the
+ * model makes of it; the candidate along the directions of the cost alone, and no set judges it. */
+static void mhe_judge(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial, int is_candidate)
 {
     const mhe_settings *s = e->settings;
     const real *prior = k->prior.mean, *factors = k->factors;
@@ -19,6 +32,12 @@ static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *tr
         for (int j = 0; j < NX; j++)
             if (set->lower[j] == set->upper[j]) x[NX + j] = predicted[j] + set->lower[j];
         mhe_enter_turn(s, x + NX);
+#endif
+#if MHE_QUIET
+        if (is_candidate)
+            mhe_follow(s, predicted, s->candidate_keep, 0, x + NX);
+        else
+            mhe_follow(s, predicted, s->keep, s->shift, x + NX);
 #endif
         for (int j = 0; j < NX; j++) w[j] = x[NX + j] - predicted[j];
         /* A model that fails in a missing output fails, as it does everywhere. */
@@ -37,9 +56,17 @@ static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *tr
         return;
     }
 #if CONSTRAINED
-    trial->violation = mhe_violation(e, trial, k->left_out, 0);
+    if (is_candidate) return;
+    trial->violation = mhe_violation(e, trial, trial->w, k->left_out, 0);
     if (trial->violation > MHE_FEASIBLE) trial->cost = INFINITY;
+#else
+    (void)is_candidate;
 #endif
+}
+
+static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
+{
+    mhe_judge(e, k, trial, 0);
 }
 
 /* What rounding of the residuals of a trial can contribute to its cost. */

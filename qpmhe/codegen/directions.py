@@ -1,0 +1,104 @@
+"""What users say of disturbances w, as the C step has it of d = x(t+1) - f(x(t))."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .._linalg import inverse
+from ..costs import Cost, lifted
+from ..estimation.constraints import Constraints, Rows
+from ..estimation.prior import PriorWeights
+from ..model.sets import ConvexSet
+from ..model.system import System
+from ..observers import Observer
+
+Array = NDArray[np.float64]
+
+#: Sides of a set.
+SIDES = ("lower", "upper", "row_lower", "row_upper")
+
+
+class Directions:
+    """Between w (r,) and d (n,), which are the same unless disturbances have fewer directions.
+
+    Parameters
+    ----------
+    system, observer, cost : System, Observer and Cost
+        Those that the user gave.
+
+    Attributes
+    ----------
+    system, observer : System and Observer
+        As given.
+    cost : Cost
+        The cost of d.
+    """
+
+    def __init__(self, system: System, observer: Observer, cost: Cost) -> None:
+        self.cost = lifted(cost, system.disturbance_matrix, observer.initial_covariance())
+        self.system, self.observer = system, observer
+
+    @cached_property
+    def constraints(self) -> Constraints:
+        """The rows on states, d and noises, and the noise-free directions."""
+        return self.constraints_of(self.system, self.cost)
+
+    def constraints_of(self, system: System, cost: Cost) -> Constraints:
+        """The same for a system with other sets, and a cost of d with other weights."""
+        observer = self.observer
+        _, regular = PriorWeights(system, observer, cost)(observer.initial_covariance())
+        return Constraints(system, cost, inverse(regular))
+
+    @property
+    def quiet(self) -> int:
+        """Noise-free directions of the cost, at least 1 where d has any; 0 where it has none."""
+        space = self.cost.space
+        if space is None or self.constraints.directions is None:
+            return 0
+        return max(int(space.noise_free.shape[1]), 1)
+
+    @property
+    def rows(self) -> Rows | None:
+        """The rows on d in place of the set W; None where W itself is on d."""
+        return None if self.cost.space is None else self.constraints.disturbances
+
+    def weight_of_d(self, weight: Array) -> Array:
+        """The weight (n, n) of d, from that of w."""
+        n = self.system.n
+        return self.cost.joint_weight(None, weight)[:n, :n]
+
+    def weight_of_w(self, weight: Array) -> Array:
+        """The weight (r, r) of w, from that of d."""
+        space = self.cost.space
+        return weight if space is None else space.directions.T @ weight @ space.directions
+
+    def write_sides(self, name: str, sides: Any, one: ConvexSet) -> None:
+        """Write the sides of a set into ``mhe_w_set``, ``mhe_v_set`` or ``mhe_x_set``."""
+        rows = self.rows if name == "disturbances" else None
+        if rows is not None:
+            rows = rows.with_sides([one])
+            sides["lower"], sides["upper"] = -np.inf, np.inf
+            for side, values in (("row_lower", rows.lower[0]), ("row_upper", rows.upper[0])):
+                sides[side][: values.size] = values
+            return
+        for side in SIDES:
+            values = getattr(one, side)
+            sides[side][: values.size] = values
+
+    def read_sides(self, name: str, sides: Any, built: ConvexSet) -> dict[str, Array]:
+        """The sides of a set; ``built`` has the same rows, and those that C leaves out."""
+        rows = self.rows if name == "disturbances" else None
+        if rows is None or rows.kept is None:
+            return {side: sides[side][: getattr(built, side).size].copy() for side in SIDES}
+        found = {}
+        for side in ("lower", "upper"):
+            bounds, general = getattr(built, side).copy(), getattr(built, f"row_{side}")
+            joined = np.append(bounds[rows.components], general)
+            joined[rows.kept] = sides[f"row_{side}"][: np.count_nonzero(rows.kept)]
+            bounds[rows.components] = joined[: rows.components.size]
+            found[side], found[f"row_{side}"] = bounds, joined[rows.components.size :]
+        return found
