@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,6 @@ from ..estimation.settings import Settings
 from ..model.expressions import CasadiModel
 from ..model.system import System
 from ..observers import Observer
-from .comparison import Interpreter, estimator_fault
 from .compiler import NotCachedError, cached_library, compiled_library
 from .fingerprint import source_key
 from .layout import TERMS, Layout, settings_record
@@ -238,13 +238,13 @@ class EstimatorLibrary:
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
         model = symbolic_model(system)
-        made: list[Interpreter] = []  # only where there is something to check
 
         @np.errstate(all="ignore")
         def fault(library: ctypes.CDLL) -> str:
+            from .rehearsal import estimator_fault
+
             self._bind(library)
-            made[:] = made or [Interpreter(model)]
-            return estimator_fault(made[0], self, system, cost)
+            return estimator_fault(self, system, observer, cost, settings)
 
         key = source_key(model, layout)
         if settings.engine == "auto":
@@ -261,6 +261,21 @@ class EstimatorLibrary:
             )
         self.path = Path(found._name)
         self._bind(found)
+
+    def varied(
+        self, system: System, observer: Observer, cost: Cost, settings: Settings
+    ) -> EstimatorLibrary | None:
+        """The same functions with other settings; None where these need other code."""
+        try:
+            layout, record = planned(system, observer, cost, settings, lapack=True)
+        except OptionError:
+            return None
+        if layout != self.layout:
+            return None
+        other = copy(self)
+        other._options, other.settings = settings, record
+        other._set_clock(record)
+        return other
 
     def settings_for(self, system: System, cost: Cost, usual: Conditions) -> NDArray[Any]:
         """``mhe_settings`` with the sets and weights of these, which are the usual conditions."""
