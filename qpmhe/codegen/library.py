@@ -15,7 +15,6 @@ from ..costs import Cost, RobustCost
 from ..errors import CompilationError, OptionError
 from ..estimation.conditions import Conditions
 from ..estimation.estimate import Status
-from ..estimation.prior import PriorWeights
 from ..estimation.settings import Settings
 from ..model.expressions import CasadiModel
 from ..model.system import System
@@ -233,8 +232,7 @@ class EstimatorLibrary:
         self.layout, self.settings = layout, record = planned(
             system, observer, cost, settings, lapack=True
         )
-        self.system, self.observer, self._options = system, observer, settings
-        self.prior_weights = PriorWeights(system, observer, cost)
+        self.observer, self._options = observer, settings
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
         model = symbolic_model(system)

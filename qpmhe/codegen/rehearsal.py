@@ -338,8 +338,8 @@ class _Rehearsal:
             ))
         for found, one in zip(made, estimates, strict=False):
             expected = one.state, one.filtered, one.cost, one.candidate_cost
-            for got, true in zip(found, expected, strict=True):
-                if _differs(np.asarray(got), np.asarray(true), ROUNDING * np.abs(true).max()):
+            for got, true in zip(found, map(np.asarray, expected), strict=True):
+                if _differs(np.asarray(got), true, ROUNDING * abs(true).max()):
                     return "samples of a run differ from single ones"
         return ""
 
@@ -347,14 +347,10 @@ class _Rehearsal:
 def _own_conditions(system: System, cost: Cost, settings: Settings) -> list[Conditions]:
     """Conditions of single samples, as far as the estimator takes them."""
     reader, usual, found = ConditionReader(system, cost), usual_conditions(settings), []
-    for given in (
-        {"noise_weight": 2.0 * cost.noise, "disturbance_weight": 0.5 * cost.disturbance},
-        {"noise_weight": 2.0 * cost.noise},
-    ):
-        try:
-            found.append(reader.read(usual, **given))
-        except QpmheError:
-            continue
+    noise = 2.0 * cost.noise
+    for disturbance in (0.5 * cost.disturbance, None):
+        with suppress(QpmheError):  # of what the cost does not take
+            found.append(reader.read(usual, noise_weight=noise, disturbance_weight=disturbance))
     if system.p > 1:
         found.append(Conditions(sampled=np.arange(system.p) > 0))
     return found or [Conditions()]

@@ -6,7 +6,6 @@ import pytest
 import qpmhe
 from qpmhe.codegen import write
 from qpmhe.codegen.compiler import find_compiler
-from qpmhe.codegen.layout import Layout
 from qpmhe.estimation.estimate import Status
 
 from .cases import CASES, case
@@ -21,8 +20,6 @@ def test_only_the_engine_uses_lapack(name, tmp_path):
     assert compiled._engine._library.layout.lapack
     header, _ = write(compiled, tmp_path)
     assert "#define MHE_LAPACK 0" in header.read_text()
-    layout = compiled._engine._library.layout
-    assert not Layout.of(one.system, one.cost, 4, layout.continuous, "double", False, False).lapack
     assert not case("inputs").estimator("compiled")._engine._library.layout.lapack
 
 
