@@ -10,13 +10,16 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 
+import scipy
 from platformdirs import user_cache_path
 
+from .._version import __version__
 from ..errors import CompilationError
 
 # Contraction and the like may round differently, but keep infinities and NaN.
@@ -212,16 +215,37 @@ def _fault(
     """What is wrong with a library; an empty text if nothing is, or it was checked before."""
     if check is None:
         return ""
-    try:
-        content = seal.read_text("ascii")
-    except (OSError, UnicodeError):  # another process is replacing it
-        content = ""
-    if (library._name, content) in _checked:
+    content, _, checked = _seal(seal).partition("\n")
+    if (library._name, content) in _checked or (content and checked == _checked_by()):
         return ""
     fault = check(library)
     if not fault and content:
         _checked.add((library._name, content))
+        _replace(seal, f"{content}\n{_checked_by()}")
     return fault
+
+
+def _checked_by() -> str:
+    """The last line of the seal of a library that was checked: by whom, and with which LAPACK."""
+    return f"right by qpmhe {__version__} and scipy {scipy.__version__}"
+
+
+def _seal(path: Path) -> str:
+    """The hash of a library's content, and whether it was checked; empty if there is none."""
+    try:
+        return path.read_text("ascii")
+    except (OSError, UnicodeError):  # another process is replacing it
+        return ""
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a small file in one motion, where that is possible."""
+    scratch = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}")
+    try:
+        scratch.write_text(text, encoding="utf-8")
+        os.replace(scratch, path)
+    except OSError:
+        scratch.unlink(missing_ok=True)
 
 
 def _remembered(note: Path) -> tuple[int, str]:
@@ -234,13 +258,8 @@ def _remembered(note: Path) -> tuple[int, str]:
 
 
 def _remember(note: Path, level: int, fault: str) -> None:
-    """Write the note in one motion; without it the next process tries all levels again."""
-    scratch = note.with_name(f"{note.name}.{os.getpid()}")
-    try:
-        scratch.write_text(f"{level}\n{fault}", encoding="utf-8")
-        os.replace(scratch, note)
-    except OSError:
-        scratch.unlink(missing_ok=True)
+    """Write the note; without it the next process tries all levels again."""
+    _replace(note, f"{level}\n{fault}")
 
 
 def _make(
@@ -274,9 +293,10 @@ def _remove_stale(folder: Path) -> None:
 def _intact(library: Path, seal: Path) -> bool:
     """Whether a library in the cache is what was put there: a damaged one kills the process."""
     try:
-        return hashlib.sha256(library.read_bytes()).hexdigest() == seal.read_text("ascii")
-    except (OSError, UnicodeError):
+        content = hashlib.sha256(library.read_bytes()).hexdigest()
+    except OSError:
         return False
+    return content == _seal(seal).partition("\n")[0]
 
 
 def _user() -> int | None:

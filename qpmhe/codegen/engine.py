@@ -62,9 +62,10 @@ class CompiledEngine:
 
     def __init__(
         self, system: System, observer: Observer, cost: Cost, settings: Settings,
-        initial_state: Array,
+        initial_state: Array, library: EstimatorLibrary | None = None,
     ) -> None:
-        self._library = library = EstimatorLibrary(system, observer, cost, settings)
+        library = library or EstimatorLibrary(system, observer, cost, settings)
+        self._library = library
         self._system, self._given_cost, self._settings = system, cost, settings
         self._reader = ConditionReader(system, cost)
         self._directions = directions = library.directions

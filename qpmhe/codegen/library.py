@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,10 @@ from ..costs import Cost, RobustCost
 from ..errors import CompilationError, OptionError
 from ..estimation.conditions import USUAL, Conditions
 from ..estimation.estimate import Status
-from ..estimation.prior import PriorWeights
 from ..estimation.settings import Settings
 from ..model.expressions import CasadiModel
 from ..model.system import System
 from ..observers import Observer
-from .comparison import Interpreter, estimator_fault
 from .compiler import NotCachedError, cached_library, compiled_library
 from .directions import Directions
 from .fingerprint import source_key
@@ -243,20 +242,19 @@ class EstimatorLibrary:
         self.layout, self.settings = layout, record = planned(
             system, observer, cost, settings, lapack=True
         )
-        self.system, self.observer, self._options = system, observer, settings
+        self.observer, self._options = observer, settings
         #: How the user's disturbances are those of C.
         self.directions = Directions(system, observer, cost)
-        self.prior_weights = PriorWeights(system, observer, self.directions.cost)
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
         model = symbolic_model(system, cost)
-        made: list[Interpreter] = []  # only where there is something to check
 
         @np.errstate(all="ignore")
         def fault(library: ctypes.CDLL) -> str:
+            from .rehearsal import estimator_fault
+
             self._bind(library)
-            made[:] = made or [Interpreter(model)]
-            return estimator_fault(made[0], self, system, cost)
+            return estimator_fault(self, system, observer, cost, settings)
 
         key = source_key(model, layout)
         if settings.engine == "auto":
@@ -273,6 +271,22 @@ class EstimatorLibrary:
             )
         self.path = Path(found._name)
         self._bind(found)
+
+    def varied(
+        self, system: System, observer: Observer, cost: Cost, settings: Settings
+    ) -> EstimatorLibrary | None:
+        """The same functions with other settings; None where these need other code."""
+        try:
+            layout, record = planned(system, observer, cost, settings, lapack=True)
+        except OptionError:
+            return None
+        if layout != self.layout:
+            return None
+        other = copy(self)
+        other._options, other.settings = settings, record
+        other.directions = Directions(system, observer, cost)
+        other._set_clock(record)
+        return other
 
     def settings_for(self, system: System, cost: Cost, usual: Conditions) -> NDArray[Any]:
         """``mhe_settings`` with the sets and weights of these, which are the usual conditions."""

@@ -126,6 +126,35 @@ def _with_inputs() -> Case:
     return Case(system, qpmhe.Luenberger(gain), cost, start, recorded(system, start))
 
 
+def _many_states(dense: bool) -> Case:
+    """So many states that LAPACK factorises: neighbours in a row, or all in touch with all."""
+    import casadi
+
+    n, p = 42, 6
+    generator = np.random.default_rng(5)
+    mixing = generator.standard_normal((n, n)) / n**0.5
+    outputs = generator.standard_normal((p, n)) / n**0.5
+
+    def chain(x: Any) -> Any:
+        return -0.5 * x + casadi.sin(casadi.vertcat(x[1:], x[0]))
+
+    def mixed(x: Any) -> Any:
+        return 0.9 * casadi.sin(casadi.mtimes(casadi.DM(mixing), x))
+
+    system = qpmhe.from_casadi(
+        mixed if dense else chain, lambda x: casadi.mtimes(casadi.DM(outputs), x), n=n,
+        dt=None if dense else 0.1, compiled=False,
+    )
+    weight = spd(6, n) / n if dense else np.diag(generator.uniform(20.0, 50.0, n))
+    cost = qpmhe.QuadraticCost(prior=np.eye(n), disturbance=weight, noise=40 * spd(7, p) / p)
+    start = generator.standard_normal(n)
+    observer = qpmhe.Luenberger(0.05 * outputs.T)
+    return Case(
+        system, observer, cost, start, recorded(system, start, steps=9),
+        {"horizon": 4, "max_qps": 3},
+    )
+
+
 def with_outliers(one: Case, share: float = 0.2, size: float = 3.0) -> Case:
     """The case with a large error in some of its measurements."""
     generator = np.random.default_rng(9)
@@ -544,6 +573,9 @@ CASES: dict[str, Callable[[], Case]] = {
         OTHER_GAIN, disturbances=qpmhe.Box([0.01, -np.inf], [0.01, np.inf])
     ).with_options(max_qps=None),
     "singular covariance": lambda: _singular().with_gaps(),
+    "many states": lambda: _many_states(False),
+    "many states, dense": lambda: _many_states(True),
+    "many states with gaps": lambda: case("many states").with_gaps(),
     "huber": lambda: _robust(noise=_huber(1.345)),
     "huber with gaps": lambda: _weighed(case("huber").with_gaps()),
     "huber in sets": lambda: _boxed(case("huber")),

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.codegen import compiler, fingerprint, library
+from qpmhe.codegen import compiler, fingerprint, library, rehearsal
 from qpmhe.errors import CompilationError, InvalidInputError, OptionError
 from qpmhe.estimation.settings import Settings
 
@@ -242,7 +242,8 @@ def test_a_compiler_that_reads_standard_input(monkeypatch):
 def test_wrong_code_is_not_used_and_not_compiled_again(filled, calls, monkeypatch):
     before = calls()
     compiler._checked.clear()
-    monkeypatch.setattr(library, "estimator_fault", lambda *_: "J of the estimate is 2")
+    monkeypatch.setattr(compiler, "_checked_by", lambda: "another release")
+    monkeypatch.setattr(rehearsal, "estimator_fault", lambda *_: "J of the estimate is 2")
     assert estimator().engine == "python"
     assert calls() == before
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.codegen import compiler
+from qpmhe.codegen import compiler, rehearsal
 from qpmhe.errors import CompilationError, EngineWarning
 
 ca = pytest.importorskip("casadi")
@@ -241,3 +241,16 @@ def test_an_estimator_does_not_make_the_model_anew(cache, monkeypatch):
     system = linear()
     monkeypatch.setattr("qpmhe.adapters.casadi.casadi_model", None)
     assert estimator(system, "python").update([1.0, 2.0]).cost >= 0.0
+
+
+def test_a_library_is_checked_once(cache, monkeypatch):
+    calls, checked = [], rehearsal.estimator_fault
+    monkeypatch.setattr(
+        rehearsal, "estimator_fault", lambda *given: calls.append(1) or checked(*given)
+    )
+    system = linear(False)
+    for release, count in (("one", 1), ("one", 1), ("two", 2)):
+        monkeypatch.setattr(compiler, "_checked_by", lambda release=release: release)
+        monkeypatch.setattr(compiler, "_checked", set())  # as in another process
+        assert estimator(system).engine == "compiled"
+        assert len(calls) == count

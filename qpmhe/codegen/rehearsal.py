@@ -1,0 +1,364 @@
+"""Compiled estimators compared with the Python step on CasADi's interpreter, before their use.
+
+Short records go through both. The Python step takes over the trajectories that C returns, and
+judges them: whatever C computes is compared, and none of it is stated again here.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from copy import copy
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..costs import Cost
+from ..errors import ModelError, QpmheError
+from ..estimation.conditions import ConditionReader, Conditions, usual_conditions
+from ..estimation.engine import PythonEngine, Tools
+from ..estimation.estimate import Estimate, Status
+from ..estimation.estimator import check_start
+from ..estimation.limits import FEASIBLE, LARGEST
+from ..estimation.optimizer import Optimizer, Outcome
+from ..estimation.problem import Problem
+from ..estimation.settings import Settings
+from ..model.evaluation import NAMES, RESIDUALS, Buffers, Evaluator, results_of
+from ..model.functions import Trusted
+from ..model.system import System
+from ..observers import Observer
+from .comparison import ROUNDING, Interpreter, points
+from .engine import CompiledEngine
+
+if TYPE_CHECKING:
+    from .library import EstimatorLibrary
+
+Array = NDArray[np.float64]
+
+# Relative change of all that goes in, which shows how rounding spreads, and its weight.
+_NUDGE, _WEIGHT = 1e-11, 300.0
+# Samples of a record, and how many of them first go through the functions for many samples.
+_SAMPLES, _BY_RUN, _BY_MEMBERS = 22, 7, 2
+_MANY_STATES, _FEW_SAMPLES = 40, 12
+# C takes for infinite what has no finite square.
+_NO_SQUARE = 1e150
+# So many steps, of which the Python step halves the cost and C none, are no chance.
+_MISSED = 3
+
+
+def estimator_fault(
+    library: EstimatorLibrary, system: System, observer: Observer, cost: Cost, settings: Settings
+) -> str:
+    """Where a compiled estimator differs from the Python step; empty where it does not."""
+    assert system.symbolic is not None
+    interpreter = Interpreter(system.symbolic)
+    system = _interpreted_system(system, interpreter)
+    # Other estimators use the library with other options.
+    usual = replace(
+        settings, max_qps=min(max(settings.qp_limit, 1), 3), max_solver_iterations=None,
+        time_budget=None if settings.time_budget is None else 1e9,
+    )
+    other = replace(
+        usual, max_qps=2, warm_start=not settings.warm_start,
+        candidate="observer" if settings.candidate == "reinitialized" else "reinitialized",
+    )
+    aging = copy(cost)
+    aging.discount = 1.0 if cost.discount < 1.0 else 0.95
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of an observer that is far off
+        for is_wild, weighed, options in ((False, cost, usual), (True, aging, other)):
+            varied = library.varied(system, observer, weighed, options)
+            if varied is None:
+                weighed, options = cost, usual
+                varied = library.varied(system, observer, cost, usual) or library
+            fault = _Rehearsal(
+                varied, interpreter, system, observer, weighed, options, is_wild
+            ).fault()
+            if fault:
+                return fault
+    return ""
+
+
+def _interpreted_system(system: System, interpreter: Interpreter) -> System:
+    """The system with its functions evaluated by CasADi's virtual machine."""
+
+    def changed(given: System, timed: bool) -> System:
+        evaluator = Evaluator(partial(_looped, interpreter, timed))
+        one = {name: Trusted(partial(evaluator.one, name)) for name in NAMES}
+        bare = System(
+            one["f"], one["h"], n=given.n, p=given.p, m=given.m, f_jacobian=one["f_jacobian"],
+            h_jacobian=one["h_jacobian"],
+        )
+        other = given.with_sets({})  # a copy
+        for name in NAMES:
+            setattr(other, name, getattr(bare, name))
+        other.kernel = evaluator
+        return other
+
+    other = changed(system, False)
+    if system.make_timed is not None:
+        other.make_timed = lambda: changed(system.timed, True)
+    return other
+
+
+def _looped(
+    interpreter: Interpreter, timed: bool, count: int, names: tuple[str, ...]
+) -> Buffers:
+    """Evaluation at one state after the other."""
+    model, along = interpreter.model, names == RESIDUALS
+    n, m = model.n, model.m
+    states, inputs = np.zeros((count + along, n)), np.zeros((count, m + timed))
+    results = results_of(model, count, names)
+
+    def evaluate() -> None:
+        for k in range(count):
+            x, u, dt = states[k], inputs[k, :m], inputs[k, m] if timed else model.dt or 0.0
+            if along:
+                row = results["residuals"][k]
+                row[:n] = states[k + 1] - interpreter.value("f", x, u, dt)
+                row[n:] = results["y"][k] - interpreter.value("h", x, u, dt)
+                continue
+            for name in names:
+                results[name].reshape(count, -1)[k] = interpreter.value(name, x, u, dt).ravel()
+
+    return states, inputs, results, evaluate
+
+
+class _Guide:
+    """Takes the place of the Python step's optimizer: the estimate is what C returned.
+
+    Attributes
+    ----------
+    found : Estimate
+        C's, set before each step.
+    nudge : float or (n,) array
+        A factor on its trajectory.
+    violation : float
+        Of the trajectory, as the Python step sees it.
+    optimizer : Optimizer
+        The Python step's own.
+    improved, missed : int
+        In how many steps C found a better trajectory than the candidate, and in how many it did
+        not where the Python step halves the cost.
+    """
+
+    found: Estimate
+    optimizer: Optimizer
+    violation = 0.0
+    improved = missed = 0
+
+    def __init__(self, nudge: Any) -> None:
+        self.nudge = nudge
+
+    def improve(
+        self, problem: Problem, shifted: Callable[[], Array | None], deadline: float = math.inf
+    ) -> Outcome:
+        """C's trajectory, evaluated by the problem."""
+        found, outcome = self.found, Outcome(problem.candidate)
+        self.violation = 0.0
+        if Status.IMPROVED in found.status:
+            self.improved += 1
+            if Status.ROWS_DROPPED in found.status:
+                problem = problem.without_violated()
+            outcome.trial = problem.evaluate(found.trajectory * self.nudge)
+            outcome.improved, outcome.dropped = True, found.dropped
+            self.violation = outcome.trial.violation
+        elif not (self.improved or np.ndim(self.nudge)):
+            best = self.optimizer.improve(problem, shifted).trial.cost
+            self.missed += best < 0.5 * found.candidate_cost < _NO_SQUARE
+        return outcome
+
+
+class _Follower(PythonEngine):
+    """The Python step with C's trajectories in place of its own."""
+
+    def __init__(self, nudge: Any, *arguments: Any) -> None:
+        self.guide = _Guide(nudge)
+        super().__init__(*arguments)
+
+    def _tools_for(self, usual: Conditions) -> Tools:
+        tools = super()._tools_for(usual)
+        self.guide.optimizer = tools.optimizer
+        return tools._replace(optimizer=cast("Optimizer", self.guide))
+
+
+class _Sample(NamedTuple):
+    """Arguments of an engine's step."""
+
+    y: Array
+    u: Array
+    dt: float | None = None
+    own: Conditions | None = None
+
+
+class _Rehearsal:
+    """One record run through the library and the Python step."""
+
+    def __init__(
+        self, library: EstimatorLibrary, interpreter: Interpreter, system: System,
+        observer: Observer, cost: Cost, settings: Settings, is_wild: bool,
+    ) -> None:
+        n, p = system.n, system.p
+        self._library, self._generator = library, np.random.default_rng(int(is_wild))
+        first = next(points(interpreter, system.states, int(is_wild)))[0][0]
+        start = first * (1 + 0.1 * self._generator.uniform(-1.0, 1.0, n))
+        with suppress(ModelError):  # of a model that has no finite values there
+            start = check_start(system, observer, cost, start)
+        # Relative changes without a pattern: equal ones would leave differences as they are.
+        nudge_x, self._nudge_y = (
+            1 + _NUDGE * self._generator.uniform(-1.0, 1.0, size) for size in (n, p)
+        )
+        self._start = start
+        arguments = system, observer, cost, settings
+        self._compiled = CompiledEngine(*arguments, start, library)
+        self._python = _Follower(1.0, *arguments, start)
+        self._nudged = _Follower(nudge_x, *arguments, start * nudge_x)
+        most = _SAMPLES if n <= _MANY_STATES else _FEW_SAMPLES
+        count = min(settings.horizon + _BY_RUN + _BY_MEMBERS, most)
+        self._own = _own_conditions(system, cost, settings)
+        self._record = [
+            self._sample(t, x, u, interpreter, is_wild)
+            for t, (x, u) in enumerate(self._states(first, count, interpreter))
+        ]
+
+    def _states(
+        self, first: Array, count: int, interpreter: Interpreter
+    ) -> list[tuple[Array, Array]]:
+        """Noisy states that stay near the first, and inputs."""
+        model, generator, x, found = interpreter.model, self._generator, first, []
+        for u in generator.uniform(0.2, 1.0, (count, model.m)):
+            found.append((x, u))
+            x = interpreter.value("f", x, u, model.dt or 0.0)
+            x = x * (1 + 0.05 * generator.standard_normal(model.n))
+            if not abs(x).max() <= 1e3 * abs(first).max():  # NaN, too
+                x = first
+        return found
+
+    def _sample(
+        self, t: int, x: Array, u: Array, interpreter: Interpreter, is_wild: bool
+    ) -> _Sample:
+        """A measurement with noise, or far off; parts of some are missing or not as usual."""
+        p, generator, dt = interpreter.model.p, self._generator, interpreter.model.dt
+        factor = generator.uniform(-2.0, 2.0, p) if is_wild else (
+            1 + 0.1 * generator.standard_normal(p)
+        )
+        y = interpreter.value("h", x, u, 0.0) * factor
+        y[~(abs(y) < LARGEST)] = np.nan
+        if t % 5 == 3:
+            y[t % p] = np.nan
+        if t % 11 == 7:
+            y[:] = np.nan
+        if t < _BY_RUN + _BY_MEMBERS or t % 3:
+            return _Sample(y, u)
+        own = self._own[t % len(self._own)]
+        if own.sampled is not None:
+            y[~own.sampled] = np.nan
+        return _Sample(y, u, None if dt is None or t % 2 else 0.75 * dt, own)
+
+    def fault(self) -> str:
+        """What is wrong; empty if nothing is."""
+        estimates = []
+        for sample in self._record:
+            found = self._compiled.step(*sample, 0.0)
+            estimates.append(found)
+            self._python.guide.found = self._nudged.guide.found = found
+            expected = self._python.step(*sample, 0.0)
+            nudged = self._nudged.step(sample.y * self._nudge_y, *sample[1:], 0.0)
+            if abs(expected.candidate).max() > _NO_SQUARE:
+                break
+            fault = self._step_fault(found, expected, nudged, sample.y)
+            if fault:
+                return fault
+            if not math.isfinite(expected.candidate_cost):
+                break
+        guide = self._python.guide
+        if guide.missed >= _MISSED and not guide.improved:
+            return "it improves no estimate where the Python step does"
+        return self._many_fault(estimates)
+
+    def _step_fault(
+        self, found: Estimate, expected: Estimate, nudged: Estimate, y: Array
+    ) -> str:
+        for name, what in (("candidate_cost", "the candidate"), ("cost", "the estimate")):
+            got, true, other = (getattr(one, name) for one in (found, expected, nudged))
+            if not (math.isfinite(true) and math.isfinite(other)):
+                near_limit = name == "cost" and self._python.guide.violation <= 2 * FEASIBLE
+                if math.isfinite(got) and not near_limit and true == other:
+                    return f"J of {what} is {got:.6g}, but CasADi's interpreter has no number"
+                return ""
+            if not abs(got - true) <= _WEIGHT * abs(other - true) + ROUNDING * abs(true):
+                return f"J of {what} is {got:.6g}, by CasADi's interpreter {true:.6g}"
+        if not found.cost <= found.candidate_cost:
+            return (
+                f"J of the estimate, {found.cost:.6g}, is above the candidate's "
+                f"{found.candidate_cost:.6g}"
+            )
+        states = abs(np.vstack((expected.candidate, expected.trajectory))).max(axis=0)
+        width = expected.disturbances.shape[1]
+        outputs = np.nan_to_num(abs(expected.noises)).max(axis=0) + np.nan_to_num(abs(y))
+        for name, sizes in (
+            ("candidate", states), ("trajectory", states), ("filtered", states),
+            ("disturbances", states if width == states.size else states.max()),
+            ("noises", outputs),
+        ):
+            got, true, other = (getattr(one, name) for one in (found, expected, nudged))
+            allowed = _WEIGHT * np.nan_to_num(abs(other - true)) + ROUNDING * sizes
+            if _differs(got, true, allowed):
+                return f"{name} of an estimate differ from those by CasADi's interpreter"
+        return ""
+
+    def _many_fault(self, estimates: list[Estimate]) -> str:
+        """Whether the functions for many samples give what those for one have given."""
+        library, count = self._library, min(_BY_RUN, len(estimates))
+        ys, us = (np.array([getattr(one, name) for one in self._record]) for name in ("y", "u"))
+        memory, workspace = library.estimators(self._start[None]), library.workspace()
+        log, out = library.log((count,)), np.zeros(1, library.estimate_type)
+        library.run(
+            memory.ctypes.data, 1, workspace.ctypes.data, count, ys.ctypes.data,
+            us.ctypes.data if us.size else None, log.pointers(0),
+        )
+        made = [
+            (log.states[t], log.filtered[t], log.costs[t], log.candidate_costs[t])
+            for t in range(count)
+        ]
+        for t in range(count, min(count + _BY_MEMBERS, len(estimates))):
+            library.update_members(
+                memory.ctypes.data, 1, workspace.ctypes.data, ys[t].ctypes.data,
+                us[t].ctypes.data, out.ctypes.data,
+            )
+            one = out[0].copy()
+            made.append((
+                one["trajectory"][one["length"]], one["filtered"], one["cost"],
+                one["candidate_cost"],
+            ))
+        for found, one in zip(made, estimates, strict=False):
+            expected = one.state, one.filtered, one.cost, one.candidate_cost
+            for got, true in zip(found, map(np.asarray, expected), strict=True):
+                if _differs(np.asarray(got), true, ROUNDING * abs(true).max()):
+                    return "samples of a run differ from single ones"
+        return ""
+
+
+def _own_conditions(system: System, cost: Cost, settings: Settings) -> list[Conditions]:
+    """Conditions of single samples, as far as the estimator takes them."""
+    reader, usual, found = ConditionReader(system, cost), usual_conditions(settings), []
+    noise = 2.0 * cost.noise
+    for disturbance in (0.5 * cost.disturbance, None):
+        with suppress(QpmheError):  # of what the cost does not take
+            found.append(reader.read(usual, noise_weight=noise, disturbance_weight=disturbance))
+    if system.p > 1:
+        found.append(Conditions(sampled=np.arange(system.p) > 0))
+    return found or [Conditions()]
+
+
+def _differs(got: Array, true: Array, allowed: Array | float) -> bool:
+    """Whether numbers differ by more than allowed, or are finite where others are not."""
+    finite = np.isfinite(true)
+    if (np.isfinite(got) != finite).any():
+        return True
+    return bool((abs(got - true) > allowed)[finite].any())
