@@ -12,8 +12,6 @@ static real mhe_dot(int n, const real *a, const real *b)
 /* The larger one; b where a is NaN. Unlike fmax, it is no call. */
 static real mhe_max(real a, real b) { return a > b ? a : b; }
 
-static real mhe_min(real a, real b) { return a < b ? a : b; }
-
 static int mhe_all_finite(int n, const real *a)
 {
     return isfinite(mhe_dot(n, a, a));
@@ -58,6 +56,8 @@ void mhe_set_lapack(void *const *functions)
 #pragma GCC diagnostic push
 #pragma GCC diagnostic ignored "-Wunused-function"
 #endif
+
+static real mhe_min(real a, real b) { return a < b ? a : b; }
 
 /* out = A B for A (m, k) and B (k, n). */
 static void mhe_multiply(int m, int k, int n, const real *A, const real *B, real *out)
