@@ -661,7 +661,11 @@ class OwnCost(qpmhe.QuadraticCost):
 
 
 class OwnGain(qpmhe.Luenberger):
-    """May correct in another way."""
+    """Corrects in another way."""
+
+    def correct(self, z, v, sample):
+        correction, covariance = super().correct(z, v, sample)
+        return 0.5 * correction, covariance
 
 
 def without_form(case):
