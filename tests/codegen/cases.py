@@ -394,6 +394,14 @@ def _steady() -> Case:
     return replace(base, observer=observer, cost=cost)
 
 
+def _filtered(make: Callable[..., qpmhe.Observer], one: Case) -> Case:
+    """The case with a filter of the cost's covariances, which weighs the prior."""
+    weights = {name: getattr(one.cost, name) for name in ("prior", "disturbance", "noise")}
+    observer = make(**{name: np.linalg.inv(weight) for name, weight in weights.items()})
+    cost = qpmhe.QuadraticCost(**weights | {"prior": qpmhe.ObserverPrior()})
+    return replace(one, observer=observer, cost=cost)
+
+
 def _failing() -> Case:
     """A model that is not defined below zero, where measurements lead the observer at times."""
     import casadi
@@ -693,6 +701,10 @@ CASES: dict[str, Callable[[], Case]] = {
             prior=0.1 * np.eye(2), disturbance=0.01 * np.eye(2), noise=[[0.01]]
         )
     ),
+    "extended angles": lambda: _filtered(qpmhe.ExtendedKalman, _rover(True, True).with_gaps()),
+    "unscented angles": lambda: _filtered(
+        qpmhe.UnscentedKalman, _rover(True, True, True).with_gaps()
+    ).with_options(arrival="smoothed"),
     "steady prior": _steady,
     "steady prior with gaps": lambda: _weighed(_steady().with_gaps()),
     "extended huber": lambda: replace(
