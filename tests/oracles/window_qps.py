@@ -26,6 +26,8 @@ int32_t solve(mhe_estimator *e, mhe_workspace *k, const mhe_settings *s, int32_t
     memset(k->rows.place, 0, sizeof k->rows.place);
     memset(e, 0, sizeof *e);
     e->settings = s;
+    k->prior.mean = e->stages[0].z;
+    k->prior.weight = k->prior.distance_weight = s->prior_weight;
     e->length = count;
     memcpy(e->stages[0].z, prior, sizeof e->stages[0].z);
     mhe_set_prior(e, k);
