@@ -450,6 +450,11 @@ class _Rehearsal:
             )
             if library.layout.covariance:
                 sample.covariance = stages["covariance"][k]
+            v = np.where(np.isfinite(y), y - found["h"][k], 0.0)
+            if library.layout.observer == 3:  # a function, as the gain that gives its value
+                value, _ = library.observer.correct(xs[k], v, sample)
+                gains[k] = np.outer(value, v) / (v @ v or 1.0)
+                continue
             try:
                 _, posterior = library.observer.correct(xs[k], np.zeros(p), sample)
                 if posterior is not None and not np.isfinite(posterior).all():

@@ -394,6 +394,20 @@ def _steady() -> Case:
     return replace(base, observer=observer, cost=cost)
 
 
+def _filtered(make: Callable[..., qpmhe.Observer], one: Case) -> Case:
+    """The case with a filter of the cost's covariances, which weighs the prior."""
+    weights = {name: getattr(one.cost, name) for name in ("prior", "disturbance", "noise")}
+    observer = make(**{name: np.linalg.inv(weight) for name, weight in weights.items()})
+    cost = qpmhe.QuadraticCost(**weights | {"prior": qpmhe.ObserverPrior()})
+    return replace(one, observer=observer, cost=cost)
+
+
+def _saturated(z: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """A correction that large errors cannot drive far, and that depends on the state."""
+    bounded = np.tanh(v)
+    return np.array([[0.3, 0.0], [0.1, 0.05], [0.0, 0.3]]) @ bounded * (1.0 + 0.2 * np.cos(z))
+
+
 def _failing() -> Case:
     """A model that is not defined below zero, where measurements lead the observer at times."""
     import casadi
@@ -692,6 +706,28 @@ CASES: dict[str, Callable[[], Case]] = {
         _failing(), observer=qpmhe.UnscentedKalman(
             prior=0.1 * np.eye(2), disturbance=0.01 * np.eye(2), noise=[[0.01]]
         )
+    ),
+    "extended angles": lambda: _filtered(qpmhe.ExtendedKalman, _rover(True, True).with_gaps()),
+    "unscented angles": lambda: _filtered(
+        qpmhe.UnscentedKalman, _rover(True, True, True).with_gaps()
+    ).with_options(arrival="smoothed"),
+    "injection": lambda: replace(
+        case("inputs"), observer=qpmhe.OutputInjection(_saturated)
+    ).with_gaps(),
+    "injection reinitialized": lambda: with_changes(
+        with_conditions(case("injection")).with_options(candidate="reinitialized", warm_start=True)
+    ),
+    "injection in sets": lambda: replace(
+        case("inputs and states"), observer=qpmhe.OutputInjection(
+            lambda z, v: 2.0 * _saturated(z, v)
+        )
+    ),
+    "injection failing": lambda: replace(
+        _failing(), observer=qpmhe.OutputInjection(
+            lambda z, v: np.array([0.4 * v[0] / np.sqrt(z[0]), 0.0])
+        ), cost=qpmhe.QuadraticCost(
+            prior=np.eye(2), disturbance=100.0 * np.eye(2), noise=[[100.0]]
+        ),
     ),
     "steady prior": _steady,
     "steady prior with gaps": lambda: _weighed(_steady().with_gaps()),
