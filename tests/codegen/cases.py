@@ -300,11 +300,15 @@ def _turned_states(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return d - np.array([0.0, 0.0, 2.0 * np.pi, 0.0]) * np.floor(d / (2.0 * np.pi) + 0.5)
 
 
-def _rover(outputs: bool, states: bool, functions: bool = False, **sets: Any) -> Case:
+def _rover(
+    outputs: bool, states: bool, functions: bool = False,
+    observer: type[qpmhe.Observer] | None = None, **sets: Any,
+) -> Case:
     """A turning rover with a compass that sees distance and bearing of a beacon.
 
     Where states have angles, f keeps the heading in one turn. Where outputs have none, they are
-    smooth functions of both. The angles may be stated by functions of two vectors.
+    smooth functions of both. The angles may be stated by functions of two vectors. An observer with
+    a covariance weighs the prior.
     """
     import casadi as ca
 
@@ -336,9 +340,9 @@ def _rover(outputs: bool, states: bool, functions: bool = False, **sets: Any) ->
         "prior": [0.5, 0.5, 0.4, 0.1], "disturbance": [0.1, 0.1, 0.03, 0.02],
         "noise": [0.2, 0.1 * unit, 0.1],
     }
-    cost = qpmhe.QuadraticCost.from_covariances(
-        **{name: np.diag(np.square(one)) for name, one in deviations.items()}
-    )
+    covariances = {name: np.diag(np.square(one)) for name, one in deviations.items()}
+    weighs = {} if observer is None else {"prior": qpmhe.ObserverPrior()}
+    cost = qpmhe.QuadraticCost.from_covariances(**(covariances | weighs))
     generator, x, samples = np.random.default_rng(4), np.array([0.3, -0.2, 0.5, 1.7]), []
     for _ in range(3 * STEPS):
         y = system.h(x, np.zeros(0)) + generator.normal(0.0, deviations["noise"])
@@ -349,8 +353,9 @@ def _rover(outputs: bool, states: bool, functions: bool = False, **sets: Any) ->
     turning = [[0.0, -0.2 / unit, 0.4], [0.0, 0.0, 0.1]] if outputs else np.zeros((2, 3))
     gain = [[0.2, 0.0, 0.0], [0.0, 0.0, 0.0], *turning]
     start = np.array([0.0, 0.0, 0.9, 1.6])
+    filters = qpmhe.Luenberger(gain) if observer is None else observer(**covariances)
     return Case(
-        system, qpmhe.Luenberger(gain), cost, start, tuple(samples), {"horizon": 6, "max_qps": 3}
+        system, filters, cost, start, tuple(samples), {"horizon": 6, "max_qps": 3}
     )
 
 
@@ -467,6 +472,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "residual functions": lambda: _rover(True, True, True).with_gaps().with_options(
         warm_start=True
     ),
+    "angles extended": lambda: _rover(True, True, observer=qpmhe.ExtendedKalman).with_gaps(),
     "angles across the seam": lambda: _compass(),
     "functions across the seam": lambda: _compass(True).with_gaps().with_options(
         candidate="reinitialized", warm_start=True
