@@ -591,6 +591,18 @@ CASES: dict[str, Callable[[], Case]] = {
         functools.partial(Heavier, threshold=0.4, per_component=True), _huber(0.2),
         functools.partial(PseudoHuber, per_component=True), discount=0.95,
     ).with_options(max_qps=4, warm_start=True),
+    "power failing": lambda: replace(
+        _failing(), observer=qpmhe.Luenberger([[0.5], [0.3]]), cost=qpmhe.RobustCost(
+            prior=_power(1.5)(10.0 * np.eye(2)), disturbance=_power(1.2)(100.0 * np.eye(2)),
+            noise=_power(1.5)([[100.0]]),
+        ),
+    ).with_options(max_qps=1),
+    "huber extended": lambda: replace(
+        _observed(qpmhe.ExtendedKalman), cost=qpmhe.RobustCost(
+            prior=qpmhe.ObserverPrior(), disturbance=_huber(1.0)(40.0 * np.eye(3)),
+            noise=_power(1.5)(spd(3, 2)), discount=0.95,
+        ),
+    ).with_gaps(),
     "mixed losses": lambda: _weighed(
         _robust(_huber(1.0), _power(1.5, True), _huber(2.0, True)).with_gaps()
     ).with_options(max_qps=4, candidate="reinitialized", warm_start=True),
