@@ -399,8 +399,8 @@ def _steady() -> Case:
     return replace(base, observer=observer, cost=cost)
 
 
-def _failing() -> Case:
-    """A model that is not defined below zero, where measurements lead the observer at times."""
+def _failing(error: float = 12.0) -> Case:
+    """A model that is not defined below zero, where errors lead the observer at times."""
     import casadi
 
     system = qpmhe.from_casadi(
@@ -410,7 +410,7 @@ def _failing() -> Case:
     start, options = np.array([1.0, 1.0]), {"disturbance": 0.01, "noise": 0.02}
     samples = list(recorded(system, start, **options))
     for t in (6, 7, 15):
-        samples[t] = {"y": samples[t]["y"] - 12.0}
+        samples[t] = {"y": samples[t]["y"] - error}
     cost = qpmhe.QuadraticCost(
         prior=qpmhe.ObserverPrior(), disturbance=100.0 * np.eye(2), noise=[[100.0]]
     )
@@ -592,11 +592,11 @@ CASES: dict[str, Callable[[], Case]] = {
         functools.partial(PseudoHuber, per_component=True), discount=0.95,
     ).with_options(max_qps=4, warm_start=True),
     "power failing": lambda: replace(
-        _failing(), observer=qpmhe.Luenberger([[0.5], [0.3]]), cost=qpmhe.RobustCost(
+        _failing(1.8), observer=qpmhe.Luenberger([[0.5], [0.3]]), cost=qpmhe.RobustCost(
             prior=_power(1.5)(10.0 * np.eye(2)), disturbance=_power(1.2)(100.0 * np.eye(2)),
             noise=_power(1.5)([[100.0]]),
         ),
-    ).with_options(max_qps=1),
+    ).with_options(max_qps=2),
     "huber extended": lambda: replace(
         _observed(qpmhe.ExtendedKalman), cost=qpmhe.RobustCost(
             prior=qpmhe.ObserverPrior(), disturbance=_huber(1.0)(40.0 * np.eye(3)),
