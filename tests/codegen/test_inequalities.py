@@ -7,7 +7,6 @@ import pytest
 from oracles.window_qps import SOLVED, CSolver, random_qp
 
 from qpmhe.codegen.compiler import find_compiler
-from qpmhe.codegen.layout import SET_NAMES
 
 piqp = pytest.importorskip("piqp")
 pytest.importorskip("casadi")
