@@ -767,6 +767,12 @@ CASES: dict[str, Callable[[], Case]] = {
     "conditions of one sample": lambda: with_changes(with_conditions(
         case("inputs and states")
     )).with_options(horizon=1),
+    "states and covariance, conditions": lambda: with_changes(with_conditions(replace(
+        case("inputs and states"), observer=_observed(qpmhe.ExtendedKalman).observer
+    ))),
+    "states and sigma points, conditions": lambda: with_changes(with_conditions(replace(
+        case("inputs and states"), observer=_observed(qpmhe.UnscentedKalman).observer
+    ).with_options(candidate="reinitialized"))),
     "tank in time": lambda: case("tank conditions").with_options(time_budget=1e6),
     "smoothed": lambda: case("inputs").with_options(arrival="smoothed", horizon=4),
     "smoothed with gaps": lambda: case("smoothed").with_gaps().with_options(

@@ -660,18 +660,22 @@ class OwnCost(qpmhe.QuadraticCost):
     """May weigh in another way."""
 
 
+class OwnGain(qpmhe.Luenberger):
+    """May correct in another way."""
+
+
 def without_form(case):
-    plain = qpmhe.System(lambda x: 0.9 * x, lambda x: x[..., :1], n=3, p=1)
+    branching = qpmhe.System(
+        lambda x: 0.9 * x if float(x[0]) > 9.0 else x, lambda x: x[:1], n=3, p=1
+    )
     system, n = model(p=1), 3
     gain, weights = np.full((3, 1), 0.1), {"prior": np.eye(n), "disturbance": np.eye(n)}
     parts = [system, qpmhe.Luenberger(gain), qpmhe.QuadraticCost(**weights, noise=1.0)]
     options = {}
     if case == "from_casadi":
-        parts[0] = plain
-    elif case == "constant gain":
-        parts[1] = qpmhe.ExtendedKalman(
-            prior=np.eye(3), disturbance=np.eye(3), noise=np.eye(1)
-        )
+        parts[0] = branching
+    elif case == "of qpmhe's own":
+        parts[1] = OwnGain(gain)
     elif case == "QuadraticCost":
         parts[2] = OwnCost(**weights, noise=1.0)
     elif case == "backend='auto'":
@@ -682,7 +686,7 @@ def without_form(case):
 
 
 @pytest.mark.parametrize("remedy", [
-    "from_casadi", "constant gain", "QuadraticCost", "backend='auto'",
+    "from_casadi", "of qpmhe's own", "QuadraticCost", "backend='auto'",
 ])
 def test_what_has_no_c_form_tells_the_remedy(remedy, tmp_path):
     with pytest.raises(OptionError, match=remedy):

@@ -43,7 +43,7 @@ if find_compiler() is not None:
         f"{name}, in C": OPTIONS[name] | {"engine": "compiled"}
         for name in (
             "plain", "two", "observer alone", "reinitialized", "discount", "sets",
-            "sets, reinitialized", "kalman", "unscented", "robust",
+            "sets, reinitialized", "sets, kalman", "kalman", "unscented", "robust",
         )
     }
 every = pytest.mark.parametrize("name", OPTIONS)
