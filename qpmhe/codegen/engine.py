@@ -38,6 +38,7 @@ from .handover import hand_over
 from .layout import CHANGES, SET_NAMES, STAGE_FLAGS
 from .library import EstimatorLibrary
 from .sample import SampleRecord
+from .watched import WatchedFunctions
 
 Array = NDArray[np.float64]
 
@@ -102,7 +103,8 @@ class CompiledEngine:
         self._observer, self._watch = observer, CompiledWatch(horizon)
         self._time = self._memory["time"]
         # The time of the next comparison of the trace with the functions that it stands for.
-        self._next_check: float = 0 if system.is_traced else math.inf
+        self._traces = WatchedFunctions(system, observer, cost)
+        self._next_check: float = 0 if self._traces else math.inf
 
     def reset(self, initial_state: Array) -> None:
         """Forget all measurements and start at this state."""
@@ -118,6 +120,7 @@ class CompiledEngine:
         except BaseException:
             self._memory[...], self._tools = before
             raise
+        self._next_check = 0 if self._traces else math.inf
 
     def _tools_for(self, usual: Conditions) -> Tools:
         """What a step uses under these usual conditions."""
@@ -215,7 +218,7 @@ class CompiledEngine:
         """
         record = self._memory[0]
         self._next_check = next_check(int(record["time"]), self._sizes[2])
-        fault = self._system.trace_fault(record["z_end"], u)
+        fault = self._traces.fault(record["z_end"], u)
         if not fault:
             return
         if before is not None:

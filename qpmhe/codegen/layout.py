@@ -47,7 +47,7 @@ _MOST = int(np.iinfo(np.int32).max)
 _LAPACK_STATES = 40
 _POLICIES = get_args(Infeasible)
 # What corrects an observer, in the order of the numbers in C.
-_OBSERVERS = ("gain", "extended", "unscented")
+_OBSERVERS = ("gain", "extended", "unscented", "function")
 # In single precision rounding makes eigenvalues of correlations of this size.
 _LEAST_SINGLE = 1e-6
 
@@ -149,7 +149,7 @@ class Layout:
         fields: list[Any] = [
             ("gain", r, n * p), ("filter_gain", r, n * p), ("prior_weight", r, n * n),
             ("disturbance_weight", r, n * n), ("noise_weight", r, p * p),
-            *((f"{name}_loss", loss) for name in TERMS),
+            ("noise_deviations", r, p), *((f"{name}_loss", loss) for name in TERMS),
             ("output_periods", r, p), ("state_periods", r, n), ("turn_middle", r, n),
         ]
         if self.covariance:
@@ -339,6 +339,7 @@ def _filled(
             periods = record[f"{name}_periods"]
             periods[residual.components] = residual.periods
     record["turn_middle"] = np.inf if system.turns is None else system.turns.middle
+    record["noise_deviations"] = np.sqrt(inverse(form.noise).diagonal())
     record["sample_time"] = system.dt or 0.0
     # Single precision distinguishes less.
     record["tolerance"] = max(settings.tolerance, 1e-6 if single else 0.0)

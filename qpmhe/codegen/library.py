@@ -55,7 +55,13 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     if form is None:
         return (
             f"{type(observer).__name__} has no C form; take an observer of qpmhe's own "
-            "(Luenberger, HighGain, SteadyStateKalman, ExtendedKalman, UnscentedKalman)."
+            "(Luenberger, HighGain, SteadyStateKalman, ExtendedKalman, UnscentedKalman, "
+            "OutputInjection)."
+        )
+    if form.correction is not None and (why := form.correction(system.n, system.p).reason):
+        return (
+            f"the correction of {type(observer).__name__} has no C form ({why}); change that, or "
+            "take engine='python'."
         )
     if cost.observer_prior is not None and form.prior is None:
         return (
@@ -131,13 +137,13 @@ def generated(
 ) -> dict[str, str]:
     """Header and source of an estimator, by the names of their files."""
     layout, record = planned(system, observer, cost, settings, real, usual=usual)
-    return estimator_files(symbolic_model(system, cost), layout, record, name)
+    return estimator_files(symbolic_model(system, observer, cost), layout, record, name)
 
 
-def symbolic_model(system: System, cost: Cost) -> CasadiModel:
+def symbolic_model(system: System, observer: Observer, cost: Cost) -> CasadiModel:
     """The model of a system that has a C form, with all that is generated from CasADi."""
     model: CasadiModel = system.symbolic
-    form = cost.c_form
+    form, own = cost.c_form, observer.c_form
     functions: dict[str, Any] = {
         name: residual.expression.function
         for name in ("output_residual", "state_residual")
@@ -147,6 +153,8 @@ def symbolic_model(system: System, cost: Cost) -> CasadiModel:
         functions["losses"] = tuple(
             loss_function(one).function if one.kind == "own" else None for one in form.losses
         )
+    if own is not None and own.correction is not None:
+        functions["correction"] = own.correction(system.n, system.p).function
     return replace(model, **functions) if functions else model
 
 
@@ -160,7 +168,7 @@ def planned(
     if reason:
         raise OptionError(f"no C code for this estimator: {reason}")
     assert system.symbolic is not None
-    model = symbolic_model(system, cost)
+    model = symbolic_model(system, observer, cost)
     directions = Directions(system, observer, cost)
     layout = Layout.of(
         directions, settings.horizon, CONTINUOUS[model.method], real, lapack,
@@ -247,7 +255,7 @@ class EstimatorLibrary:
         self.directions = Directions(system, observer, cost)
         self.estimator_type, self.estimate_type = layout.estimator_type(), layout.estimate_type()
         self.sample_type = layout.sample_type()
-        model = symbolic_model(system, cost)
+        model = symbolic_model(system, observer, cost)
 
         @np.errstate(all="ignore")
         def fault(library: ctypes.CDLL) -> str:

@@ -30,4 +30,4 @@ def loss_function(form: LossForm) -> Traced:
     ca = import_casadi()
     q = ca.SX.sym("q")
     value = found.function(ca.vertcat(q, 1.0))
-    return Traced(ca.Function("loss", [q], [value[0], value[2]]), "", (2,))
+    return Traced(ca.Function("loss", [q], [value[0], value[2]]), "", (2,), made_of=found)

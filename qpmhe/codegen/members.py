@@ -24,6 +24,7 @@ from ..observers import Observer
 from .estimate import WATCHED, CompiledWatch
 from .handover import hand_over
 from .library import EstimatorLibrary
+from .watched import WatchedFunctions
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ class CompiledMembers:
         threads: int | None,
     ) -> None:
         self._library = library = EstimatorLibrary(system, observer, cost, settings)
-        self._system, self._settings = system, settings
+        self._traces, self._settings = WatchedFunctions(system, observer, cost), settings
         self._m, self._horizon = system.m, settings.horizon
         self._watch = CompiledWatch(settings.horizon)
         count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -56,7 +57,7 @@ class CompiledMembers:
         """Forget all samples and start at these states."""
         self._memory = self._library.estimators(states)
         # The time of the next comparison of the trace with the functions that it stands for.
-        self._next_check: float = 0 if self._system.is_traced else math.inf
+        self._next_check: float = 0 if self._traces else math.inf
 
     @property
     def time(self) -> int:
@@ -85,7 +86,7 @@ class CompiledMembers:
         self._next_check = next_check(self.time, self._horizon)
         count = len(self._memory)
         for k in np.linspace(0, count - 1, min(count, _COMPARED)).astype(int):
-            fault = self._system.trace_fault(self._memory["z_end"][k], u[k])
+            fault = self._traces.fault(self._memory["z_end"][k], u[k])
             if fault:
                 raise ModelChangedError(fault)
 

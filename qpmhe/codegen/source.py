@@ -76,12 +76,15 @@ def model_source(model: CasadiModel) -> str:
             f"#define MHE_{which.upper()}_NONZEROS {len(places)}\n"
             f"static const int mhe_{which}_place[] = {{{listed}}};\n"
         )
-    for which, size in (("output_residual", model.p), ("state_residual", model.n)):
+    for which, *sizes in (
+        ("output_residual", model.p, model.p), ("state_residual", model.n, model.n),
+        ("correction", model.n, model.p),
+    ):
         function = getattr(model, which)
         if function is None:
             continue
         name = f"mhe_casadi_{which}"
-        named = _named(ca, function, name, size, size)
+        named = _named(ca, function, name, *sizes)
         generator.add(named)
         calls.append(_call(f"mhe_call_{which}", name, named))
     for which, function in zip(TERMS, model.losses, strict=True):

@@ -402,6 +402,7 @@ class PythonEngine:
     def _use(self, memory: Memory) -> None:
         self._tools, self._window, self._trajectory, self._watch.counts, history = memory
         self._history = deque(history, maxlen=self._history.maxlen)
+        self._next_check = 0 if self._system.is_traced else math.inf
 
     def take_over(
         self, usual: Conditions, time: int, state: Array, covariance: Array | None,

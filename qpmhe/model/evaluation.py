@@ -163,21 +163,23 @@ class VirtualMachine:
 
     def __init__(self, model: CasadiModel, timed: bool) -> None:
         self._model, self._timed = model, timed
-        self._made: dict[tuple[str, ...], tuple[Any, dict[str, Any], bool]] = {}
+        self._made: dict[tuple[str, ...], tuple[Any, dict[str, Any]]] = {}
+        self._expressions: dict[str, Any] = {}  # of the same symbols
+        self._fallible = may_fail(model.f) or may_fail(model.h)
 
     def __call__(self, count: int, names: tuple[str, ...]) -> Buffers:
         """Make buffers for so many states and these results."""
         if names == RESIDUALS:
             return self._residuals(count)
         model, timed = self._model, self._timed
-        function, functions, fallible = self._functions(names)
+        function, functions = self._functions(names)
         if count > 1:
             function = function.map(count)
         states, inputs = np.zeros((count, model.n)), np.zeros((count, model.m + timed))
         results = results_of(model, count, names)
         all_inputs = inputs if timed else np.full((count, model.m + 1), model.dt or 0.0)
         run = fixed_call(
-            function, (states, all_inputs), [results[name] for name in names], fallible
+            function, (states, all_inputs), [results[name] for name in names], self._fallible
         )
         again: list[Callable[[], None]] = []
 
@@ -191,29 +193,36 @@ class VirtualMachine:
 
         return states, inputs, results, evaluate
 
-    def _functions(self, names: tuple[str, ...]) -> tuple[Any, dict[str, Any], bool]:
+    def _functions(self, names: tuple[str, ...]) -> tuple[Any, dict[str, Any]]:
         """A function of x and (u, dt) to all of these results, and one to each."""
         if names not in self._made:
-            ca, model = import_casadi(), self._model
-            kind = ca.SX if model.f.is_a("SXFunction") and model.h.is_a("SXFunction") else ca.MX
-            x, given = kind.sym("x", model.n), kind.sym("u", model.m + 1)
-            u, dt = given[: model.m], given[model.m]
-            # Transposed: CasADi stores by columns, NumPy by rows.
-            columns: dict[str, Any] = {}
-            if {"f", "f_jacobian"} & set(names):
-                columns["f"] = following = model.step()(x, u, dt)
-            if {"h", "h_jacobian"} & set(names):
-                columns["h"] = output = model.h(x, u)
-            if "f_jacobian" in names:
-                columns["f_jacobian"] = ca.densify(ca.jacobian(following, x).T)
-            if "h_jacobian" in names:
-                columns["h_jacobian"] = ca.densify(ca.jacobian(output, x).T)
+            ca, found = import_casadi(), [self._expression(name) for name in names]
+            arguments = [self._expressions["x"], self._expressions["given"]]
+            function = ca.Function("model", arguments, found)
             functions = {
-                name: ca.Function("model", [x, given], [columns[name]]) for name in names
+                name: ca.Function("model", arguments, [one])
+                for name, one in zip(names, found, strict=True)
             }
-            function = ca.Function("model", [x, given], [columns[name] for name in names])
-            self._made[names] = function, functions, may_fail(function)
+            self._made[names] = function, functions
         return self._made[names]
+
+    def _expression(self, name: str) -> Any:
+        """One of the results as an expression of x and (u, dt), made once."""
+        ca, model, made = import_casadi(), self._model, self._expressions
+        if "x" not in made:
+            kind = ca.SX if model.f.is_a("SXFunction") and model.h.is_a("SXFunction") else ca.MX
+            made["given"], made["x"] = kind.sym("u", model.m + 1), kind.sym("x", model.n)
+        if name not in made:
+            u, dt = made["given"][: model.m], made["given"][model.m]
+            if name == "f":
+                made[name] = model.step()(made["x"], u, dt)
+            elif name == "h":
+                made[name] = model.h(made["x"], u)
+            else:
+                value = self._expression(name.partition("_")[0])
+                # Transposed: CasADi stores by columns, NumPy by rows.
+                made[name] = ca.densify(ca.jacobian(value, made["x"]).T)
+        return made[name]
 
     def _residuals(self, count: int) -> Buffers:
         states, inputs, values, evaluate_values = self(count, VALUES)

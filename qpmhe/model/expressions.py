@@ -26,7 +26,8 @@ class CasadiModel:
     f is the rate of an ODE with sampling time ``dt`` and discretisation ``method``, or the
     discrete-time map itself, where these are None. u has no rows where there are no inputs.
     ``output_residual`` and ``state_residual`` are the user's functions of (a, b) for differences,
-    where there are any; ``losses`` those of one number q to rho(q) and rho'(q), for prior, w and v.
+    where there are any; ``losses`` those of one number q to rho(q) and rho'(q), for prior, w and v;
+    ``correction`` an observer's function of (z, v).
     """
 
     f: Any
@@ -39,6 +40,7 @@ class CasadiModel:
     output_residual: Any = None
     state_residual: Any = None
     losses: tuple[Any, Any, Any] = (None, None, None)
+    correction: Any = None
 
     def with_jacobian(self, which: str) -> tuple[Any, list[int]]:
         """A function of (x, u) to f or h and the nonzeros of its Jacobian by x.

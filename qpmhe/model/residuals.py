@@ -302,7 +302,8 @@ class _Extended(Residual):
         ca = import_casadi()
         a, b = (ca.SX.sym(name, self._dimension) for name in "ab")
         joined = ca.vertcat(first.function(a[:count], b[:count]), a[count:] - b[count:])
-        return Traced(ca.Function("residual", [a, b], [joined]), "", (self._dimension,))
+        function = ca.Function("residual", [a, b], [joined])
+        return Traced(function, "", (self._dimension,), made_of=first)
 
     def wrap(self, differences: Array, minuends: Array) -> None:
         """See `Residual.wrap`."""

@@ -16,8 +16,6 @@ from typing import Any
 
 import numpy as np
 
-# A function that does more with single symbols than this is not traced any further.
-_MOST_OPERATIONS = 200_000
 _HERE = Path(__file__).parent
 # Frames of these files and folders are never the user's code that asked for something.
 _MACHINERY = (
@@ -52,6 +50,9 @@ def place(frame: Any) -> str:
 class Record(ABC):
     """What happened during one trace, which all of its symbols share."""
 
+    #: A function that does more with single symbols than this is not traced any further.
+    most_operations = 200_000
+
     def __init__(self) -> None:
         #: Why it was refused, the first time; blank if never. Whatever the function catches.
         self.reason = ""
@@ -74,8 +75,8 @@ class Record(ABC):
     def symbol(self, value: Any, logical: bool = False) -> Symbol:
         """One more symbol."""
         self._operations += 1
-        if self._operations > _MOST_OPERATIONS:
-            raise self.refuse(f"more than {_MOST_OPERATIONS} operations on single numbers")
+        if self._operations > self.most_operations:
+            raise self.refuse(f"more than {self.most_operations} operations on single numbers")
         return Symbol(self, value, logical)
 
     def array(self, values: Any) -> SymbolArray:
@@ -254,7 +255,9 @@ class SymbolArray(np.ndarray[Any, Any]):
     tofile: Any = _refuse
     __reduce__: Any = _refuse
     __array_interface__: Any = property(_refuse)
+    __array_struct__: Any = property(_refuse)
     data: Any = property(_refuse)
+    ctypes: Any = property(_refuse)
 
 
 def _holds_symbols(value: Any) -> bool:

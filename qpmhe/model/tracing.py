@@ -174,11 +174,28 @@ class Traced(NamedTuple):
         Why there is no function; blank if there is one.
     shape : tuple of int
         The shape of the value; () without a function.
+    original, points : callable and sequence, or None
+        What was traced, and where it was compared.
+    made_of : Traced or None
+        The trace that this function was made of, if it is no trace itself.
     """
 
     function: Any
     reason: str
     shape: tuple[int, ...] = ()
+    original: Callable[..., Any] | None = None
+    points: Sequence[Sequence[Array]] | None = None
+    made_of: Any = None
+
+    def fault(self, k: int) -> str:
+        """Where the function that was traced differs from its trace now; blank where it does not.
+
+        Compares at one of the points only, another one for each k.
+        """
+        one: Traced = self if self.made_of is None else self.made_of
+        if one.function is None or one.original is None or not one.points:
+            return ""
+        return difference(one, one.original, [one.points[k % len(one.points)]])
 
 
 def traced(
@@ -217,8 +234,9 @@ def traced(
     found = expressed(function, sizes, name)
     if found.function is None:
         return found
-    reason = difference(found, function, random_points(sizes) if points is None else points)
-    return Traced(None, reason) if reason else found
+    points = random_points(sizes) if points is None else points
+    reason = difference(found, function, points)
+    return Traced(None, reason) if reason else found._replace(original=function, points=points)
 
 
 def expressed(function: Callable[..., Any], sizes: Sequence[int], name: str = "traced") -> Traced:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from .._linalg import inverse
 from ..errors import ShapeError
 from ..model.sets import ConvexSet
 from ..model.system import System
+from ..model.tracing import Traced
 
 #: Two inversions of a covariance change its correlations by no more.
 SAME_COVARIANCE = 1e-9
@@ -56,8 +58,8 @@ class ObserverForm:
 
     Parameters
     ----------
-    kind : {"gain", "extended", "unscented"}
-        What corrects: a constant gain, an extended or an unscented Kalman filter.
+    kind : {"gain", "extended", "unscented", "function"}
+        What corrects: a constant gain, an extended or an unscented Kalman filter, a function.
     gain, filter_gain : (n, p) array or None
         The constant gain, and that of the measurement update.
     prior, disturbance, noise : (n, n), (r, r) and (p, p) array or None
@@ -66,6 +68,8 @@ class ObserverForm:
         The constant Jacobians by which the covariance of a constant gain's error proceeds.
     spread : float
         Distance of sigma points from the state, in standard deviations.
+    correction : callable or None
+        The CasADi form of a function L(z, v), from the sizes of its arguments.
     """
 
     kind: str
@@ -77,6 +81,7 @@ class ObserverForm:
     f_jacobian: Array | None = None
     h_jacobian: Array | None = None
     spread: float = 0.0
+    correction: Callable[[int, int], Traced] | None = None
 
 
 class Observer(ABC):

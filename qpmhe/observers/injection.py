@@ -14,7 +14,8 @@ from .._checks import Array, positive_definite
 from ..errors import ModelError
 from ..model.residuals import difference
 from ..model.system import System
-from .base import Observer, Sample
+from ..model.tracing import Traced, traced
+from .base import Observer, ObserverForm, Sample
 
 
 class OutputInjection(Observer):
@@ -38,6 +39,7 @@ class OutputInjection(Observer):
                 f"correction is {shown(correction)}; expected a function of z and v."
             )
         self._correction = correction
+        self._expressions: dict[tuple[int, int], Traced] = {}
         self._metric = None if metric is None else positive_definite("metric", metric)
 
     def check(self, system: System, initial_state: Array) -> None:
@@ -79,6 +81,19 @@ class OutputInjection(Observer):
                 f"correction is {value.tolist()} at z = {z.tolist()} and v = 0; an observer in "
                 "output-injection form must not correct where the output fits: L(z, 0) = 0."
             )
+
+    @property
+    def c_form(self) -> ObserverForm | None:
+        """The correction, unless a derived class may compute otherwise."""
+        if type(self) is not OutputInjection:
+            return None
+        return ObserverForm("function", correction=self._expression)
+
+    def _expression(self, n: int, p: int) -> Traced:
+        """The correction as CasADi has it, compared with the function; found once."""
+        if (n, p) not in self._expressions:
+            self._expressions[n, p] = traced(self._correction, (n, p), name="correction")
+        return self._expressions[n, p]
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, None]:
         """L(z, v); see `Observer.correct`."""

@@ -329,11 +329,15 @@ def _turned_states(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return d - np.array([0.0, 0.0, 2.0 * np.pi, 0.0]) * np.floor(d / (2.0 * np.pi) + 0.5)
 
 
-def _rover(outputs: bool, states: bool, functions: bool = False, **sets: Any) -> Case:
+def _rover(
+    outputs: bool, states: bool, functions: bool = False,
+    observer: type[qpmhe.Observer] | None = None, **sets: Any,
+) -> Case:
     """A turning rover with a compass that sees distance and bearing of a beacon.
 
     Where states have angles, f keeps the heading in one turn. Where outputs have none, they are
-    smooth functions of both. The angles may be stated by functions of two vectors.
+    smooth functions of both. The angles may be stated by functions of two vectors. An observer with
+    a covariance weighs the prior.
     """
     import casadi as ca
 
@@ -365,9 +369,9 @@ def _rover(outputs: bool, states: bool, functions: bool = False, **sets: Any) ->
         "prior": [0.5, 0.5, 0.4, 0.1], "disturbance": [0.1, 0.1, 0.03, 0.02],
         "noise": [0.2, 0.1 * unit, 0.1],
     }
-    cost = qpmhe.QuadraticCost.from_covariances(
-        **{name: np.diag(np.square(one)) for name, one in deviations.items()}
-    )
+    covariances = {name: np.diag(np.square(one)) for name, one in deviations.items()}
+    weighs = {} if observer is None else {"prior": qpmhe.ObserverPrior()}
+    cost = qpmhe.QuadraticCost.from_covariances(**(covariances | weighs))
     generator, x, samples = np.random.default_rng(4), np.array([0.3, -0.2, 0.5, 1.7]), []
     for _ in range(3 * STEPS):
         y = system.h(x, np.zeros(0)) + generator.normal(0.0, deviations["noise"])
@@ -378,8 +382,9 @@ def _rover(outputs: bool, states: bool, functions: bool = False, **sets: Any) ->
     turning = [[0.0, -0.2 / unit, 0.4], [0.0, 0.0, 0.1]] if outputs else np.zeros((2, 3))
     gain = [[0.2, 0.0, 0.0], [0.0, 0.0, 0.0], *turning]
     start = np.array([0.0, 0.0, 0.9, 1.6])
+    filters = qpmhe.Luenberger(gain) if observer is None else observer(**covariances)
     return Case(
-        system, qpmhe.Luenberger(gain), cost, start, tuple(samples), {"horizon": 6, "max_qps": 3}
+        system, filters, cost, start, tuple(samples), {"horizon": 6, "max_qps": 3}
     )
 
 
@@ -423,8 +428,22 @@ def _steady() -> Case:
     return replace(base, observer=observer, cost=cost)
 
 
-def _failing() -> Case:
-    """A model that is not defined below zero, where measurements lead the observer at times."""
+def _filtered(make: Callable[..., qpmhe.Observer], one: Case) -> Case:
+    """The case with a filter of the cost's covariances, which weighs the prior."""
+    weights = {name: getattr(one.cost, name) for name in ("prior", "disturbance", "noise")}
+    observer = make(**{name: np.linalg.inv(weight) for name, weight in weights.items()})
+    cost = qpmhe.QuadraticCost(**weights | {"prior": qpmhe.ObserverPrior()})
+    return replace(one, observer=observer, cost=cost)
+
+
+def _saturated(z: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """A correction that large errors cannot drive far, and that depends on the state."""
+    bounded = np.tanh(v)
+    return np.array([[0.3, 0.0], [0.1, 0.05], [0.0, 0.3]]) @ bounded * (1.0 + 0.2 * np.cos(z))
+
+
+def _failing(error: float = 12.0) -> Case:
+    """A model that is not defined below zero, where errors lead the observer at times."""
     import casadi
 
     system = qpmhe.from_casadi(
@@ -434,7 +453,7 @@ def _failing() -> Case:
     start, options = np.array([1.0, 1.0]), {"disturbance": 0.01, "noise": 0.02}
     samples = list(recorded(system, start, **options))
     for t in (6, 7, 15):
-        samples[t] = {"y": samples[t]["y"] - 12.0}
+        samples[t] = {"y": samples[t]["y"] - error}
     cost = qpmhe.QuadraticCost(
         prior=qpmhe.ObserverPrior(), disturbance=100.0 * np.eye(2), noise=[[100.0]]
     )
@@ -547,6 +566,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "residual functions": lambda: _rover(True, True, True).with_gaps().with_options(
         warm_start=True
     ),
+    "angles extended": lambda: _rover(True, True, observer=qpmhe.ExtendedKalman).with_gaps(),
     "angles across the seam": lambda: _compass(),
     "functions across the seam": lambda: _compass(True).with_gaps().with_options(
         candidate="reinitialized", warm_start=True
@@ -685,6 +705,18 @@ CASES: dict[str, Callable[[], Case]] = {
         functools.partial(Heavier, threshold=0.4, per_component=True), _huber(0.2),
         functools.partial(PseudoHuber, per_component=True), discount=0.95,
     ).with_options(max_qps=4, warm_start=True),
+    "power failing": lambda: replace(
+        _failing(1.8), observer=qpmhe.Luenberger([[0.5], [0.3]]), cost=qpmhe.RobustCost(
+            prior=_power(1.5)(10.0 * np.eye(2)), disturbance=_power(1.2)(100.0 * np.eye(2)),
+            noise=_power(1.5)([[100.0]]),
+        ),
+    ).with_options(max_qps=2),
+    "huber extended": lambda: replace(
+        _observed(qpmhe.ExtendedKalman), cost=qpmhe.RobustCost(
+            prior=qpmhe.ObserverPrior(), disturbance=_huber(1.0)(40.0 * np.eye(3)),
+            noise=_power(1.5)(spd(3, 2)), discount=0.95,
+        ),
+    ).with_gaps(),
     "mixed losses": lambda: _weighed(
         _robust(_huber(1.0), _power(1.5, True), _huber(2.0, True)).with_gaps()
     ).with_options(max_qps=4, candidate="reinitialized", warm_start=True),
@@ -798,6 +830,28 @@ CASES: dict[str, Callable[[], Case]] = {
         _failing(), observer=qpmhe.UnscentedKalman(
             prior=0.1 * np.eye(2), disturbance=0.01 * np.eye(2), noise=[[0.01]]
         )
+    ),
+    "extended angles": lambda: _filtered(qpmhe.ExtendedKalman, _rover(True, True).with_gaps()),
+    "unscented angles": lambda: _filtered(
+        qpmhe.UnscentedKalman, _rover(True, True, True).with_gaps()
+    ).with_options(arrival="smoothed"),
+    "injection": lambda: replace(
+        case("inputs"), observer=qpmhe.OutputInjection(_saturated)
+    ).with_gaps(),
+    "injection reinitialized": lambda: with_changes(
+        with_conditions(case("injection")).with_options(candidate="reinitialized", warm_start=True)
+    ),
+    "injection in sets": lambda: replace(
+        case("inputs and states"), observer=qpmhe.OutputInjection(
+            lambda z, v: 2.0 * _saturated(z, v)
+        )
+    ),
+    "injection failing": lambda: replace(
+        _failing(), observer=qpmhe.OutputInjection(
+            lambda z, v: np.array([0.4 * v[0] / np.sqrt(z[0]), 0.0])
+        ), cost=qpmhe.QuadraticCost(
+            prior=np.eye(2), disturbance=100.0 * np.eye(2), noise=[[100.0]]
+        ),
     ),
     "steady prior": _steady,
     "steady prior with gaps": lambda: _weighed(_steady().with_gaps()),

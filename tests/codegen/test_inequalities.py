@@ -22,9 +22,11 @@ shapes = pytest.mark.parametrize("shape", SHAPES)
 solver_of = functools.cache(lambda shape, real="double": CSolver(*SHAPES[shape], real))
 
 
-def reference(qp):
+def reference(qp, nearest=False):
     """The solution by another solver, in rows of deviations."""
     H, g, rows, low, high, scale = qp.dense()
+    if nearest:
+        g = np.zeros_like(g)
     rows, low, high = rows / scale[:, None], low / scale, high / scale
     solver, equal = piqp.DenseSolver(), low == high
     for name in ("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"):
@@ -60,3 +62,97 @@ def test_random_qps(shape, tight):
     rng, solver = np.random.default_rng([7, int(100 * tight)]), solver_of(shape)
     for _ in range(20):
         solves(solver, random_qp(rng, *SHAPES[shape], tight))
+
+
+@shapes
+def test_equations_and_repeated_rows(shape):
+    """Rows without width, many of them combinations of others, with and without limits."""
+    rng, solver = np.random.default_rng(11), solver_of(shape)
+    for tight in (1.0, 0.3, 0.03):
+        for _ in range(10):
+            shares = rng.choice([0.0, 0.5]), rng.choice([0.0, 0.5, 0.9])
+            solves(solver, random_qp(rng, *SHAPES[shape], tight, 0.3, *shares))
+
+
+@shapes
+def test_no_unit_matters(shape):
+    rng, solver = np.random.default_rng(12), solver_of(shape)
+    n, p, *_ = SHAPES[shape]
+    for equal in (0.0, 0.3):
+        for _ in range(10):
+            qp = random_qp(rng, *SHAPES[shape], 10 ** rng.uniform(-2, 0.5), equal)
+            of_x, of_y = (10.0 ** rng.integers(-9, 10, size) for size in (n, p))
+            status, d, _ = solver(qp.in_units(of_x, of_y))
+            d = (d.reshape(-1, n) / of_x).ravel()
+            assert status == SOLVED
+            assert missed(qp, d) < 1e-8
+            best = objective(qp, reference(qp))
+            assert objective(qp, d) == pytest.approx(best, rel=1e-7, abs=1e-7)
+
+
+@shapes
+def test_iterations_are_capped_and_counted(shape):
+    rng, solver = np.random.default_rng(13), solver_of(shape)
+    for _ in range(20):
+        qp = random_qp(rng, *SHAPES[shape], 0.1, 0.3)
+        needed = solver(qp)[2]
+        for limit in range(needed):
+            status, d, iterations = solver(qp, limit=limit)
+            assert status != SOLVED
+            assert iterations <= limit
+            assert np.isfinite(d).all()
+        assert solver(qp, limit=needed)[::2] == (SOLVED, needed)
+
+
+def test_inactive_rows_cost_no_iteration():
+    rng, solver = np.random.default_rng(14), solver_of("boxes")
+    qp = random_qp(rng, *SHAPES["boxes"], 1e3)
+    status, d, iterations = solver(qp)
+    assert (status, iterations) == (SOLVED, 0)
+    H, g, *_ = qp.dense()
+    np.testing.assert_allclose(H @ d, -g, atol=1e-9)
+
+
+@pytest.mark.parametrize(("shape", "name"), [("all", "disturbances"), ("V", "noises"),
+                                             ("X", "states")])
+@pytest.mark.parametrize("equal", [0.0, 0.3])
+def test_rows_that_exclude_each_other(shape, name, equal):
+    """They end the iterations early, at a finite point."""
+    rng, solver, most = np.random.default_rng(15), solver_of(shape), 0
+    for _ in range(20):
+        qp = random_qp(rng, *SHAPES[shape], 0.5, equal)
+        matrix, low, high = qp.sets[name]
+        first = matrix.shape[1]
+        matrix[first] = matrix[0]
+        low[0], high[0], low[first], high[first] = -np.inf, 5.0, 10.0, np.inf
+        status, d, iterations = solver(qp, limit=200)
+        assert status != SOLVED
+        assert np.isfinite(d).all()
+        most = max(most, iterations)
+    assert most <= 60
+
+
+@shapes
+def test_the_nearest_point_in_the_rows(shape):
+    """Its metric is the Hessian: the same QP without a gradient."""
+    rng, solver = np.random.default_rng(16), solver_of(shape)
+    for _ in range(10):
+        qp = random_qp(rng, *SHAPES[shape], 0.1)
+        status, d, _ = solver(qp, nearest=True)
+        assert status == SOLVED
+        assert missed(qp, d) < 1e-8
+        H = qp.dense()[0]
+        best = reference(qp, nearest=True)
+        assert d @ H @ d == pytest.approx(best @ H @ best, rel=1e-7, abs=1e-9)
+
+
+@shapes
+def test_single_precision(shape):
+    rng, solver = np.random.default_rng(17), solver_of(shape, "float")
+    for _ in range(10):
+        qp = random_qp(rng, *SHAPES[shape], 0.3)
+        status, d, _ = solver(qp, tolerance=1e-4)
+        H, best = qp.dense()[0], reference(qp)
+        assert status == SOLVED
+        assert missed(qp, d) < 1e-4
+        assert objective(qp, d) <= objective(qp, best) + 1e-2 * (1.0 + best @ H @ best)

@@ -180,6 +180,13 @@ class OwnGain(qpmhe.Luenberger):
         return 2.0 * super().correct(z, v, sample)[0], None
 
 
+class OwnInjection(qpmhe.OutputInjection):
+    """Corrects by something else."""
+
+    def correct(self, z, v, sample):
+        return 2.0 * super().correct(z, v, sample)[0], None
+
+
 class OwnFilter(qpmhe.ExtendedKalman):
     """Filters by something else."""
 
@@ -232,8 +239,9 @@ LOSSES = {Whole: "cost of its own", Branching: "", Together: "depends on others"
         ("from_casadi", {"system": lambda: qpmhe.System(
             lambda x: x if x[0] > 12.0 else 0.9 * x, lambda x: x, n=1, p=1)}),
         ("OwnGain has no C form; take an observer of qpmhe", {"observer": lambda: OwnGain([0.3])}),
-        ("OutputInjection has no C form",
-         {"observer": lambda: qpmhe.OutputInjection(lambda z, v: 0.3 * v)}),
+        (r"the correction of OutputInjection has no C form \(.*asks for .*\); change that",
+         {"observer": lambda: qpmhe.OutputInjection(lambda z, v: 0.3 * v if v[0] > 0 else v)}),
+        ("OwnInjection has no C form", {"observer": lambda: OwnInjection(lambda z, v: 0.3 * v)}),
         *((rf"{kind.__name__}, the loss of noise, has no C form \(.*{why}.*\); take Quadratic, "
            "Huber or Power",
            {"cost": lambda kind=kind: qpmhe.RobustCost(**(ONES | {"noise": kind(1.0)}))})

@@ -447,3 +447,50 @@ def test_a_batch_goes_on_in_python_where_a_closure_has_changed(call, monkeypatch
     assert (found.costs <= found.candidate_costs).all()
     batch.reset()
     assert batch.time == 0
+
+
+class Changing:
+    """A correction, a residual function and a loss with a number that can be changed."""
+
+    def __init__(self):
+        self.share = 0.4
+
+    def correction(self, z, v):
+        return self.share * np.array([v[0], 0.5 * np.tanh(v[0])])
+
+    def turn(self, a, b):
+        return a - b - 6.0 * self.share * np.round((a - b) / (6.0 * self.share))
+
+
+@pytest.mark.parametrize("what", ["correction", "output_residual"])
+def test_other_traced_functions_of_a_compiled_step_may_change_too(what):
+    plant, changing = Plant(), Changing()
+    residual = {"output_residual": changing.turn} if what == "output_residual" else {}
+    options = {"horizon": 5, "initial_state": [1.0, -1.0], "max_qps": 1}
+    observer = qpmhe.Luenberger([0.4, 0.1])
+    if what == "correction":
+        observer = qpmhe.OutputInjection(changing.correction)
+    mhe = qpmhe.MovingHorizonEstimator(
+        plant.system(**residual), observer,
+        qpmhe.QuadraticCost(prior=np.eye(2), disturbance=10.0 * np.eye(2), noise=4.0),
+        engine="compiled", **options,
+    )
+    ys = np.random.default_rng(0).normal(size=60)
+    update_all(mhe, ys[:3])
+    assert mhe.engine == "compiled"
+    changing.share = 0.3
+    with pytest.warns(EngineWarning, match=f"{what} has changed since it was traced"):
+        update_all(mhe, ys[3:])
+    assert (mhe.engine, mhe.time) == ("python", 60)
+
+
+def test_comparisons_begin_anew_after_a_reset():
+    plant = Plant()
+    for engine in ENGINES:
+        mhe = estimator(plant.system(), engine)
+        update_all(mhe, np.zeros(40))
+        mhe.reset()
+        mhe.update(0.1)
+        plant.gain += 0.1
+        with pytest.warns(EngineWarning, match="has changed"):
+            mhe.update(0.2)

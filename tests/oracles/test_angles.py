@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.codegen.compiler import find_compiler
 from qpmhe.studies.ipopt import IpoptEstimator
 
 pytest.importorskip("casadi")
@@ -45,8 +46,11 @@ class Rover:
             *(m.sqrt(e * e + n * n) for e, n in seen), *(angle(n, e) - x[2] for e, n in seen)
         ]
 
-    def system(self, **sets):
+    def system(self, engine="python", **sets):
         """With f and h that wrap, each in its own way."""
+        sets |= {"state_residual": qpmhe.angles([2]), "output_residual": qpmhe.angles([2, 3])}
+        if engine == "compiled":
+            return self.casadi_system(sets)
 
         def f(x):
             value = np.array(self.f(x))
@@ -58,10 +62,20 @@ class Rover:
             value[2:] = (value[2:] + PI) % (2.0 * PI) - PI
             return value
 
-        return qpmhe.System(
-            f, h, n=4, p=4, state_residual=qpmhe.angles([2]), output_residual=qpmhe.angles([2, 3]),
-            **sets,
-        )
+        return qpmhe.System(f, h, n=4, p=4, **sets)
+
+    def casadi_system(self, options):
+        import casadi as ca
+
+        def f(x):
+            *others, heading, rate = self.f(ca.vertsplit(x), ca)
+            return [*others, ca.atan2(ca.sin(heading), ca.cos(heading)), rate]
+
+        def h(x):
+            *ranges, one, two = self.h(ca.vertsplit(x), ca)
+            return [*ranges, *(a - 2.0 * PI * ca.floor(a / (2.0 * PI) + 0.5) for a in (one, two))]
+
+        return qpmhe.from_casadi(f, h, n=4, compiled=False, **options)
 
     def record(self, system, steps):
         x, y = self.start, []
@@ -73,18 +87,23 @@ class Rover:
 
 
 @pytest.mark.parametrize("sets", SETS)
-@pytest.mark.parametrize("seed", range(6))
-def test_converged_cost_is_ipopts(seed, sets):
+@pytest.mark.parametrize(
+    ("seed", "engine"), [*((seed, "python") for seed in range(6)), (0, "compiled")]
+)
+def test_converged_cost_is_ipopts(seed, engine, sets):
     import casadi as ca
 
+    if engine == "compiled" and find_compiler() is None:
+        pytest.skip("there is no C compiler")
     rover = Rover(seed)
-    system = rover.system(**SETS[sets])
+    system = rover.system(engine, **SETS[sets])
     y = rover.record(rover.system(), 25)
     assert (np.abs(np.diff(y[:, 2:], axis=0)) > PI).sum() > 5
     common = {"horizon": 6, "initial_state": rover.start + np.array([0.3, -0.3, 0.3, 0.0])}
     observer = qpmhe.ExtendedKalman(
         **{name: np.diag(np.square(one)) for name, one in rover.deviations.items()})
-    mhe = qpmhe.MovingHorizonEstimator(system, observer, rover.cost, max_qps=None, **common)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, observer, rover.cost, max_qps=None, engine=engine, **common)
     ipopt = IpoptEstimator(
         system, observer, rover.cost, tolerance=1e-10, **common,
         f=lambda x: ca.vertcat(*rover.f(ca.vertsplit(x), ca)),

@@ -26,8 +26,11 @@ int32_t solve(mhe_estimator *e, mhe_workspace *k, const mhe_settings *s, int32_t
     memset(k->rows.place, 0, sizeof k->rows.place);
     memset(e, 0, sizeof *e);
     e->settings = s;
+    k->prior.mean = e->stages[0].z;
+    k->prior.weight = k->prior.distance_weight = s->prior_weight;
     e->length = count;
     memcpy(e->stages[0].z, prior, sizeof e->stages[0].z);
+    mhe_set_prior(e, k);
     memcpy(trial->x, x, sizeof(real) * (size_t)(count + 1) * NX);
     memcpy(trial->w, w, sizeof(real) * (size_t)count * NX);
     memcpy(trial->v, v, sizeof(real) * (size_t)count * NY);
@@ -152,7 +155,7 @@ class CSolver:
         )
         files["mhe.c"] += HOOK
         self._library = compiled_library(files, "mhe.c")
-        sizes = np.zeros(4, np.int64)
+        sizes = np.zeros(5, np.int64)
         self._library.mhe_sizes(ctypes.c_void_p(sizes.ctypes.data))
         self._memory = [np.zeros(int(size), np.uint8) for size in sizes[:2]]
 

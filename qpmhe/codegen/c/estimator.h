@@ -60,10 +60,12 @@ typedef $real mhe_real;
 /* Step lengths, tolerances and thresholds. */
 $limits
 
-/* What corrects the observer: a constant gain, an extended or an unscented Kalman filter. */
+/* What corrects the observer: a constant gain, an extended or an unscented Kalman filter, or a
+ * function of its state and the fitting error. */
 #define MHE_GAIN 0
 #define MHE_EXTENDED 1
 #define MHE_UNSCENTED 2
+#define MHE_FUNCTION 3
 
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
@@ -155,6 +157,7 @@ typedef struct {
     mhe_real prior_weight[MHE_NX * MHE_NX];
     mhe_real disturbance_weight[MHE_NX * MHE_NX];
     mhe_real noise_weight[MHE_NY * MHE_NY];
+    mhe_real noise_deviations[MHE_NY]; /* steps for the slope of a correction */
     mhe_loss prior_loss, disturbance_loss, noise_loss;
     mhe_real output_periods[MHE_NY], state_periods[MHE_NX]; /* of angles; 0 for no angle */
     mhe_real turn_middle[MHE_NX]; /* of an angle's bounds; infinite where there are none */

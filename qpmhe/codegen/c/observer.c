@@ -262,6 +262,9 @@ static void mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *
     mhe_add_product(POINTS, NX, NX, ahead, ahead, following);
     mhe_add_noise(&seen, gain, following);
     mhe_add_disturbance(s, stage, following);
+#elif MHE_OBSERVER == MHE_FUNCTION
+    mhe_call_correction(stage->z, stage->v, out);
+    (void)s; (void)following;
 #else
     for (int j = 0; j < NX; j++) out[j] = mhe_dot(NY, s->gain + j * NY, stage->v);
 #if MHE_COVARIANCE
@@ -308,6 +311,9 @@ static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out,
     for (int j = 0; j < NX; j++) out[j] += stage->z[j];
     if (!isfinite(stage->cost) || !mhe_all_finite(NX, out))
         memcpy(out, stage->z, sizeof stage->z);
+#elif MHE_OBSERVER == MHE_FUNCTION
+    memcpy(out, stage->z, sizeof stage->z);
+    (void)s; (void)covariance;
 #else
     for (int j = 0; j < NX; j++)
         out[j] = stage->z[j] + mhe_dot(NY, s->filter_gain + j * NY, stage->v);
@@ -325,3 +331,21 @@ static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out,
 #endif
 #endif
 }
+
+#if MHE_X_SET
+/* The slope of L(z, v) at v = 0, by steps of the noise's deviations. */
+static void mhe_correction_slope(const mhe_settings *s, const mhe_stage *stage, real *slope)
+{
+#if MHE_OBSERVER == MHE_FUNCTION
+    for (int j = 0; j < NY; j++) {
+        real v[NY] = {0}, value[NX];
+        v[j] = s->noise_deviations[j];
+        mhe_call_correction(stage->z, v, value);
+        for (int i = 0; i < NX; i++) slope[i * NY + j] = value[i] / v[j];
+    }
+#else
+    (void)stage;
+    memcpy(slope, s->gain, sizeof s->gain);
+#endif
+}
+#endif

@@ -421,7 +421,11 @@ static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const real *predi
 {
     const mhe_settings *s = e->settings;
     const mhe_x_set *set = mhe_x_set_behind(e, stage);
-    if (!e->metric_settled) e->metric_settled = mhe_settle(s, s->gain, &stage->terms, e->metric);
+    if (!e->metric_settled) {
+        real slope[NX * NY];
+        mhe_correction_slope(s, stage, slope);
+        e->metric_settled = mhe_settle(s, slope, &stage->terms, e->metric);
+    }
     if (mhe_is_inside(set, next)) return 0;
     const int events =
         mhe_keep_inside(set, mhe_metric(e, covariance), predicted, next, stage->w);
