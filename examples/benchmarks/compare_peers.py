@@ -39,9 +39,9 @@ NOTES = [
     "(qpmhe, EKF) run, on growing windows.",
     "Peers are handed the observer's trajectory, prior and window; qpmhe's time includes them, "
     "and the verdict by the true J.",
-    "qpmhe NumPy: plain NumPy model. CasADi: qpmhe.from_casadi, the functions compiled in C. "
-    "compiled: the whole step in C. start best: from the shifted previous estimate, where its J "
-    "is lower.",
+    "qpmhe: NumPy model, traced, or model from qpmhe.from_casadi, whose functions are compiled in "
+    "C; compiled: the whole step in C, of a CasADi model where nothing else is said. start best: "
+    "from the shifted previous estimate, where its J is lower.",
     "CasADi's programs: (x), the states are the variables; (x, w), the disturbances as well; C, "
     "functions (sqpmethod: all of it) compiled, else in CasADi's virtual machine. Compare like "
     "with like. They start at their own previous solution, shifted, unless --start candidate.",

@@ -51,9 +51,9 @@ def make(groups: tuple[str, ...], problem: Problem, compiled: bool, start: str) 
         "filterpy": [FilterpyEkf()],
         "qpmhe": [
             Qpmhe("numpy", 0), Qpmhe("numpy", 1), Qpmhe("numpy", 2), Qpmhe("numpy", None),
-            Qpmhe("casadi", 1), Qpmhe("casadi", None),
+            Qpmhe("casadi", 1), Qpmhe("casadi", None), Qpmhe("numpy compiled", 1),
             Qpmhe("compiled", 1), Qpmhe("compiled", 1, "best"), Qpmhe("compiled", 2),
-            Qpmhe("compiled", None),
+            Qpmhe("compiled", None), Qpmhe("extended", 1),
         ],
     }
     if compiled:

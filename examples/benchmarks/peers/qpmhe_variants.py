@@ -1,9 +1,10 @@
-"""qpmhe itself: plain NumPy model, CasADi model, compiled engine."""
+"""qpmhe itself: plain NumPy model or CasADi model, Python step or compiled step."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from problems import Problem
 
 import qpmhe
@@ -12,7 +13,22 @@ from .base import Array, Peer, WindowData
 
 __all__ = ["Qpmhe"]
 
-_WORDS = {"numpy": "NumPy", "casadi": "CasADi", "compiled": "compiled"}
+_WORDS = {
+    "numpy": "NumPy model", "casadi": "CasADi model", "compiled": "compiled",
+    "numpy compiled": "NumPy model compiled", "extended": "compiled, EKF and its prior",
+}
+
+
+def _extended(cost: qpmhe.QuadraticCost) -> tuple[qpmhe.ExtendedKalman, qpmhe.QuadraticCost]:
+    """An extended Kalman filter of the cost's covariances, and the cost with its covariance."""
+    covariances = {
+        name: np.linalg.inv(getattr(cost, name)) for name in ("prior", "disturbance", "noise")
+    }
+    weights = {"disturbance": cost.disturbance, "noise": cost.noise}
+    return (
+        qpmhe.ExtendedKalman(**covariances),
+        qpmhe.QuadraticCost(prior=qpmhe.ObserverPrior(), **weights),
+    )
 
 
 class Qpmhe(Peer):
@@ -20,8 +36,9 @@ class Qpmhe(Peer):
 
     Parameters
     ----------
-    variant : {"numpy", "casadi", "compiled"}
-        How the model is written, and the engine.
+    variant : {"numpy", "casadi", "numpy compiled", "compiled", "extended"}
+        How the model is written, and the engine. "extended" has an extended Kalman filter as
+        observer, whose covariance weighs the prior: another problem.
     max_qps : int or None
         QPs per sample; None converges.
     start : {"candidate", "best"}
@@ -39,6 +56,8 @@ class Qpmhe(Peer):
             max_qps, f"{max_qps} QPs"
         )
         self.name = f"qpmhe {_WORDS[variant]}, {amount}"
+        if variant == "extended":
+            self.kind = "other"
         if start == "best":
             self.name += ", start best"
 
@@ -46,12 +65,15 @@ class Qpmhe(Peer):
         """Build the estimator."""
         system = problem.system
         options: dict[str, Any] = {"engine": "python"}
-        if self.variant != "numpy":
+        if not self.variant.startswith("numpy"):
             system = problem.casadi_system()
-        if self.variant == "compiled":
+        if self.variant not in ("numpy", "casadi"):
             options["engine"] = "compiled"
+        observer, cost = problem.observer, problem.cost
+        if self.variant == "extended":
+            observer, cost = _extended(cost)
         self._mhe = qpmhe.MovingHorizonEstimator(
-            system, problem.observer, problem.cost, horizon=problem.horizon,
+            system, observer, cost, horizon=problem.horizon,
             initial_state=problem.scenario.initial_estimate, max_qps=self.max_qps,
             warm_start=self.start == "best", **options,
         )
