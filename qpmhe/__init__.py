@@ -53,9 +53,9 @@ def _compiled_engine(
 ) -> Engine:
     if settings.engine == "auto":
         check_any_cached(MAIN)
-    from .codegen.engine import CompiledEngine  # late: most programs do without
+    from .codegen.rehearsal import compiled_engine  # late: most programs do without
 
-    return CompiledEngine(system, observer, cost, settings, initial_state)
+    return compiled_engine(system, observer, cost, settings, initial_state)
 
 
 register_engine("compiled", _compiled_engine)

@@ -90,7 +90,7 @@ def compile(  # noqa: A001 - the name that users look for
             "the estimator has an observer, a cost and options already; leave them out, or give "
             "its system in its place."
         )
-    from .library import EstimatorLibrary  # late: most programs do without
+    from .rehearsal import checked_library  # late: most programs do without
 
     parts = estimator.system, estimator.observer, estimator.cost
     only_cached, wanted = (
@@ -98,10 +98,10 @@ def compile(  # noqa: A001 - the name that users look for
     )
     began, is_new = perf_counter(), False
     try:
-        library = EstimatorLibrary(*parts, only_cached)
+        library = checked_library(*parts, only_cached)
     except NotCachedError:
-        EstimatorLibrary(*parts, wanted)
-        library, is_new = EstimatorLibrary(*parts, only_cached), True
+        checked_library(*parts, wanted)
+        library, is_new = checked_library(*parts, only_cached), True
     return Compiled(library.path, perf_counter() - began, is_new)
 
 
@@ -109,7 +109,8 @@ def engine_choice(
     system: System, observer: Observer, cost: Cost, settings: Settings
 ) -> tuple[str, str]:
     """The engine that an estimator with these arguments runs now, and why."""
-    from .library import EstimatorLibrary, uncovered
+    from .library import uncovered
+    from .rehearsal import checked_library
 
     if settings.engine == "python":
         return "python", "it asks for engine='python'."
@@ -122,7 +123,7 @@ def engine_choice(
         if reason:
             return "python", reason
         required_compiler()
-        found = EstimatorLibrary(system, observer, cost, replace(settings, engine="auto"))
+        found = checked_library(system, observer, cost, replace(settings, engine="auto"))
     except NotCachedError as error:
         if settings.engine == "compiled":
             return "compiled", "it asks for engine='compiled', and waits for the compiler."

@@ -63,9 +63,8 @@ class CompiledEngine:
 
     def __init__(
         self, system: System, observer: Observer, cost: Cost, settings: Settings,
-        initial_state: Array, library: EstimatorLibrary | None = None,
+        initial_state: Array, library: EstimatorLibrary,
     ) -> None:
-        library = library or EstimatorLibrary(system, observer, cost, settings)
         self._library = library
         self._system, self._given_cost, self._settings = system, cost, settings
         self._reader = ConditionReader(system, cost)

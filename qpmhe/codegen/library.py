@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -241,11 +242,13 @@ class EstimatorLibrary:
     ``update``, ``undo``, ``set``, ``update_members``, ``amend``, ``reset``, ``run`` and
     ``recompute`` are the C functions of these names; `update` is ``mhe_update_undoable``, which
     `undo` reverses. ``path`` is the file. With ``settings.engine="auto"`` it must be in the cache:
-    `NotCachedError` is raised if it is not.
+    `NotCachedError` is raised if it is not. ``check`` says what is wrong with a library that was
+    not checked before; `checked_library` has the usual one.
     """
 
     def __init__(
-        self, system: System, observer: Observer, cost: Cost, settings: Settings
+        self, system: System, observer: Observer, cost: Cost, settings: Settings,
+        check: Callable[[EstimatorLibrary, System, Observer, Cost, Settings], str],
     ) -> None:
         self.layout, self.settings = layout, record = planned(
             system, observer, cost, settings, lapack=True
@@ -259,10 +262,8 @@ class EstimatorLibrary:
 
         @np.errstate(all="ignore")
         def fault(library: ctypes.CDLL) -> str:
-            from .rehearsal import estimator_fault
-
             self._bind(library)
-            return estimator_fault(self, system, observer, cost, settings)
+            return check(self, system, observer, cost, settings)
 
         key = source_key(model, layout)
         if settings.engine == "auto":

@@ -23,7 +23,7 @@ from ..model.traces import next_check
 from ..observers import Observer
 from .estimate import WATCHED, CompiledWatch
 from .handover import hand_over
-from .library import EstimatorLibrary
+from .rehearsal import checked_library
 from .watched import WatchedFunctions
 
 Array = NDArray[np.float64]
@@ -41,7 +41,7 @@ class CompiledMembers:
         self, system: System, observer: Observer, cost: Cost, settings: Settings, states: Array,
         threads: int | None,
     ) -> None:
-        self._library = library = EstimatorLibrary(system, observer, cost, settings)
+        self._library = library = checked_library(system, observer, cost, settings)
         self._traces, self._settings = WatchedFunctions(system, observer, cost), settings
         self._m, self._horizon = system.m, settings.horizon
         self._watch = CompiledWatch(settings.horizon)

@@ -13,7 +13,7 @@ from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,7 @@ from ..model.system import System
 from ..observers import Observer
 from .comparison import ROUNDING, Interpreter, points
 from .engine import CompiledEngine
-
-if TYPE_CHECKING:
-    from .library import EstimatorLibrary
+from .library import EstimatorLibrary
 
 Array = NDArray[np.float64]
 
@@ -49,6 +47,21 @@ _MANY_STATES, _FEW_SAMPLES = 40, 12
 _NO_SQUARE = 1e150
 # So many steps, of which the Python step halves the cost and C none, are no chance.
 _MISSED = 3
+
+
+def checked_library(
+    system: System, observer: Observer, cost: Cost, settings: Settings
+) -> EstimatorLibrary:
+    """The library of an estimator, compared with the Python step before its first use."""
+    return EstimatorLibrary(system, observer, cost, settings, estimator_fault)
+
+
+def compiled_engine(
+    system: System, observer: Observer, cost: Cost, settings: Settings, initial_state: Array
+) -> CompiledEngine:
+    """The compiled engine on such a library."""
+    library = checked_library(system, observer, cost, settings)
+    return CompiledEngine(system, observer, cost, settings, initial_state, library)
 
 
 def estimator_fault(

@@ -382,7 +382,7 @@ def key_and_source(parts, settings, monkeypatch):
 
     monkeypatch.setattr(library, "compiled_library", capture)
     with pytest.raises(Captured) as caught:
-        library.EstimatorLibrary(*parts, replace(settings, engine="compiled"))
+        rehearsal.checked_library(*parts, replace(settings, engine="compiled"))
     key, files = caught.value.args
     code, mark, _ = files["mhe.c"].partition("/* Weights, gain, sets")
     assert mark

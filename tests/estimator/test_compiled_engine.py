@@ -12,7 +12,8 @@ import pytest
 
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
-from qpmhe.codegen.library import EstimatorLibrary, planned
+from qpmhe.codegen.library import planned
+from qpmhe.codegen.rehearsal import checked_library
 from qpmhe.errors import EngineWarning, OptionError, QpmheError
 
 from .test_compiled import estimator, made, system_of
@@ -310,6 +311,6 @@ def test_horizons_beyond_a_structure(horizon):
 
 def test_more_memory_than_there_is():
     mhe = uncovered()
-    library = EstimatorLibrary(mhe.system, mhe.observer, mhe.cost, mhe.settings)
+    library = checked_library(mhe.system, mhe.observer, mhe.cost, mhe.settings)
     with pytest.raises(OptionError, match=r"memory of 1000000000000 estimators needs .* bytes"):
         library.estimators(np.broadcast_to(np.zeros(1), (10**12, 1)))
