@@ -187,7 +187,7 @@ class Layout:
             ("noises", r, (count, p)), ("filtered", r, n), ("time", np.int64),
             ("length", np.int32), ("status", np.int32), ("qps", np.int32),
             ("iterations", np.int32), ("corrections", np.int32), ("nearest_points", np.int32),
-            ("dropped", np.uint8, (count + self.sets[2][0], max(sum(self.set_rows), 1))),
+            ("dropped", np.uint8, self.rows),
         ])
 
     def set_type(self, name: str) -> np.dtype[Any]:
@@ -219,6 +219,11 @@ class Layout:
                 (self.nx, self.ny, self.nx), self.sets, strict=True
             )
         )
+
+    @property
+    def rows(self) -> tuple[int, int]:
+        """Stages of a window with rows, and rows of each, at least one."""
+        return self.horizon + self.sets[2][0], max(sum(self.set_rows), 1)
 
     def dropped_rows(self, sides: NDArray[np.uint8], first: int) -> tuple[DroppedRow, ...]:
         """The rows in ``dropped`` of an estimate whose window starts at this time."""
@@ -267,7 +272,7 @@ class Layout:
             ("smoothed", r, n), ("last_good", r, n), ("z_end", r, n),
             *self._if_covariance("last_good_covariance", "covariance_end"),
             ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
-            ("stages", stage, count),
+            ("places", np.int8, self.rows), ("stages", stage, count),
         ])
 
     def _if_covariance(self, *names: str) -> list[Any]:

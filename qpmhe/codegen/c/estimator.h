@@ -248,6 +248,7 @@ typedef struct {
 #endif
     mhe_real history[(MHE_HORIZON + 1) * MHE_NX]; /* ring of estimates of x(t), newest last */
     mhe_real trajectory[(MHE_HORIZON + 1) * MHE_NX];
+    int8_t places[MHE_ROWS];       /* of the window's rows in the last QP's active set */
     mhe_stage stages[MHE_HORIZON];
 } mhe_estimator;
 

@@ -26,8 +26,6 @@ enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
 
 #if CONSTRAINED
 
-static real mhe_min(real a, real b) { return a < b ? a : b; }
-
 /* Limits of all rows about a trajectory x with residuals w and v. */
 static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, const real *w,
                            const real *v)
@@ -256,8 +254,9 @@ static int mhe_first_guess(mhe_rows *q, int rows, int limit)
     for (int i = 0; i < rows; i++) {
         const int place = q->place[i];
         q->force[i] = 0;
+        q->place[i] = place < 0 ? AT_LOWER : place > 0 ? AT_UPPER : BETWEEN;
         if (q->low[i] == q->high[i]) q->place[i] = EQUATION;
-        else if (place == EQUATION || !isfinite(mhe_limit_of(q, i))) q->place[i] = BETWEEN;
+        else if (!isfinite(mhe_limit_of(q, i))) q->place[i] = BETWEEN;
         if (limit == 0) q->place[i] = BETWEEN;
         active += q->place[i] != BETWEEN;
     }
@@ -349,7 +348,7 @@ static int mhe_exclude(mhe_rows *q, int rows, real open)
  * active-set method of Hintermueller, Ito and Kunisch (SIAM Journal on Optimization 13, 2002),
  * which mostly ends after a few factorisations, with an exact solution. The equations are those of
  * an augmented Lagrangian, so that rows may depend on each other. The first guess
- * is in rows.place; with `again`, it is factorised. STOPPED where the guesses do not
+ * is in rows.place, from the QP before; with `again`, it is factorised. STOPPED where the guesses do not
  * settle, EXCLUDED where the rows exclude each other. */
 static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest,
                           int limit, int again, int *iterations)

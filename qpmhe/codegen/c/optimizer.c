@@ -470,7 +470,7 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     mhe_set_prior(e, k);
     memset(o, 0, sizeof *o);
 #if CONSTRAINED
-    memset(k->rows.place, 0, sizeof k->rows.place);
+    memcpy(k->rows.place, e->places, sizeof e->places);
 #endif
     o->candidate = o->best = k->trials;
     o->spare = k->trials + 1;
@@ -492,6 +492,9 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
 #if MHE_QUIET /* implies CONSTRAINED */
     if (rolled_out && feasible && s->max_qps > 0 && o->best == o->candidate)
         mhe_search_from_rolled_out(e, k, o);
+#endif
+#if CONSTRAINED
+    memcpy(e->places, k->rows.place, sizeof e->places);
 #endif
     o->events |= o->best != o->candidate ? MHE_IMPROVED : MHE_CANDIDATE;
 }

@@ -35,6 +35,14 @@ static void mhe_distances(int n, int count, const real *q, const real *lower, co
 /* Stages that have rows: behind the last sample, there is a state. */
 static int mhe_row_stages(const mhe_estimator *e) { return e->length + MHE_X_SET; }
 
+/* Move the active set of the last QP on with the window, when its first stage leaves it. */
+static void mhe_shift_places(mhe_estimator *e)
+{
+    const size_t kept = sizeof e->places - ROWS;
+    memmove(e->places, e->places + ROWS, kept);
+    memset(e->places + kept, 0, ROWS);
+}
+
 /* The stage whose X state i has to be in: the state behind the last sample has that sample's. */
 static mhe_stage *mhe_stage_of_state(mhe_estimator *e, int i)
 {

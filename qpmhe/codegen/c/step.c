@@ -67,6 +67,9 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
         memcpy(e->smoothed, e->trajectory + NX, sizeof e->smoothed);
         e->has_smoothed = 1;
     }
+#if CONSTRAINED
+    if (before == MHE_HORIZON) mhe_shift_places(e);
+#endif
     int events = mhe_push(e, sample);
     if (e->settings->reinitialize) {
         /* The ring of estimates reaches back to that of the window's first state. */
