@@ -135,7 +135,7 @@ def test_only_our_own_errors(value, tmp_path, monkeypatch):
 @pytest.mark.parametrize("option", ["engine", "candidate", "infeasible"])
 @pytest.mark.parametrize("value", [np.array(["python", "observer"]), np.array("python")])
 def test_an_array_is_no_word(option, value):
-    words = rf"{option} is array\(.*expected one of '(python|observer|drop_rows)'"
+    words = rf"{option} is array\(.*expected one of '(auto|observer|drop_rows)'"
     with pytest.raises(OptionError, match=words):
         estimator(**{option: value})
 

@@ -130,7 +130,8 @@ class Settings:
     @property
     def needs_python(self) -> bool:
         """Whether these settings ask for a QP solver, which only the Python step uses."""
-        return self.isolated or self.backend not in ("auto", "banded")
+        is_own = isinstance(self.backend, str) and self.backend in ("auto", "banded")
+        return self.isolated or not is_own
 
     @property
     def qp_limit(self) -> int:
