@@ -5,6 +5,7 @@ import functools
 
 import numpy as np
 import pytest
+from oracles.test_kalman import Plant, distance, kalman
 
 import qpmhe
 from qpmhe import codegen
@@ -13,7 +14,6 @@ from qpmhe.codegen.layout import Layout
 from qpmhe.codegen.source import estimator_files
 from qpmhe.errors import InvalidInputError
 
-from oracles.test_kalman import Plant, distance, kalman
 from .cases import case
 from .test_write import STRICT, WATCHED, check, compiled, play, record
 
@@ -141,8 +141,8 @@ def test_the_weight_of_the_prior_in_bounds(n, bounds):
 
 
 WRITTEN = [
-    "extended", "extended prior", "extended prior bounded", "extended irregular", "extended singular",
-    "unscented prior", "unscented irregular", "injection", "smoothed", "steady prior",
+    "extended", "extended prior", "extended prior bounded", "extended irregular",
+    "extended singular", "unscented prior", "unscented irregular", "injection", "smoothed", "steady prior",
 ]
 
 
