@@ -136,7 +136,12 @@ int main(void)
         if (command == 2) put(mhe_amend(e, k, time, y, o));
         if (command == 4) {
             const mhe_real factor = (mhe_real)number();
+            mhe_real *R = numbers(MHE_NY * MHE_NY);
             for (int j = 0; j < MHE_NY * MHE_NY; j++) settings.noise_weight[j] *= factor;
+#if MHE_COVARIANCE
+            memcpy(settings.covariances.noise, R, sizeof settings.covariances.noise);
+#endif
+            free(R);
             mhe_set(e, k, &settings, MHE_NOISE_WEIGHT, 0, 0, o);
         }
         tell(o);
@@ -277,9 +282,9 @@ def record(mhe, steps=14, seed=0, spread=0.1, special=True):
         )
         expected.append(mhe.update(y[mask > 0], u if m else None, **options))
         if special and t % 8 == 6:
-            commands.append((4, np.zeros(p), 1.5))
             usual = mhe.usual.noise_weight
             usual = mhe.cost.noise if usual is None else usual
+            commands.append((4, np.zeros(p), 1.5, np.linalg.inv(1.5 * usual)))
             expected.append(mhe.set(noise_weight=1.5 * usual))
         if special and t % 6 == 4:
             late = rng.uniform(-0.3, 0.3, p)

@@ -379,8 +379,9 @@ void mhe_set_lapack(void *const *functions);
 /* Let other settings hold for all samples of the window and from now on, run the observer again
  * from the start of the window, and estimate the same state again. What the samples had of their
  * own in place of what changes is forgotten; `changes` are its bits. Deviations and scales of
- * sets, which are in the settings, too, go with the weights. parameters: a null pointer, or values of the last `count` inputs of all samples. Before the first sample, there is no
- * estimate to write. */
+ * sets and the observer's covariances, which are in the settings, too, go with the weights.
+ * parameters: a null pointer, or values of the last `count` inputs of all samples. Before the
+ * first sample, there is no estimate to write. */
 void mhe_set(mhe_estimator *estimator, mhe_workspace *workspace, const mhe_settings *settings,
              int32_t changes, const mhe_real *parameters, int32_t count, mhe_estimate *estimate);
 

@@ -72,6 +72,7 @@ static void mhe_add_disturbance(const mhe_settings *s, const mhe_stage *stage, r
     mhe_symmetrise(NX, P);
 }
 
+#if MHE_OBSERVER != MHE_GAIN
 /* out = K v */
 static void mhe_gained(const mhe_seen *seen, const real *gain, real *out)
 {
@@ -79,6 +80,7 @@ static void mhe_gained(const mhe_seen *seen, const real *gain, real *out)
     for (int i = 0; i < seen->count; i++)
         for (int j = 0; j < NX; j++) out[j] += gain[i * NX + j] * seen->v[i];
 }
+#endif
 #endif
 
 #if MHE_COVARIANCE && MHE_OBSERVER != MHE_UNSCENTED
