@@ -282,10 +282,12 @@ class ExpressionRecord(Record):
             return self.finished(np.asarray(np.matmul(a, b), np.object_))
         if a.shape[-1] != b.shape[0]:
             raise ValueError(f"matmul of shapes {a.shape} and {b.shape}")
+        shape = (*a.shape[:-1], *b.shape[1:])
+        if not (a.size and b.size):
+            return np.zeros(shape)
         # In CasADi itself: quicker than entry by entry.
         rows, columns = np.atleast_2d(a), b.reshape(b.shape[0], -1)
         found = self.casadi.mtimes(self.matrix(rows), self.matrix(columns))
-        shape = (*a.shape[:-1], *b.shape[1:])
         return self.from_matrix(found, shape)
 
     @without_symbols

@@ -80,8 +80,11 @@ def sides(draw, size, width):
     )
 
 
-def case(draw):
-    """A random small problem with a random mixture of features."""
+def case(draw, engine="python"):
+    """A random small problem with a random mixture of features.
+
+    The compiled step has no soft sets and no nonlinear constraints.
+    """
     n, p = int(draw.integers(1, 4)), int(draw.integers(1, 3))
     r = int(draw.integers(1, n + 1)) if draw.random() < 0.5 else n
     k = int(draw.integers(0, 3)) if draw.random() < 0.5 else 0  # parameters
@@ -127,7 +130,7 @@ def case(draw):
                 if n == 1:
                     continue
             sets[name] = qpmhe.Box(low, high)
-            if draw.random() < 0.4:
+            if draw.random() < 0.4 and engine == "python":
                 soft[name] = (
                     (draw.uniform(0.1, 5), 0.0), (0.0, draw.uniform(0.1, 50)), (0.5, 5.0)
                 )[draw.integers(3)]
@@ -136,7 +139,7 @@ def case(draw):
         if name in soft:
             options[name] = one.soften(linear=soft[name][0], quadratic=soft[name][1])
     g = g_penalty = along = None
-    if draw.random() < 0.3:
+    if draw.random() < 0.3 and engine == "python":
         along, limit = draw.normal(size=n), draw.uniform(0.5, 4.0)
         if states:
             along[0] = 0.0
@@ -166,7 +169,7 @@ def case(draw):
         initial_state=0.3 * draw.normal(size=n),
         max_qps=[0, 1, 1, 2, 3, None][draw.integers(6)], warm_start=bool(draw.random() < 0.3),
         infeasible=("drop_rows", "keep_candidate")[draw.integers(2)],
-        candidate=("observer", "reinitialized")[int(draw.random() < 0.2)], **extra,
+        candidate=("observer", "reinitialized")[int(draw.random() < 0.2)], engine=engine, **extra,
     )
     inverses = {name: np.linalg.inv(matrix) for name, matrix in covariances.items()}
     usual = Sample(
@@ -369,14 +372,14 @@ def broken(one, estimate):
     return faults
 
 
-def run(steps, seed):
-    """Counts of statuses, and the faults, of so many steps."""
+def run(steps, seed, engine="python"):
+    """Counts of statuses, and the faults, of so many steps of an engine."""
     draw, counts, faults, taken = np.random.default_rng(seed), Counter(), [], 0
     while taken < steps:
         start = int(draw.integers(2**31))
         inner = np.random.default_rng(start)
-        one = case(inner)
-        for t in range(STEPS):
+        one = case(inner, engine)
+        for t in range(STEPS if engine == "python" else 5 * STEPS):  # that compiling pays
             estimate = update(one, inner)
             found = broken(one, estimate)
             if inner.random() < 0.03 and (again := reset(one, inner)) is not None:

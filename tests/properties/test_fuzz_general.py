@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 
+from qpmhe.codegen.compiler import find_compiler
 from tests.properties import fuzz_general
 
 
@@ -15,6 +16,17 @@ def test_no_step_breaks_the_promise(seed):
     assert faults == []
     assert counts["IMPROVED"] > 60
     assert counts["CANDIDATE_OUTSIDE"] > 20
+    assert counts["set"] > 0
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_compiled_step_breaks_the_promise(seed):
+    counts, faults = fuzz_general.run(1200, seed, "compiled")
+    assert faults == []
+    assert counts["IMPROVED"] > 300
     assert counts["set"] > 0
 
 
