@@ -300,7 +300,7 @@ class _Looped:
         traced: bool = True,
     ) -> None:
         self._delay = settings.delay
-        scaled = system.copy(_scales(system, cost, observer))
+        scaled = system.copy(_scales(system, cost, observer), traced=traced)
         self.engines = [
             PythonEngine(scaled.copy(traced=traced), observer, cost, settings, state.copy())
             for state in states

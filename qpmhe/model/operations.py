@@ -440,6 +440,11 @@ def _forms() -> dict[str, Form]:
     return forms
 
 
+def _no_nan(record: ExpressionRecord, *_: Any, **__: Any) -> Any:
+    # NumPy's own code takes objects for numbers that are never NaN.
+    raise record.refuse("numpy.isnan, which has no CasADi form here")
+
+
 def _where(record: ExpressionRecord, condition: Any, *chosen: Any) -> Any:
     if len(chosen) != 2:
         raise record.refuse("numpy.where with a condition alone")
@@ -566,7 +571,7 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.where: _where, np.clip: _clipped, np.select: _selected, np.round: _rounded,
     np.around: _rounded, np.interp: _interpolated, np.linalg.norm: _norm, np.dot: _dot,
     np.linalg.solve: _solved, np.linalg.inv: _inverse, np.linalg.det: _determinant,
-    np.einsum: _einsum,
+    np.einsum: _einsum, np.nan_to_num: _no_nan,
 }
 
 

@@ -231,6 +231,7 @@ class System:
         # are written, where it stands in their place.
         self._pinned: Pinned | None = None
         self._pins = False
+        self._in_place: list[str] = []
         self._as_written: dict[str, Any] | None = None
         #: Makes the system `timed`; None where there is no model in continuous time.
         self.make_timed: Callable[[], System] | None = None
@@ -455,18 +456,23 @@ class System:
         if scales is not None:
             other.use_scales(scales)
         if traced:
-            other._use_trace()
+            other._use_trace(self._pinned, self._in_place)
         return other
 
-    def _use_trace(self) -> None:
-        """Evaluate f and h by their traces, which agree with them, and with given Jacobians."""
+    def _use_trace(self, pinned: Pinned | None, names: list[str]) -> None:
+        """Evaluate f and h by their traces, which agree with them, and with given Jacobians.
+
+        By traces that have been compared already, if there are any.
+        """
         tracing = self.tracing
         self._pins = True
         if tracing is None or self.kernel is not None:  # the latter has exact Jacobians
             return
-        self._pinned = pinned = tracing.confirm(self.scales)
-        names = [name for name, one in pinned.found.items() if one.function]
-        names = [name for name in names if self._jacobian_agrees(name, pinned.evaluator())]
+        if pinned is None:
+            pinned = tracing.confirm(self.scales)
+            names = [name for name, one in pinned.found.items() if one.function]
+            names = [name for name in names if self._jacobian_agrees(name, pinned.evaluator())]
+        self._pinned, self._in_place = pinned, names
         if not names:
             return
         self._as_written = {name: getattr(self, name) for name in _TRACED}

@@ -1,6 +1,8 @@
 """Functions of NumPy as CasADi expressions: the same numbers, or no trace and the reason."""
 
 import contextlib
+import ctypes
+import functools
 import math
 import threading
 import time
@@ -181,6 +183,13 @@ def changed(x):
     return x
 
 
+def into_memory(x):
+    out = np.zeros(2)
+    (ctypes.c_double * 2).from_buffer(out)
+    out[:] = x
+    return out
+
+
 def bisected(x):
     from scipy.optimize import brentq
 
@@ -226,6 +235,20 @@ BAD = {
     "a special function": (lambda x: __import__("scipy.special").special.gamma(x), "gamma"),
     "nothing": (lambda x: None, "NoneType"),
     "an exception": (lambda x: 1 / 0, "ZeroDivisionError"),
+    "an address": (lambda x: x * (x.ctypes.data % 7), "bytes"),
+    "bytes": (lambda x: x if x.tobytes()[0] else -x, "bytes"),
+    "memory of numbers": (into_memory, "float()"),
+    "a comparison by text": (lambda x: x if f"{x[0]:.1f}" > "0" else -x, "text"),
+    "a cache": (functools.lru_cache(lambda x: x), ""),
+    "a set": (lambda x: x if x[0] not in {0.3} else -x, "hash"),
+    "equality": (lambda x: x if x[0] == 0.3 else -x, "branch"),
+    "rounding": (lambda x: x * round(x[0]), "round()"),
+    "a search": (lambda x: x * np.searchsorted([0.0, 1.0], x[0]), "branch"),
+    "what is not a number": (lambda x: np.nan_to_num(x), "isnan"),
+    "a histogram": (lambda x: np.histogram(x, 2)[0] * 1.0, ""),
+    "unique values": (lambda x: np.unique(x), "branch"),
+    "a range": (lambda x: x * len(range(int(x[0] + 9.0))), "int()"),
+    "complex numbers": (lambda x: np.abs(x + 1j * x), "complex"),
 }
 
 
