@@ -567,6 +567,12 @@ CASES: dict[str, Callable[[], Case]] = {
         warm_start=True
     ),
     "angles extended": lambda: _rover(True, True, observer=qpmhe.ExtendedKalman).with_gaps(),
+    "angles smoothed": lambda: _rover(
+        True, True, observer=qpmhe.ExtendedKalman
+    ).with_options(arrival="smoothed"),
+    "functions unscented": lambda: _rover(
+        True, True, True, observer=qpmhe.UnscentedKalman
+    ).with_gaps().with_options(arrival="smoothed", warm_start=True),
     "angles across the seam": lambda: _compass(),
     "functions across the seam": lambda: _compass(True).with_gaps().with_options(
         candidate="reinitialized", warm_start=True
