@@ -567,10 +567,20 @@ CASES: dict[str, Callable[[], Case]] = {
         warm_start=True
     ),
     "angles extended": lambda: _rover(True, True, observer=qpmhe.ExtendedKalman).with_gaps(),
+    "angles smoothed": lambda: _rover(
+        True, True, observer=qpmhe.ExtendedKalman
+    ).with_options(arrival="smoothed"),
+    "functions unscented": lambda: _rover(
+        True, True, True, observer=qpmhe.UnscentedKalman
+    ).with_gaps().with_options(arrival="smoothed", warm_start=True),
     "angles across the seam": lambda: _compass(),
     "functions across the seam": lambda: _compass(True).with_gaps().with_options(
         candidate="reinitialized", warm_start=True
     ),
+    "angles in curved sets": lambda: _rover(
+        True, True, disturbances=qpmhe.Box([-0.4, -0.4, -0.03, -0.02], [0.4, 0.4, 0.03, 0.02]),
+        noises=qpmhe.Box([-0.2, -25.0, -0.25], [0.2, 25.0, 0.25]),
+    ).with_options(max_qps=None),
     "angles in sets": lambda: _rover(
         True, True,
         disturbances=qpmhe.Box([-0.4, -0.4, -0.03, -0.02], [0.4, 0.4, 0.03, 0.02]),
