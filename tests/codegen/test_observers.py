@@ -142,7 +142,8 @@ def test_the_weight_of_the_prior_in_bounds(n, bounds):
 
 WRITTEN = [
     "extended", "extended prior", "extended prior bounded", "extended irregular",
-    "extended singular", "unscented prior", "unscented irregular", "injection", "smoothed", "steady prior",
+    "extended singular", "unscented prior", "unscented irregular", "injection", "smoothed",
+    "steady prior",
 ]
 
 
