@@ -26,7 +26,7 @@ from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import check_start
 from ..estimation.limits import FEASIBLE, LARGEST
 from ..estimation.optimizer import Optimizer, Outcome
-from ..estimation.problem import Problem
+from ..estimation.problem import Problem, Trial
 from ..estimation.settings import Settings
 from ..model.evaluation import NAMES, RESIDUALS, Buffers, Evaluator, results_of
 from ..model.functions import Trusted
@@ -47,6 +47,8 @@ _MANY_STATES, _FEW_SAMPLES = 40, 12
 _NO_SQUARE = 1e150
 # So many steps, of which the Python step halves the cost and C none, are no chance.
 _MISSED = 3
+# Where the terms of J are so much larger than J, not every factorisation of H succeeds.
+_CANCELLED = 1e6
 
 
 def checked_library(
@@ -153,6 +155,8 @@ class _Guide:
         A factor on its trajectory.
     violation : float
         Of the trajectory, as the Python step sees it.
+    magnitudes : dict
+        Sums of the absolute terms of J, by name of the cost: where they cancel, J is rounded.
     optimizer : Optimizer
         The Python step's own.
     improved, missed : int
@@ -162,6 +166,7 @@ class _Guide:
 
     found: Estimate
     optimizer: Optimizer
+    magnitudes: dict[str, float]
     violation = 0.0
     improved = missed = 0
 
@@ -173,7 +178,7 @@ class _Guide:
     ) -> Outcome:
         """C's trajectory, evaluated by the problem."""
         found, outcome = self.found, Outcome(problem.candidate)
-        self.violation = 0.0
+        self.violation, usual, known = 0.0, problem, _magnitude(problem, problem.candidate)
         if Status.IMPROVED in found.status:
             self.improved += 1
             if Status.ROWS_DROPPED in found.status:
@@ -181,10 +186,19 @@ class _Guide:
             outcome.trial = problem.evaluate(found.trajectory * self.nudge)
             outcome.improved, outcome.dropped = True, found.dropped
             self.violation = outcome.trial.violation
-        elif not (self.improved or np.ndim(self.nudge)):
+        elif not (self.improved or np.ndim(self.nudge) or known > _CANCELLED * abs(found.cost)):
             best = self.optimizer.improve(problem, shifted).trial.cost
             self.missed += best < 0.5 * found.candidate_cost < _NO_SQUARE
+        self.magnitudes = {"candidate_cost": known, "cost": _magnitude(usual, outcome.trial)}
         return outcome
+
+
+def _magnitude(problem: Problem, trial: Trial) -> float:
+    residuals, offset = abs(trial.residuals), abs(problem.offset(trial.trajectory))
+    weights = abs(problem.stage_weights)
+    weights = np.broadcast_to(weights, (len(residuals), *weights.shape[-2:]))
+    stages = np.einsum("ki,kij,kj->", residuals, weights, residuals)
+    return float(np.nan_to_num(stages + offset @ abs(problem.prior_weight) @ offset))
 
 
 class _Follower(PythonEngine):
@@ -304,7 +318,8 @@ class _Rehearsal:
                 if math.isfinite(got) and not near_limit and true == other:
                     return f"J of {what} is {got:.6g}, but CasADi's interpreter has no number"
                 return ""
-            if not abs(got - true) <= _WEIGHT * abs(other - true) + ROUNDING * abs(true):
+            size = abs(true) + self._python.guide.magnitudes[name]
+            if not abs(got - true) <= _WEIGHT * abs(other - true) + ROUNDING * size:
                 return f"J of {what} is {got:.6g}, by CasADi's interpreter {true:.6g}"
         if not found.cost <= found.candidate_cost:
             return (

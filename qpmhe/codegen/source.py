@@ -44,6 +44,9 @@ def prologue() -> str:
         "#if defined(__GNUC__) && !defined(__clang__)\n"
         # 12.2 also takes stores of 64 bytes for dead where a loop copies eight doubles.
         '#pragma GCC optimize ("no-tree-loop-if-convert", "no-strict-aliasing")\n#endif\n'
+        "#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)\n"
+        '#error "NaN and infinity have a meaning here: leave out -ffast-math and the like"\n'
+        "#endif\n"
         "#include <math.h>\n#include <stddef.h>\n#include <string.h>\n\n"
         "#define real mhe_real\n#define NX MHE_NX\n#define NY MHE_NY\n#define NU MHE_NU\n"
         "#define SIZE(n) ((n) > 0 ? (n) : 1)\n\n"

@@ -391,4 +391,4 @@ class Optimizer:
 
 def _target(best: Trial) -> float:
     """The cost below which a trial is better than the best one."""
-    return best.cost - ROUNDING * best.cost if best.cost < math.inf else math.inf
+    return best.cost - ROUNDING * abs(best.cost) if best.cost < math.inf else math.inf

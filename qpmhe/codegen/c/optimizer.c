@@ -30,7 +30,7 @@ static real mhe_best_cost(const mhe_outcome *o)
 static real mhe_target(const mhe_outcome *o)
 {
     const real cost = mhe_best_cost(o);
-    return isfinite(cost) ? cost - MHE_ROUNDING * cost : INFINITY;
+    return isfinite(cost) ? cost - MHE_ROUNDING * fabs(cost) : INFINITY;
 }
 
 /* Clip a trial to the bounds of X, in the turns of its angles. */
