@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..model.operations import without_symbols
+from ..model.stand_ins import without_symbols
 from ..model.symbols import NotTraceableError
 
 # A loop with more turns, all together, is not unrolled.

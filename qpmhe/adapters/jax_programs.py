@@ -15,7 +15,7 @@ from .._checks import need
 from ..errors import InvalidInputError, ModelError
 from ..model.discretize import discretize
 from ..model.functions import Probes, check_inputs, takes_input
-from ..model.operations import without_symbols
+from ..model.stand_ins import without_symbols
 from .jax_expressions import numpy_function
 from .jax_indices import check_indices
 

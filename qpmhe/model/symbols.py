@@ -19,7 +19,9 @@ import numpy as np
 _HERE = Path(__file__).parent
 # Frames of these files and folders are never the user's code that asked for something.
 _MACHINERY = (
-    *(str(_HERE / f"{name}.py") for name in ("symbols", "operations", "tracing", "functions")),
+    *(str(_HERE / f"{name}.py") for name in (
+        "symbols", "operations", "stand_ins", "tracing", "functions",
+    )),
     str(Path(np.__file__).parent),
 )
 _PACKAGE = str(_HERE.parent)

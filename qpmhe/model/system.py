@@ -21,7 +21,7 @@ from .evaluation import Evaluator
 from .functions import BatchedFunction, Probes, Trusted, check_inputs
 from .residuals import Residual, Turns, checked_residual
 from .sets import ConvexSet, SoftSet, equilibrated
-from .traces import ModelTrace, Pinned, points, warn_of
+from .traces import ModelTrace, Pinned, warn_of
 
 if TYPE_CHECKING:
     from .augmentation import Augmentation
@@ -470,8 +470,12 @@ class System:
             return
         if pinned is None:
             pinned = tracing.confirm(self.scales)
-            names = [name for name, one in pinned.found.items() if one.function]
-            names = [name for name in names if self._jacobian_agrees(name, pinned.evaluator())]
+            names = [
+                name for name, one in pinned.found.items()
+                if one.function and tracing.replaces(
+                    getattr(self, f"{name}_jacobian"), pinned, f"{name}_jacobian", self.scales
+                )
+            ]
         self._pinned, self._in_place = pinned, names
         if not names:
             return
@@ -501,28 +505,6 @@ class System:
             )
         if len(names) == 2:
             self.kernel = evaluator
-
-    def _jacobian_agrees(self, name: str, evaluator: Evaluator) -> bool:
-        """Whether a given Jacobian is the trace's up to rounding; also if none was given."""
-        jacobian = getattr(self, f"{name}_jacobian")
-        if jacobian.method != "given":
-            return True
-        scales, compared = 1.0 if self.scales is None else self.scales, 0
-        for x, u in points(self.states, self.n, self.m, scales, usual=True):
-            try:
-                with np.errstate(all="ignore"):
-                    given = np.asarray(jacobian(x, u), np.float64)
-            except Exception:  # outside its domain
-                continue
-            mine = evaluator.one(f"{name}_jacobian", x, u)
-            if not (np.isfinite(given).all() and np.isfinite(mine).all()):
-                continue
-            size = np.maximum(np.abs(x), scales)
-            row = (np.abs(mine) * size).max(axis=1, keepdims=True)
-            if (np.abs(given - mine) * size > 1e-9 * row).any():
-                return False
-            compared += 1
-        return compared > 0
 
     def use_functions(self) -> None:
         """Evaluate f and h as they are written from now on, if a trace stands in their place."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import EngineWarning
+from .derivatives import Jacobian
 from .evaluation import Evaluator, VirtualMachine
 from .expressions import CasadiModel, import_casadi
 from .functions import BatchedFunction
@@ -26,6 +27,8 @@ _UNUSUAL = ((10.0, -1.0), (30.0, 0.2), (0.01, -1.0), (1e-3, 0.2), (1e-6, -1.0), 
             (1e3, 0.2), (1e4, -1.0))
 # The function takes longer in CasADi's virtual machine, and in a compiler, than it is worth.
 _MOST_OPERATIONS = 20_000
+# Entries of a given Jacobian are right where they differ by less than this share of their row's.
+_SAME = 1e-9
 
 
 def points(
@@ -176,6 +179,32 @@ class ModelTrace:
                     again = self._traced(name, [*points(self._states, self._n, self._m), *where])
                     self._pin({**self.now.found, name: again})
             return self.now
+
+    def replaces(
+        self, jacobian: Jacobian, pinned: Pinned, name: str, scales: Array | None
+    ) -> bool:
+        """Whether a trace's Jacobian may stand in the place of this one.
+
+        In that of a computed one always, of a given one where they agree up to rounding.
+        """
+        if jacobian.method != "given":
+            return True
+        units, compared = 1.0 if scales is None else scales, 0
+        for x, u in points(self._states, self._n, self._m, units, usual=True):
+            try:
+                with np.errstate(all="ignore"):
+                    given = np.asarray(jacobian(x, u), np.float64)
+            except Exception:  # outside its domain
+                continue
+            mine = pinned.evaluator().one(name, x, u)
+            if not (np.isfinite(given).all() and np.isfinite(mine).all()):
+                continue
+            size = np.maximum(np.abs(x), units)
+            row = (np.abs(mine) * size).max(axis=1, keepdims=True)
+            if (np.abs(given - mine) * size > _SAME * row).any():
+                return False
+            compared += 1
+        return compared > 0
 
     def wrong(self, pinned: Pinned, x: Array, u: Array) -> tuple[str, str] | None:
         """Which function differs from its trace at a point, and how; None if none does."""

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .operations import ExpressionRecord, numpy_on_symbols
+from .operations import ExpressionRecord
+from .stand_ins import numpy_on_symbols
 from .symbols import (
     NotTraceableError,
     Record,

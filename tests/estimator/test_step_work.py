@@ -107,7 +107,7 @@ def calls_in_a_step(mhe, measurements):
 # clock has to see.
 @pytest.mark.parametrize(
     ("options", "most"),
-    [({"max_qps": 0}, 99), ({"max_qps": 1}, 153), ({"max_qps": 2}, 240)],
+    [({"max_qps": 0}, 96), ({"max_qps": 1}, 132), ({"max_qps": 2}, 222)],
     ids=["no QP", "one QP", "two QPs"],
 )
 def test_a_step_takes_no_more_calls_than_it_did(options, most):
