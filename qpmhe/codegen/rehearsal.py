@@ -45,6 +45,8 @@ _SAMPLES, _BY_RUN, _BY_MEMBERS = 22, 7, 2
 _MANY_STATES, _FEW_SAMPLES = 40, 12
 # C takes for infinite what has no finite square.
 _NO_SQUARE = 1e150
+# Of a record on which the nudge has grown to this share of J, rounding decides.
+_LOST = 1e-2
 # So many steps, of which the Python step halves the cost and C none, are no chance.
 _MISSED = 3
 # Where the terms of J are so much larger than J, not every factorisation of H succeeds.
@@ -296,7 +298,7 @@ class _Rehearsal:
             self._python.guide.found = self._nudged.guide.found = found
             expected = self._python.step(*sample, 0.0)
             nudged = self._nudged.step(sample.y * self._nudge_y, *sample[1:], 0.0)
-            if abs(expected.candidate).max() > _NO_SQUARE:
+            if abs(expected.candidate).max() > _NO_SQUARE or self._is_lost(expected, nudged):
                 break
             fault = self._step_fault(found, expected, nudged, sample.y)
             if fault:
@@ -307,6 +309,11 @@ class _Rehearsal:
         if guide.missed >= _MISSED and not guide.improved:
             return "it improves no estimate where the Python step does"
         return self._many_fault(estimates)
+
+    def _is_lost(self, expected: Estimate, nudged: Estimate) -> bool:
+        """Whether the record is chaotic by now: two that nearly agreed have separate ways."""
+        size = abs(expected.candidate_cost) + self._python.guide.magnitudes["candidate_cost"]
+        return abs(nudged.candidate_cost - expected.candidate_cost) > _LOST * size
 
     def _step_fault(
         self, found: Estimate, expected: Estimate, nudged: Estimate, y: Array

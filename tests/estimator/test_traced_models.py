@@ -88,6 +88,18 @@ def test_estimates_are_those_of_the_functions(name):
         np.testing.assert_allclose(one, two, rtol=1e-7, atol=1e-8 * np.abs(one).max())
 
 
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("name", ZOO)
+def test_all_models_of_the_zoo_run_in_c(name):
+    """The quadrotor tumbles in the records of the check, so that rounding decides its states."""
+    system, observer, cost, scenario = ZOO[name]()
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=scenario.horizon,
+        initial_state=scenario.initial_estimate, engine="compiled",
+    )
+    assert mhe.engine == "compiled"
+
+
 A = np.array([[0.9, 0.2], [-0.1, 0.8]])
 
 
