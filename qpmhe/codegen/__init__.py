@@ -48,7 +48,7 @@ def write(
     ----------
     estimator : MovingHorizonEstimator
         What to write: a system made with `qpmhe.from_casadi` that has no set of states, an
-        observer of constant gain or an extended Kalman filter, a `QuadraticCost` or a
+        observer of the package's own classes, a `QuadraticCost` or a
         `RobustCost`, whose losses may be your own if their methods have no branch on a value. Its
         measurements so far are not written.
     directory : str or path

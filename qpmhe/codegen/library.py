@@ -69,6 +69,14 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             f"the covariance of {type(observer).__name__} has no C form, and the prior's weight "
             "comes from it; take a constant weight."
         )
+    if (
+        system.states is not None and settings.project_observer and observer.metric is None
+        and form.prior is None and observer.initial_covariance() is not None
+    ):
+        return (
+            f"the covariance of {type(observer).__name__} has no C form, and is the metric in "
+            "which it is projected onto X; take engine='python', or leave states out."
+        )
     reason = _without_form(cost)
     if reason:
         return reason

@@ -250,6 +250,10 @@ LOSSES = {Whole: "cost of its own", Branching: "", Together: "depends on others"
         ("OwnRobustCost has no C form", {"cost": lambda: OwnRobustCost(**ONES)}),
         ("OwnCost has no C form; take a QuadraticCost", {"cost": lambda: OwnCost(**ONES)}),
         ("OwnFilter has no C form", {"observer": lambda: OwnFilter(**ONES)}),
+        ("covariance of OwnSteady has no C form, and is the metric",
+         {"system": lambda: symbolic(states=qpmhe.Box(-5.0, 5.0)),
+          "observer": lambda: OwnSteady(
+              plain(), [0.0], disturbance=[[1.0]], noise=[[1.0]])}),
         ("covariance of OwnSteady has no C form.*take a constant weight",
          {"cost": lambda: qpmhe.QuadraticCost(**(ONES | {"prior": qpmhe.ObserverPrior()})),
           "observer": lambda: OwnSteady(
