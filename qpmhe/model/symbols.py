@@ -163,7 +163,9 @@ class Symbol:
     __gt__, __ge__ = _binary(np.greater, after=False), _binary(np.greater_equal, after=False)
     __eq__ = _binary(np.equal, after=False)
     __ne__ = _binary(np.not_equal, after=False)
-    __float__, __int__ = _value("float() of a symbol"), _value("int() of a symbol")
+    __float__, __int__ = _value(
+        "float() of a symbol, or to store it in an array of numbers"
+    ), _value("int() of a symbol")
     __index__ = _value("an index from a symbol")
     __complex__, __round__ = _value("complex() of a symbol"), _value("round() of a symbol")
     __trunc__ = __floor__ = __ceil__ = _value("an integer from a symbol")
