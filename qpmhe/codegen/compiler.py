@@ -14,9 +14,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
 
-import scipy
 from platformdirs import user_cache_path
 
 from .._version import __version__
@@ -227,7 +227,7 @@ def _fault(
 
 def _checked_by() -> str:
     """The last line of the seal of a library that was checked: by whom, and with which LAPACK."""
-    return f"right by qpmhe {__version__} and scipy {scipy.__version__}"
+    return f"right by qpmhe {__version__} and scipy {version('scipy')}"
 
 
 def _seal(path: Path) -> str:
