@@ -22,7 +22,9 @@ from platformdirs import user_cache_path
 from .._version import __version__
 from ..errors import CompilationError
 
-# Contraction and the like may round differently, but keep infinities and NaN.
+# They keep infinities and NaN, and the order of operations: without contraction of a * b + c to
+# one rounding, all levels give the same bits. The verdict compares costs that are stored, each
+# computed once, so that it holds whichever way they were rounded.
 _FLAGS = ("-std=c99", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno",
           "-fno-trapping-math")
 # Tried in turn until the code is right. Without vectors, masked loads cannot go wrong.
