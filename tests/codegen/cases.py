@@ -484,7 +484,7 @@ def _compass(functions: bool = False) -> Case:
         prior=np.diag([9.0, 1.0]), disturbance=np.diag([0.5, 0.5]), noise=np.diag([16.0, 4.0])
     )
     generator, x, samples = np.random.default_rng(11), np.array([178.0, 1.0]), []
-    for _ in range(2 * STEPS):
+    for _ in range(4 * STEPS):
         y = system.h(x, np.zeros(0)) + generator.normal(0.0, [4.0, 1.0])
         samples.append({"y": np.array([wrapped(y[0]), y[1]])})
         x = system.f(x, np.zeros(0)) + generator.normal(0.0, [0.7, 0.7])
