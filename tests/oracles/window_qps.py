@@ -113,12 +113,16 @@ class WindowQP:
         there = np.isfinite(low) | np.isfinite(high)
         return H, g, rows[there], low[there], high[there], scale[there]
 
+    def deviations(self, name):
+        """Standard deviations of the rows of a set."""
+        weight = dict(zip(SET_NAMES, (self.Q, self.R, self.P), strict=True))[name]
+        matrix = self.sets[name][0]
+        return np.sqrt(np.diag(matrix @ np.linalg.inv(weight) @ matrix.T))
+
     def scales(self, name):
         """What a miss of each row of a set counts in."""
-        weight = dict(zip(SET_NAMES, (self.Q, self.R, self.P), strict=True))[name]
-        matrix, lower, upper = self.sets[name]
-        deviation = np.sqrt(np.diag(matrix @ np.linalg.inv(weight) @ matrix.T))
-        width = upper - lower
+        _, lower, upper = self.sets[name]
+        deviation, width = self.deviations(name), upper - lower
         return np.where(width > 0, np.minimum(width, deviation), deviation)
 
     def in_units(self, of_x, of_y):
@@ -174,6 +178,8 @@ class CSolver:
             part["rows"][: rows * d] = matrix[d:].ravel()
             part["row_lower"][:rows], part["row_upper"][:rows] = lower[d:], upper[d:]
             part["row_scale"][:rows] = scale[d:]
+            deviation = qp.deviations(name)
+            part["deviation"], part["row_deviation"][:rows] = deviation[:d], deviation[d:]
         kind = self.layout.number
         arrays = [
             np.ascontiguousarray(one, kind)
