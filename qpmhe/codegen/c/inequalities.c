@@ -26,8 +26,6 @@ enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
 
 #if CONSTRAINED
 
-static real mhe_min(real a, real b) { return a < b ? a : b; }
-
 /* Limits of all rows about a trajectory x with residuals w and v. */
 static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, const real *w,
                            const real *v)
