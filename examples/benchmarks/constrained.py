@@ -21,7 +21,7 @@ import statistics
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any, ClassVar
 
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -156,15 +156,16 @@ class Hpipm:
             start[: -3 * n] = self._last[2 * n : -n]
             start[-3 * n : -2 * n], start[-2 * n : -n] = end, 0.0
             start[-n:] = np.array(self._step(end)).ravel()
-        began = perf_counter()
+        # Of what takes many milliseconds, a busy machine would be most of the time on the wall.
+        began = process_time()
         found = self._solver(
             x0=start, p=np.append(candidate[0], measurements.ravel()), **self._sides
         )
-        seconds, stats = perf_counter() - began, self._solver.stats()
+        seconds, stats = process_time() - began, self._solver.stats()
         self._last = np.array(found["x"]).ravel()
         qps = max(stats["iter_count"], 1)
         cost = float(found["f"]) if stats["success"] else np.nan
-        return cost, seconds, stats["t_wall_QP"] / qps
+        return cost, seconds, stats["t_proc_QP"] / qps
 
 
 @dataclass

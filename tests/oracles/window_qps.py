@@ -17,13 +17,13 @@ SOLVED, STOPPED, UNCONSTRAINED, FAILED = range(4)
 HOOK = """
 int32_t solve(mhe_estimator *e, mhe_workspace *k, const mhe_settings *s, int32_t count,
               const real *prior, const real *x, const real *w, const real *v, const real *A,
-              const real *C, real *step, int32_t nearest)
+              const real *C, real *step, int32_t nearest, const int8_t *places)
 {
     mhe_outcome o;
     mhe_trial *trial = k->trials + 1;
     memset(&o, 0, sizeof o);
     memset(k->left_out, 0, sizeof k->left_out);
-    memset(k->rows.place, 0, sizeof k->rows.place);
+    memcpy(k->rows.place, places, sizeof k->rows.place);
     memset(e, 0, sizeof *e);
     e->settings = s;
     k->prior.mean = e->stages[0].z;
@@ -113,12 +113,16 @@ class WindowQP:
         there = np.isfinite(low) | np.isfinite(high)
         return H, g, rows[there], low[there], high[there], scale[there]
 
+    def deviations(self, name):
+        """Standard deviations of the rows of a set."""
+        weight = dict(zip(SET_NAMES, (self.Q, self.R, self.P), strict=True))[name]
+        matrix = self.sets[name][0]
+        return np.sqrt(np.diag(matrix @ np.linalg.inv(weight) @ matrix.T))
+
     def scales(self, name):
         """What a miss of each row of a set counts in."""
-        weight = dict(zip(SET_NAMES, (self.Q, self.R, self.P), strict=True))[name]
-        matrix, lower, upper = self.sets[name]
-        deviation = np.sqrt(np.diag(matrix @ np.linalg.inv(weight) @ matrix.T))
-        width = upper - lower
+        _, lower, upper = self.sets[name]
+        deviation, width = self.deviations(name), upper - lower
         return np.where(width > 0, np.minimum(width, deviation), deviation)
 
     def in_units(self, of_x, of_y):
@@ -159,8 +163,10 @@ class CSolver:
         self._library.mhe_sizes(ctypes.c_void_p(sizes.ctypes.data))
         self._memory = [np.zeros(int(size), np.uint8) for size in sizes[:2]]
 
-    def __call__(self, qp, limit=50, tolerance=1e-9, nearest=False):
-        """Status, increments d and iterations."""
+    def __call__(self, qp, limit=50, tolerance=1e-9, nearest=False, places=None):
+        """Status, increments d and iterations; ``places`` is the first guess of active rows."""
+        if places is None:
+            places = np.zeros(self.layout.rows, np.int8)
         n, _, count = qp.sizes
         settings = np.zeros((), self.layout.settings_type())
         settings["prior_weight"], settings["disturbance_weight"] = qp.P.ravel(), qp.Q.ravel()
@@ -174,6 +180,8 @@ class CSolver:
             part["rows"][: rows * d] = matrix[d:].ravel()
             part["row_lower"][:rows], part["row_upper"][:rows] = lower[d:], upper[d:]
             part["row_scale"][:rows] = scale[d:]
+            deviation = qp.deviations(name)
+            part["deviation"], part["row_deviation"][:rows] = deviation[:d], deviation[d:]
         kind = self.layout.number
         arrays = [
             np.ascontiguousarray(one, kind)
@@ -184,7 +192,7 @@ class CSolver:
         found = self._library.solve(
             *pointers, ctypes.c_int32(count),
             *(ctypes.c_void_p(one.ctypes.data) for one in (*arrays, step)),
-            ctypes.c_int32(nearest),
+            ctypes.c_int32(nearest), ctypes.c_void_p(places.ctypes.data),
         )
         return found % 4, step.ravel(), found // 4
 

@@ -281,7 +281,7 @@ typedef struct {
 
 /* Rows of a constrained QP: low <= value <= high. */
 typedef struct {
-    mhe_real low[MHE_ROWS], high[MHE_ROWS], scale[MHE_ROWS];
+    mhe_real low[MHE_ROWS], high[MHE_ROWS], scale[MHE_ROWS], deviation[MHE_ROWS];
     mhe_real value[MHE_ROWS], weight[MHE_ROWS], load[MHE_ROWS];
     mhe_real force[MHE_ROWS], missed[MHE_ROWS];
     int8_t place[MHE_ROWS], next[MHE_ROWS];

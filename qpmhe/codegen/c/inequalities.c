@@ -32,7 +32,7 @@ static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, co
 {
     real low[ROWS], high[ROWS];
     for (int i = 0; i < mhe_row_stages(e); i++) {
-        mhe_stage_scales(e, i, k->rows.scale + i * ROWS);
+        mhe_stage_scales(e, i, k->rows.scale + i * ROWS, k->rows.deviation + i * ROWS);
         mhe_stage_distances(e, i, x, w, v, low, high);
         for (int r = 0; r < ROWS; r++) {
             const int at = i * ROWS + r, out = k->left_out[at];
@@ -363,7 +363,8 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
         if (active && (*iterations == limit || *iterations == GUESSES)) return STOPPED;
         *iterations += active > 0;
         for (int i = 0; i < rows; i++) {
-            q->weight[i] = q->place[i] == BETWEEN ? 0 : STIFFNESS / (q->scale[i] * q->scale[i]);
+            q->weight[i] =
+                q->place[i] == BETWEEN ? 0 : STIFFNESS / (q->deviation[i] * q->deviation[i]);
             q->load[i] = q->weight[i] * mhe_limit_of(q, i) - q->force[i];
         }
         if (!again) {
@@ -434,7 +435,7 @@ static real mhe_set_residuals(mhe_rows *q, int rows, real stiffness, real *infea
     for (int i = 0; i < rows; i++) {
         const int s = i % STRANDS, equation = q->low[i] == q->high[i];
         q->missed[i] = equation ? q->value[i] - q->high[i] : 0;
-        q->weight[i] = equation ? stiffness / (q->scale[i] * q->scale[i]) : 0;
+        q->weight[i] = equation ? stiffness / (q->deviation[i] * q->deviation[i]) : 0;
         q->load[i] = -q->force[i];
         worst[s] = mhe_max(fabs(q->missed[i]) / q->scale[i], worst[s]);
     }

@@ -129,6 +129,15 @@ static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
         if (!mhe_solve_free(e, k, offset, nearest)) return FAILED;
         if (guesses < limit && !mhe_time_is_up(k))
             status = mhe_interior_point(e, k, offset, nearest, limit - guesses, &iterations);
+        if (status == SOLVED && guesses + iterations < limit) {
+            /* Its active set gives the solution up to rounding. */
+            const int left = limit - guesses - iterations;
+            int more = 0;
+            memcpy(k->residual, k->step, sizeof k->step);
+            o->factorised = mhe_active_set(e, k, offset, nearest, left, 0, &more) == SOLVED;
+            if (!o->factorised) memcpy(k->step, k->residual, sizeof k->step);
+            guesses += more;
+        }
     }
     if (status != SOLVED) memset(k->rows.place, 0, sizeof k->rows.place);
     o->iterations += guesses + iterations;
