@@ -57,8 +57,6 @@ void mhe_set_lapack(void *const *functions)
 #pragma GCC diagnostic ignored "-Wunused-function"
 #endif
 
-static real mhe_min(real a, real b) { return a < b ? a : b; }
-
 /* out = A B for A (m, k) and B (k, n). */
 static void mhe_multiply(int m, int k, int n, const real *A, const real *B, real *out)
 {

@@ -26,8 +26,6 @@ enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
 
 #if CONSTRAINED
 
-static real mhe_min(real a, real b) { return a < b ? a : b; }
-
 /* Limits of all rows about a trajectory x with residuals w and v. */
 static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, const real *w,
                            const real *v)
@@ -561,7 +559,8 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
         mhe_hessian_times(k, count, k->step, k->product);
         mhe_rows_times(e, k, k->step);
         const real products = mhe_set_residuals(q, rows, stiffness, &infeasible);
-        stiffness = mhe_min(mhe_max(stiffness, STIFFNESS * scale / products), STIFFNESS * STIFFNESS);
+        stiffness = mhe_max(stiffness, STIFFNESS * scale / products);
+        if (!(stiffness < STIFFNESS * STIFFNESS)) stiffness = STIFFNESS * STIFFNESS;
         for (int j = 0; j < size; j++) k->residual[j] = -k->product[j] - k->gradient[j];
         mhe_add_loads(e, k, k->residual);
         for (int j = 0; j < size; j++) {
