@@ -560,7 +560,8 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
         mhe_hessian_times(k, count, k->step, k->product);
         mhe_rows_times(e, k, k->step);
         const real products = mhe_set_residuals(q, rows, stiffness, &infeasible);
-        stiffness = mhe_min(mhe_max(stiffness, STIFFNESS * scale / products), STIFFNESS * STIFFNESS);
+        stiffness = mhe_max(stiffness, STIFFNESS * scale / products);
+        if (!(stiffness < STIFFNESS * STIFFNESS)) stiffness = STIFFNESS * STIFFNESS;
         for (int j = 0; j < size; j++) k->residual[j] = -k->product[j] - k->gradient[j];
         mhe_add_loads(e, k, k->residual);
         for (int j = 0; j < size; j++) {

@@ -243,8 +243,8 @@ static int mhe_nearest_in(const mhe_x_set *set, const real *P, const real *point
  * sizes of the components as standard deviations, and the result 0. */
 static int mhe_project(const mhe_x_set *set, const real *P, const real *point, real *out)
 {
-    real other[NX * NX] = {0};
     if (mhe_nearest_in(set, P, point, out)) return 1;
+    real other[NX * NX] = {0};
     for (int j = 0; j < NX; j++) {
         real size = fabs(point[j]);
         for (int r = 0; r < SIDES; r++) {
