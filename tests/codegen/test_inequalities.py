@@ -96,11 +96,17 @@ def test_iterations_are_capped_and_counted(shape):
     for _ in range(20):
         qp = random_qp(rng, *SHAPES[shape], 0.1, 0.3)
         needed = solver(qp)[2]
+        best = objective(qp, reference(qp))
+        statuses = []
         for limit in range(needed):
             status, d, iterations = solver(qp, limit=limit)
-            assert status != SOLVED
+            statuses.append(status)
             assert iterations <= limit
             assert np.isfinite(d).all()
+            # The iterations behind a solution only take its rounding off.
+            if status == SOLVED:
+                assert objective(qp, d) == pytest.approx(best, rel=1e-6, abs=1e-6)
+        assert SOLVED not in statuses[:1]
         assert solver(qp, limit=needed)[::2] == (SOLVED, needed)
 
 
