@@ -40,7 +40,8 @@ def estimator(f=f, h=h, *, observer=None, prior=WEIGHTS[0], f_jacobian=None, h_j
               noises=None, **options):
     # As they are written: of a trace, nothing breaks.
     system = qpmhe.System(
-        untraced(f), untraced(h), n=2, p=1, f_jacobian=f_jacobian, h_jacobian=h_jacobian, noises=noises
+        untraced(f), untraced(h), n=2, p=1, f_jacobian=f_jacobian, h_jacobian=h_jacobian,
+        noises=noises,
     )
     cost = qpmhe.QuadraticCost(prior=prior, disturbance=WEIGHTS[1], noise=WEIGHTS[2])
     options = {"horizon": HORIZON, "initial_state": Z0, **options}
