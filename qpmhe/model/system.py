@@ -524,7 +524,7 @@ class System:
 
         Blank if none does. Never raises, whatever the functions do.
         """
-        if self._pinned is None or self.tracing is None:
+        if self._pinned is None or self.tracing is None or not np.isfinite(u).all():
             return ""
         wrong = self.tracing.wrong(self._pinned, x, u)
         return "" if wrong is None else f"{wrong[0]} has changed since it was traced: {wrong[1]}"

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from estimator.untraced import untraced
 from scipy.optimize import least_squares
 
 import qpmhe
@@ -37,8 +38,10 @@ def record(steps=40, seed=0):
 
 def estimator(f=f, h=h, *, observer=None, prior=WEIGHTS[0], f_jacobian=None, h_jacobian=None,
               noises=None, **options):
+    # As they are written: of a trace, nothing breaks.
     system = qpmhe.System(
-        f, h, n=2, p=1, f_jacobian=f_jacobian, h_jacobian=h_jacobian, noises=noises
+        untraced(f), untraced(h), n=2, p=1, f_jacobian=f_jacobian, h_jacobian=h_jacobian,
+        noises=noises,
     )
     cost = qpmhe.QuadraticCost(prior=prior, disturbance=WEIGHTS[1], noise=WEIGHTS[2])
     options = {"horizon": HORIZON, "initial_state": Z0, **options}
@@ -328,7 +331,7 @@ def test_no_outlier_raises_with_any_backend(backend, value):
 
 def test_an_input_that_is_not_finite_spoils_its_step_only():
     X, Y = record(40)
-    system = qpmhe.System(lambda x, u: f(x) + 0.0 * u, lambda x, u: h(x), n=2, p=1, m=1)
+    system = qpmhe.System(lambda x, u: f(x) + (u - 1.0), lambda x, u: h(x), n=2, p=1, m=1)
     cost = qpmhe.QuadraticCost(prior=WEIGHTS[0], disturbance=WEIGHTS[1], noise=WEIGHTS[2])
     mhe = qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger(GAIN), cost, horizon=HORIZON, initial_state=Z0
