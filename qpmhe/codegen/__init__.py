@@ -47,8 +47,8 @@ def write(
     Parameters
     ----------
     estimator : MovingHorizonEstimator
-        What to write: a system made with `qpmhe.from_casadi` that has no set of states, an
-        observer of the package's own classes, a `QuadraticCost` or a
+        What to write: a traced system or one of `qpmhe.from_casadi`, without soft sets and
+        nonlinear constraints; an observer of the package's own classes; a `QuadraticCost` or a
         `RobustCost`, whose losses may be your own if their methods have no branch on a value. Its
         measurements so far are not written.
     directory : str or path
