@@ -92,7 +92,7 @@ class PythonEngine:
         initial_state: Array,
     ) -> None:
         if not (settings.qp_limit or observer.needs_jacobians):
-            # Without a Jacobian a trace saves little, and the observer is the user's to the last bit.
+            # A trace saves little here, and the observer is the user's to the last bit.
             system.use_functions()
         self._system, self._observer, self._given_cost = system, observer, cost
         self._cost = cost = lifted(cost, system.disturbance_matrix, observer.initial_covariance())
