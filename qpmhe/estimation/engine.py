@@ -546,7 +546,11 @@ class PythonEngine:
         ):
             if not isinstance(found, (list, tuple)) or len(found) != len(known):
                 raise ValueError(f"{name} is {found!r}; expected {len(known)} of them")
-            for one, mine in zip(found, known, strict=True):
+            traced = zip(methods, known_methods, strict=False)
+            for one, mine, both in zip(found, known, traced, strict=False):
+                # What is traced on one side alone is called in another way there.
+                if both[0] != both[1] and "traced" in both:
+                    continue
                 # The saved estimator may have found another way to call the model, at other states.
                 # Computing the stages again shows whether it gives the same here.
                 other = {"unknown": ("batched", "columns"), slowest: ("complex step",)}

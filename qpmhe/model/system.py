@@ -523,6 +523,13 @@ class System:
         """Which function differs from the trace that this copy relies on at a point, and how.
 
         Blank if none does. Never raises, whatever the functions do.
+
+        Parameters
+        ----------
+        x : (n,) array
+            The state.
+        u : (m,) array
+            The input.
         """
         if self._pinned is None or self.tracing is None or not np.isfinite(u).all():
             return ""

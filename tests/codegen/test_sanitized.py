@@ -34,4 +34,6 @@ def test_the_written_code_is_clean(name, level, tmp_path):
             assert (np.isfinite(found) == finite).all()
             sizes = np.where(finite, np.abs(expected), 0.0).max(axis=0)
             apart = np.abs(np.where(finite, found, 0.0) - np.where(finite, expected, 0.0))
+            # Beside a column that is nearly zero, another one's rounding.
+            sizes = np.maximum(sizes, 1e-3 * sizes.max())
             assert (apart <= 10 * one.tolerance * sizes).all()

@@ -125,7 +125,10 @@ int main(void)
             memcpy(W->lower, settings.disturbances.lower, sizeof W->lower);
             memcpy(W->row_lower, settings.disturbances.row_lower, sizeof W->row_lower);
             memcpy(W->row_upper, settings.disturbances.row_upper, sizeof W->row_upper);
-            for (int j = 0; j < MHE_NX; j++) W->upper[j] = settings.disturbances.upper[j] / 2;
+            for (int j = 0; j < MHE_NX; j++) {
+                W->upper[j] = settings.disturbances.upper[j] / 2;
+                if (W->upper[j] < W->lower[j]) W->upper[j] = W->lower[j];
+            }
             for (int j = 0; j < MHE_NY; j++) mask[j] = number() != 0;
             sample.y = y, sample.u = MHE_NU ? u : 0, sample.step = step;
             sample.noise_weight = own ? R : 0, sample.disturbance_weight = weighs ? Q : 0;
@@ -272,7 +275,7 @@ def record(mhe, steps=14, seed=0, spread=0.1, special=True):
             options["sensors"] = mask > 0
         if special and t % 7 == 6 and one is not None:
             options["bounds"] = {"disturbances": one.with_sides(
-                one.lower, 0.5 * one.upper, one.row_lower, one.row_upper)}
+                one.lower, np.maximum(0.5 * one.upper, one.lower), one.row_lower, one.row_upper)}
         if special and system.dt and t % 5 in (1, 3):
             options["dt"] = 0.35
         commands.append(

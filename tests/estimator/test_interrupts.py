@@ -20,6 +20,7 @@ from .test_own_memory import (
     numbers,
     samples,
 )
+from .untraced import untraced
 
 WITHIN = str(pathlib.Path(qpmhe.__file__).parent)
 CASES = {
@@ -188,7 +189,8 @@ def test_an_interrupt_out_of_what_the_user_wrote(where, candidate, monkeypatch):
             return call
 
         system = qpmhe.System(
-            ticking("f", lambda x: 0.9 * x), ticking("h", lambda x: x[..., :1] ** 2), n=2, p=1
+            untraced(ticking("f", lambda x: 0.9 * x)),
+            untraced(ticking("h", lambda x: x[..., :1] ** 2)), n=2, p=1,
         )
         observer = qpmhe.OutputInjection(
             ticking("observer", lambda z, v: np.array([0.1, 0.2]) * v[0])

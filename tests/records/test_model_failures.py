@@ -37,8 +37,9 @@ BEYOND = "    if np.any(np.real(x) > 2.5):\n        raise ValueError('beyond the
 MISTAKE = "    if np.any(np.real(x) > 2.5):\n        x = x + ofset"
 INFINITE = "    x = np.where(np.real(x) > 2.5, np.inf, 1.0) * x"
 WRONG_SHAPE = "    if np.any(np.real(x) > 2.5):\n        return np.zeros(2)"
-LATE_SHAPE = "    if calls > 150:\n        return np.zeros(2)"
-LATE = "    if calls > 100:\n        raise ArithmeticError('no convergence')"
+# What is not traced is called at every sample.
+LATE_SHAPE = "    np.isnan(x)\n    if calls > 150:\n        return np.zeros(2)"
+LATE = "    np.isnan(x)\n    if calls > 100:\n        raise ArithmeticError('no convergence')"
 
 
 @pytest.fixture
