@@ -185,7 +185,7 @@ class ModelTrace:
     ) -> bool:
         """Whether a trace's Jacobian may stand in the place of this one.
 
-        In that of a computed one always, of a given one where they agree up to rounding.
+        It always replaces a computed one, and a given one where both agree up to rounding.
         """
         if jacobian.method != "given":
             return True

@@ -61,7 +61,7 @@ class ObserverForm:
     kind : {"gain", "extended", "unscented", "function"}
         What corrects: a constant gain, an extended or an unscented Kalman filter, a function.
     gain, filter_gain : (n, p) array or None
-        The constant gain, and that of the measurement update.
+        The constant gain of the correction, and the gain of the measurement update.
     prior, disturbance, noise : (n, n), (r, r) and (p, p) array or None
         Covariances of the initial error, of w and of v, of an observer with a covariance.
     f_jacobian, h_jacobian : (n, n) and (p, n) array or None
