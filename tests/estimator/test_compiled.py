@@ -15,6 +15,7 @@ from qpmhe.models.batch_reactor import batch_reactor
 from qpmhe.models.batch_reactor import casadi_output as reactor_output
 from qpmhe.models.batch_reactor import casadi_rate as reactor_rate
 from qpmhe.models.chain import casadi_output, casadi_rate, chain_of_masses
+from tests.codegen.test_agreement import agree
 
 from .plain import spd
 
@@ -153,26 +154,9 @@ def input_at(model, t):
     return () if model.U is None else (model.U[t % STEPS],)
 
 
-ARRAYS = ("state", "filtered", "trajectory", "candidate", "disturbances", "noises", "delayed")
-
-
 def close(expected, found, tolerance=1e-10):
-    """Equality up to rounding of all that two estimates of a window tell."""
-    for name in ("status", "qps", "dropped", "time", "corrections", "nearest_points"):
-        assert getattr(found, name) == getattr(expected, name), name
-    for name in ARRAYS:
-        one, other = getattr(expected, name), getattr(found, name)
-        assert (one is None) == (other is None), name
-        if one is None:
-            continue
-        assert one.shape == other.shape, name
-        finite = np.abs(one[np.isfinite(one)])
-        atol = tolerance * (1.0 + finite.max(initial=0.0))
-        np.testing.assert_allclose(other, one, rtol=0.0, atol=atol, err_msg=name)
-    for name in ("cost", "candidate_cost"):
-        one, other = getattr(expected, name), getattr(found, name)
-        assert other == pytest.approx(one, rel=tolerance, abs=tolerance), name
-    assert found.cost <= found.candidate_cost
+    """Equality up to rounding of all that two estimates of a window say."""
+    agree(expected, found, tolerance)
 
 
 def follow(model, pair, steps=STEPS, tolerance=1e-10):

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
+from tests.codegen.test_agreement import ARRAYS
 
-from .test_compiled import ARRAYS, both, estimator, input_at, made, system_of
+from .test_compiled import both, estimator, input_at, made, system_of
 from .test_compiled_sets import missed_rows
 
 casadi = pytest.importorskip("casadi")

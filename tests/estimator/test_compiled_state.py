@@ -9,8 +9,9 @@ import pytest
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
+from tests.codegen.test_agreement import ARRAYS
 
-from .test_compiled import ARRAYS, STEPS, both, estimator, input_at, made
+from .test_compiled import STEPS, both, estimator, input_at, made
 from .test_compiled_data import fragile, outliers, spoilt
 from .test_compiled_sets import case_of
 from .test_compiled_sets import estimator as with_sets
