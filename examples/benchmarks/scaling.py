@@ -24,7 +24,7 @@ os.environ["MKL_NUM_THREADS"] = "1"
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 from problems import Problem, chain_problem, reactor_problem
 from report import LIGHT, environment
 from rich import box
@@ -171,6 +171,7 @@ def draw(panels: list[tuple[str, str, dict[str, Any]]], path: Path) -> None:
             axes.xaxis.set_minor_locator(NullLocator())
             axes.xaxis.set_major_formatter(FuncFormatter(lambda size, _: f"{size:g}"))
             axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
             axes.grid(axis="y")
             axes.set_xlabel(x_label)
             axes.set_ylabel(y_label)
