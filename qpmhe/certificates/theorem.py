@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -49,17 +48,9 @@ class DecayingSums:
     ----------
     rate : float
         r in (0, 1), per step: eta, rho or lambda of the paper.
-    initial : float
-        c_p >= 1 (without unit); less contradicts the bound at t = 0.
-    disturbance : float
-        c_w >= 0 (without unit).
-    noise : float
-        c_v >= 0, in units of the state per unit of the output.
-
-    Raises
-    ------
-    OptionError
-        If a constant is outside of its range. Infinite ones are allowed: they bound nothing.
+    initial, disturbance, noise : float
+        c_p >= 1, c_w >= 0, and c_v >= 0 in units of the state per unit of the output. They may
+        be infinite. An `OptionError` names one that is outside of its range.
     """
 
     rate: float
@@ -82,37 +73,24 @@ class DecayingSums:
         """c_p, c_w and c_v."""
         return self.initial, self.disturbance, self.noise
 
-    def bound(self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike) -> Array:
-        """The right-hand side at t = 0, ..., T, (T + 1, ...).
+    def bound(self, initial: float, disturbances: ArrayLike, noises: ArrayLike) -> Array:
+        """The right-hand side at t = 0, ..., T, (T + 1,), from lengths (T,) of w and v.
 
-        Parameters
-        ----------
-        initial : float or (...) array_like
-            |e(0)|; of several runs at once, if an array.
-        disturbances, noises : (T, ...) array_like
-            |w(0)|, ..., |w(T-1)| and |v(0)|, ..., |v(T-1)|.
-
-        Raises
-        ------
-        ShapeError, InvalidInputError
-            If these are not nonnegative, finite and of one length.
+        Lengths that are not nonnegative, finite and equally many are refused.
         """
-        start, w, v = (
-            numbers(name, value) for name, value in
-            (("initial", initial), ("disturbances", disturbances), ("noises", noises))
-        )
-        if w.ndim != 1 + start.ndim or w.shape != v.shape:
+        start = checked_length("initial", initial)
+        w, v = numbers("disturbances", disturbances), numbers("noises", noises)
+        if w.ndim != 1 or w.shape != v.shape:
             raise ShapeError(
                 f"disturbances have shape {w.shape} and noises {v.shape}; expected (T,) each, "
                 "their Euclidean lengths at one sample after another."
             )
-        if any((each < 0.0).any() for each in (start, w, v)):
+        if (w < 0.0).any() or (v < 0.0).any():
             raise OptionError("a length is negative; expected Euclidean lengths, all >= 0.")
         if not all(math.isfinite(each) for each in self.constants):
-            return np.full((len(w) + 1, *start.shape), np.inf)
-        sums = decaying_sums(self.rate, self.disturbance * w + self.noise * v)
-        decay: Array = self.rate ** np.arange(len(w) + 1.0)
-        return np.multiply.outer(decay, self.initial * start) + self.rate * sums
+            return np.full(len(w) + 1, np.inf)
+        decay: Array = self.initial * start * self.rate ** np.arange(len(w) + 1.0)
+        return decay + self.rate * decaying_sums(self.rate, self.disturbance * w + self.noise * v)
 
     def limit(self, disturbance: float, noise: float) -> float:
         """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows.
@@ -129,7 +107,7 @@ class DecayingSums:
 
 def decaying_sums(rate: float, entering: Array) -> Array:
     """s(t) = sum of rate^(tau - 1) entering(t - tau) over tau = 1, ..., t; at t = 0, ..., T."""
-    sums = np.zeros((len(entering) + 1, *entering.shape[1:]))
+    sums = np.zeros(len(entering) + 1)
     for t, value in enumerate(entering):
         sums[t + 1] = rate * sums[t] + value
     return sums
@@ -178,6 +156,21 @@ class TheoremConstants:
     horizon : int
         N >= 1.
 
+    Attributes
+    ----------
+    L_bar, c_bar : float
+        max(L_h, 1 / C_v), before (eq:proof_2), and (3 L_bar)^a (c_w kappa^a + c_v), (eq:proof_rho).
+    rho_bar_1, rho_bar_2 : float
+        The sums of rho^(-a k) over k = 1, ..., N, (eq:proof_rho4), and from 0 on, (eq:proof_rho5).
+    C_bar : (float, float, float)
+        Of the estimate's parts, (eq:bound_hat_x).
+    eta_bar, lam : float
+        eta / (1 - eta), (eq:proof_ali), and the rate of the result, max(eta, rho).
+    C_prime, C_double_prime, C : (float, float, float)
+        Those for t >= N and for t < N, and the larger ones, of (eq:RGES_result).
+    result : DecayingSums
+        (eq:RGES_result): the estimator's own robust stability.
+
     Raises
     ------
     OptionError
@@ -200,16 +193,61 @@ class TheoremConstants:
     kappa: float = field(kw_only=True)
     lipschitz: float = field(kw_only=True)
     horizon: int = field(kw_only=True)
+    L_bar: float = field(init=False)
+    c_bar: float = field(init=False)
+    rho_bar_1: float = field(init=False)
+    rho_bar_2: float = field(init=False)
+    C_bar: Triple = field(init=False)
+    eta_bar: float = field(init=False)
+    lam: float = field(init=False)
+    C_prime: Triple = field(init=False)
+    C_double_prime: Triple = field(init=False)
+    C: Triple = field(init=False)
+    result: DecayingSums = field(init=False)
 
     def __post_init__(self) -> None:
+        self._check()
+        cost, a, N = self.cost, self.cost.exponent, self.horizon
+        eta, (c_p, c_w, c_v) = self.detectability.rate, self.detectability.constants
+        rho, (C_p, C_w, C_v) = self.observer.rate, self.observer.constants
+        L_bar = max(self.lipschitz, 1.0 / C_v)
+        c_bar = _power(3.0 * L_bar, a) * (
+            cost.disturbance[1] * _power(self.kappa, a) + cost.noise[1]
+        )
+        rho_bar_2 = _geometric(-a * math.log(rho), N)
+        rho_bar_1 = rho_bar_2 * _power(rho, -a)
+        first = _power(3.0 * c_bar * rho_bar_1, 1.0 / a)
+        second = _power(3.0 * c_bar * rho_bar_2, 1.0 / a) / rho
+        C_bar = C_p * first, _product(C_w, second), C_v * second
+        eta_bar, lam = eta / (1.0 - eta), max(eta, rho)
+        # From the bounds of the estimate's parts to bounds of its error.
+        prior, disturbance, noise = (
+            each[0] ** (-1.0 / a) for each in (cost.prior, cost.disturbance, cost.noise)
+        )
+        window = eta_bar * (c_w * disturbance + c_v * noise)
+        late, early = c_p * prior * eta**N + window, c_p * prior + window
+        begun = c_p * (eta / lam) ** N
+        C_prime = (
+            _product(late, C_bar[0]) + begun * C_p,
+            _product(late, C_bar[1]) + begun * C_w + c_w,
+            _product(late, C_bar[2]) + begun * C_v + c_v,
+        )
+        C_double_prime = (
+            _product(early, C_bar[0]) + c_p, _product(early, C_bar[1]) + c_w,
+            _product(early, C_bar[2]) + c_v,
+        )
+        C = tuple(map(max, C_prime, C_double_prime))
+        vars(self).update(
+            L_bar=L_bar, c_bar=c_bar, rho_bar_1=rho_bar_1, rho_bar_2=rho_bar_2, C_bar=C_bar,
+            eta_bar=eta_bar, lam=lam, C_prime=C_prime, C_double_prime=C_double_prime, C=C,
+            result=DecayingSums(lam, *C),
+        )
+
+    def _check(self) -> None:
         count("horizon", self.horizon, 1)
-        for name, value in (("kappa", self.kappa), ("lipschitz", self.lipschitz)):
-            if not 0.0 <= value < math.inf:
-                raise OptionError(f"{name} is {value!r}; expected a finite number >= 0.")
-        if not 0.0 < self.cost.exponent < math.inf:
-            raise OptionError(
-                f"the cost's exponent is {self.cost.exponent!r}; expected a number > 0."
-            )
+        checked_length("kappa", self.kappa)
+        checked_length("lipschitz", self.lipschitz)
+        positive("the cost's exponent", self.cost.exponent)
         for name in ("prior", "disturbance", "noise"):
             lower, upper = getattr(self.cost, name)
             if not 0.0 < lower <= upper < math.inf:
@@ -223,92 +261,13 @@ class TheoremConstants:
                 "larger one, which holds as well, such as 1 / L_h."
             )
 
-    @cached_property
-    def L_bar(self) -> float:  # noqa: N802 - the paper's symbol
-        """max(L_h, 1 / C_v), before (eq:proof_2)."""
-        return max(self.lipschitz, 1.0 / self.observer.noise)
 
-    @cached_property
-    def c_bar(self) -> float:
-        """(3 L_bar)^a (c_w kappa^a + c_v) with the cost's upper constants, (eq:proof_rho)."""
-        a = self.cost.exponent
-        upper = self.cost.disturbance[1] * _power(self.kappa, a) + self.cost.noise[1]
-        return _power(3.0 * self.L_bar, a) * upper
-
-    @cached_property
-    def rho_bar_1(self) -> float:
-        """(rho^(-a N) - 1) / (1 - rho^a), (eq:proof_rho4)."""
-        return self._geometric(self.horizon) * _power(self.observer.rate, -self.cost.exponent)
-
-    @cached_property
-    def rho_bar_2(self) -> float:
-        """(rho^(-a (N-1)) - rho^a) / (1 - rho^a), (eq:proof_rho5)."""
-        return self._geometric(self.horizon)
-
-    def _geometric(self, count: int) -> float:
-        """The sum of rho^(-a k) over k = 0, ..., count - 1, accurate for rho near 1."""
-        slope = -self.cost.exponent * math.log(self.observer.rate)
-        try:
-            return math.expm1(count * slope) / math.expm1(slope)
-        except OverflowError:
-            return math.inf
-
-    @cached_property
-    def C_bar(self) -> Triple:  # noqa: N802
-        """The constants C_bar_p(N), C_bar_w(N), C_bar_v(N) of (eq:bound_hat_x)."""
-        C_p, C_w, C_v = self.observer.constants
-        a, rho = self.cost.exponent, self.observer.rate
-        first = _power(3.0 * self.c_bar * self.rho_bar_1, 1.0 / a)
-        second = _power(3.0 * self.c_bar * self.rho_bar_2, 1.0 / a) / rho
-        return C_p * first, _product(C_w, second), C_v * second
-
-    @cached_property
-    def eta_bar(self) -> float:
-        """The geometric series eta / (1 - eta), (eq:proof_ali)."""
-        return self.detectability.rate / (1.0 - self.detectability.rate)
-
-    @cached_property
-    def lam(self) -> float:
-        """The rate max(eta, rho) of the result, lambda."""
-        return max(self.detectability.rate, self.observer.rate)
-
-    @cached_property
-    def C_prime(self) -> Triple:  # noqa: N802
-        """The constants C_1'(N), C_2'(N), C_3'(N), for t >= N."""
-        c_p, c_w, c_v = self.detectability.constants
-        eta, N = self.detectability.rate, self.horizon
-        start = [c_p * (eta / self.lam) ** N * C for C in self.observer.constants]
-        return self._sums(eta**N, (start[0], start[1] + c_w, start[2] + c_v))
-
-    @cached_property
-    def C_double_prime(self) -> Triple:  # noqa: N802
-        """The constants C_1''(N), C_2''(N), C_3''(N), for t < N."""
-        return self._sums(1.0, self.detectability.constants)
-
-    def _sums(self, decay: float, own: Triple) -> Triple:
-        """What the bounds of the estimate's parts come to, and what else there is."""
-        c_p, c_w, c_v = self.detectability.constants
-        # From the bounds of the estimate's parts to bounds of its error.
-        prior, disturbance, noise = (
-            each[0] ** (-1.0 / self.cost.exponent)
-            for each in (self.cost.prior, self.cost.disturbance, self.cost.noise)
-        )
-        factor = c_p * prior * decay + self.eta_bar * (c_w * disturbance + c_v * noise)
-        first, second, third = (
-            _product(factor, C) + each for C, each in zip(self.C_bar, own, strict=True)
-        )
-        return first, second, third
-
-    @cached_property
-    def C(self) -> Triple:  # noqa: N802
-        """C_1, C_2, C_3 of (eq:RGES_result)."""
-        first, second, third = map(max, self.C_prime, self.C_double_prime)
-        return first, second, third
-
-    @cached_property
-    def result(self) -> DecayingSums:
-        """(eq:RGES_result): the estimator's own robust stability."""
-        return DecayingSums(self.lam, *self.C)
+def _geometric(slope: float, count: int) -> float:
+    """The sum of exp(k slope) over k = 0, ..., count - 1, accurate for small slopes."""
+    try:
+        return math.expm1(count * slope) / math.expm1(slope)
+    except OverflowError:
+        return math.inf
 
 
 def _power(base: float, exponent: float) -> float:

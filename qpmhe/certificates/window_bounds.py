@@ -54,8 +54,8 @@ class WindowBound:
     exponent: float  # a
     slope: float  # from the observer's error to the root of a stage's cost
     entry: float  # from the observer's norm to detectability's
+    scale: float  # s, from detectability's norm to the error's length
     alphas: Array = field(repr=False)  # (N + 1,): alpha_0, ..., alpha_N
-    scales: Array = field(repr=False)  # (1 + n,): s, and that of each component of the error
     norms: Norms = field(repr=False)
 
     def bound(self, initial: Array, w: Array, v: Array, costs: Array | None = None) -> Array:
@@ -63,26 +63,6 @@ class WindowBound:
 
         Arguments are vectors or lengths, (T, n) or (T,); with costs, (T,), where these are known.
         """
-        bound: Array = self.scales[0] * self._along(initial, w, v, costs)
-        return bound
-
-    def components(self, initial: Array, w: Array, v: Array, costs: Array | None = None) -> Array:
-        """The bound of each component's error, (T + 1, n); arguments as of `bound`."""
-        return np.multiply.outer(self._along(initial, w, v, costs), self.scales[1:])
-
-    def _entering(self, w: Array, v: Array) -> Array:
-        if self.norms.gain is not None and w.ndim == v.ndim == 2:
-            return norms(w - v @ self.norms.gain.T, self.norms.driving)
-        return norms(w, self.norms.driving) + norms(v, self.norms.corrected)
-
-    def _advanced(self, difference: Array, disturbance: Array, noise: Array) -> Array:
-        """One step of detectability, in its norms."""
-        if self.kind == "weighted":
-            return np.hypot(self.eta * difference, noise) + disturbance
-        return self.eta * difference + noise + disturbance
-
-    def _along(self, initial: Array, w: Array, v: Array, costs: Array | None) -> Array:
-        """The bound in the norm of detectability."""
         N, a, steps, weights = self.horizon, self.exponent, len(w), self.norms
         lengths = np.minimum(np.arange(steps + 1), N)
         first = np.asarray(initial, np.float64)[None]
@@ -101,8 +81,19 @@ class WindowBound:
         own = entry
         for j in range(N):  # a shorter window begins later
             own = np.where(lengths < N - j, entry, self._advanced(own, *true[:, j : j + steps + 1]))
-        bound: Array = self.alphas[lengths] * roots + own
+        bound: Array = self.scale * (self.alphas[lengths] * roots + own)
         return bound
+
+    def _entering(self, w: Array, v: Array) -> Array:
+        if self.norms.gain is not None and w.ndim == v.ndim == 2:
+            return norms(w - v @ self.norms.gain.T, self.norms.driving)
+        return norms(w, self.norms.driving) + norms(v, self.norms.corrected)
+
+    def _advanced(self, difference: Array, disturbance: Array, noise: Array) -> Array:
+        """One step of detectability, in its norms."""
+        if self.kind == "weighted":
+            return np.hypot(self.eta * difference, noise) + disturbance
+        return self.eta * difference + noise + disturbance
 
     def limit(self, disturbance: float, noise: float) -> float:
         """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows."""
@@ -115,7 +106,7 @@ class WindowBound:
             )
         fit = self.slope * error + norms(v, self.norms.misfit)
         root = self.horizon ** (1.0 / self.exponent) * fit
-        return float(self.scales[0] * (self.alphas[-1] * root + own)[0])
+        return float(self.scale * (self.alphas[-1] * root + own)[0])
 
 
 def summed_bound(constants: TheoremConstants, n: int = 1, p: int = 1) -> WindowBound:
@@ -153,8 +144,7 @@ def summed_bound(constants: TheoremConstants, n: int = 1, p: int = 1) -> WindowB
         )
     ))
     return WindowBound(
-        "summed", N, rho, eta, a, root * constants.lipschitz, c_p, np.array(alphas),
-        np.ones(1 + n), weights,
+        "summed", N, rho, eta, a, root * constants.lipschitz, c_p, 1.0, np.array(alphas), weights
     )
 
 
@@ -176,11 +166,9 @@ def weighted_bound(
     noise = largest(V, cost.noise)
     for _ in range(horizon):
         squares.append(max(eta**2 * squares[-1], noise) + bought)
-    inverse = np.linalg.inv(P)
-    scales = np.append(np.linalg.eigvalsh(inverse)[-1], np.diag(inverse))
     return WindowBound(
-        "weighted", horizon, rho, eta, 2.0, slope,
-        math.sqrt(largest(P, O)), np.sqrt(squares), _rounding(P) * np.sqrt(scales),
+        "weighted", horizon, rho, eta, 2.0, slope, math.sqrt(largest(P, O)),
+        math.sqrt(largest(np.eye(len(P)), P)), np.sqrt(squares),
         Norms(O, P, O, K.T @ O @ K, fit_weight(cost, K), P, V, K),
     )
 
@@ -205,14 +193,10 @@ def _rounding(weight: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class HorizonBounds:
-    """What bounds the error for one horizon.
+    """What bounds the error for one horizon: the paper's constants, and a window's bound.
 
-    Parameters
-    ----------
-    paper : TheoremConstants
-    window : WindowBound or None
-        The sharper bound: with norms for a quadratic cost and certified constants, with sums
-        for other costs and assumed constants, none for costs whose exponent is below 1.
+    The latter has norms for a quadratic cost and certified constants, sums for other costs and
+    assumed constants, and is None for costs whose exponent is below 1.
     """
 
     paper: TheoremConstants
