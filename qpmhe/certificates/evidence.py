@@ -69,6 +69,8 @@ def json_ready(value: Any) -> Any:
     """Lists for arrays and tuples, and None for numbers that are not finite."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
+    if isinstance(value, Evidence):
+        return value.value
     if isinstance(value, Mapping):
         return {str(key): json_ready(each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):

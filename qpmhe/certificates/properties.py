@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from .._checks import Array, numbers, positive
+from .._checks import Array, positive
 from ..model.sets import ConvexSet
 from ..model.system import System
 from .evidence import Evidence, MismatchError, json_ready
@@ -34,33 +33,13 @@ class _Certified:
         """Without the system, whose functions often cannot be pickled."""
         return vars(self) | {"system": None}
 
-    @property
-    def sums(self) -> DecayingSums:
-        """The rate and the constants of the bound."""
-        raise NotImplementedError
-
     def to_dict(self) -> dict[str, Any]:
         """All but the region, in types that JSON knows; infinite numbers become None."""
-        values = vars(self) | {"evidence": str(self.evidence)}
-        content: dict[str, Any] = json_ready({
-            name: value for name, value in values.items() if name not in ("region", "system")
-        })
-        return content
-
-    def bound(self, initial: ArrayLike, disturbances: ArrayLike, noises: ArrayLike) -> Array:
-        """The right-hand side of the definition at t = 0, ..., T, (T + 1, ...).
-
-        Parameters
-        ----------
-        initial : (..., n) array_like
-            The initial error, or difference of states.
-        disturbances, noises : (T, ..., n) and (T, ..., p) array_like
-            w and v, or the differences of w and of h(x), at t = 0, ..., T - 1.
-        """
-        given = ("initial", initial), ("disturbances", disturbances), ("noises", noises)
-        return self.sums.bound(
-            *(np.linalg.norm(numbers(name, value), axis=-1) for name, value in given)
+        left_out = ("region", "system")
+        content: dict[str, Any] = json_ready(
+            {name: value for name, value in vars(self).items() if name not in left_out}
         )
+        return content
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,12 +97,7 @@ class Detectability(_Certified):
     ) -> Detectability:
         """Constants that the user states without proof; without a region, everywhere.
 
-        Raises
-        ------
-        OptionError
-            If a constant is not positive, or eta not below 1.
-        SetError
-            If the region is no set.
+        An `OptionError` names one that is not positive, or not below 1 for eta.
         """
         return cls(
             checked_rate("eta", eta), positive("c_p", c_p), positive("c_w", c_w),
@@ -197,13 +171,11 @@ Result = TypeVar("Result", "Detectability", "ObserverStability")
 
 def sealed(result: Result, system: System, evidence: Evidence) -> Result:
     """The result itself, with its system and what it rests on; its arrays are fixed."""
-    object.__setattr__(result, "system", system)
-    object.__setattr__(result, "evidence", evidence)
-    for name, value in list(vars(result).items()):
+    for name, value in vars(result).items():
         if isinstance(value, np.ndarray):
-            own = value.copy()
-            own.setflags(write=False)
-            object.__setattr__(result, name, own)
+            vars(result)[name] = value = value.copy()
+            value.setflags(write=False)
+    vars(result).update(system=system, evidence=evidence)
     return result
 
 

@@ -207,7 +207,7 @@ def test_assumed_constants_are_labelled():
     assumed = Detectability.assumed(eta=0.9, c_p=2.0, c_w=3.0, c_v=4.0)
     assert assumed.evidence is Evidence.ASSUMED
     assert weakest([Evidence.PROVED, assumed.evidence]) is Evidence.ASSUMED
-    bound = assumed.bound([3.0, 4.0], [[1.0, 0.0]], [[2.0]])
+    bound = assumed.sums.bound(5.0, [1.0], [2.0])
     np.testing.assert_allclose(bound, [10.0, 0.9 * (10.0 + 3.0 + 8.0)])
     with pytest.raises(OptionError, match="eta"):
         Detectability.assumed(eta=1.0, c_p=2.0, c_w=3.0, c_v=4.0)
