@@ -6,6 +6,7 @@ import qpmhe
 
 REACTOR = qpmhe.Box([0.1, 0.0], [9.0, 9.0])
 PENDULUM = qpmhe.Box([-3.0, -10.0], [3.0, 10.0])
+TANKS = qpmhe.Box([0.2, 0.2], [2.0, 2.0])
 
 
 def linear(A, C, **options):
@@ -29,3 +30,16 @@ def unit_box(n):
 
 def unit_cost(n=1, p=1):
     return qpmhe.QuadraticCost(prior=np.eye(n), disturbance=np.eye(n), noise=np.eye(p))
+
+
+def two_tanks():
+    """Two tanks in a row with Torricelli's outflow; the second level is measured."""
+
+    def rate(x):
+        flow = np.sqrt(x) * 0.3
+        out = np.empty(x.shape, x.dtype)
+        out[..., 0] = 0.35 - flow[..., 0]
+        out[..., 1] = flow[..., 0] - flow[..., 1]
+        return out / 0.5
+
+    return qpmhe.System.from_ode(rate, lambda x: x[..., 1:], dt=0.1, n=2, p=1)

@@ -1,7 +1,5 @@
 """Detectability: known constants, the paper's reactor, pairs of trajectories, refusals."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -17,45 +15,31 @@ from qpmhe.certificates.sdp import Answer, Program
 from qpmhe.errors import OptionError
 
 from .attacks import attack_detectability
+from .helpers import PENDULUM, REACTOR, linear, scalar, unit_box
 
-REACTOR = qpmhe.Box([0.1, 0.0], [9.0, 9.0])
-
-
-def linear(A, C):
-    A, C = np.atleast_2d(A), np.atleast_2d(C)
-    return qpmhe.System(
-        lambda x: x @ A.T, lambda x: x @ C.T, n=A.shape[0], p=C.shape[0]
-    )
+TRIANGLE = qpmhe.Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 2.0]], [0.0, 0.0, 1.0])
 
 
-def unit_box(n):
-    return qpmhe.Box(-np.ones(n), np.ones(n))
-
-
-def test_scalar_system_has_the_known_constants():
-    a, c, eta = 1.1, 0.5, 0.8
-    found = certify_detectability(linear(a, c), unit_box(1), eta=eta)
-    assert found.evidence is Evidence.PROVED
-    assert found.form == "output weight"
-    sharp = math.sqrt(a * a - eta * eta) / c / eta
+@pytest.mark.parametrize(
+    ("A", "C", "eta", "sharp"),
+    [
+        (1.1, 0.5, 0.8, math.sqrt(1.1**2 - 0.8**2) / 0.5 / 0.8),
+        # A normal matrix needs no output above its spectral radius.
+        (np.diag([0.7, 0.5]), [[1.0, 1.0]], 0.75, 0.0),
+    ],
+)
+def test_linear_systems_have_the_known_constants(A, C, eta, sharp):
+    system = linear(A, C)
+    found = certify_detectability(system, unit_box(system.n), eta=eta)
+    assert (found.evidence, found.form) == (Evidence.PROVED, "output weight")
     np.testing.assert_allclose([found.c_p, found.c_w], [1.0, 1.0 / eta], rtol=1e-4)
-    assert sharp < found.c_v < sharp * (1 + 1e-4)
-
-
-def test_normal_system_needs_no_output_above_its_spectral_radius():
-    found = certify_detectability(linear(np.diag([0.7, 0.5]), [[1.0, 1.0]]), unit_box(2), eta=0.75)
-    assert found.evidence is Evidence.PROVED
-    np.testing.assert_allclose([found.c_p, found.c_w], [1.0, 1 / 0.75], rtol=1e-4)
-    assert found.c_v < 1e-2
+    assert sharp < found.c_v < max(sharp * (1 + 1e-4), 1e-2)
 
 
 @pytest.mark.parametrize("eta", [0.9, 0.95])
 def test_reactor_is_detectable(eta):
-    system = qpmhe.models.batch_reactor()[0]
-    found = certify_detectability(system, REACTOR, eta=eta)
-    assert found.evidence is Evidence.PROVED
-    assert found.eta == eta
-    assert found.cells == 1
+    found = certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=eta)
+    assert (found.evidence, found.eta, found.cells) == (Evidence.PROVED, eta, 1)
     assert 1.0 <= found.c_p < 1.1
     A = np.array(
         [np.eye(2) + 0.1 * np.array([[-0.64 * x, 1.28], [0.32 * x, -0.64]]) for x in (0.1, 9.0)]
@@ -64,27 +48,18 @@ def test_reactor_is_detectable(eta):
     assert np.linalg.eigvalsh(slack).min() > 0.0
 
 
-def test_reactor_is_refused_at_a_rate_that_is_too_fast():
-    system = qpmhe.models.batch_reactor()[0]
-    with pytest.raises(NotCertifiedError, match="infeasible") as caught:
-        certify_detectability(system, REACTOR, eta=0.5)
-    assert 0.6 < caught.value.smallest_rate < 0.75
-    assert "a larger eta" in str(caught.value)
-
-
 SYSTEMS = {
     "batch_reactor": (REACTOR, None),
-    "pendulum": (qpmhe.Box([-3.0, -10.0], [3.0, 10.0]), None),
+    "pendulum": (PENDULUM, None),
     "van_der_pol": (qpmhe.Box([-2.0, -2.0], [2.0, 2.0]), None),
-    "cstr": (qpmhe.Box([0.4, 345.0], [0.6, 355.0]), (290.0, 310.0)),
+    "cstr": (qpmhe.Box([0.4, 345.0], [0.6, 355.0]), qpmhe.Box([290.0], [310.0])),
 }
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_pairs_of_trajectories_keep_to_the_bound(name):
-    box, u = SYSTEMS[name]
+    box, inputs = SYSTEMS[name]
     system = getattr(qpmhe.models, name)()[0]
-    inputs = u and qpmhe.Box([u[0]], [u[1]])
     found = certify_detectability(system, box, eta=0.9, inputs=inputs)
     assert found.evidence is Evidence.PROVED
     attack = attack_detectability(
@@ -105,7 +80,7 @@ def test_pairs_of_trajectories_keep_to_the_bound(name):
 
 
 def test_default_rate_lies_between_the_smallest_and_one():
-    found = certify_detectability(qpmhe.models.pendulum()[0], qpmhe.Box([-3, -10], [3, 10]))
+    found = certify_detectability(qpmhe.models.pendulum()[0], PENDULUM)
     assert found.evidence is Evidence.PROVED
     assert 0.1 < found.eta < 0.99
     assert found.cells > 1
@@ -114,10 +89,9 @@ def test_default_rate_lies_between_the_smallest_and_one():
 
 def test_nonlinear_output_takes_output_injection():
     # C in [0.7, 1.3]: with multipliers any rate is feasible, and R = (1 - eta^2) / 0.7^2.
-    system = qpmhe.System(lambda x: 1.0 * x, lambda x: x + 0.3 * np.sin(x), n=1, p=1)
+    system = scalar(lambda x: 1.0 * x, lambda x: x + 0.3 * np.sin(x))
     found = certify_detectability(system, qpmhe.Box([-5.0], [5.0]), eta=0.6)
-    assert found.evidence is Evidence.PROVED
-    assert found.form == "output injection"
+    assert (found.evidence, found.form) == (Evidence.PROVED, "output injection")
     assert any("not affine" in note for note in found.notes)
     sharp = 0.8 / 0.7 / 0.6
     assert sharp < found.c_v < 1.05 * sharp
@@ -145,28 +119,29 @@ def test_polytope_asks_for_less_than_its_box():
         lambda x: np.stack((0.5 * x[..., 0] + 0.6 * x[..., 0] * x[..., 1], 0.5 * x[..., 1]), -1),
         lambda x: 0.0 * x[..., :1], n=2, p=1,
     )
-    triangle = qpmhe.Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 2.0]], [0.0, 0.0, 1.0])
-    assert certify_detectability(system, triangle, eta=0.9).evidence is Evidence.PROVED
+    assert certify_detectability(system, TRIANGLE, eta=0.9).evidence is Evidence.PROVED
     with pytest.raises(NotCertifiedError):
         certify_detectability(system, qpmhe.Box([0.0, 0.0], [1.0, 1.0]), eta=0.9)
 
 
-def test_undetectable_system_is_told_its_mode():
-    system = linear(np.diag([1.1, 0.5]), [[0.0, 1.0]])
-    with pytest.raises(NotCertifiedError, match=r"eigenvalue 1\.1.*not in the output") as caught:
-        certify_detectability(system, unit_box(2))
-    assert "measure something" in str(caught.value)
+def test_what_is_refused_says_why():
+    with pytest.raises(NotCertifiedError, match=r"infeasible.*a larger eta") as caught:
+        certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=0.5)
+    assert 0.6 < caught.value.smallest_rate < 0.75
+    hidden = linear(np.diag([1.1, 0.5]), [[0.0, 1.0]])
+    with pytest.raises(NotCertifiedError, match=r"eigenvalue 1\.1.*not in the out.*measure some"):
+        certify_detectability(hidden, unit_box(2))
+    for eta in (0.0, 1.0, -0.5, math.nan, True, "fast"):
+        with pytest.raises(OptionError, match="eta is"):
+            certify_detectability(hidden, unit_box(2), eta=eta)
 
 
 def test_what_intervals_cannot_run_is_sampled_with_the_reason():
-    system = qpmhe.System(
-        lambda x: np.array([0.5 * math.sin(x[0])]), lambda x: x[:1], n=1, p=1
-    )
+    system = scalar(lambda x: np.array([0.5 * math.sin(x[0])]), lambda x: x[:1])
     found = certify_detectability(system, unit_box(1), eta=0.8)
-    assert found.evidence is Evidence.SAMPLED
+    assert (found.evidence, found.cells) == (Evidence.SAMPLED, 0)
     assert "cannot be run with intervals" in found.notes[0]
     assert "holds at 4" in found.notes[0]
-    assert found.cells == 0
 
 
 def test_too_many_cells_are_sampled(monkeypatch):
@@ -175,32 +150,22 @@ def test_too_many_cells_are_sampled(monkeypatch):
         search_module, "cover",
         lambda model, region, form, **options: full(model, region, form, 3, **options),
     )
-    box = qpmhe.Box([-3.0, -10.0], [3.0, 10.0])
-    found = certify_detectability(qpmhe.models.pendulum()[0], box, eta=0.9)
+    found = certify_detectability(qpmhe.models.pendulum()[0], PENDULUM, eta=0.9)
     assert found.evidence is Evidence.SAMPLED
     assert "given up" in found.notes[0]
 
 
-def test_solvers_that_lie_prove_nothing(monkeypatch):
-    """A matrix that does not satisfy the inequality is never called proved."""
-    system = qpmhe.models.batch_reactor()[0]
-    for P in (np.eye(2), -np.eye(2), np.full((2, 2), np.nan)):
-        wrong = Answer("solved", 1.0, OutputWeight(P, 1e-3 * np.eye(1), 0.9))
-        monkeypatch.setattr(Program, "solve", lambda *_, wrong=wrong, **__: wrong)
-        with pytest.raises(NotCertifiedError, match="no matrix that passes"):
-            certify_detectability(system, REACTOR, eta=0.9)
-
-
-def test_solver_that_stops_early_is_named(monkeypatch):
-    monkeypatch.setattr(Program, "solve", lambda *_, **__: Answer("user_limit"))
-    with pytest.raises(NotCertifiedError, match="user_limit"):
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [(Answer("user_limit"), "user_limit"), *(
+        (Answer("solved", 1.0, OutputWeight(P, 1e-3 * np.eye(1), 0.9)), "no matrix that passes")
+        for P in (np.eye(2), -np.eye(2), np.full((2, 2), np.nan))
+    )],
+)
+def test_solvers_that_lie_or_stop_early_prove_nothing(monkeypatch, answer, words):
+    monkeypatch.setattr(Program, "solve", lambda *_, **__: answer)
+    with pytest.raises(NotCertifiedError, match=words):
         certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=0.9)
-
-
-@pytest.mark.parametrize("eta", [0.0, 1.0, -0.5, math.nan, True, "fast"])
-def test_rate_out_of_range(eta):
-    with pytest.raises(OptionError, match="eta is"):
-        certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=eta)
 
 
 def test_assumed_constants_are_labelled():
