@@ -10,102 +10,76 @@ from qpmhe.certificates.monitor import Monitor, monitor
 from qpmhe.certificates.properties import Detectability, ObserverStability
 from qpmhe.errors import InvalidInputError
 
-COST = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
-SYSTEM = qpmhe.System(lambda x: 1.1 * x, lambda x: 1.0 * x, n=1, p=1)
-OBSERVER = qpmhe.Luenberger([[0.2]])
-STEPS = 30
+from .helpers import box, linear, unit_cost
+
+COST, SYSTEM, OBSERVER = unit_cost(), linear(1.1, 1.0), qpmhe.Luenberger([[0.2]])
+CHEAP = qpmhe.QuadraticCost(prior=0.01, disturbance=0.01, noise=0.01)
+RNG = np.random.default_rng(0)
+W, V = 0.3 * RNG.standard_normal((2, 30, 1))
+X = [RNG.uniform(-1.0, 1.0, 1)]
+for disturbance in W:
+    X.append(1.1 * X[-1] + disturbance)
+Y = np.array(X[:-1]) + V
 
 
 @pytest.fixture(scope="module")
 def certificate():
     return certify(
-        SYSTEM, OBSERVER, COST, horizon=[1, 5], region=qpmhe.Box([-100.0], [100.0]),
+        SYSTEM, OBSERVER, COST, horizon=[1, 5], region=box(-100.0, 100.0),
         detectability=Detectability.assumed(eta=0.5, c_p=1.0, c_w=2.0, c_v=1.2),
         stability=ObserverStability.assumed(rho=0.9, C_p=1.0, C_w=1.2, C_v=0.3, kappa=0.2),
     )
 
 
-def estimator(horizon=5, cost=COST, **options):
+def estimator(horizon=5, cost=COST, observer=OBSERVER, **options):
     return qpmhe.MovingHorizonEstimator(
-        SYSTEM, OBSERVER, cost, horizon=horizon, initial_state=[0.0], max_qps=1, **options
+        SYSTEM, observer, cost, horizon=horizon, initial_state=[0.0], **({"max_qps": 1} | options)
     )
 
 
-def record(seed=0):
-    """States, measurements, disturbances and noises."""
-    rng = np.random.default_rng(seed)
-    w, v = 0.3 * rng.standard_normal((2, STEPS, 1))
-    x = [rng.uniform(-1.0, 1.0, 1)]
-    for t in range(STEPS):
-        x.append(1.1 * x[-1] + w[t])
-    return np.array(x), np.array(x[:-1]) + v, w, v
+def bound(certificate, run, kind="measured", **options):
+    return certificate.bound(run, W, V, initial_error=X[0], kind=kind, **options)
 
 
-def measured(certificate, run, **options):
-    x, _, w, v = record()
-    return certificate.bound(run, w, v, initial_error=x[0], kind="measured", **options)
-
-
-def test_a_run_alone_does_not_tell(certificate):
-    run = estimator(1).run(record()[1])
-    with pytest.raises(InvalidInputError, match="does not say its horizon and cost"):
-        measured(certificate, run, horizon=5)
-
-
-def test_the_sources_horizon_is_taken_and_insisted_on(certificate):
+def test_the_sources_horizon_is_taken(certificate):
     mhe = estimator(1)
-    run = mhe.run(record()[1])
+    run = mhe.run(Y)
     np.testing.assert_array_equal(
-        measured(certificate, run, source=mhe), measured(certificate, run, horizon=1, source=mhe)
+        bound(certificate, run, source=mhe), bound(certificate, run, horizon=1, source=mhe)
     )
-    with pytest.raises(MismatchError, match="horizon is 5, but the run's estimator has 1"):
-        measured(certificate, run, horizon=5, source=mhe)
-    x, _, w, v = record()
-    with pytest.raises(MismatchError, match="horizon is 5"):  # for the other kinds as well
-        certificate.bound(run, w, v, initial_error=x[0], horizon=5, source=mhe)
+    with pytest.raises(InvalidInputError, match="does not say its horizon and cost"):
+        bound(certificate, run, horizon=5)
+    for kind in ("measured", "paper"):
+        with pytest.raises(MismatchError, match="horizon is 5, but the run's estimator has 1"):
+            bound(certificate, run, kind, horizon=5, source=mhe)
 
 
-def test_another_cost_system_or_observer_is_refused(certificate):
-    other = qpmhe.QuadraticCost(prior=0.01, disturbance=0.01, noise=0.01)
-    mhe = estimator(cost=other)
-    with pytest.raises(MismatchError, match="another cost"):
-        measured(certificate, mhe.run(record()[1]), source=mhe)
-    mhe = qpmhe.MovingHorizonEstimator(
-        SYSTEM, qpmhe.Luenberger([[0.3]]), COST, horizon=5, initial_state=[0.0]
-    )
-    with pytest.raises(MismatchError, match="another observer"):
-        measured(certificate, mhe.run(record()[1]), source=mhe)
-
-
-def test_an_estimator_that_did_not_make_the_run_is_refused(certificate):
-    mhe = estimator()
-    run = mhe.run(record()[1])
-    fresh = estimator()
-    with pytest.raises(MismatchError, match="not at the end of this run"):
-        measured(certificate, run, source=fresh)
-    fresh.run(record(1)[1])
-    with pytest.raises(MismatchError, match="not at the end of this run"):
-        measured(certificate, run, source=fresh)
+def test_another_estimator_is_refused(certificate):
+    for options in ({"cost": CHEAP}, {"observer": qpmhe.Luenberger([[0.3]])}):
+        mhe = estimator(**options)
+        with pytest.raises(MismatchError, match=f"another {next(iter(options))}"):
+            bound(certificate, mhe.run(Y), source=mhe)
+    mhe, fresh, other = estimator(), estimator(), estimator()
+    run = mhe.run(Y)
+    other.run(-Y)
     mhe.update(0.0)
-    with pytest.raises(MismatchError, match="not at the end of this run"):
-        measured(certificate, run, source=mhe)
+    for source in (fresh, other, mhe):
+        with pytest.raises(MismatchError, match="not at the end of this run"):
+            bound(certificate, run, source=source)
 
 
 def test_costs_of_broken_windows_are_not_used(certificate):
-    y = record()[1]
+    y, mhe = Y.copy(), estimator()
     y[10] = np.nan
-    mhe = estimator()
     run = mhe.run(y)
-    found = measured(certificate, run, source=mhe)
-    x, _, w, v = record()
-    plain = certificate.bound(run, w, v, initial_error=x[0], horizon=5, kind="summed")
+    found = bound(certificate, run, source=mhe)
+    plain = bound(certificate, run, "summed", horizon=5)
     np.testing.assert_array_equal(found[11:16], plain[11:16])
     assert (found[16:] < plain[16:]).all()
 
 
 def test_a_monitor_sees_each_estimate_of_its_horizon(certificate):
-    mhe = estimator(1)
-    watch = Monitor(certificate, 5)
+    mhe, watch = estimator(1), Monitor(certificate, 5)
     first = mhe.update(0.1)
     assert watch.check(first).held
     with pytest.raises(MismatchError, match="of the time 0; expected 1"):
@@ -115,10 +89,8 @@ def test_a_monitor_sees_each_estimate_of_its_horizon(certificate):
 
 
 def test_corrections_by_another_gain_are_seen(certificate):
-    # Another gain within kappa: no bound on its size can tell.
-    mhe = qpmhe.MovingHorizonEstimator(
-        SYSTEM, qpmhe.Luenberger([[0.1]]), COST, horizon=5, initial_state=[0.0], max_qps=0
-    )
+    # Another gain within kappa: no bound on its size can show it.
+    mhe = estimator(observer=qpmhe.Luenberger([[0.1]]), max_qps=0)
     check = monitor(certificate, mhe.update(1.0))
     assert check.kappa
     assert check.failed == ("observer_candidate",)
