@@ -73,7 +73,9 @@ class DecayingSums:
         """c_p, c_w and c_v."""
         return self.initial, self.disturbance, self.noise
 
-    def bound(self, initial: float, disturbances: ArrayLike, noises: ArrayLike) -> Array:
+    def bound(
+        self, initial: float | np.floating[Any], disturbances: ArrayLike, noises: ArrayLike
+    ) -> Array:
         """The right-hand side at t = 0, ..., T, (T + 1,), from lengths (T,) of w and v.
 
         Lengths that are not nonnegative, finite and equally many are refused.

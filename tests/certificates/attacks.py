@@ -16,19 +16,16 @@ RELATIVE, ABSOLUTE = 1e-9, 1e-12
 #: Kinds of noise of size about 1: (generator, steps, width) to (steps, width).
 NOISES = {
     "none": lambda rng, steps, width: np.zeros((steps, width)),
-    "normal": lambda rng, steps, width: rng.standard_normal((steps, width)),
-    "signs": lambda rng, steps, width: rng.choice([-1.0, 1.0], (steps, width)),
+    "normal": lambda rng, *shape: rng.standard_normal(shape),
+    "signs": lambda rng, *shape: rng.choice([-1.0, 1.0], shape),
     "constant": lambda rng, steps, width: np.tile(rng.choice([-1.0, 1.0], width), (steps, 1)),
     "sine": lambda rng, steps, width: np.sin(
         np.outer(np.arange(steps), rng.uniform(0.1, 3.0, width)) + rng.uniform(0.0, 6.0, width)
     ),
     "ramp": lambda rng, steps, width: np.linspace(0.0, 1.0, steps)[:, None]
     * rng.choice([-1.0, 1.0], width),
-    "impulses": lambda rng, steps, width: rng.standard_normal((steps, width))
-    * (rng.random((steps, 1)) < 0.1),
-    "heavy tails": lambda rng, steps, width: np.clip(
-        rng.standard_t(2.0, (steps, width)), -30.0, 30.0
-    ),
+    "impulses": lambda rng, *shape: rng.standard_normal(shape) * (rng.random((shape[0], 1)) < 0.1),
+    "heavy tails": lambda rng, *shape: np.clip(rng.standard_t(2.0, shape), -30.0, 30.0),
 }
 
 
@@ -241,29 +238,27 @@ def attack_estimator(
     noises = list(product(NOISES, NOISES))
     rng.shuffle(noises)
     names = qpmhe.solvers.available() if backends is None else backends
+    found, kind = [], certificate.kinds[-1]
+
+    def play(trial):
+        error, bounds = played(certificate, trial)
+        found.append((share_of(error, bounds[kind])[1:].max(), trial, error, bounds))
+        return found[-1][0]
+
     turns = zip(cycle(product(names, caps)), cycle(noises), range(trials), strict=False)
-    found = []
     for (backend, cap), kinds, _ in turns:
-        trial = drawn_trial(certificate, backend, cap, kinds, steps, rng)
-        found.append((trial, played(certificate, trial)))
-    kind = certificate.kinds[-1]
-
-    def reached(outcome):
-        return share_of(outcome[0], outcome[1][kind])[1:].max()
-
-    ranked = sorted(found, key=lambda pair: -reached(pair[1]))
+        play(drawn_trial(certificate, backend, cap, kinds, steps, rng))
+    ranked = sorted(found, key=lambda each: -each[0])
     # A large disturbance reaches its own bound one step later; without any, more can be found.
-    silent = [pair for pair in ranked if not pair[0].w.any()]
-    for trial, outcome in ranked[: polished - polished // 2] + silent[: polished // 2]:
-        best, most = trial, reached(outcome)
+    silent = [each for each in ranked if not each[1].w.any()]
+    for most, best, *_ in ranked[: polished - polished // 2] + silent[: polished // 2]:
         for i in range(rounds):
             other = worse(certificate.region, best, 10.0 ** (-0.3 - 2.0 * i / rounds), rng)
-            found.append((other, played(certificate, other)))
-            if reached(found[-1][1]) > most:
-                best, most = other, reached(found[-1][1])
-    error = np.array([each[0] for _, each in found])
+            if (reached := play(other)) > most:
+                best, most = other, reached
+    error = np.array([each[2] for each in found])
     attacks = {
-        kind: verdict(error[:, 1:], np.array([each[1][kind] for _, each in found])[:, 1:])
+        kind: verdict(error[:, 1:], np.array([each[3][kind] for each in found])[:, 1:])
         for kind in certificate.kinds
     }
     return attacks, sum(int(np.isnan(row).any()) for row in error)

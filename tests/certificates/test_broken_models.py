@@ -78,7 +78,7 @@ def test_the_audit_names_where_f_is_not_finite():
     found = audit(scalar(lost), GAIN, COST, box(6.0, 10.0))["states stay in X"]
     assert found.holds is False
     assert "not finite" in found.text
-    assert np.isnan(found.counterexample["f(x)"]).all()
+    assert "[nan]" in found.text
 
 
 def test_nothing_is_enclosed_where_the_value_is_not_a_number():
