@@ -19,6 +19,7 @@ from ..estimation.engine import PythonEngine
 from ..estimation.engines import EngineChangeError
 from ..estimation.estimate import DroppedRow, Estimate, Status
 from ..estimation.prior import PriorWeights
+from ..estimation.problem import Solved
 from ..estimation.run import Run
 from ..estimation.settings import Settings
 from ..estimation.snapshot import (
@@ -101,6 +102,8 @@ class CompiledEngine:
         self._call = library.update
         self._observer, self._watch = observer, CompiledWatch(horizon)
         self._time = self._memory["time"]
+        # Holds the present window where that is asked for.
+        self._mirror: PythonEngine | None = None
         # The time of the next comparison of the trace with the functions that it stands for.
         self._traces = WatchedFunctions(system, observer, cost)
         self._next_check: float = 0 if self._traces else math.inf
@@ -327,6 +330,18 @@ class CompiledEngine:
                 prior * factors[0],
                 self._basis(),
             )
+
+    def solved(self) -> Solved:
+        """The last step's problem and its estimate, as the Python step has them."""
+        record = self._memory[0]
+        if not record["has_trajectory"]:
+            raise InvalidInputError("there is no estimate yet; update first.")
+        if self._mirror is None:
+            parts = self._system.copy(traced=True), self._observer, self._given_cost
+            self._mirror = PythonEngine(*parts, self._settings, self.state)
+        with np.errstate(all="ignore"):
+            hand_over(record, self._directions, self.usual, self._mirror)
+        return self._mirror.solved()
 
     def _basis(self) -> Array:
         """The directions (n, k) in which there are disturbances."""

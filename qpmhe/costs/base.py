@@ -17,7 +17,7 @@ from qpmhe_solvers.values import finite, shown
 
 from .._checks import SINGULAR, Array
 from .._linalg import inverse
-from ..errors import OptionError
+from ..errors import InvalidInputError, OptionError
 from .subspace import Subspace
 
 Mask = NDArray[np.bool_]
@@ -306,6 +306,37 @@ class Cost(ABC):
     def majorise_prior(self, offset: Array, weight: Array) -> Array:
         """The prior's counterpart of `majorise`, for offset and weight as of `prior_cost`."""
 
+    def stage_hessian(self, residuals: Array, weights: Array) -> Array:
+        """Second derivatives (K, n + p, n + p) of the stage costs; see `stage_costs`."""
+        raise self._no_second_derivatives()
+
+    def stage_weight_gradient(
+        self, residuals: Array, directions: Array, weights: Array
+    ) -> Array:
+        """Derivatives by the weights of the slopes of the stage costs in some directions.
+
+        Directions are (..., K, n + p), and the derivatives symmetric (..., K, r + p, r + p), by
+        weights of (w, v).
+        """
+        raise self._no_second_derivatives()
+
+    def prior_hessian(self, offset: Array, weight: Array) -> Array:
+        """Second derivative (n, n) of the prior's cost; see `prior_cost`."""
+        raise self._no_second_derivatives()
+
+    def prior_weight_gradient(
+        self, offset: Array, directions: Array, weight: Array
+    ) -> Array:
+        """The prior's counterpart of `stage_weight_gradient`: (..., n) to (..., n, n)."""
+        raise self._no_second_derivatives()
+
+    def _no_second_derivatives(self) -> InvalidInputError:
+        return InvalidInputError(
+            f"{type(self).__name__} has no second derivatives; take qpmhe.QuadraticCost or "
+            "qpmhe.RobustCost, or give it the methods stage_hessian, stage_weight_gradient, "
+            "prior_hessian and prior_weight_gradient."
+        )
+
     def joint_weight(self, noise: Array | None, disturbance: Array | None = None) -> Array:
         """The weight of (w, v), of ``disturbance`` and ``noise``; None is the usual weight."""
         size = self.disturbance.shape[0]
@@ -373,3 +404,9 @@ def quadratic_form(residuals: Array, weights: Array) -> Array:
     else:
         form = np.einsum("ki,kij,kj->k", residuals, weights, residuals)
     return form
+
+
+def both_ways(left: Array, right: Array) -> Array:
+    """The symmetric matrices ``left right' + right left'`` of vectors (..., d)."""
+    product = left[..., :, None] * right[..., None, :]
+    return np.asarray(product + np.swapaxes(product, -1, -2))

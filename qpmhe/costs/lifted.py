@@ -81,6 +81,29 @@ class LiftedCost(Cost):
         """The user's; see `Cost.majorise_prior`."""
         return self._cost.majorise_prior(offset, weight)
 
+    def stage_hessian(self, residuals: Array, weights: Array) -> Array:
+        """The user's, of d; see `Cost.stage_hessian`."""
+        if self.quadratic:
+            return self._cost.stage_hessian(residuals, weights)
+        bent = self._cost.stage_hessian(residuals @ self._lift.T, self._lowered(weights))
+        lifted: Array = self._lift.T @ bent @ self._lift
+        n = len(self._stand_in)
+        lifted[..., :n, :n] += 2.0 * self._stand_in
+        return lifted
+
+    def stage_weight_gradient(self, residuals: Array, directions: Array, weights: Array) -> Array:
+        """By the user's weights; see `Cost.stage_weight_gradient`."""
+        along = residuals @ self._lift.T, directions @ self._lift.T
+        return self._cost.stage_weight_gradient(*along, self._lowered(weights))
+
+    def prior_hessian(self, offset: Array, weight: Array) -> Array:
+        """The user's; see `Cost.prior_hessian`."""
+        return self._cost.prior_hessian(offset, weight)
+
+    def prior_weight_gradient(self, offset: Array, directions: Array, weight: Array) -> Array:
+        """The user's; see `Cost.prior_weight_gradient`."""
+        return self._cost.prior_weight_gradient(offset, directions, weight)
+
     def joint_weight(self, noise: Array | None, disturbance: Array | None = None) -> Array:
         """The weight of (d, v) with a weight (r, r) of w; see `Cost.joint_weight`."""
         return super().joint_weight(noise, self._lifted(disturbance))

@@ -8,8 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array, flag, positive, positive_definite
-from ..errors import OptionError, WeightError
+from ..errors import InvalidInputError, OptionError, WeightError
 from .base import LossForm, quadratic_form
+
+# Of central differences of rho'.
+_STEP = float(np.finfo(np.float64).eps) ** (1 / 3)
 
 
 class Loss(ABC):
@@ -87,6 +90,51 @@ class Loss(ABC):
             return scaled[:, :, None] * np.eye(s.shape[1])
         return self._slope(quadratic_form(s, weight))[:, None, None] * weight
 
+    def hessian(self, s: Array, weight: Array) -> Array:
+        """Second derivatives (K, d, d) of the loss at each row s; see `cost`."""
+        slope, curvature, weighted = self._derivatives(s, weight)
+        if self.per_component:
+            diagonal = np.diagonal(weight, axis1=-2, axis2=-1)
+            second = 2.0 * diagonal * slope + 4.0 * curvature * weighted * weighted
+            return second[:, :, None] * np.eye(s.shape[1])
+        products = weighted[:, :, None] * weighted[:, None, :]
+        bent: Array = 2.0 * slope[:, None, None] * weight
+        return bent + 4.0 * curvature[:, None, None] * products
+
+    def weight_gradient(self, s: Array, directions: Array, weight: Array) -> Array:
+        """Derivatives by a symmetric weight of the loss's slope at s (K, d) in some directions.
+
+        Directions are (..., K, d), and the derivatives symmetric matrices (..., K, d, d).
+        """
+        slope, curvature, weighted = self._derivatives(s, weight)
+        if self.per_component:
+            found = 2.0 * directions * s * (slope + curvature * weighted * s)
+            return np.asarray(found[..., None] * np.eye(s.shape[1]))
+        half = slope[:, None, None] * directions[..., :, None] * s[:, None, :]
+        along = 2.0 * curvature * np.einsum("...ki,ki->...k", directions, weighted)
+        outer = s[:, :, None] * s[:, None, :]
+        return np.asarray(half + np.swapaxes(half, -1, -2) + along[..., None, None] * outer)
+
+    def _derivatives(self, s: Array, weight: Array) -> tuple[Array, Array, Array]:
+        """Rho' and rho'' at each row s, or each of its components, and W s."""
+        if any(
+            getattr(type(self), name) is not getattr(Loss, name) for name in ("cost", "majorise")
+        ):
+            raise InvalidInputError(
+                f"{type(self).__name__} computes its cost in its own way, so its second "
+                "derivatives are not known; write it as a function of the quadratic form, "
+                "with _value and _slope, or take qpmhe.Huber or qpmhe.Power."
+            )
+        weighted = np.matmul(weight, s[:, :, None])[:, :, 0]
+        form = s * weighted if self.per_component else np.einsum("ki,ki->k", s, weighted)
+        return self._slope(form), self._curvature(form), weighted
+
+    def _curvature(self, q: Array) -> Array:
+        """rho''(q), by differences unless a loss knows better; forms have no unit."""
+        step = _STEP * np.maximum(q, 1.0)
+        below = np.maximum(q - step, 0.0)
+        return np.asarray((self._slope(q + step) - self._slope(below)) / (q + step - below))
+
     def constants(self) -> tuple[float, float] | None:
         """Constants c, C with c |s|^a <= loss(s) <= C |s|^a; None if there are none."""
         if self.exponent is None:
@@ -118,6 +166,9 @@ class Quadratic(Loss):
 
     def _slope(self, q: Array) -> Array:
         return np.ones_like(q)
+
+    def _curvature(self, q: Array) -> Array:
+        return np.zeros_like(q)
 
 
 class Huber(Loss):
@@ -162,6 +213,10 @@ class Huber(Loss):
     def _slope(self, q: Array) -> Array:
         return np.minimum(1.0, self.threshold / np.sqrt(np.maximum(q, self.threshold**2)))
 
+    def _curvature(self, q: Array) -> Array:
+        k = self.threshold
+        return np.where(q <= k * k, 0.0, -0.5 * k * np.maximum(q, k * k) ** -1.5)
+
 
 class Power(Loss):
     r"""The power :math:`|s|_W^a` of the weighted norm, :math:`a \ge 1`.
@@ -201,3 +256,7 @@ class Power(Loss):
 
     def _slope(self, q: Array) -> Array:
         return 0.5 * self.exponent * np.maximum(q, 1e-8) ** (0.5 * self.exponent - 1.0)
+
+    def _curvature(self, q: Array) -> Array:
+        half = 0.5 * self.exponent
+        return np.where(q < 1e-8, 0.0, half * (half - 1.0) * np.maximum(q, 1e-8) ** (half - 2.0))

@@ -9,7 +9,7 @@ from qpmhe_solvers.errors import report_unknown_options
 
 from .._checks import SINGULAR, Array, check_prior_size, positive_definite, positive_semidefinite
 from .._linalg import inverse, unit_diagonal
-from .base import Cost, CostConstants, CostForm, ObserverPrior, quadratic_form
+from .base import Cost, CostConstants, CostForm, ObserverPrior, both_ways, quadratic_form
 
 
 @report_unknown_options
@@ -122,6 +122,27 @@ class QuadraticCost(Cost):
     def majorise_prior(self, offset: Array, weight: Array) -> Array:
         """The weight itself; see `Cost.majorise_prior`."""
         return weight
+
+    def stage_hessian(self, residuals: Array, weights: Array) -> Array:
+        """Twice the weights; see `Cost.stage_hessian`."""
+        self._check_own()
+        return np.broadcast_to(2.0 * weights, (len(residuals), *weights.shape[-2:]))
+
+    def stage_weight_gradient(self, residuals: Array, directions: Array, weights: Array) -> Array:
+        """See `Cost.stage_weight_gradient`."""
+        return both_ways(directions, residuals)
+
+    def prior_hessian(self, offset: Array, weight: Array) -> Array:
+        """Twice the weight; see `Cost.prior_hessian`."""
+        return 2.0 * weight
+
+    def prior_weight_gradient(self, offset: Array, directions: Array, weight: Array) -> Array:
+        """See `Cost.prior_weight_gradient`."""
+        return both_ways(directions, offset)
+
+    def _check_own(self) -> None:
+        if type(self).stage_costs is not QuadraticCost.stage_costs:
+            raise self._no_second_derivatives()
 
 
 def _inverse(name: str, covariance: ArrayLike) -> Array:

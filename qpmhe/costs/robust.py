@@ -116,6 +116,37 @@ class RobustCost(Cost):
         value: Array = self.prior_loss.majorise(offset[None], weight)[0]
         return value
 
+    def stage_hessian(self, residuals: Array, weights: Array) -> Array:
+        """See `Cost.stage_hessian`."""
+        if type(self).stage_costs is not RobustCost.stage_costs:
+            raise self._no_second_derivatives()
+        r, q = self.r, self.r + self.p
+        joint = np.zeros((residuals.shape[0], q, q))
+        joint[:, :r, :r] = self.disturbance_loss.hessian(residuals[:, :r], weights[..., :r, :r])
+        joint[:, r:, r:] = self.noise_loss.hessian(residuals[:, r:], weights[..., r:, r:])
+        return joint
+
+    def stage_weight_gradient(self, residuals: Array, directions: Array, weights: Array) -> Array:
+        """See `Cost.stage_weight_gradient`."""
+        r, q = self.r, self.r + self.p
+        joint = np.zeros((*directions.shape, q))
+        for loss, part in ((self.disturbance_loss, slice(r)), (self.noise_loss, slice(r, q))):
+            joint[..., part, part] = loss.weight_gradient(
+                residuals[:, part], directions[..., part], weights[..., part, part]
+            )
+        return joint
+
+    def prior_hessian(self, offset: Array, weight: Array) -> Array:
+        """See `Cost.prior_hessian`."""
+        value: Array = self.prior_loss.hessian(offset[None], weight)[0]
+        return value
+
+    def prior_weight_gradient(self, offset: Array, directions: Array, weight: Array) -> Array:
+        """See `Cost.prior_weight_gradient`."""
+        found = self.prior_loss.weight_gradient(offset[None], directions[..., None, :], weight)
+        value: Array = found[..., 0, :, :]
+        return value
+
 
 def _loss(name: str, given: Loss | ArrayLike) -> Loss:
     if isinstance(given, Loss):

@@ -27,7 +27,7 @@ from .conditions import USUAL, ConditionReader, Conditions, usual_conditions
 from .covariance import window_covariances
 from .estimate import Estimate, Status
 from .optimizer import Optimizer
-from .problem import Formulation
+from .problem import Formulation, Solved
 from .recheck import check_stages
 from .settings import Settings
 from .snapshot import (
@@ -446,6 +446,15 @@ class PythonEngine:
                 problem.prior_weight_at(problem.offset(trial.trajectory)),
                 problem.constraints.basis,
             )
+
+    def solved(self) -> Solved:
+        """The last step's problem and its estimate."""
+        if self._trajectory is None:
+            raise InvalidInputError("there is no estimate yet; update first.")
+        window, formulation = self._window, self._tools.formulation
+        with np.errstate(all="ignore"):
+            problem = formulation.problem(window)
+        return Solved(problem, formulation, self._trajectory.copy(), window.conditions)
 
     def state_dict(self) -> dict[str, Any]:
         """The memory as plain arrays and numbers."""

@@ -24,6 +24,7 @@ from ..observers import Observer
 from .conditions import Conditions
 from .engine import PythonEngine
 from .estimate import Estimate
+from .problem import Solved
 from .run import Run
 from .settings import Settings
 
@@ -74,6 +75,9 @@ class Engine(Protocol):
 
     def covariances(self) -> Array:
         """Covariances along the last estimate."""
+
+    def solved(self) -> Solved:
+        """The last step's problem and its estimate."""
 
     def state_dict(self) -> dict[str, Any]:
         """The memory as plain arrays and numbers."""

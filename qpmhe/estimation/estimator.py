@@ -19,6 +19,7 @@ from .._checks import flag, numbers, positive, record, vector
 from .._linalg import inverse
 from ..costs import Cost
 from ..errors import InvalidInputError, ModelError, ObserverWarning, OptionError, ShapeError
+from ..model.second_derivatives import SecondDerivatives
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..model.traces import warn_of
@@ -28,6 +29,7 @@ from .conditions import ConditionReader, Conditions
 from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
 from .run import Run
+from .sensitivity import Sensitivity
 from .settings import Settings
 
 Array = NDArray[np.float64]
@@ -192,6 +194,7 @@ class MovingHorizonEstimator:
         self._full_input = self._usual_input.copy()  # each sample's, overwritten
         self._reader, self._partial = ConditionReader(system, cost), np.empty(system.p)
         self._initial_state: Array = self._checked_start(initial_state, self._own_system)
+        self._second: SecondDerivatives | None = None
         try:
             self._engine = engine_for(
                 self._own_system, observer, cost, self.settings, self._initial_state
@@ -570,6 +573,35 @@ class MovingHorizonEstimator:
             Before the first measurement, or if the model cannot be linearised there.
         """
         return self._engine.covariances()
+
+    def sensitivity(self) -> Sensitivity:
+        """Derivatives of the last estimate with respect to weights, data and parameters.
+
+        By the implicit function theorem on the window's true cost, with its exact Hessian and
+        its active rows held; whatever engine made the step. It takes a few factorisations of a
+        banded matrix, O(N n^3), and each derivative one solve.
+
+        Returns
+        -------
+        Sensitivity
+            Its `Sensitivity.adjoint` gives the derivative of any function of the trajectory by
+            everything at once.
+
+        Raises
+        ------
+        InvalidInputError
+            Before the first measurement, or if second derivatives do not exist along the
+            estimate or are not known: of a cost of the user's own, or of an active nonlinear
+            constraint.
+        """
+        solved = self._engine.solved()
+        system, second = solved.formulation.system, self._second
+        if second is None or second.system is not system or second.traced != system.is_traced:
+            self._second = second = SecondDerivatives(system)
+        with np.errstate(all="ignore"):
+            return Sensitivity(
+                solved, second, self.settings.tolerance, len(self.settings.parameters)
+            )
 
     def _newest_covariance(self) -> Array:
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from ..model.functions import contained, raised_along
 from ..model.residuals import difference
 from ..model.system import System
 from ..observers import Observer
+from .conditions import Conditions
 from .constraints import Constraints
 from .estimate import DroppedRow
 from .limits import FEASIBLE
@@ -428,3 +430,23 @@ class Problem:
             return self._prior_band
         return band_of(self.prior_weight_at(offset))
 
+
+class Solved(NamedTuple):
+    """The last step's problem and what it was solved with.
+
+    Attributes
+    ----------
+    problem : Problem
+        The problem of the window, with all of its rows.
+    formulation : Formulation
+        What it was made from.
+    trajectory : (K + 1, n) array
+        The estimate.
+    conditions : list of Conditions
+        What each sample was taken with.
+    """
+
+    problem: Problem
+    formulation: Formulation
+    trajectory: Array
+    conditions: list[Conditions]
