@@ -1,0 +1,417 @@
+"""What tuning has found: weights, their intervals, what is not identified, held-out scores."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._checks import Array, dimension
+from ..costs import Cost
+from ..observers import Observer
+from ..plots.style import STYLES, panels
+from .data import Data
+from .likelihood import Likelihood
+from .score import Score
+from .search import limit
+from .structures import Structure
+from .weights import Weights
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Of a normal variable, within 95 %; and half of the matching rise of twice the log likelihood.
+_NORMAL, _RISE = 1.959964, 1.920729
+# Wider 95 % intervals, either way: a factor for standard deviations, else a share or a number.
+_WIDEST_LOG, _WIDEST = float(np.log(10.0)), 1.0
+# Uncertainties that are as correlated as this are told in one sentence.
+_TOGETHER = 0.8
+# Eigenvalues of the Hessian below this count as it; an interval is infinite then.
+_FLAT = 1e-6
+
+
+@dataclass(frozen=True)
+class HorizonScore:
+    """A row of `Tuning.horizons`.
+
+    Attributes
+    ----------
+    horizon : int
+        N.
+    arrival : str
+        What weighs the prior, "observer" or "constant".
+    score : float
+        The held-out score, with 1 that of the start weights.
+    seconds : float
+        For a sample.
+    """
+
+    horizon: int
+    arrival: str
+    score: float
+    seconds: float
+
+
+class Tuning:
+    """The answer of `qpmhe.tune`; printing it gives a table.
+
+    Attributes
+    ----------
+    weights : Weights
+        What was found, as a whole.
+    values : dict
+        What each name stands for: standard deviations of disturbance, noise and prior in the
+        units of state and output, of a group that of its first component; parameters.
+    intervals : dict
+        Its 95 % interval (low, high) by the likelihood's curvature. That is honest where the
+        model is right; errors of the model make intervals too narrow.
+    likeliest : dict
+        The values of largest likelihood, about which the intervals are.
+    unidentified : tuple of str
+        What the records do not determine, in words.
+    scores : dict
+        (before, after) on the blocks held out, or on all if none are: the negative log
+        likelihood per sample, and root mean square errors in units of output or state.
+    judgement : str
+        Whether the search on the estimator's own error was taken, and why.
+    seconds : dict
+        How long each search took.
+    notes : tuple of str
+        What else the user should know.
+    """
+
+    def __init__(
+        self, structure: Structure, data: list[Data], likelihood: Likelihood, score: Score,
+        weights_at: Callable[[Array], Weights], theta: Array, hessian: Array,
+        refined: Array | None, objective: str, ahead: int, seconds: dict[str, float],
+        labels: Mapping[str, Sequence[str]], constant: list[int],
+    ) -> None:
+        self._structure, self._data, self._likelihood = structure, data, likelihood
+        self._score, self._weights_at = score, weights_at
+        self._objective, self._ahead, self._labels = objective, ahead, labels
+        self.seconds = seconds
+        self._judged = [one.held if any(each.held.any() for each in data)
+                        else np.ones(len(one), np.bool_) for one in data]
+        before = score.samples(weights_at(structure.start))
+        self._samples: dict[str, list[Array]] = {"before": before}
+        chosen = theta
+        self.judgement = "by the likelihood alone."
+        likeliest = score.samples(weights_at(theta))
+        if refined is not None:
+            chosen, self.judgement = self._judge(theta, refined, likeliest)
+        self._theta = chosen
+        self._samples["after"] = (
+            likeliest if chosen is theta else score.samples(weights_at(chosen))
+        )
+        self.weights = weights_at(chosen)
+        self.values = structure.values(chosen)
+        self.likeliest = structure.values(theta)
+        self._find_intervals(theta, hessian)
+        self.scores = self._scores(theta)
+        self.notes = tuple(
+            f"input {j + 1} is constant in all records, so nothing that it acts by is identified; "
+            "vary it." for j in constant
+        ) + ((f"the model failed at some points of the search ({likelihood.failure}), which were "
+              "avoided.",) if likelihood.failure else ())
+
+    @property
+    def prior(self) -> Array:
+        """Covariance of the initial error (n, n)."""
+        return self.weights.prior
+
+    @property
+    def disturbance(self) -> Array:
+        """Covariance of w (r, r)."""
+        return self.weights.disturbance
+
+    @property
+    def noise(self) -> Array:
+        """Covariance of v (p, p)."""
+        return self.weights.noise
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Parameters of the model."""
+        return self.weights.parameters
+
+    def cost(self) -> Cost:
+        """The cost of these weights, ready for `qpmhe.MovingHorizonEstimator`."""
+        return self.weights.cost()
+
+    def observer(self) -> Observer:
+        """The observer that goes with it."""
+        return self.weights.observer(self._score.kind)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the weights as TOML, for `qpmhe.tuning.load` and ``qpmhe estimate --weights``."""
+        return self.weights.save(path, str(self))
+
+    def _judge(
+        self, theta: Array, refined: Array, likeliest: list[Array]
+    ) -> tuple[Array, str]:
+        """The weights to take: those of the second search where they are better beyond chance."""
+        found = self._score.samples(self._weights_at(refined))
+        gains = []
+        for one, mask, new, old in zip(self._data, self._judged, found, likeliest, strict=True):
+            gains += [
+                float(np.nanmean((old - new)[mask & (one.block == b)]))
+                for b in np.unique(one.block[mask])
+                if np.isfinite((old - new)[mask & (one.block == b)]).any()
+            ]
+        what = "error" if self._objective == "truth" else "prediction error"
+        mean = float(np.mean(gains)) if gains else 0.0
+        spread = float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else 0.0
+        base = float(np.mean([np.nanmean(each) for each in likeliest]))
+        share = f"{100.0 * mean / base:.2g} % (standard error {100.0 * spread / base:.2g} %)"
+        if mean > spread:
+            return refined, (
+                f"by the likelihood, then the estimator's {what}: the mean square on held-out "
+                f"blocks falls by {share}."
+            )
+        return theta, (
+            f"by the likelihood: tuning the estimator's {what} as well would change its mean "
+            f"square on held-out blocks by {-100.0 * mean / base:.2g} % (standard error "
+            f"{100.0 * spread / base:.2g} %), no gain beyond chance."
+        )
+
+    def _find_intervals(self, theta: Array, hessian: Array) -> None:
+        structure, count = self._structure, self._structure.seen
+        eigenvalues, vectors = np.linalg.eigh(hessian) if count else (np.zeros(0), np.zeros((0, 0)))
+        inverse = (vectors / np.maximum(eigenvalues, _FLAT)) @ vectors.T
+        deviations = np.sqrt(inverse.diagonal())
+        values, self.intervals = structure.values(theta), {}
+        unknown, texts = [], []
+        for k in range(count):
+            name, value, width = structure.names[k], values[structure.names[k]], (
+                _NORMAL * deviations[k]
+            )
+            is_log = structure.is_log(k)
+            at_end = min(theta[k] - structure.limits[k][0], structure.limits[k][1] - theta[k])
+            if width > (_WIDEST_LOG if is_log else _WIDEST) or at_end < 1e-3:
+                unknown.append(k)
+            if is_log:
+                factor = float(np.exp(min(width, 700.0)))
+                self.intervals[name] = value / factor, value * factor
+            elif k < structure.covariances:
+                self.intervals[name] = value - width, value + width
+            else:
+                size = abs(structure.setting(structure.start).parameters[name])
+                self.intervals[name] = value - width * size, value + width * size
+        correlations = inverse / np.outer(deviations, deviations)
+        told: set[int] = set()
+        for k in unknown:
+            if k in told:
+                continue
+            joined = [j for j in unknown if j == k or abs(correlations[k, j]) > _TOGETHER]
+            told.update(joined)
+            texts.append(
+                self._words(theta, joined, correlations) if len(joined) > 1
+                else self._alone(theta, k)
+            )
+        self.unidentified = tuple(texts)
+
+    def _alone(self, theta: Array, k: int) -> str:
+        """The range of a component that the records do not determine, by the likelihood itself."""
+        structure = self._structure
+        name = structure.names[k]
+        reach = [
+            limit(self._likelihood, theta, structure, self._data, k, sign, _RISE)
+            for sign in (-1.0, 1.0)
+        ]
+        ends = []
+        for one in reach:
+            at = theta.copy()
+            at[k] = theta[k] if one is None else one
+            ends.append(structure.values(at)[name])
+        low, high = ends
+        is_log = structure.is_log(k)
+        self.intervals[name] = (
+            low if reach[0] is not None else (0.0 if is_log else -np.inf),
+            high if reach[1] is not None else np.inf,
+        )
+        if reach[0] is None and reach[1] is None:
+            return f"{name}: the records say nothing about it, any value fits."
+        if reach[0] is None:
+            return f"{name}: any value below {high:.3g} fits the records."
+        if reach[1] is None:
+            return f"{name}: any value above {low:.3g} fits the records."
+        return f"{name}: the records fit anything from {low:.3g} to {high:.3g}."
+
+    def _words(self, theta: Array, members: list[int], correlations: Array) -> str:
+        names = [self._structure.names[k] for k in members]
+        for k in members:
+            self._alone(theta, k)
+        same = [correlations[members[0], k] > 0.0 for k in members]
+        how = "together" if all(same) else "one against the other"
+        return (
+            f"{', '.join(names[:-1])} and {names[-1]}: they can change {how}, and fit the records "
+            "as well; fix one of them, or tie them in a group."
+        )
+
+    def _scores(self, theta: Array) -> dict[str, tuple[float, float]]:
+        """Before and after, on the blocks that judge."""
+        start, found = self._structure.start, {}
+        samples = sum(int(mask.sum()) for mask in self._judged)
+        found["negative log likelihood per sample"] = tuple(
+            self._likelihood.value(at, self._judged) / samples for at in (start, theta)
+        )
+        errors = [self._score.errors(self._weights_at(at)) for at in (start, self._theta)]
+        truth = self._objective == "truth"
+        labels = self._labels["prior" if truth else "noise"]
+        for j, label in enumerate(labels):
+            sizes = []
+            for each in errors:
+                part = np.concatenate(
+                    [one[mask, j] for one, mask in zip(each, self._judged, strict=True)]
+                )
+                part = part[np.isfinite(part)]
+                sizes.append(float(np.sqrt(np.mean(part * part))) if part.size else np.nan)
+            name = f"error of {label}" if truth else f"{label}, {self._ahead} ahead"
+            if np.isfinite(sizes[0]):
+                found[name] = sizes[0], sizes[1]
+        return {name: (float(a), float(b)) for name, (a, b) in found.items()}
+
+    def horizons(
+        self, horizons: Sequence[int] = (2, 5, 10, 20, 40),
+        arrivals: Sequence[str] = ("observer", "constant"),
+    ) -> list[HorizonScore]:
+        """The held-out score against N, and against what weighs the prior.
+
+        Take the shortest horizon whose score is about the best.
+
+        Parameters
+        ----------
+        horizons : sequence of int
+            N to try.
+        arrivals : sequence of str
+            "observer", "constant" or both.
+
+        Returns
+        -------
+        list of HorizonScore
+            In the order of ``horizons``; scores have the unit of those before tuning.
+        """
+        rows = []
+        for horizon in horizons:
+            dimension("horizon", horizon, 1)
+            for arrival in arrivals:
+                weights = Weights(**{
+                    **vars(self.weights), "horizon": horizon, "arrival": arrival,
+                })
+                began = perf_counter()
+                samples = self._score.samples(weights)
+                spent = (perf_counter() - began) / sum(map(len, self._data))
+                rows.append(HorizonScore(horizon, arrival, self._mean(samples), spent))
+        return rows
+
+    def _mean(self, samples: list[Array]) -> float:
+        return float(np.nanmean(np.concatenate(
+            [one[mask] for one, mask in zip(samples, self._judged, strict=True)]
+        )))
+
+    def __str__(self) -> str:
+        from rich.console import Console
+        from rich.table import Table
+
+        start = self._structure.values(self._structure.start)
+        weights = Table(box=None, pad_edge=False, title="Weights, as standard deviations",
+                        title_justify="left")
+        for title in ("", "before", "after", "95 % interval"):
+            weights.add_column(title, justify="left" if not title else "right", no_wrap=True)
+        for name, value in self.values.items():
+            interval = self.intervals.get(name)
+            text = "" if interval is None else f"{interval[0]:.3g} to {interval[1]:.3g}"
+            weights.add_row(name, f"{start[name]:.4g}", f"{value:.4g}", text)
+        held = "held-out blocks" if any(one.held.any() for one in self._data) else "all samples"
+        scores = Table(box=None, pad_edge=False, title=f"Scores on {held}, less is better",
+                       title_justify="left")
+        for title in ("", "before", "after"):
+            scores.add_column(title, justify="left" if not title else "right", no_wrap=True)
+        for name, (before, after) in self.scores.items():
+            scores.add_row(name, f"{before:.4g}", f"{after:.4g}")
+        console = Console(file=io.StringIO(), width=110, no_color=True)
+        console.print(weights)
+        console.print()
+        console.print(scores)
+        texts = [f"Chosen {self.judgement}"]
+        texts += [f"Not identified: {one}" for one in self.unidentified]
+        texts += [f"Note: {one}" for one in self.notes]
+        for text in texts:
+            console.print(text, highlight=False, markup=False)
+        file = console.file
+        assert isinstance(file, io.StringIO)
+        return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw how each value has changed with its interval, and the held-out scores.
+
+        Parameters
+        ----------
+        axes : two matplotlib Axes, optional
+            To draw into; a new figure if left out.
+
+        Returns
+        -------
+        list of Axes
+            Values as factors of the start; scores of the blocks.
+        """
+        if axes is None:
+            from matplotlib import rc_context
+            from matplotlib.figure import Figure
+
+            from ..plots.style import LIGHT
+
+            with rc_context(LIGHT):
+                tall = 1.2 + 0.24 * len(self.intervals)
+                figure = Figure(figsize=(8.4, max(2.6, tall)), layout="constrained")
+                axes = figure.subplots(1, 2, width_ratios=(3, 2))
+        left, right = panels(2, axes)
+        self._draw_values(left)
+        self._draw_blocks(right)
+        return [left, right]
+
+    def _draw_values(self, axes: Axes) -> None:
+        start = self._structure.values(self._structure.start)
+        shown = [name for name in self.intervals if start[name] > 0.0]
+        found, blue = STYLES[0]["color"], STYLES[1]["color"]
+        for row, name in enumerate(reversed(shown)):
+            low, high = (
+                float(np.clip(end / start[name], 1e-4, 1e4)) for end in self.intervals[name]
+            )
+            axes.plot([low, high], [row, row], color=found, linewidth=5.0, alpha=0.3,
+                      solid_capstyle="butt", label="95 % interval" if row == 0 else None)
+            axes.plot(self.values[name] / start[name], row, "o", color=found, markersize=5.0,
+                      label="after" if row == 0 else None)
+        axes.axvline(1.0, color=blue, linestyle="--", linewidth=1.2, label="before")
+        axes.set_xscale("log")
+        axes.set_yticks(range(len(shown)), list(reversed(shown)))
+        axes.set_xlabel("standard deviation, as a factor of the start")
+        axes.legend(fontsize="small", loc="best")
+
+    def _draw_blocks(self, axes: Axes) -> None:
+        where, rows = [], {"before": [], "after": []}  # type: ignore[var-annotated]
+        for k, one in enumerate(self._data):
+            for block in np.unique(one.block):
+                inside = one.block == block
+                if not np.isfinite(self._samples["before"][k][inside]).any():
+                    continue
+                where.append(bool(one.held[inside].any()))
+                for name, found in rows.items():
+                    found.append(float(np.nanmean(self._samples[name][k][inside])))
+        at = np.arange(len(where))
+        for k, (name, found) in enumerate(rows.items()):
+            style = STYLES[1 - k]
+            axes.plot(at, found, marker="o", markersize=3.5, label=name, **style)
+        for k in np.flatnonzero(where):
+            axes.axvspan(k - 0.5, k + 0.5, color="0.93", zorder=0,
+                         label="held out" if k == int(np.argmax(where)) else None)
+        axes.set_xlabel("block")
+        what = "error" if self._objective == "truth" else f"prediction error, {self._ahead} ahead"
+        axes.set_ylabel(f"{what}, mean square, scaled")
+        axes.set_ylim(bottom=0.0)
+        axes.legend(fontsize="small", loc="best")

@@ -1,0 +1,195 @@
+"""The records that weights are tuned on, checked, and which of their blocks are held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qpmhe_solvers.values import shown
+
+from .._checks import Array, numbers, record, vector
+from ..errors import InvalidInputError, OptionError, ShapeError
+from ..model.system import System
+from ..models.scenario import Record
+
+Mask = NDArray[np.bool_]
+
+# Blocks of a record, at most, and measured numbers for each parameter, at least.
+_BLOCKS, _LEAST = 12, 10
+
+
+@dataclass(frozen=True, eq=False)
+class TuningRecord:
+    """A record to tune on.
+
+    Parameters
+    ----------
+    measurements : (T, p) array_like
+        y(0), ..., y(T-1), NaN where they are missing.
+    inputs : (T, m) array_like, optional
+        The inputs of the same times, without the model's parameters.
+    states : (T, n) or (T + 1, n) array_like, optional
+        The true states, NaN throughout in a column where a state has no truth.
+    dt : (T,) array_like, optional
+        Length of each step, from t to t + 1, where they are not the sampling time.
+    initial_state : (n,) array_like, optional
+        The estimate of x(0); the one given to `qpmhe.tune` if left out.
+    """
+
+    measurements: ArrayLike
+    inputs: ArrayLike | None = None
+    states: ArrayLike | None = None
+    dt: ArrayLike | None = None
+    initial_state: ArrayLike | None = None
+
+
+class Data:
+    """A checked record: y (T, p), u (T, m), dt (T,) or None, truth or None, z(0), blocks."""
+
+    def __init__(self, name: str, given: TuningRecord, system: System, inputs: int,
+                 initial_state: Array | None) -> None:
+        self.name = name
+        self.y = record(f"measurements of {name}", given.measurements, system.p)
+        self.observed: Mask = np.isfinite(self.y)
+        samples = len(self.y)
+        if not self.observed.any():
+            raise InvalidInputError(
+                f"all measurements of {name} are missing; leave this record out, or check its "
+                "columns."
+            )
+        if inputs and given.inputs is None:
+            raise InvalidInputError(
+                f"{name} has no inputs, and the system takes {inputs}; give (measurements, inputs)."
+            )
+        us = np.zeros((samples, 0))
+        if given.inputs is not None:
+            us = record(f"inputs of {name}", given.inputs, inputs)
+        self.u = us
+        if len(us) != samples or not np.isfinite(us).all():
+            raise InvalidInputError(
+                f"inputs of {name}: {len(us)} samples, {int((~np.isfinite(us)).sum())} numbers "
+                f"missing; expected {samples} samples without gaps. Hold the last value in gaps."
+            )
+        self.dt: Array | None = None
+        if given.dt is not None:
+            self.dt = vector(f"dt of {name}", given.dt, samples)
+            if not (self.dt > 0.0).all():
+                raise InvalidInputError(f"dt of {name} has steps <= 0; sort the record by time.")
+            if system.make_timed is None:
+                raise InvalidInputError(
+                    f"{name} has steps of its own (dt), and the system is discrete; make it by "
+                    "System.from_ode, or resample the record."
+                )
+        self.truth = None if given.states is None else _truth(name, given.states, system, samples)
+        start = initial_state
+        if given.initial_state is not None:
+            start = vector(f"initial_state of {name}", given.initial_state, system.n)
+        if start is None:
+            raise InvalidInputError(
+                f"{name} has no initial_state; give tune(..., initial_state=x0), the estimate at "
+                "the first measurement."
+            )
+        self.start: Array = start
+        self.block = np.zeros(samples, np.intp)
+        self.held: Mask = np.zeros(samples, np.bool_)
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+
+def _truth(name: str, given: ArrayLike, system: System, samples: int) -> Array:
+    truth = numbers(f"states of {name}", given, finite=False)
+    if truth.ndim != 2 or truth.shape[1] != system.n or len(truth) not in (samples, samples + 1):
+        raise ShapeError(
+            f"states of {name} have shape {truth.shape}; expected ({samples}, {system.n}), or one "
+            "row more."
+        )
+    missing = ~np.isfinite(truth)
+    partly = missing.any(axis=0) & ~missing.all(axis=0)
+    if partly.any() or missing.all():
+        j = int(np.argmax(partly)) if partly.any() else 0
+        rows = np.flatnonzero(missing[:, j])
+        raise InvalidInputError(
+            f"the truth of state {j + 1} of {name} is missing in {rows.size} rows, first in row "
+            f"{rows[0]}; interpolate it, or make its whole column NaN: then the state counts as "
+            "one without truth. Leave states out if no state has any."
+        )
+    return truth
+
+
+def checked_data(
+    records: Any, system: System, inputs: int, initial_state: ArrayLike | None
+) -> list[Data]:
+    """The records as `qpmhe.tune` takes them."""
+    if isinstance(records, (TuningRecord, Record)):
+        records = [records]
+    if not isinstance(records, Sequence) or isinstance(records, str) or not len(records):
+        raise InvalidInputError(
+            f"records is {shown(records)}; expected a list such as [(Y, U), ...], of arrays of "
+            "measurements (T, p) and inputs (T, m), or of qpmhe.tuning.TuningRecord."
+        )
+    start = None if initial_state is None else vector("initial_state", initial_state, system.n)
+    found = []
+    for k, one in enumerate(records):
+        if isinstance(one, Record):
+            made = TuningRecord(one.measurements, one.inputs, one.states)
+        elif isinstance(one, TuningRecord):
+            made = one
+        elif isinstance(one, tuple) and 1 <= len(one) <= 3:
+            made = TuningRecord(*one)
+        elif isinstance(one, np.ndarray):
+            made = TuningRecord(one)
+        else:
+            raise InvalidInputError(
+                f"records[{k}] is {shown(one)}; expected (Y,), (Y, U), (Y, U, X) or a "
+                "qpmhe.tuning.TuningRecord."
+            )
+        found.append(Data(f"records[{k}]", made, system, inputs, start))
+    return found
+
+
+def hold_out(data: list[Data], share: float, least: int) -> None:
+    """Cut each record into blocks of at least so many samples; hold some of them out."""
+    if not 0.0 <= share <= 0.5:
+        raise OptionError(f"held_out is {share!r}; expected a share from 0 to 0.5.")
+    count = 0
+    for one in data:
+        parts = max(1, min(_BLOCKS, len(one) // least))
+        one.block = count + np.arange(len(one)) * parts // len(one)
+        count += parts
+    if share == 0.0:
+        return
+    # Spread evenly, and never the first one: it begins with the initial error.
+    wanted = max(1, round(share * count))
+    chosen = np.unique(((np.arange(wanted) + 0.5) / wanted * count).astype(np.intp))
+    if count < 3:
+        samples = sum(map(len, data))
+        raise InvalidInputError(
+            f"the records have {samples} samples, too few for held-out blocks of {least}; record "
+            "for longer, take a shorter horizon, or give held_out=0: then nothing judges the "
+            "weights."
+        )
+    for one in data:
+        one.held = np.isin(one.block, chosen)
+
+
+def check_enough(data: list[Data], names: Sequence[str], noise: Sequence[int]) -> None:
+    """Check that what is not held out can determine the parameters, `noise` the outputs' levels."""
+    seen = sum(one.observed[~one.held].sum(axis=0) for one in data)
+    for j in noise:
+        if not seen[j]:
+            raise InvalidInputError(
+                f"output {j + 1} is missing in all blocks that tune, so its noise cannot be tuned; "
+                "leave it out of the structure of the noise, as in structure={'noise': "
+                "{'level': [0]}, 'disturbance': 'diagonal'}, or hold out other blocks."
+            )
+    if int(np.sum(seen)) < _LEAST * len(names):
+        raise InvalidInputError(
+            f"{int(np.sum(seen))} measured numbers are too few for {len(names)} parameters "
+            f"({', '.join(names)}); expected {_LEAST} for each at least. Record for longer, or "
+            "take structure='scalar' or groups."
+        )

@@ -1,0 +1,384 @@
+"""The negative log likelihood of an extended Kalman filter's innovations, and its gradient."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from .._checks import Array
+from ..errors import ModelError, QpmheError
+from ..model.expressions import import_casadi
+from ..model.system import System
+from .data import Data, Mask
+from .structures import Setting, Structure
+
+# Step of central differences by numbers without unit: rounding and curvature are balanced.
+_STEP = 3e-5
+
+
+class Likelihood:
+    r"""The negative log likelihood of records, as a function of what is tuned.
+
+    With the innovations e and their covariances S of the extended Kalman filter, as
+    `qpmhe.ExtendedKalman` computes it, and L L' = S,
+
+    .. math::
+        \sum_t \tfrac12 |L_t^{-1} e_t|^2 + \log \det L_t,
+
+    over the samples of chosen blocks; outputs that are missing do not enter. With a threshold k,
+    components of :math:`L^{-1} e` beyond k cost k times their size, less k^2 / 2, and correct the
+    filter as if they were k. States are clipped to the bounds of X.
+
+    A system that is traced has the exact gradient, by one sweep back through the filter; of others
+    it is made of central differences, for all of which the filter runs at once.
+    """
+
+    def __init__(
+        self, structure: Structure, data: list[Data], make: Callable[[dict[str, float]], System],
+        remade: bool,
+    ) -> None:
+        self._structure, self._data, self._make = structure, data, make
+        self._remade = remade  # a change of parameters makes another system
+        #: What makes another one of the same structure and data.
+        self.recipe = make, remade
+        self._filters: dict[tuple[float, ...], _Filter] = {}
+        #: The first thing that a model has raised far from the start; blank if none did.
+        self.failure = ""
+
+    def value(self, theta: Array, chosen: list[Mask]) -> float:
+        """At theta, of the samples chosen in each record; infinite where the model fails."""
+        found = self._values([self._structure.setting(theta)], chosen)
+        return float(found[0])
+
+    def gradient(self, theta: Array, chosen: list[Mask]) -> tuple[float, Array]:
+        """The value, and the derivative by theta."""
+        structure = self._structure
+        setting = structure.setting(theta)
+        filter_ = self._filter(setting)
+        slope = np.zeros(len(theta))
+        exact = filter_ is not None and filter_.traced
+        differenced = range(structure.seen)
+        if filter_ is not None and exact:
+            value, slopes, behind = filter_.adjoint(setting, self._data, chosen)
+            by = behind if not self._remade else np.zeros(len(structure.parameters))
+            slope = structure.adjoint(theta, slopes, by)
+            own = structure.covariances if self._remade else structure.seen
+            differenced = range(own, structure.seen)
+        if differenced:
+            moved = _STEP * np.eye(len(theta))[list(differenced)]
+            points = [theta, *(theta + one for one in moved), *(theta - one for one in moved)]
+            values = self._values([structure.setting(one) for one in points], chosen)
+            half = len(moved)
+            with np.errstate(invalid="ignore"):
+                slope[list(differenced)] = (values[1 : half + 1] - values[half + 1 :]) / (2 * _STEP)
+            value = float(values[0])
+        if not (np.isfinite(value) and np.isfinite(slope).all()):
+            return np.inf, np.zeros(len(theta))
+        return value, slope
+
+    def innovations(self, theta: Array) -> list[Array]:
+        """The innovations in standard deviations, L^-1 e, of each record, NaN where missing."""
+        setting = self._structure.setting(theta)
+        found = []
+        for one in self._data:
+            made = self._required(setting)
+            whitened = made.run([setting], one)[1][:, 0]
+            found.append(np.where(one.observed, whitened, np.nan))
+        return found
+
+    def _required(self, setting: Setting) -> _Filter:
+        made = self._filter(setting)
+        if made is None:
+            raise ModelError(f"the model fails at the tuned parameters: {self.failure}")
+        return made
+
+    def _values(self, settings: list[Setting], chosen: list[Mask]) -> Array:
+        """The values at several settings; those of one system at once."""
+        values = np.zeros(len(settings))
+        groups: dict[int, tuple[_Filter, list[int]]] = {}
+        for k, setting in enumerate(settings):
+            made = self._filter(setting)
+            if made is None:
+                values[k] = np.inf
+            else:
+                groups.setdefault(id(made), (made, []))[1].append(k)
+        for made, members in groups.values():
+            for one, mask in zip(self._data, chosen, strict=True):
+                try:
+                    costs, _ = made.run([settings[k] for k in members], one)
+                    values[members] += costs[mask].sum(axis=0)
+                except Exception as error:  # whatever a model raises far from the data
+                    self._note(settings[members[0]], error)
+                    values[members] = np.inf
+        values[~np.isfinite(values)] = np.inf
+        return values
+
+    def _filter(self, setting: Setting) -> _Filter | None:
+        key = tuple(setting.parameters.values()) if self._remade else ()
+        if key not in self._filters:
+            try:
+                made = _Filter(self._make(setting.parameters), setting)
+            except Exception as error:
+                self._note(setting, error)
+                return None
+            if len(self._filters) > 16:
+                self._filters.pop(next(iter(self._filters)))
+            self._filters[key] = made
+        return self._filters[key]
+
+    def _note(self, setting: Setting, error: Exception) -> None:
+        if not self.failure:
+            at = ", ".join(f"{name} = {value:.6g}" for name, value in setting.parameters.items())
+            said = str(error) if isinstance(error, QpmheError) else (
+                f"{type(error).__name__}: {error}"
+            )
+            self.failure = f"{f'at {at}: ' if at else ''}{said}"
+
+
+class _Filter:
+    """The filter of one system, in CasADi where it is traced and in NumPy where it is not."""
+
+    def __init__(self, system: System, setting: Setting) -> None:
+        self._system = system.copy(np.sqrt(setting.prior.diagonal().clip(1e-300)), traced=True)
+        self._threshold = setting.threshold
+        self._clip = _bounds(system)
+        self._sweeps: dict[int, tuple[Any, Any]] = {}
+        self._step: Any = None
+        model = self._system.symbolic
+        residual = system.output_residual
+        self.traced = (
+            model is not None and model.f.is_a("SXFunction") and model.h.is_a("SXFunction")
+            and (residual is None or residual.periods is not None)
+        )
+        if self.traced:
+            self._step = _symbolic_step(model, self._system, self._clip, setting.threshold)
+
+    def _covariances(self, setting: Setting) -> tuple[Array, Array, Array]:
+        return (
+            setting.prior, self._system.state_covariance(setting.disturbance), setting.noise
+        )
+
+    def _inputs(self, setting: Setting, one: Data) -> Array:
+        """u (T, m) with the model's parameters behind, where they are inputs."""
+        missing = self._system.m - one.u.shape[1]
+        if not missing:
+            return one.u
+        behind = list(setting.parameters.values())[:missing]
+        return np.hstack((one.u, np.tile(behind, (len(one), 1))))
+
+    def run(self, settings: list[Setting], one: Data) -> tuple[Array, Array]:
+        """Costs (T, B) and whitened innovations (T, B, p) of a record at B settings."""
+        if not self.traced:
+            return self._run_together(settings, one)
+        costs, whitened = [], []
+        for setting in settings:
+            _, _, cost, white = self._forward(setting, one)
+            costs.append(cost)
+            whitened.append(white)
+        return np.stack(costs, axis=1), np.stack(whitened, axis=1)
+
+    # In CasADi
+
+    def _sweep(self, samples: int) -> tuple[Any, Any]:
+        """The filter over so many samples, and its adjoint from the last one to the first."""
+        if samples not in self._sweeps:
+            ca, step = import_casadi(), self._step
+            forward = step.mapaccum("forward", samples, [0, 1], [0, 1], {"base": 10})
+            back = step.reverse(1)
+            symbols = [ca.SX.sym(step.name_in(i), step.sparsity_in(i)) for i in range(step.n_in())]
+            z, P, *known = symbols
+            seeds = [ca.SX.sym("seed", *z.shape), ca.SX.sym("seed", *P.shape), ca.SX.sym("seed")]
+            nothing = [ca.SX(*step.size_out(i)) for i in range(step.n_out())]
+            found = back(*symbols, *nothing, *seeds, ca.SX(*step.size_out(3)))
+            made = ca.Function(
+                "back", [*seeds[:2], z, P, *known, seeds[2]],
+                [ca.densify(found[0]), ca.densify(found[1]), *map(ca.densify, found[2:])],
+            )
+            backward = made.mapaccum("backward", samples, [0, 1], [0, 1], {"base": 10})
+            self._sweeps[samples] = forward, backward
+        return self._sweeps[samples]
+
+    def _given(self, setting: Setting, one: Data) -> list[Any]:
+        """What the step takes besides z and P, sample beside sample."""
+        _, q, r = self._covariances(setting)
+        observed = one.observed.T.astype(np.float64)
+        dt = np.full((1, len(one)), self._system.dt or 0.0) if one.dt is None else one.dt[None]
+        return [
+            np.where(one.observed, one.y, 0.0).T, self._inputs(setting, one).T, dt, observed,
+            np.tile(q, len(one)), np.tile(r, len(one)),
+        ]
+
+    def _forward(self, setting: Setting, one: Data) -> tuple[Array, Array, Array, Array]:
+        """z (n, T) and P (n, n T) after each sample, costs (T,), whitened innovations (T, p)."""
+        forward, _ = self._sweep(len(one))
+        z, covariance, cost, white = (
+            np.asarray(each) for each in forward(
+                one.start, self._covariances(setting)[0], *self._given(setting, one)
+            )
+        )
+        return z, covariance, cost[0], white.T
+
+    def adjoint(
+        self, setting: Setting, data: list[Data], chosen: list[Mask]
+    ) -> tuple[float, dict[str, Array], Array]:
+        """The value, and its derivatives by the covariances and the parameters among the inputs."""
+        system, count = self._system, len(setting.parameters)
+        n, p, behind = system.n, system.p, np.zeros(count)
+        prior, entering, noise = np.zeros((n, n)), np.zeros((n, n)), np.zeros((p, p))
+        total = 0.0
+        for one, mask in zip(data, chosen, strict=True):
+            z, covariance, cost, _ = self._forward(setting, one)
+            total += float(cost[mask].sum())
+            if not np.isfinite(total):
+                break
+            blocks = covariance.reshape(n, len(one), n)
+            first = self._covariances(setting)[0]
+            before = [
+                np.hstack((one.start[:, None], z[:, :-1]))[:, ::-1],
+                np.concatenate((first[:, None], blocks[:, :-1]), axis=1)[:, ::-1].reshape(n, -1),
+            ]
+            given = self._given(setting, one)
+            reversed_ = [each[:, ::-1] for each in given[:4]]
+            _, backward = self._sweep(len(one))
+            found = [
+                np.asarray(each) for each in backward(
+                    np.zeros(n), np.zeros((n, n)), *before, *reversed_, *given[4:],
+                    mask[None, ::-1].astype(np.float64),
+                )
+            ]
+            prior += found[1][:, -n:]
+            if count and system.m > one.u.shape[1]:
+                behind += found[3][one.u.shape[1] :].sum(axis=1)
+            entering += found[6].reshape(n, -1, n).sum(axis=1)
+            noise += found[7].reshape(p, -1, p).sum(axis=1)
+        matrix = system.disturbance_matrix
+        by_w = entering if matrix is None else matrix.T @ entering @ matrix
+        return total, {"prior": prior, "disturbance": by_w, "noise": noise}, behind
+
+    # In NumPy, several settings at once
+
+    def _run_together(self, settings: list[Setting], one: Data) -> tuple[Array, Array]:
+        system, timed = self._system, one.dt is not None
+        model = system.timed if timed else system
+        p, samples, count = system.p, len(one), len(settings)
+        parts = [self._covariances(setting) for setting in settings]
+        P, Q, R = (np.array([part[k] for part in parts]) for k in range(3))
+        u = np.stack([self._inputs(setting, one) for setting in settings], axis=1)
+        if timed:
+            assert one.dt is not None
+            u = np.concatenate((u, np.broadcast_to(one.dt[:, None, None], (samples, count, 1))), 2)
+        z = np.tile(one.start, (count, 1))
+        costs, white = np.zeros((samples, count)), np.zeros((samples, count, p))
+        low, high = self._clip
+        with np.errstate(all="ignore"):
+            for t in range(samples):
+                there = one.observed[t]
+                A = model.f_jacobian.batch(z, u[t])
+                C = model.h_jacobian.batch(z, u[t]) * there[:, None]
+                e = one.y[t] - model.h.batch(z, u[t])
+                if system.output_residual is not None:
+                    system.output_residual.wrap(e, np.broadcast_to(one.y[t], e.shape))
+                e[:, ~there] = 0.0
+                r = R * np.outer(there, there) + np.diag(1.0 - there)
+                S = C @ P @ C.swapaxes(1, 2) + r
+                L = _cholesky(S)
+                white[t] = np.linalg.solve(L, e[..., None])[..., 0]
+                size = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
+                costs[t] = size + _loss(white[t], self._threshold)
+                used = white[t]
+                if self._threshold is not None:
+                    used = np.clip(used, -self._threshold, self._threshold)
+                gain = np.linalg.solve(S, C @ P @ A.swapaxes(1, 2)).swapaxes(1, 2)
+                move = gain @ (L @ used[..., None])
+                z = np.clip(model.f.batch(z, u[t]) + move[..., 0], low, high)
+                closed = A - gain @ C
+                P = closed @ P @ closed.swapaxes(1, 2) + gain @ (r @ gain.swapaxes(1, 2)) + Q
+                P = 0.5 * (P + P.swapaxes(1, 2))
+        return costs, white
+
+
+def _cholesky(S: Array) -> Array:
+    try:
+        return np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:  # of one setting: the others go on
+        found = np.full_like(S, np.nan)
+        for k, one in enumerate(S):
+            with suppress(np.linalg.LinAlgError):
+                found[k] = np.linalg.cholesky(one)
+        return found
+
+
+def _loss(white: Array, threshold: float | None) -> Array:
+    """Half the square of each row, or Huber's loss of its components."""
+    if threshold is None:
+        return np.asarray(0.5 * (white * white).sum(axis=-1))
+    size = np.abs(white)
+    beyond = threshold * (size - 0.5 * threshold)
+    return np.asarray(np.where(size <= threshold, 0.5 * size * size, beyond).sum(axis=-1))
+
+
+def _bounds(system: System) -> tuple[Array, Array]:
+    """The bounds of X on components that are no angles."""
+    low, high = np.full(system.n, -np.inf), np.full(system.n, np.inf)
+    if system.states is not None:
+        low, high = system.states.lower.copy(), system.states.upper.copy()
+    if system.state_residual is not None:
+        components = np.asarray(system.state_residual.components)
+        low[components], high[components] = -np.inf, np.inf
+    return low, high
+
+
+def _symbolic_step(
+    model: Any, system: System, clip: tuple[Array, Array], threshold: float | None
+) -> Any:
+    """One step: (z, P, y, u, dt, observed, Q, R) to z and P after it, cost, and L^-1 e."""
+    ca = import_casadi()
+    n, p, m = model.n, model.p, model.m
+    z, P = ca.SX.sym("z", n), ca.SX.sym("P", n, n)
+    y, u, dt, there = (ca.SX.sym(name, d) for name, d in (("y", p), ("u", m), ("dt", 1), ("k", p)))
+    Q, R = ca.SX.sym("Q", n, n), ca.SX.sym("R", p, p)
+    following, output = model.step()(z, u, dt), model.h(z, u)
+    A, C = ca.jacobian(following, z), ca.mtimes(ca.diag(there), ca.jacobian(output, z))
+    e = y - output
+    if system.output_residual is not None and system.output_residual.periods is not None:
+        residual = system.output_residual
+        for i, period in zip(residual.components, residual.periods, strict=True):
+            e[int(i)] -= period * ca.floor(e[int(i)] / period + 0.5)
+    # An output that is missing has the innovation 0 and the variance 1.
+    e = ca.if_else(there > 0.0, e, 0.0)
+    r = R * ca.mtimes(there, there.T) + ca.diag(1.0 - there)
+    S = ca.mtimes([C, P, C.T]) + r
+    cross = ca.mtimes([C, P, A.T])
+    L = ca.SX(p, p)
+    white, W = ca.SX(p, 1), ca.SX(p, n)
+    for i in range(p):
+        for j in range(i + 1):
+            rest = S[i, j] - sum((L[i, k] * L[j, k] for k in range(j)), ca.SX(0))
+            L[i, j] = ca.sqrt(rest) if i == j else rest / L[j, j]
+        white[i] = (e[i] - sum((L[i, k] * white[k] for k in range(i)), ca.SX(0))) / L[i, i]
+        W[i, :] = (cross[i, :] - sum((L[i, k] * W[k, :] for k in range(i)), ca.SX(1, n))) / L[i, i]
+    used, size = white, ca.fabs(white)
+    losses = 0.5 * white * white
+    if threshold is not None:
+        used = ca.fmax(ca.fmin(white, threshold), -threshold)
+        losses = ca.if_else(
+            size <= threshold, losses, threshold * (size - 0.5 * threshold)
+        )
+    gain = ca.SX(p, n)  # transposed
+    for i in reversed(range(p)):
+        rest = W[i, :] - sum((L[k, i] * gain[k, :] for k in range(i + 1, p)), ca.SX(1, n))
+        gain[i, :] = rest / L[i, i]
+    moved = following + ca.mtimes(W.T, used)
+    for i in range(n):
+        if np.isfinite(clip[0][i]):
+            moved[i] = ca.fmax(moved[i], clip[0][i])
+        if np.isfinite(clip[1][i]):
+            moved[i] = ca.fmin(moved[i], clip[1][i])
+    closed = A - ca.mtimes(gain.T, C)
+    covariance = ca.mtimes([closed, P, closed.T]) + ca.mtimes([gain.T, r, gain]) + Q
+    cost = ca.sum1(losses) + ca.sum1(ca.log(ca.diag(L)))
+    found = (moved, 0.5 * (covariance + covariance.T), cost, white)
+    return ca.Function("step", [z, P, y, u, dt, there, Q, R], [ca.densify(one) for one in found])

@@ -1,0 +1,159 @@
+"""How good an estimator is on records: its prediction error, or its error where truth is known."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .._checks import Array
+from ..errors import EngineWarning, ObserverWarning, QpmheError
+from ..estimation.estimator import MovingHorizonEstimator
+from ..model.system import System
+from ..observers import Observer
+from .data import Data
+from .weights import Weights
+
+# Beyond this many robust deviations an error counts with its size only.
+_OUTLYING = 3.0
+
+
+class Score:
+    r"""Errors of the estimator along records, in units of their size at the start.
+
+    The estimate of x(t+1) that was made with y(t) is predicted k - 1 steps on, and compared with
+    y(t+k); or with the true x(t+1), where the records have one. With e the error of a component
+    and s its root mean square at the start weights (1.48 times the median of :math:`|e|` with a
+    robust loss), a sample's score is the mean of :math:`e^2 / s^2` over the components, in which
+    errors beyond 3 s count with their size only, if the loss is robust.
+
+    Parameters
+    ----------
+    data : list of Data
+        The records.
+    make : callable
+        From the model's parameters to the system.
+    kind : callable
+        From covariances to the observer.
+    ahead : int
+        k.
+    truth : bool
+        Whether the truth is compared with.
+    robust : bool
+        Whether the loss is robust.
+    options : dict
+        Of `qpmhe.MovingHorizonEstimator`.
+    """
+
+    def __init__(
+        self, data: list[Data], make: Callable[[dict[str, float]], System],
+        kind: Callable[..., Observer], *, ahead: int, truth: bool, robust: bool,
+        options: dict[str, Any],
+    ) -> None:
+        self._data, self._make, self.kind = data, make, kind
+        self._ahead, self._truth, self._robust = ahead, truth, robust
+        self._options = options
+        self._scale: Array | None = None
+        #: What ran the steps last, and the first failure of a run.
+        self.engine = "python"
+        self.failure = ""
+
+    def begin(self, weights: Weights) -> None:
+        """Take the errors at these weights as the unit of all others."""
+        errors = np.concatenate(self.errors(weights))
+        if self._robust:
+            self._scale = 1.4826 * np.nanmedian(np.abs(errors), axis=0)
+        else:
+            self._scale = np.sqrt(np.nanmean(errors * errors, axis=0))
+        self._scale = np.where(self._scale > 0.0, self._scale, 1.0)
+
+    @property
+    def scale(self) -> Array:
+        """The size of each component's error at the start."""
+        assert self._scale is not None
+        return self._scale
+
+    def samples(self, weights: Weights) -> list[Array]:
+        """The score of each sample of each record (T,), NaN where there is nothing to compare."""
+        found = []
+        for errors in self.errors(weights):
+            scaled = np.abs(errors / self.scale)
+            terms = scaled * scaled
+            if self._robust:
+                terms = np.where(scaled <= _OUTLYING, terms, _OUTLYING * (2 * scaled - _OUTLYING))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # of samples without any
+                found.append(np.nanmean(terms, axis=1))
+        return found
+
+    def errors(self, weights: Weights) -> list[Array]:
+        """Errors of each record (T, n) or (T, p), NaN where there is nothing to compare."""
+        system = self._make(weights.parameters)
+        return [self._of_record(system, weights, one) for one in self._data]
+
+    def total(self, weights: Weights) -> float:
+        """The mean score of the samples that are not held out; infinite where the model fails."""
+        try:
+            found = self.samples(weights)
+        except (QpmheError, np.linalg.LinAlgError, FloatingPointError) as error:
+            self.failure = self.failure or str(error)
+            return np.inf
+        used = np.concatenate([
+            each[~one.held] for each, one in zip(found, self._data, strict=True)
+        ])
+        value = float(np.nanmean(used)) if np.isfinite(used).any() else np.inf
+        return value if np.isfinite(value) else np.inf
+
+    def _of_record(self, system: System, weights: Weights, one: Data) -> Array:
+        states = self._estimates(system, weights, one)
+        if self._truth and one.truth is not None:
+            errors = np.full((len(one), system.n), np.nan)
+            count = min(len(one), len(one.truth) - 1)
+            errors[:count] = states[:count] - one.truth[1 : count + 1]
+            if system.state_residual is not None:
+                system.state_residual.wrap(errors, states)
+            return errors
+        errors = np.full((len(one), system.p), np.nan)
+        k, count = self._ahead, len(one) - self._ahead
+        if count <= 0:
+            return errors
+        reached, model, u = states[:count], system, self._inputs(system, weights, one)
+        if one.dt is not None:
+            model, u = system.timed, np.hstack((u, one.dt[:, None]))
+        with np.errstate(all="ignore"):
+            for j in range(1, k):
+                reached = model.f.batch(reached, u[j : count + j])
+            measured = one.y[k:]
+            errors[:count] = measured - model.h.batch(reached, u[k:])
+        if system.output_residual is not None:
+            system.output_residual.wrap(errors[:count], measured)
+        return errors
+
+    def _inputs(self, system: System, weights: Weights, one: Data) -> Array:
+        missing = system.m - one.u.shape[1]
+        behind = list(weights.parameters.values())[:missing]
+        return np.hstack((one.u, np.tile(behind, (len(one), 1)))) if missing else one.u
+
+    def _estimates(self, system: System, weights: Weights, one: Data) -> Array:
+        """The estimates of x(1), ..., x(T), each made with the y before."""
+        options = dict(self._options)
+        missing = system.m - one.u.shape[1]
+        if missing:
+            options["parameters"] = list(weights.parameters.values())[:missing]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ObserverWarning)
+            warnings.simplefilter("ignore", EngineWarning)
+            mhe = MovingHorizonEstimator(
+                system, weights.observer(self.kind), weights.cost(), horizon=weights.horizon,
+                initial_state=one.start, **options,
+            )
+            self.engine = mhe.engine
+            u = one.u if one.u.shape[1] else None
+            if one.dt is None:
+                return mhe.run(one.y, u).states[1:]
+            return np.array([
+                mhe.update(y, None if u is None else u[t], dt=float(one.dt[t])).state
+                for t, y in enumerate(one.y)
+            ])

@@ -1,0 +1,312 @@
+"""The search for the weights: a likelihood first, then the estimator itself; it can be resumed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from .._checks import Array, need
+from ..errors import ModelError, QpmheError
+from .data import Data
+from .likelihood import Likelihood
+from .score import Score
+from .structures import Structure
+from .weights import Weights
+
+_FORMAT = 1
+# Seconds from checkpoint to checkpoint.
+_EVERY = 1.0
+_ITERATIONS, _REFINEMENTS = 200, 12
+# In place of infinity, which no line search survives: far above any cost per sample.
+_FAILED = 1e6
+# What a change of all standard deviations by e costs beside the score, which is about 1: where
+# the score says nothing, the likelihood's weights stay.
+_STAY = 1e-3
+# Step of the score's differences; the estimator's iterations make it less smooth than a filter.
+_STEP = 1e-2
+_HESSIAN_STEP = 1e-3
+
+
+class TuningCheckpointError(QpmheError):
+    """A checkpoint of a search that is damaged, or of another search."""
+
+
+class Checkpoint:
+    """Where each start of a search stands, in a JSON file; without a path, in memory only."""
+
+    def __init__(self, path: Path | None, identity: str) -> None:
+        self.path, self._identity, self._saved = path, identity, -np.inf
+        self.searches: dict[str, dict[str, Any]] = {}
+        if path is None or not path.exists():
+            return
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            if content["format"] != _FORMAT:
+                raise ValueError(f"its format is not {_FORMAT}")
+            found, self.searches = content["identity"], dict(content["searches"])
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise TuningCheckpointError(
+                f"the checkpoint {path} cannot be read ({error}); remove it to start again."
+            ) from error
+        if found != identity:
+            raise TuningCheckpointError(
+                f"the checkpoint {path} is of another search: records, model or options differ. "
+                "Remove it to start again, or name another file."
+            )
+
+    def note(self, name: str, theta: Array, value: float, done: bool) -> None:
+        """Keep the best point of a search, and write it now and then."""
+        self.searches[name] = {"theta": theta.tolist(), "value": value, "done": done}
+        if self.path is not None and (done or monotonic() - self._saved > _EVERY):
+            text = json.dumps(
+                {"format": _FORMAT, "identity": self._identity, "searches": self.searches}
+            )
+            temporary = self.path.with_name(f"{self.path.name}.tmp")
+            try:
+                temporary.write_text(text, encoding="utf-8")
+                os.replace(temporary, self.path)
+            except OSError as error:
+                raise TuningCheckpointError(
+                    f"cannot write the checkpoint {self.path}: {error.strerror or error}."
+                ) from error
+            self._saved = monotonic()
+
+    def known(self, name: str) -> tuple[Array | None, float, bool]:
+        """The best point so far, its value, and whether the search has ended there."""
+        one = self.searches.get(name)
+        if one is None:
+            return None, np.inf, False
+        return np.array(one["theta"]), float(one["value"]), bool(one["done"])
+
+    def remove(self) -> None:
+        """Remove the file of a search that is complete."""
+        if self.path is not None:
+            self.path.unlink(missing_ok=True)
+
+
+def identity_of(data: Sequence[Data], structure: Structure, value: float, options: Any) -> str:
+    """A digest of what a search depends on; the likelihood's value stands for the model."""
+    digest = hashlib.sha256(repr((structure.names, f"{value:.6e}", options)).encode())
+    for one in data:
+        for array in (one.y, one.u, one.start, one.dt, one.truth, one.held):
+            digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:24]
+
+
+def search_likelihood(
+    likelihood: Likelihood, structure: Structure, data: list[Data], begin: Array,
+    note: Callable[[Array, float, bool], None],
+) -> tuple[Array, float]:
+    """The minimum of the likelihood near a start, and its value per sample."""
+    chosen = [~one.held for one in data]
+    samples = sum(int(mask.sum()) for mask in chosen)
+    best = [begin.copy(), np.inf]
+
+    def cost(theta: Array) -> tuple[float, Array]:
+        value, slope = likelihood.gradient(theta, chosen)
+        if not np.isfinite(value):
+            return _FAILED, np.zeros(len(theta))
+        if value / samples < best[1]:
+            best[:] = theta.copy(), value / samples
+        return value / samples, slope / samples
+
+    def after(_theta: Array) -> None:
+        note(best[0], best[1], False)
+
+    minimize(
+        cost, begin, jac=True, method="L-BFGS-B", bounds=structure.limits, callback=after,
+        options={"maxiter": _ITERATIONS, "ftol": 1e-13, "gtol": 1e-7},
+    )
+    note(best[0], best[1], True)
+    return best[0], float(best[1])
+
+
+def search_all(
+    likelihood: Likelihood, structure: Structure, data: list[Data], starts: list[Array],
+    checkpoint: Checkpoint, jobs: int, advance: Callable[[str], None],
+) -> tuple[Array, float]:
+    """The best minimum of the likelihood over all starts; those known are not searched again."""
+    waiting = []
+    for k, begin in enumerate(starts):
+        theta, _, done = checkpoint.known(f"start {k}")
+        if done:
+            advance(f"start {k + 1} was done")
+        else:
+            waiting.append((k, begin if theta is None else theta))
+    if jobs > 1 and len(waiting) > 1:
+        joblib = need("joblib", "a search in several processes")
+        tasks = (
+            joblib.delayed(_alone)(likelihood.recipe, structure, data, k, begin)
+            for k, begin in waiting
+        )
+        workers = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
+        for k, theta, value in workers(tasks):
+            checkpoint.note(f"start {k}", theta, value, True)
+            advance(f"start {k + 1} of {len(starts)}")
+    else:
+        for k, begin in waiting:
+            def note(theta: Array, value: float, done: bool, k: int = k) -> None:
+                checkpoint.note(f"start {k}", theta, value, done)
+                advance(f"start {k + 1} of {len(starts)}, {value:.6g} per sample")
+
+            search_likelihood(likelihood, structure, data, begin, note)
+    found = [checkpoint.known(f"start {k}")[:2] for k in range(len(starts))]
+    theta, value = min(found, key=lambda one: one[1])
+    if theta is None or not np.isfinite(value):
+        raise ModelError(f"the search found no weights at which the model works: "
+                         f"{likelihood.failure}")
+    return theta, value
+
+
+def _alone(
+    recipe: tuple[Any, ...], structure: Structure, data: list[Data], k: int, begin: Array
+) -> tuple[int, Array, float]:
+    """One search in a process of its own."""
+    likelihood = Likelihood(structure, data, *recipe)
+    theta, value = search_likelihood(likelihood, structure, data, begin, lambda *_: None)
+    return k, theta, value
+
+
+def curvature(likelihood: Likelihood, theta: Array, data: list[Data], count: int) -> Array:
+    """The Hessian of the likelihood by its first components, from differences of gradients."""
+    chosen = [~one.held for one in data]
+    rows = []
+    for k in range(count):
+        move = np.zeros(len(theta))
+        move[k] = _HESSIAN_STEP
+        ahead, behind = (likelihood.gradient(theta + s * move, chosen)[1] for s in (1.0, -1.0))
+        rows.append((ahead - behind)[:count] / (2 * _HESSIAN_STEP))
+    found = np.array(rows)
+    return 0.5 * (found + found.T)
+
+
+def polish(
+    likelihood: Likelihood, theta: Array, structure: Structure, data: list[Data]
+) -> tuple[Array, Array]:
+    """Newton's steps to the minimum, and the Hessian there."""
+    chosen, count = [~one.held for one in data], structure.seen
+    low, high = np.array(structure.limits).T
+    value, slope = likelihood.gradient(theta, chosen)
+    H = curvature(likelihood, theta, data, count)
+    for _ in range(5):
+        values, vectors = np.linalg.eigh(H)
+        usable = values > 1e-3
+        step = np.zeros(len(theta))
+        step[:count] = -(vectors[:, usable] / values[usable]) @ (
+            vectors[:, usable].T @ slope[:count]
+        )
+        moved = np.clip(theta + np.clip(step, -1.0, 1.0), low, high)
+        reached, by = likelihood.gradient(moved, chosen)
+        if not reached < value:
+            break
+        gain, theta, value, slope = value - reached, moved, reached, by
+        H = curvature(likelihood, theta, data, count)
+        if gain < 1e-6:
+            break
+    return theta, H
+
+
+def limit(
+    likelihood: Likelihood, theta: Array, structure: Structure, data: list[Data], k: int,
+    sign: float, rise: float,
+) -> float | None:
+    """How far component k can go one way before the likelihood's minimum rises by so much.
+
+    None if it never does within its range.
+    """
+    chosen = [~one.held for one in data]
+    least = likelihood.value(theta, chosen)
+    end = structure.limits[k][1 if sign > 0 else 0]
+    others = [j for j in range(structure.seen) if j != k]
+
+    def above(to: float, begin: Array) -> tuple[bool, Array]:
+        fixed = begin.copy()
+        fixed[k] = to
+        if likelihood.value(fixed, chosen) - least < rise:
+            return False, fixed
+
+        def cost(part: Array) -> tuple[float, Array]:
+            whole = fixed.copy()
+            whole[others] = part
+            value, slope = likelihood.gradient(whole, chosen)
+            if not np.isfinite(value):
+                return _FAILED, np.zeros(len(others))
+            return value - least, slope[others]
+
+        if others:
+            bounds = [structure.limits[j] for j in others]
+            found = minimize(cost, fixed[others], jac=True, method="L-BFGS-B", bounds=bounds,
+                             options={"maxiter": 30})
+            fixed[others] = found.x
+        return likelihood.value(fixed, chosen) - least >= rise, fixed
+
+    inside, point, reach = float(theta[k]), theta, 0.5
+    while True:
+        to = inside + sign * reach
+        if sign * to >= sign * end:
+            is_above, _ = above(end, point)
+            if not is_above:
+                return None
+            to = end
+            break
+        is_above, reached = above(to, point)
+        if is_above:
+            break
+        inside, point, reach = to, reached, 2.0 * reach
+    for _ in range(5):
+        middle = 0.5 * (inside + to)
+        is_above, reached = above(middle, point)
+        if is_above:
+            to = middle
+        else:
+            inside, point = middle, reached
+    return 0.5 * (inside + to)
+
+
+def refine(
+    score: Score, weights_at: Callable[[Array], Weights], theta: Array, structure: Structure,
+    checkpoint: Checkpoint, advance: Callable[[str], None],
+) -> Array:
+    """The minimum of the estimator's score near the likelihood's, by differences of runs."""
+    known, value, done = checkpoint.known("estimator")
+    if done and known is not None:
+        return known
+    best: list[Any] = [theta if known is None else known, value]
+    low, high = np.array(structure.limits).T
+
+    def total(point: Array) -> float:
+        found = score.total(weights_at(point))
+        return found + _STAY * float(np.sum((point - theta) ** 2))
+
+    def cost(point: Array) -> tuple[float, Array]:
+        value = total(point)
+        if not np.isfinite(value):
+            return _FAILED, np.zeros(len(point))
+        if value < best[1]:
+            best[:] = point.copy(), value
+        slope = np.zeros(len(point))
+        for k in range(len(point)):
+            move = np.zeros(len(point))
+            move[k] = _STEP
+            ahead = min(total(np.minimum(point + move, high)), _FAILED)
+            behind = min(total(np.maximum(point - move, low)), _FAILED)
+            slope[k] = (ahead - behind) / (2 * _STEP)
+            advance(f"estimator, score {best[1]:.5g}")
+        checkpoint.note("estimator", best[0], best[1], False)
+        return value, slope
+
+    minimize(
+        cost, best[0], jac=True, method="L-BFGS-B", bounds=structure.limits,
+        options={"maxiter": _REFINEMENTS, "ftol": 1e-5},
+    )
+    checkpoint.note("estimator", best[0], best[1], True)
+    found: Array = best[0]
+    return found

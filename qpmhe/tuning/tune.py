@@ -1,0 +1,332 @@
+"""`qpmhe.tune`: the weights of an estimator, from records."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from qpmhe_solvers.values import shown
+
+from .._checks import Array, choice, count, dimension
+from ..errors import InvalidInputError, ModelError, OptionError, QpmheError
+from ..model.system import System
+from ..observers import ExtendedKalman, Observer
+from .answer import Tuning
+from .data import Data, check_enough, checked_data, hold_out
+from .likelihood import Likelihood
+from .score import Score
+from .search import Checkpoint, identity_of, polish, refine, search_all
+from .structures import KINDS, Setting, Structure, checked_start
+from .weights import Weights
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_OBJECTIVES = ("auto", "likelihood", "prediction", "truth")
+# Spread of the logarithms of further starts.
+_SPREAD = 1.0
+
+
+def tune(
+    system: System | Callable[..., System],
+    records: Any,
+    *,
+    prior: ArrayLike,
+    disturbance: ArrayLike,
+    noise: ArrayLike,
+    horizon: int = 10,
+    initial_state: ArrayLike | None = None,
+    structure: str | Mapping[str, Any] = "diagonal",
+    objective: str = "auto",
+    parameters: Mapping[str, float] | None = None,
+    threshold: float | None = None,
+    discount: float = 1.0,
+    observer: Callable[..., Observer] = ExtendedKalman,
+    arrival: str = "observer",
+    ahead: int = 5,
+    held_out: float = 0.25,
+    names: Mapping[str, Sequence[str]] | None = None,
+    starts: int = 1,
+    seed: int = 0,
+    jobs: int = 1,
+    checkpoint: str | Path | None = None,
+    progress: bool | Console = True,
+    **options: Any,
+) -> Tuning:
+    r"""Choose the covariances of disturbance and noise, and more, from records.
+
+    First it maximises the likelihood of the innovations of an extended Kalman filter: that gives
+    the size of each covariance, its 95 % interval, and what the records do not identify. Then it
+    lowers the error of the estimator itself: of its predictions, or of its states where the
+    records have the truth. Some blocks of the records are held out of both; they judge, and
+    what does not improve on them by more than its standard error is not taken.
+
+    Parameters
+    ----------
+    system : System or callable
+        The model; or a function ``make(**parameters)`` that makes it.
+    records : list
+        Of (Y,), (Y, U) or (Y, U, X), arrays of measurements (T, p), inputs (T, m) and true states
+        (T, n) or (T + 1, n); of `qpmhe.tuning.TuningRecord`, which also has lengths of steps; or
+        of simulated records. NaN in Y is a missing measurement.
+    prior, disturbance, noise : (n, n), (r, r) and (p, p) array_like
+        Covariances of the initial error, of w and of v to start from, in squared units. A guess
+        within a factor of a hundred will do. A disturbance without variance stays without.
+    horizon : int
+        N of the estimator.
+    initial_state : (n,) array_like, optional
+        The estimate of x(0); needed unless each record has its own.
+    structure : str or dict
+        What is tuned. ``"diagonal"``: each standard deviation of w and v, with the correlations
+        of the start; ``"scalar"``: one factor for each of the two covariances; ``"full"``: their
+        Cholesky factors. Or a dict by ``"prior"``, ``"disturbance"`` and ``"noise"``, of such a
+        word or of groups of components that share a factor, ``{"positions": [0, 1]}``; what it
+        does not name stays as it is. ``"threshold": True`` and ``"discount": True`` tune these.
+    objective : {"auto", "likelihood", "prediction", "truth"}
+        What the second search lowers; "likelihood" leaves it out, "auto" takes the truth where
+        all records have it.
+    parameters : dict, optional
+        Parameters of the model to be tuned, with values to start from: arguments of the function
+        that makes the system, or the last inputs of the system, in their order. Signs stay.
+    threshold : float, optional
+        Threshold of Huber's loss of the noise, in standard deviations, for records with outliers.
+    discount : float
+        As for `qpmhe.QuadraticCost`.
+    observer : callable
+        Makes the estimator's observer from ``prior``, ``disturbance`` and ``noise``.
+    arrival : {"observer", "constant"}
+        What weighs the prior: the observer's covariance, or ``prior`` at all times.
+    ahead : int
+        Steps from the newest measurement to the predicted one.
+    held_out : float
+        Share of the blocks that judge; 0 for none.
+    names : dict, optional
+        Names of ``"states"`` and ``"outputs"``.
+    starts, seed : int
+        Number of starts of the search, the first one at the covariances given, and the seed of
+        the others.
+    jobs : int
+        Processes for several starts.
+    checkpoint : str or Path, optional
+        File by which the same call resumes a search that was stopped; removed at the end.
+    progress : bool or rich.console.Console
+        Whether, and where, to show a progress bar.
+    **options
+        Of `qpmhe.MovingHorizonEstimator`, such as ``engine`` and ``max_qps``, by default 2.
+
+    Returns
+    -------
+    Tuning
+        The covariances, their intervals and scores; print it for a table.
+
+    Raises
+    ------
+    InvalidInputError
+        If something does not fit: records too short, without measurements, or with gaps in the
+        truth; a covariance that is none; a model that fails at the start.
+
+    Examples
+    --------
+    >>> import qpmhe
+    >>> system, _, cost, scenario = qpmhe.models.van_der_pol()
+    >>> tuning = qpmhe.tune(
+    ...     system, [scenario.simulate(0, 500).measurements], prior=[[1, 0], [0, 1]],
+    ...     disturbance=[[0.01, 0], [0, 0.01]], noise=[[1.0]], initial_state=[0, 0],
+    ...     objective="likelihood")
+    >>> low, high = tuning.intervals["noise y1"]
+    >>> low < 0.1 < high
+    True
+    """
+    began = perf_counter()
+    choice("objective", objective, _OBJECTIVES)
+    choice("arrival", arrival, ("observer", "constant"))
+    dimension("horizon", horizon, 1)
+    dimension("ahead", ahead, 1)
+    dimension("starts", starts, 1)
+    dimension("jobs", jobs, 1)
+    count("seed", seed, 0)
+    started = dict(parameters or {})
+    make, remade = _maker(system, started)
+    first = make(started)
+    inputs = first.m if remade else first.m - len(started)
+    if inputs < 0:
+        raise InvalidInputError(
+            f"parameters names {len(started)}, and the system has {first.m} inputs, the last of "
+            "which are the parameters; give a function make(**parameters) as system instead."
+        )
+    sizes = {"prior": first.n, "disturbance": first.r, "noise": first.p}
+    start = checked_start(sizes, prior, disturbance, noise, discount, threshold, started)
+    data = checked_data(records, first, inputs, initial_state)
+    hold_out(data, held_out, horizon + ahead)
+    labels = _labels(first, names)
+    plan = Structure(start, structure, labels)
+    check_enough(data, plan.names, _noise_outputs(plan, labels["noise"]))
+    constant = _constant_inputs(data, bool(started))
+    has_truth = all(one.truth is not None for one in data)
+    if objective == "truth" and not has_truth:
+        raise InvalidInputError(
+            "objective is 'truth', and not all records have true states; give (Y, U, X)."
+        )
+    if objective == "auto":
+        objective = "truth" if has_truth else "prediction"
+    options = {"max_qps": 2, **options}
+
+    def weights_at(theta: Array) -> Weights:
+        at = plan.setting(theta)
+        return Weights(
+            at.prior, at.disturbance, at.noise, horizon, at.discount, at.threshold, arrival,
+            at.parameters,
+        )
+
+    likelihood = Likelihood(plan, data, make, remade)
+    at_start = likelihood.value(plan.start, [~one.held for one in data])
+    if not np.isfinite(at_start):
+        raise ModelError(
+            "the likelihood is not finite at the start: "
+            f"{likelihood.failure or 'the filter diverges'}. Start from larger covariances, "
+            "another initial_state or other parameters, or bound the states by System(states=...)."
+        )
+    score = Score(
+        data, make, observer, ahead=ahead, truth=objective == "truth",
+        robust=threshold is not None, options=options,
+    )
+    score.begin(weights_at(plan.start))  # errors of the options show before a long search
+    kept = Checkpoint(
+        None if checkpoint is None else Path(checkpoint),
+        identity_of(data, plan, at_start, (horizon, objective, ahead, arrival, seed, starts,
+                                           _plain(start), sorted(options.items(), key=str))),
+    )
+    generator = np.random.default_rng(seed)
+    low, high = np.array(plan.limits).T
+    beginnings = [plan.start] + [
+        np.clip(plan.start + _SPREAD * generator.standard_normal(len(low)), low, high)
+        for _ in range(starts - 1)
+    ]
+    with _shown(progress) as advance:
+        found, _ = search_all(likelihood, plan, data, beginnings, kept, jobs, advance)
+        found, hessian = polish(likelihood, found, plan, data)
+        seconds = {"likelihood": perf_counter() - began}
+        refined = None
+        if objective != "likelihood":
+            refined = refine(score, weights_at, found, plan, kept, advance)
+            seconds["estimator"] = perf_counter() - began - seconds["likelihood"]
+        tuning = Tuning(
+            plan, data, likelihood, score, weights_at, found, hessian, refined, objective, ahead,
+            seconds, labels, constant,
+        )
+    kept.remove()
+    return tuning
+
+
+def _plain(start: Setting) -> list[Any]:
+    matrices = [getattr(start, kind).tolist() for kind in KINDS]
+    return [*matrices, start.discount, start.threshold, start.parameters]
+
+
+def _maker(
+    system: Any, parameters: dict[str, float]
+) -> tuple[Callable[[dict[str, float]], System], bool]:
+    """What makes the system from its parameters, and whether it is another one for each."""
+    if isinstance(system, System):
+        return _Same(system), False
+    if not callable(system):
+        raise ModelError(
+            f"system is {shown(system)}; expected a qpmhe.System, or a function make(**parameters)."
+        )
+    make = _Making(system)
+    try:
+        made = make(parameters)
+    except QpmheError:
+        raise
+    except Exception as error:
+        given = ", ".join(f"{name}={value!r}" for name, value in parameters.items())
+        raise ModelError(
+            f"system({given}) raised {type(error).__name__}: {error}; expected a function that "
+            "makes a qpmhe.System of these parameters."
+        ) from error
+    if not isinstance(made, System):
+        raise ModelError(
+            f"the function given as system returned {shown(made)}; expected a qpmhe.System."
+        )
+    return make, bool(parameters)
+
+
+class _Same:
+    """Makes one and the same system; an object, so that other processes can have it."""
+
+    def __init__(self, system: System) -> None:
+        self._system = system
+
+    def __call__(self, _parameters: dict[str, float]) -> System:
+        return self._system
+
+
+class _Making:
+    """Makes a system of its parameters."""
+
+    def __init__(self, function: Callable[..., System]) -> None:
+        self._function = function
+
+    def __call__(self, parameters: dict[str, float]) -> System:
+        return self._function(**parameters)
+
+
+def _labels(system: System, names: Mapping[str, Sequence[str]] | None) -> dict[str, list[str]]:
+    given = dict(names or {})
+    found = {}
+    for kind, letter, size in (("states", "x", system.n), ("outputs", "y", system.p)):
+        labels = [str(one) for one in given.pop(kind, [])]
+        if not labels:
+            labels = [f"{letter}{i + 1}" for i in range(size)]
+        if len(labels) != size or len(set(labels)) != size:
+            raise OptionError(f"names of {kind} are {labels}; expected {size} different ones.")
+        found[kind] = labels
+    if given:
+        raise OptionError(f"names has {', '.join(map(repr, given))}; expected states, outputs.")
+    w = found["states"]
+    if system.r != system.n:
+        w = [f"w{i + 1}" for i in range(system.r)]
+    return {"prior": found["states"], "disturbance": w, "noise": found["outputs"]}
+
+
+def _noise_outputs(plan: Structure, outputs: Sequence[str]) -> list[int]:
+    """The outputs whose own noise is tuned."""
+    return [j for j, name in enumerate(outputs) if f"noise {name}" in plan.names]
+
+
+def _constant_inputs(data: list[Data], needed: bool) -> list[int]:
+    """The inputs that never change, which identify no parameters."""
+    us = np.concatenate([one.u for one in data])
+    still = np.flatnonzero(np.ptp(us, axis=0) == 0.0).tolist() if us.size else []
+    if needed and us.shape[1] and len(still) == us.shape[1]:
+        raise InvalidInputError(
+            "all inputs are constant in all records: what they act by cannot be told from an "
+            "offset, so parameters of the model cannot be tuned. Record with inputs that change, "
+            "or leave parameters out."
+        )
+    return still
+
+
+@contextmanager
+def _shown(progress: bool | Console) -> Iterator[Callable[[str], None]]:
+    """A progress bar, and what tells it where the search is."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    if not isinstance(progress, bool) and not hasattr(progress, "print"):
+        raise OptionError(
+            f"progress is {shown(progress)}; expected True, False or a rich.console.Console."
+        )
+    console = Console(stderr=True) if isinstance(progress, bool) else progress
+    with Progress(
+        TextColumn("tuning"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn(),
+        console=console, transient=True, disable=progress is False or not console.is_terminal,
+    ) as bar:
+        task = bar.add_task("likelihood", total=None)
+        yield lambda text: bar.update(task, description=text)

@@ -1,0 +1,167 @@
+"""Weights as covariances: what estimators are made with, and a TOML file of it."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .._checks import Array, checked_path, numbers
+from .._linalg import inverse
+from .._version import __version__
+from ..costs import Cost, Huber, ObserverPrior, QuadraticCost, RobustCost
+from ..errors import InvalidInputError, QpmheError
+from ..observers import ExtendedKalman, Observer
+from .structures import KINDS
+
+_FORMAT = 1
+
+
+class WeightsError(QpmheError):
+    """A file of weights that cannot be read or written."""
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """Covariances with what else makes a cost and an observer.
+
+    Parameters
+    ----------
+    prior, disturbance, noise : (n, n), (r, r) and (p, p) array
+        Covariances of the initial error, of w and of v, in squared units.
+    horizon : int
+        N.
+    discount : float
+        As for `qpmhe.QuadraticCost`.
+    threshold : float or None
+        That of Huber's loss of the noise, in standard deviations; None for a quadratic loss.
+    arrival : {"observer", "constant"}
+        What weighs the prior: the observer's own covariance, or the one of the initial error.
+    parameters : dict
+        Parameters of the model, by name.
+    """
+
+    prior: Array
+    disturbance: Array
+    noise: Array
+    horizon: int = 10
+    discount: float = 1.0
+    threshold: float | None = None
+    arrival: str = "observer"
+    parameters: dict[str, float] = field(default_factory=dict)
+
+    def observer(self, kind: Callable[..., Observer] = ExtendedKalman) -> Observer:
+        """The observer: kind(prior=..., disturbance=..., noise=...)."""
+        return kind(prior=self.prior, disturbance=self.disturbance, noise=self.noise)
+
+    def cost(self) -> Cost:
+        """The cost: quadratic, or with Huber's loss of the noise where there is a threshold."""
+        prior: Any = ObserverPrior() if self.arrival == "observer" else None
+        if self.threshold is None:
+            return QuadraticCost.from_covariances(
+                prior=self.prior if prior is None else prior, disturbance=self.disturbance,
+                noise=self.noise, discount=self.discount,
+            )
+        return RobustCost(
+            prior=inverse(self.prior) if prior is None else prior,
+            disturbance=inverse(self.disturbance),
+            noise=Huber(inverse(self.noise), threshold=self.threshold), discount=self.discount,
+        )
+
+    def save(self, path: str | Path, comment: str = "") -> Path:
+        """Write a TOML file, which `load` and ``qpmhe estimate --weights`` read.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file; one that exists is replaced.
+        comment : str
+            Text for the top of the file.
+        """
+        target = checked_path("the file of weights", path)
+        lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+        lines += [
+            f"format = {_FORMAT}", f'version = "{__version__}"', f"horizon = {self.horizon}",
+            f"discount = {float(self.discount)!r}", f'arrival = "{self.arrival}"',
+        ]
+        if self.threshold is not None:
+            lines.append(f"threshold = {float(self.threshold)!r}")
+        lines += ["", "# In squared units, a row a line.", "[covariances]"]
+        for kind in KINDS:
+            rows = ",\n".join(f"  {row}" for row in getattr(self, kind).tolist())
+            lines.append(f"{kind} = [\n{rows},\n]")
+        if self.parameters:
+            lines += ["", "[parameters]"]
+            lines += [f'"{name}" = {float(value)!r}' for name, value in self.parameters.items()]
+        try:
+            target.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise WeightsError(f"cannot write {target}: {error.strerror or error}.") from error
+        return target
+
+
+def load(path: str | Path) -> Weights:
+    """Read the weights that `Tuning.save` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        The TOML file; a function that makes a model may name it relative to its own file.
+
+    Returns
+    -------
+    Weights
+        With ``cost()`` and ``observer()``, ready for `qpmhe.MovingHorizonEstimator`.
+
+    Raises
+    ------
+    WeightsError
+        If the file is missing, or is not such a file.
+    """
+    target = checked_path("the file of weights", path)
+    try:
+        content = tomllib.loads(target.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise WeightsError(
+            f"cannot read the weights {target} ({error.strerror or error}); make them with qpmhe "
+            "tune, or Tuning.save."
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise WeightsError(f"{target} is no TOML file ({error}); save the weights again.") from error
+    try:
+        if content.pop("format") != _FORMAT:
+            raise ValueError(f"its format is not {_FORMAT}")
+        content.pop("version", None)
+        matrices = {
+            kind: np.atleast_2d(numbers(kind, content["covariances"][kind])) for kind in KINDS
+        }
+        content.pop("covariances")
+        found = Weights(**matrices, **content)
+        found.cost()
+        found.observer()
+    except (KeyError, TypeError, ValueError, InvalidInputError) as error:
+        raise WeightsError(
+            f"{target} holds no weights of qpmhe ({error}); save them again."
+        ) from error
+    return found
+
+
+def covariances_of(observer: Observer, cost: Cost) -> dict[str, ArrayLike]:
+    """The covariances that the weights of a cost stand for, to start from."""
+    first = observer.initial_covariance()
+    if not isinstance(cost.prior, ObserverPrior):
+        first = inverse(cost.prior)
+    if first is None:
+        raise InvalidInputError(
+            f"{type(observer).__name__} has no covariance and the cost no prior weight to start "
+            "from; let the model return a cost with one."
+        )
+    disturbance = inverse(cost.disturbance)
+    if cost.disturbance_factor is not None:
+        disturbance = cost.disturbance_factor @ disturbance @ cost.disturbance_factor.T
+    return {"prior": first, "disturbance": disturbance, "noise": inverse(cost.noise)}
