@@ -16,11 +16,13 @@ Array = NDArray[np.float64]
 _FACTORS = (1 / 64, 1 / 16, 1 / 4, 4.0, 16.0, 64.0, 256.0, 4096.0)
 _STEPS = (0.5, 0.65, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.5, 2.0)
 _SHIFTS = (-2, -1, 1, 2)
+_DRIFTS = tuple(late for late in range(-16, 17) if abs(late) > 1)
 # More components than this have no factors or pairs of their own.
 _MOST = 8
-# What a fault must gain in log likelihood, and the least effect worth a word: factors of
-# covariances, deviations of a bias, shares of a step and of an input, samples.
-_GAIN = 12.0
+# What a fault must gain in log likelihood, in all and for each measurement that it concerns; and the
+# least effect worth a word: factors of covariances, deviations of a bias, shares of a step and of an
+# input, samples.
+_GAIN, _GAIN_EACH, _LOCAL = 12.0, 0.05, ("bias", "outliers")
 _LEAST = {
     "noise": np.log(2.0), "disturbance": np.log(2.0), "bias": 0.5, "step": 0.02, "sign": 0.1,
     "input": 0.1, "shift": 0.3, "clock": 0.5, "outliers": 0.0, "swapped": 0.0,
@@ -78,7 +80,7 @@ def search(
 
 
 def _best(bank: FilterBank, base: Hypothesis, null: Filtered) -> Fault | None:
-    tried = [*_scaled(base), *_exchanged(base), *_shifted(base), *_linear(bank, base, null)]
+    tried = [*_scaled(base), *_exchanged(base), *_shifted(base), *_drifted(bank, base, null), *_linear(bank, base, null)]
     likelihoods = bank.run([base, *(one.hypothesis for one in tried)]).likelihoods
     reference, values = likelihoods[0], likelihoods[1:]
     refined = list(_refined(base, tried, values, reference))
@@ -87,12 +89,13 @@ def _best(bank: FilterBank, base: Hypothesis, null: Filtered) -> Fault | None:
         tried, values = [*tried, *refined], np.append(values, further)
     if not np.isfinite(reference):
         reference = -1e300
-    ranked = sorted(
-        (replace(one, gain=float(value - reference)) for one, value in zip(tried, values, strict=True)
-         if value - reference > _GAIN and _matters(one, base)),
-        key=lambda one: -one.gain,
-    )
-    return ranked[0] if ranked else None
+    each = _GAIN_EACH * np.isfinite(base.measurements).sum()
+    ranked = [
+        replace(one, gain=float(value - reference))
+        for one, value in zip(tried, values, strict=True)
+        if value - reference > _GAIN + each * (one.kind not in _LOCAL) and _matters(one, base)
+    ]
+    return max(ranked, key=lambda one: one.gain, default=None)
 
 
 def _matters(fault: Fault, base: Hypothesis) -> bool:
@@ -188,6 +191,22 @@ def _shifted(base: Hypothesis) -> Iterator[Fault]:
             yield Fault("shift", float(late), replace(base, measurements=y), part)
 
 
+def _drifted(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Fault]:
+    """The record as of clocks of the sensors that gain or lose samples until its end."""
+    y, total = base.measurements, len(base.measurements)
+    _, moves = bank.moves(null.states, bank.full_inputs(base.inputs, base.step))
+    for late in _DRIFTS:
+        if abs(late) > total / 10:
+            continue
+        when = np.arange(total) * (1.0 + late / total)
+        nearest = np.rint(when).astype(np.intp)
+        there = nearest < total
+        nearest, when = nearest[there], when[there]
+        moved = np.full_like(y, np.nan)
+        moved[nearest] = y[there] - (when - nearest)[:, None] * moves[nearest]
+        yield Fault("clock", float(late), replace(base, measurements=moved))
+
+
 @dataclass(frozen=True, eq=False)
 class _Signature:
     """How a fault of size one moves the outputs (T, p) and the states (T, n) of its sample."""
@@ -205,11 +224,7 @@ def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[
     none_x, none_y = np.zeros((total, n)), np.zeros((total, p))
     inputs = bank.full_inputs(base.inputs, base.step)
     # At each sample from those before it alone: else noise would look like a fault.
-    expected = bank.model.h.batch(null.states, inputs)
-    moves = bank.model.h.batch(bank.model.f.batch(null.states, inputs), inputs) - expected
-    if bank.system.output_residual is not None:
-        bank.system.output_residual.wrap(moves, expected + moves)
-    yield _Signature("clock", (), -moves * (np.arange(total) / total)[:, None], none_x)
+    expected, moves = bank.moves(null.states, inputs)
     yield _Signature("shift", (), -moves, none_x)
     if 1 < p <= _MOST:
         for j in range(p):
@@ -291,7 +306,7 @@ def _removed(base: Hypothesis, one: _Signature, size: float) -> Fault | None:
     if one.kind == "input":
         inputs = base.inputs.copy()
         inputs[:, one.subject[0]] *= 1.0 + size
-        kind = "sign" if 1.0 + size < -0.5 else "input"
+        kind = "sign" if size < -1.0 else "input"
         return Fault(kind, 1.0 + size, replace(base, inputs=inputs), one.subject)
     y = base.measurements - size * one.outputs
     return Fault(one.kind, size, replace(base, measurements=y), one.subject, one.span)

@@ -16,8 +16,6 @@ Array = NDArray[np.float64]
 _SHARE, _WIDTH = 0.02, 12.0
 # Beyond this an innovation in its own deviations is an outlier rather than noise.
 _OUTLIER = 4.0
-# Samples at both ends that do not count: a shifted record lacks them.
-_MARGIN = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +49,8 @@ class Filtered:
     Attributes
     ----------
     likelihoods : (H,) array
-        Log likelihood of the record under each hypothesis, -infinity where the filter failed.
+        Log likelihood of the record under each hypothesis, for as many measurements as the first
+        has; -infinity where the filter failed.
     states, corrected : (T, n) array
         Of the first filter: estimates before and after each measurement.
     innovations, innovation_covariances : (T, p) and (T, p, p) array
@@ -109,6 +108,16 @@ class FilterBank:
         lengths = np.broadcast_to(step * self._steps, (len(inputs),))
         return np.column_stack((inputs, lengths))
 
+    def moves(self, states: Array, inputs: Array) -> tuple[Array, Array]:
+        """Expected outputs (T, p) at states (T, n), and how far they move within a step."""
+        expected = _values(self.model.h.batch, states, inputs, (self.system.p,))
+        following = _values(self.model.f.batch, states, inputs, (self.system.n,))
+        later = _values(self.model.h.batch, following, inputs, (self.system.p,))
+        moves = later - expected
+        if self.system.output_residual is not None:
+            self.system.output_residual.wrap(moves, later)
+        return expected, moves
+
     def run(self, hypotheses: Sequence[Hypothesis]) -> Filtered:
         """Filter the record under all hypotheses at once."""
         system, model, count = self.system, self.model, len(hypotheses)
@@ -134,7 +143,6 @@ class FilterBank:
         # Outputs count in deviations of the usual noise, whatever their units.
         unit = np.sqrt(hypotheses[0].noise.diagonal())
         noise = noise / np.multiply.outer(unit, unit)
-        margin = min(_MARGIN, total // 4)
         extreme = np.log(_SHARE / _WIDTH)
         usual, all_scales_one, any_outliers = np.log1p(-_SHARE), (scale == 1.0).all(), outliers.any()
         for t in range(total):
@@ -144,7 +152,6 @@ class FilterBank:
             if system.output_residual is not None:
                 system.output_residual.wrap(e, y[:, t])
             e = e / unit
-            counts = margin <= t < total - margin
             transposed = covariance @ c.transpose(0, 2, 1)
             spread = c @ transposed
             if any_outliers:
@@ -152,9 +159,8 @@ class FilterBank:
                 far = outliers[:, None] & seen & (e * e > _OUTLIER**2 * own)
                 cost = e * e / own / _WIDTH**2 + np.log(own)
                 seen = seen & ~far
-                if counts:
-                    likelihoods += np.where(far, extreme - 0.5 * cost, 0.0).sum(axis=1)
-                    likelihoods += usual * (outliers * seen.sum(axis=1))
+                likelihoods += np.where(far, extreme - 0.5 * cost, 0.0).sum(axis=1)
+                likelihoods += usual * (outliers * seen.sum(axis=1))
             if not seen.all():
                 both = seen[:, :, None] & seen[:, None, :]
                 spread = np.where(both, spread + noise, eye_p)
@@ -171,10 +177,9 @@ class FilterBank:
                 transposed[~good] = 0.0
             inverse = _inverses(spread, alive)
             gain = transposed @ inverse
-            if counts:
-                likelihoods -= 0.5 * (
-                    np.einsum("hi,hij,hj->h", e, inverse, e) + np.linalg.slogdet(spread)[1]
-                )
+            likelihoods -= 0.5 * (
+                np.einsum("hi,hij,hj->h", e, inverse, e) + np.linalg.slogdet(spread)[1]
+            )
             first.states[t], first.outputs[t], first.gains[t] = x[0], c[0], gain[0]
             first.innovations[t] = np.where(seen[0], e[0], np.nan)
             first.innovation_covariances[t] = spread[0]
@@ -195,6 +200,9 @@ class FilterBank:
             first.transitions[t] = a[0]
             x = following
             covariance = a @ covariance @ a.transpose(0, 2, 1) + disturbance
+        # A shifted record lacks some samples, which must make no difference.
+        counts = there.sum(axis=(1, 2))
+        likelihoods *= counts[0] / np.maximum(counts, 1)
         likelihoods[~alive | ~np.isfinite(likelihoods)] = -np.inf
         first.innovations[...] *= unit
         first.innovation_covariances[...] *= np.multiply.outer(unit, unit)
