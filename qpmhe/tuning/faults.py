@@ -95,7 +95,8 @@ def _best(bank: FilterBank, base: Hypothesis, null: Filtered) -> Fault | None:
         for one, value in zip(tried, values, strict=True)
         if value - reference > _GAIN + each * (one.kind not in _LOCAL) and _matters(one, base)
     ]
-    return max(ranked, key=lambda one: one.gain, default=None)
+    best = max(ranked, key=lambda one: one.gain, default=None)
+    return best if best is None or best.kind != "bias" else _with_ends(bank, base, null, best)
 
 
 def _matters(fault: Fault, base: Hypothesis) -> bool:
@@ -276,9 +277,7 @@ def _linear(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Faul
         best.setdefault((listed[k].kind, listed[k].subject), int(k))
     for k in best.values():
         if gains[k] > 0.5 * _GAIN:
-            fault = _removed(base, listed[k], float(sizes[k]))
-            if fault is not None:
-                yield fault
+            yield _removed(base, listed[k], float(sizes[k]))
 
 
 def _sizes(listed: list[_Signature], null: Filtered) -> tuple[Array, Array]:
@@ -301,7 +300,33 @@ def _sizes(listed: list[_Signature], null: Filtered) -> tuple[Array, Array]:
     return sizes, 0.5 * sizes * against
 
 
-def _removed(base: Hypothesis, one: _Signature, size: float) -> Fault | None:
+def _with_ends(bank: FilterBank, base: Hypothesis, null: Filtered, bias: Fault) -> Fault:
+    """A bias with the first and last sample under which the record is most likely."""
+    total, p = base.measurements.shape
+    first, last = bias.span or (0, total - 1)
+    none_x = np.zeros((total, bank.system.n))
+    step = max(1, (last - first) // 2)
+    while True:
+        listed = []
+        for begin in sorted({max(first + d, 0) for d in (-step, 0, step)}):
+            for end in sorted({min(last + d, total - 1) for d in (-step, 0, step)}):
+                if end - begin >= 2:
+                    outputs = np.zeros((total, p))
+                    outputs[begin : end + 1, bias.subject[0]] = 1.0
+                    listed.append(_Signature("bias", bias.subject, outputs, none_x, (begin, end)))
+        sizes, gains = _sizes(listed, null)
+        k = int(np.argmax(gains))
+        same, (first, last) = listed[k].span == (first, last), listed[k].span or (first, last)
+        if same and step == 1:
+            break
+        step = max(1, step // 2)
+    refined = _removed(base, listed[k], float(sizes[k]))
+    values = bank.run([base, refined.hypothesis]).likelihoods
+    gain = float(values[1] - values[0])
+    return replace(refined, gain=gain) if gain > bias.gain else bias
+
+
+def _removed(base: Hypothesis, one: _Signature, size: float) -> Fault:
     """The record without this fault."""
     if one.kind == "input":
         inputs = base.inputs.copy()
