@@ -1,5 +1,6 @@
 """Suboptimal moving horizon estimation by sequences of convex QPs, with a stability promise."""
 
+from importlib import import_module
 from typing import Any
 
 from . import batch, codegen, errors, models, solvers
@@ -59,6 +60,14 @@ def _compiled_engine(
 
 
 register_engine("compiled", _compiled_engine)
+
+
+def __getattr__(name: str) -> Any:
+    """Names of `qpmhe.tuning`, which most programs do without."""
+    if name in ("diagnose", "tune", "tuning"):
+        tuning = import_module(f"{__name__}.tuning")
+        return tuning if name == "tuning" else getattr(tuning, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 __all__ = [

@@ -28,7 +28,7 @@ from ..observers.projection import NearestPoint
 from .conditions import ConditionReader, Conditions
 from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
-from .run import Run
+from .run import Run, RunSource
 from .sensitivity import Sensitivity
 from .settings import Settings
 
@@ -544,6 +544,7 @@ class MovingHorizonEstimator:
         except EngineChangeError as change:
             self._change_engine(change)
         if at_once is not None:
+            at_once.source = self.run_source(ys, whole)
             return at_once
         start, estimates, collected = self.state.copy(), [], []
         for y, u in zip(ys, [None] * len(ys) if us is None else us, strict=True):
@@ -552,7 +553,24 @@ class MovingHorizonEstimator:
                 collected.append(self._newest_covariance())
         n = self.system.n
         blocks = np.array(collected).reshape(-1, n, n) if covariances else None
-        return Run.of(start, estimates, blocks)
+        run = Run.of(start, estimates, blocks)
+        run.source = self.run_source(ys, whole)
+        return run
+
+    def run_source(
+        self, measurements: Array, inputs: Array | None, steps: Array | None = None
+    ) -> RunSource:
+        """The source of a run over a record, for one that is put together from single updates.
+
+        Parameters
+        ----------
+        measurements, inputs, steps : array
+            As for `RunSource`.
+        """
+        system, cost = self._engine.usual.applied(self._engine.system, self.cost)
+        return RunSource(
+            system, self.observer, cost, self.settings, measurements, inputs, steps
+        )
 
     def covariances(self) -> Array:
         """Covariances of the last estimate's trajectory, by linearisation along it.

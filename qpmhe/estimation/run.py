@@ -5,15 +5,43 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..costs import Cost
+from ..model.system import System
+from ..observers import Observer
 from .estimate import Estimate, Status
+from .settings import Settings
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.intp]
+
+
+class RunSource(NamedTuple):
+    """What a run was made from, by reference.
+
+    Parameters
+    ----------
+    system, observer, cost, settings
+        Those of the estimator, with what `MovingHorizonEstimator.set` has changed.
+    measurements : (T, p) array
+        y, NaN where it is missing.
+    inputs : (T, m) array or None
+        u, the parameters behind the rest; None for a system without inputs.
+    steps : (T,) array or None
+        Lengths of the steps; None where all are the usual one.
+    """
+
+    system: System
+    observer: Observer
+    cost: Cost
+    settings: Settings
+    measurements: Array
+    inputs: Array | None
+    steps: Array | None = None
 
 
 class Run:
@@ -49,7 +77,12 @@ class Run:
     ----------
     statuses : list of Status
         Outcome and events of each step.
+    source : RunSource or None
+        What it was made from, for `qpmhe.diagnose`; None for a run that was put together from
+        single estimates, or unpickled.
     """
+
+    source: RunSource | None = None
 
     def __init__(
         self,
@@ -115,6 +148,10 @@ class Run:
         """Outcome and events of each step."""
         known = {value: Status(value) for value in np.unique(self.flags).tolist()}
         return [known[value] for value in self.flags.tolist()]
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The functions of a system often cannot be pickled.
+        return {name: value for name, value in vars(self).items() if name != "source"}
 
     def __len__(self) -> int:
         return self.flags.size

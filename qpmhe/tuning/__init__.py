@@ -1,12 +1,15 @@
-"""Weights from data: covariances, their intervals, and files of them."""
+"""Weights from data, and diagnostics that need no truth."""
 
 from .answer import HorizonScore, Tuning
 from .data import TuningRecord
+from .diagnosis import Diagnosis, diagnose
+from .findings import Finding
+from .observability import Observability, observability
 from .search import TuningCheckpointError
 from .tune import tune
 from .weights import Weights, WeightsError, load
 
 __all__ = [
-    "HorizonScore", "Tuning", "TuningCheckpointError", "TuningRecord", "Weights", "WeightsError",
-    "load", "tune",
+    "Diagnosis", "Finding", "HorizonScore", "Observability", "Tuning", "TuningCheckpointError",
+    "TuningRecord", "Weights", "WeightsError", "diagnose", "load", "observability", "tune",
 ]

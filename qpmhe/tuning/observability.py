@@ -1,0 +1,128 @@
+"""What the data of each window say about its states: Gauss-Newton matrices along a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    r"""Singular values of the windows' Gauss-Newton matrices, in deviations of the prior.
+
+    With the disturbances eliminated, the measurements of a window add
+    :math:`|x_0 - \hat x_0|_\Lambda^2` to the cost of its first state, and the prior
+    :math:`|x_0 - \bar x|_P^2`. In deviations of the prior, :math:`x_0 = L \xi` with
+    :math:`P^{-1} = L L^\top`, the prior's matrix is the identity and the data's is
+    :math:`L^\top \Lambda L`. Where its singular value is 1, data and prior say equally much;
+    where it is 0, the data say nothing.
+
+    Attributes
+    ----------
+    matrices : (W, n, n) array
+        :math:`\Lambda` of the windows that start at samples 0, ..., W - 1, in inverse squared
+        units of the states.
+    values : (W, n) array
+        Singular values of :math:`L^\top \Lambda L`, the smallest first.
+    directions : (W, n, n) array
+        Their directions :math:`\xi`, as columns.
+    remaining : (W, n) array
+        How long :math:`\xi` is at the end of the window, if nothing but the model acts on it: near
+        zero where the system forgets it by itself.
+    """
+
+    matrices: Array
+    values: Array
+    directions: Array
+    remaining: Array
+
+
+def observability(
+    transitions: Array, information: Array, disturbance: Array, prior: Array, horizon: int
+) -> Observability:
+    """The `Observability` of all windows of a run, at once.
+
+    Parameters
+    ----------
+    transitions, information : (T, n, n) array
+        Along the run: Jacobians A of f, and C^T R C for the Jacobians C of h and the weights R of
+        the noise, with zeros for what is missing.
+    disturbance : (n, n) array
+        Covariance of what the disturbance adds to the state at each sample.
+    prior : (n, n) array
+        Covariance of the initial error, in whose deviations the values are.
+    horizon : int
+        N <= T.
+    """
+    total, n = transitions.shape[:2]
+    windows, eye = total - horizon + 1, np.eye(n)
+    matrices = np.zeros((windows, n, n))
+    moved = np.tile(eye, (windows, 1, 1))
+    for k in range(horizon - 1, -1, -1):
+        a = transitions[k : k + windows]
+        later = np.linalg.solve(eye + matrices @ disturbance, matrices)
+        matrices = information[k : k + windows] + a.transpose(0, 2, 1) @ later @ a
+        matrices = 0.5 * (matrices + matrices.transpose(0, 2, 1))
+        moved = moved @ a
+    root, inverse_root = _roots(prior)
+    values, directions = np.linalg.eigh(root.T @ matrices @ root)
+    ends = inverse_root @ moved @ root @ directions
+    return Observability(
+        matrices, np.maximum(values, 0.0), directions, np.linalg.norm(ends, axis=1)
+    )
+
+
+def prior_shares(
+    transitions: Array, information: Array, disturbance: Array, prior: Array, longest: int,
+    most: int = 100,
+) -> Array:
+    r"""How much the prior still matters to the newest estimate, for windows of each length.
+
+    With G the derivative of the estimate with respect to the prior's mean, the share of state
+    i is :math:`(G \Pi G^\top)_{ii} / \Sigma_{ii}`: what an error of the prior with the
+    covariance :math:`\Pi` contributes to the variance of the estimate's error.
+
+    Parameters
+    ----------
+    transitions, information, disturbance, prior
+        As for `observability`; the prior's covariance is that of each window.
+    longest : int
+        The largest horizon.
+    most : int
+        Windows to take the median of, spread over the run.
+
+    Returns
+    -------
+    (longest + 1, n) array
+        Medians over the windows; row N is for the horizon N, and row 0 is 1.
+    """
+    total, n = transitions.shape[:2]
+    starts = np.unique(np.linspace(0, total - longest, min(most, total - longest + 1)).astype(int))
+    eye = np.eye(n)
+    covariance, slope = np.tile(prior, (len(starts), 1, 1)), np.tile(eye, (len(starts), 1, 1))
+    shares = np.ones((longest + 1, n))
+    for k in range(longest):
+        a, c = transitions[starts + k], information[starts + k]
+        closed = a @ np.linalg.inv(eye + covariance @ c)
+        covariance = closed @ covariance @ a.transpose(0, 2, 1) + disturbance
+        covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+        slope = closed @ slope
+        from_prior = np.einsum("wij,jk,wik->wi", slope, prior, slope)
+        whole = np.diagonal(covariance, axis1=1, axis2=2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares[k + 1] = np.median(np.where(whole > 0.0, from_prior / whole, 0.0), axis=0)
+    return shares
+
+
+def _roots(covariance: Array) -> tuple[Array, Array]:
+    """L with L L^T the covariance, and its inverse: diagonal units first, so that none matters."""
+    units = np.sqrt(covariance.diagonal())
+    values, vectors = np.linalg.eigh(covariance / np.multiply.outer(units, units))
+    roots = np.sqrt(np.maximum(values, np.finfo(float).eps))
+    whitening: Array = (vectors * roots) @ vectors.T
+    inverse: Array = (vectors / roots) @ vectors.T
+    return units[:, None] * whitening, inverse / units
