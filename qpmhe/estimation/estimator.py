@@ -28,6 +28,7 @@ from ..observers.projection import NearestPoint
 from .conditions import ConditionReader, Conditions
 from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
+from .problem import Solved
 from .run import Run, RunSource
 from .sensitivity import Sensitivity
 from .settings import Settings
@@ -612,7 +613,9 @@ class MovingHorizonEstimator:
             estimate or are not known: of a cost of the user's own, or of an active nonlinear
             constraint.
         """
-        solved = self._engine.solved()
+        return self._sensitivity_of(self._engine.solved())
+
+    def _sensitivity_of(self, solved: Solved) -> Sensitivity:
         system, second = solved.formulation.system, self._second
         if second is None or second.system is not system or second.traced != system.is_traced:
             self._second = second = SecondDerivatives(system)
