@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -64,9 +65,9 @@ class Tuning:
     ----------
     weights : Weights
         What was found, as a whole.
-    values : dict
+    start, values : dict
         What each name stands for: standard deviations of disturbance, noise and prior in the
-        units of state and output, of a group that of its first component; parameters.
+        units of state and output, of a group that of its first component; parameters; at the start, and as tuned.
     intervals : dict
         Its 95 % interval (low, high) by the likelihood's curvature. That is honest where the
         model is right; errors of the model make intervals too narrow.
@@ -74,9 +75,6 @@ class Tuning:
         The values of largest likelihood, about which the intervals are.
     unidentified : tuple of str
         What the records do not determine, in words.
-    scores : dict
-        (before, after) on the blocks held out, or on all if none are: the negative log
-        likelihood per sample, and root mean square errors in units of output or state.
     judgement : str
         Whether the search on the estimator's own error was taken, and why.
     seconds : dict
@@ -97,22 +95,15 @@ class Tuning:
         self.seconds = seconds
         self._judged = [one.held if any(each.held.any() for each in data)
                         else np.ones(len(one), np.bool_) for one in data]
-        before = score.samples(weights_at(structure.start))
-        self._samples: dict[str, list[Array]] = {"before": before}
         chosen = theta
         self.judgement = "by the likelihood alone."
-        likeliest = score.samples(weights_at(theta))
         if refined is not None:
-            chosen, self.judgement = self._judge(theta, refined, likeliest)
-        self._theta = chosen
-        self._samples["after"] = (
-            likeliest if chosen is theta else score.samples(weights_at(chosen))
-        )
+            chosen, self.judgement = self._judge(theta, refined)
+        self._likeliest, self._theta = theta, chosen
         self.weights = weights_at(chosen)
-        self.values = structure.values(chosen)
+        self.start, self.values = structure.values(structure.start), structure.values(chosen)
         self.likeliest = structure.values(theta)
         self._find_intervals(theta, hessian)
-        self.scores = self._scores(theta)
         self.notes = tuple(
             f"input {j + 1} is constant in all records, so nothing that it acts by is identified; "
             "vary it." for j in constant
@@ -151,11 +142,17 @@ class Tuning:
         """Write the weights as TOML, for `qpmhe.tuning.load` and ``qpmhe estimate --weights``."""
         return self.weights.save(path, str(self))
 
-    def _judge(
-        self, theta: Array, refined: Array, likeliest: list[Array]
-    ) -> tuple[Array, str]:
+    @cached_property
+    def _samples(self) -> dict[str, list[Array]]:
+        """The estimator's score of each sample, before and after."""
+        first = self._weights_at(self._structure.start)
+        if not self._score.has_begun:
+            self._score.begin(first)
+        return {"before": self._score.samples(first), "after": self._score.samples(self.weights)}
+
+    def _judge(self, theta: Array, refined: Array) -> tuple[Array, str]:
         """The weights to take: those of the second search where they are better beyond chance."""
-        found = self._score.samples(self._weights_at(refined))
+        likeliest, found = (self._score.samples(self._weights_at(at)) for at in (theta, refined))
         gains = []
         for one, mask, new, old in zip(self._data, self._judged, found, likeliest, strict=True):
             gains += [
@@ -253,12 +250,17 @@ class Tuning:
             "as well; fix one of them, or tie them in a group."
         )
 
-    def _scores(self, theta: Array) -> dict[str, tuple[float, float]]:
-        """Before and after, on the blocks that judge."""
+    @cached_property
+    def scores(self) -> dict[str, tuple[float, float]]:
+        """(before, after) on the blocks held out, or on all if none are.
+
+        The negative log likelihood per sample, and root mean square errors in units of output or
+        state.
+        """
         start, found = self._structure.start, {}
         samples = sum(int(mask.sum()) for mask in self._judged)
         found["negative log likelihood per sample"] = tuple(
-            self._likelihood.value(at, self._judged) / samples for at in (start, theta)
+            self._likelihood.value(at, self._judged) / samples for at in (start, self._likeliest)
         )
         errors = [self._score.errors(self._weights_at(at)) for at in (start, self._theta)]
         truth = self._objective == "truth"
@@ -318,7 +320,6 @@ class Tuning:
         from rich.console import Console
         from rich.table import Table
 
-        start = self._structure.values(self._structure.start)
         weights = Table(box=None, pad_edge=False, title="Weights, as standard deviations",
                         title_justify="left")
         for title in ("", "before", "after", "95 % interval"):
@@ -326,7 +327,7 @@ class Tuning:
         for name, value in self.values.items():
             interval = self.intervals.get(name)
             text = "" if interval is None else f"{interval[0]:.3g} to {interval[1]:.3g}"
-            weights.add_row(name, f"{start[name]:.4g}", f"{value:.4g}", text)
+            weights.add_row(name, f"{self.start[name]:.4g}", f"{value:.4g}", text)
         held = "held-out blocks" if any(one.held.any() for one in self._data) else "all samples"
         scores = Table(box=None, pad_edge=False, title=f"Scores on {held}, less is better",
                        title_justify="left")
@@ -368,7 +369,7 @@ class Tuning:
 
             with rc_context(LIGHT):
                 tall = 1.2 + 0.24 * len(self.intervals)
-                figure = Figure(figsize=(8.4, max(2.6, tall)), layout="constrained")
+                figure = Figure(figsize=(8.4, max(3.2, tall)), layout="constrained")
                 axes = figure.subplots(1, 2, width_ratios=(3, 2))
         left, right = panels(2, axes)
         self._draw_values(left)
@@ -376,7 +377,9 @@ class Tuning:
         return [left, right]
 
     def _draw_values(self, axes: Axes) -> None:
-        start = self._structure.values(self._structure.start)
+        from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+        start = self.start
         shown = [name for name in self.intervals if start[name] > 0.0]
         found, blue = STYLES[0]["color"], STYLES[1]["color"]
         for row, name in enumerate(reversed(shown)):
@@ -389,6 +392,9 @@ class Tuning:
                       label="after" if row == 0 else None)
         axes.axvline(1.0, color=blue, linestyle="--", linewidth=1.2, label="before")
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_locator(NullLocator())
         axes.set_yticks(range(len(shown)), list(reversed(shown)))
         axes.set_xlabel("standard deviation, as a factor of the start")
         axes.legend(fontsize="small", loc="best")
@@ -411,7 +417,7 @@ class Tuning:
             axes.axvspan(k - 0.5, k + 0.5, color="0.93", zorder=0,
                          label="held out" if k == int(np.argmax(where)) else None)
         axes.set_xlabel("block")
-        what = "error" if self._objective == "truth" else f"prediction error, {self._ahead} ahead"
-        axes.set_ylabel(f"{what}, mean square, scaled")
+        what = "error" if self._objective == "truth" else f"error {self._ahead} ahead"
+        axes.set_ylabel(f"mean square {what}, scaled")
         axes.set_ylim(bottom=0.0)
         axes.legend(fontsize="small", loc="best")

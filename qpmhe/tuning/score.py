@@ -70,6 +70,11 @@ class Score:
         self._scale = np.where(self._scale > 0.0, self._scale, 1.0)
 
     @property
+    def has_begun(self) -> bool:
+        """Whether `begin` was called."""
+        return self._scale is not None
+
+    @property
     def scale(self) -> Array:
         """The size of each component's error at the start."""
         assert self._scale is not None

@@ -196,7 +196,8 @@ def tune(
         data, make, observer, ahead=ahead, truth=objective == "truth",
         robust=threshold is not None, options=options,
     )
-    score.begin(weights_at(plan.start))  # errors of the options show before a long search
+    if objective != "likelihood":
+        score.begin(weights_at(plan.start))
     kept = Checkpoint(
         None if checkpoint is None else Path(checkpoint),
         identity_of(data, plan, at_start, (horizon, objective, ahead, arrival, seed, starts,
