@@ -13,8 +13,11 @@ from .codegen import Compiled, compile  # noqa: A004
 from .codegen.compiler import check_any_cached
 from .codegen.source import MAIN
 from .costs import (
+    Barron,
+    Cauchy,
     Cost,
     CostConstants,
+    GemanMcClure,
     Huber,
     Loss,
     ObserverPrior,
@@ -62,8 +65,10 @@ register_engine("compiled", _compiled_engine)
 
 
 __all__ = [
+    "Barron",
     "BatchEstimator",
     "Box",
+    "Cauchy",
     "Compiled",
     "Constraint",
     "ConvexSet",
@@ -72,6 +77,7 @@ __all__ = [
     "DroppedRow",
     "Estimate",
     "ExtendedKalman",
+    "GemanMcClure",
     "HighGain",
     "Huber",
     "Loss",

@@ -191,6 +191,9 @@ class Cost(ABC):
     #: The directions of the disturbances, of a `LiftedCost`; None for all.
     space: Subspace | None = None
 
+    #: The largest factor by which a loss is widened while the first window fills; see `Barron`.
+    graduation: float = 1.0
+
     #: Smaller eigenvalues of the correlations in an observer's covariance count as this.
     least_correlation: float = SINGULAR
 
@@ -244,6 +247,10 @@ class Cost(ABC):
         if not isinstance(self.prior, ObserverPrior):
             return self.prior
         return (self.prior.minimum or 0.0) * np.eye(self.n)
+
+    def graduated(self, progress: float) -> Cost:
+        """The surrogate to minimise when this share of the first window is full."""
+        return self
 
     @property
     def c_form(self) -> CostForm | None:
