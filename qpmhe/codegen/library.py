@@ -113,12 +113,7 @@ def _without_form(cost: Cost) -> str:
             if reason:
                 return (
                     f"{type(loss).__name__}, the loss of {name}, has no C form ({reason}); take "
-                    "Quadratic, Huber or Power, or engine='python'."
-                )
-            if loss.graduation > 1.0:
-                return (
-                    f"{type(loss).__name__}, the loss of {name}, has no C form with a graduation "
-                    f"({loss.graduation:g}); take graduation=1, or engine='python'."
+                    "Quadratic, Huber, Power or Barron, or engine='python'."
                 )
     if cost.c_form is None:
         return f"{type(cost).__name__} has no C form; take a QuadraticCost or a RobustCost."

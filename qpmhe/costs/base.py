@@ -60,12 +60,15 @@ class LossForm(NamedTuple):
         Whether it is applied to each component and added.
     function : callable or None
         Of a user's "own" loss: forms q (K,) to rho(q) and rho'(q), (2, K).
+    graduation : float
+        By what it is widened at the first sample; see `Barron`.
     """
 
     kind: str = "quadratic"
     parameter: float = 0.0
     per_component: bool = False
     function: Callable[[Array], Array] | None = None
+    graduation: float = 1.0
 
 
 class CostForm(NamedTuple):

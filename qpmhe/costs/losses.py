@@ -62,7 +62,7 @@ class Loss(ABC):
             name in vars(self) for name in names
         ):
             return None
-        return LossForm("own", 0.0, self.per_component, self._value_and_slope)
+        return LossForm("own", 0.0, self.per_component, self._value_and_slope, self.graduation)
 
     def _value_and_slope(self, q: Array) -> Array:
         return np.stack((self._value(q), self._slope(q)))

@@ -133,8 +133,3 @@ def test_the_promise_with_everything_beside_it(name):
         assert estimate.cost <= estimate.candidate_cost
         assert Status.MODEL_FAILED not in estimate.status
     assert sum(Status.IMPROVED in estimate.status for estimate in estimates) > 30
-
-
-def test_the_compiled_step_refuses_it_by_name():
-    with pytest.raises(qpmhe.errors.InvalidInputError, match="graduation"):
-        estimator(50.0, 7.0, engine="compiled")
