@@ -14,8 +14,11 @@ from .codegen import Compiled, compile  # noqa: A004
 from .codegen.compiler import check_any_cached
 from .codegen.source import MAIN
 from .costs import (
+    Barron,
+    Cauchy,
     Cost,
     CostConstants,
+    GemanMcClure,
     Huber,
     Loss,
     ObserverPrior,
@@ -71,8 +74,10 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
+    "Barron",
     "BatchEstimator",
     "Box",
+    "Cauchy",
     "Compiled",
     "Constraint",
     "ConvexSet",
@@ -81,6 +86,7 @@ __all__ = [
     "DroppedRow",
     "Estimate",
     "ExtendedKalman",
+    "GemanMcClure",
     "HighGain",
     "Huber",
     "Loss",

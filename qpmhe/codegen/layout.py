@@ -65,6 +65,8 @@ class Layout:
     real: str = "double"
     #: Whether a term of the cost has a loss that is not quadratic.
     loss: bool = False
+    #: Whether a loss is widened while the first window fills.
+    widened: bool = False
     #: What corrects the observer, by its number in C, and whether its covariance is computed.
     observer: int = 0
     covariance: bool = False
@@ -107,6 +109,7 @@ class Layout:
         projects = system.states is not None and observer.metric is None
         return cls(
             system.n, system.p, system.m, horizon, sets, continuous, real, observer=kind,
+            widened=any(one.graduation > 1.0 for one in losses[1:]),
             loss=any(one.kind != "quadratic" for one in losses),
             own_losses=sum((one.kind == "own") << k for k, one in enumerate(losses)),
             # The covariance of a constant gain's error has no other use.
@@ -128,7 +131,7 @@ class Layout:
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
             "continuous": self.continuous, "real": self.real, "loss": int(self.loss),
-            "own_losses": self.own_losses,
+            "widened": int(self.widened), "own_losses": self.own_losses,
             "lapack": int(self.lapack),
             "clock": int(self.clock), "clock_text": _CLOCK_TEXT if self.clock else "",
             "output_residual": self.residuals[0], "state_residual": self.residuals[1],
@@ -145,7 +148,9 @@ class Layout:
     def settings_type(self) -> np.dtype[Any]:
         """``mhe_settings``."""
         r, n, p = self.number, self.nx, self.ny
-        loss = _struct([("parameter", r), ("kind", np.int32), ("per_component", np.int32)])
+        loss = _struct([
+            ("parameter", r), ("graduation", r), ("kind", np.int32), ("per_component", np.int32),
+        ])
         fields: list[Any] = [
             ("gain", r, n * p), ("filter_gain", r, n * p), ("prior_weight", r, n * n),
             ("disturbance_weight", r, n * n), ("noise_weight", r, p * p),
@@ -338,7 +343,7 @@ def _filled(
         _fill(record, f"{name}_weight", getattr(form, name))
         part = record[f"{name}_loss"]
         part["kind"], part["parameter"] = _loss_number(name, loss), loss.parameter
-        part["per_component"] = loss.per_component
+        part["per_component"], part["graduation"] = loss.per_component, loss.graduation
     for name, residual in (("output", system.output_residual), ("state", system.state_residual)):
         if residual is not None and residual.periods is not None:
             periods = record[f"{name}_periods"]

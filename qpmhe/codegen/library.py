@@ -113,7 +113,7 @@ def _without_form(cost: Cost) -> str:
             if reason:
                 return (
                     f"{type(loss).__name__}, the loss of {name}, has no C form ({reason}); take "
-                    "Quadratic, Huber or Power, or engine='python'."
+                    "Quadratic, Huber, Power or Barron, or engine='python'."
                 )
     if cost.c_form is None:
         return f"{type(cost).__name__} has no C form; take a QuadraticCost or a RobustCost."

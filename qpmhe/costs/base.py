@@ -60,12 +60,15 @@ class LossForm(NamedTuple):
         Whether it is applied to each component and added.
     function : callable or None
         Of a user's "own" loss: forms q (K,) to rho(q) and rho'(q), (2, K).
+    graduation : float
+        By what it is widened at the first sample; see `Barron`.
     """
 
     kind: str = "quadratic"
     parameter: float = 0.0
     per_component: bool = False
     function: Callable[[Array], Array] | None = None
+    graduation: float = 1.0
 
 
 class CostForm(NamedTuple):
@@ -191,6 +194,9 @@ class Cost(ABC):
     #: The directions of the disturbances, of a `LiftedCost`; None for all.
     space: Subspace | None = None
 
+    #: The largest factor by which a loss is widened while the first window fills; see `Barron`.
+    graduation: float = 1.0
+
     #: Smaller eigenvalues of the correlations in an observer's covariance count as this.
     least_correlation: float = SINGULAR
 
@@ -244,6 +250,10 @@ class Cost(ABC):
         if not isinstance(self.prior, ObserverPrior):
             return self.prior
         return (self.prior.minimum or 0.0) * np.eye(self.n)
+
+    def graduated(self, progress: float) -> Cost:
+        """The surrogate to minimise when this share of the first window is full."""
+        return self
 
     @property
     def c_form(self) -> CostForm | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from .._checks import Array
@@ -38,6 +40,12 @@ class LiftedCost(Cost):
         weight = self._lifted(cost.disturbance)
         assert weight is not None
         super().__init__(cost.prior, weight, cost.noise, cost.discount)
+
+    def graduated(self, progress: float) -> Cost:
+        """The user's surrogate; see `Cost.graduated`."""
+        found = copy(self)
+        found._cost = self._cost.graduated(progress)
+        return found
 
     @property
     def c_form(self) -> CostForm | None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from copy import copy
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +18,7 @@ _STEP = float(np.finfo(np.float64).eps) ** (1 / 3)
 
 
 class Loss(ABC):
-    r"""A convex function :math:`\rho(q)` of the quadratic form :math:`q = s^\top W s`.
+    r"""An increasing function :math:`\rho(q)` of the form :math:`q = s^\top W s`.
 
     Parameters
     ----------
@@ -46,6 +48,12 @@ class Loss(ABC):
                 "Transform the outputs so that their noises are independent."
             )
 
+    #: By which factor the loss is widened while the first window fills; see `Barron`.
+    graduation: float = 1.0
+
+    # The square of the factor by which this loss is widened, see `widened`.
+    _widening: float = 1.0
+
     #: The exponent a with c |s|^a <= loss(s) <= C |s|^a, None if there is none.
     exponent: float | None = None
 
@@ -57,7 +65,7 @@ class Loss(ABC):
             name in vars(self) for name in names
         ):
             return None
-        return LossForm("own", 0.0, self.per_component, self._value_and_slope)
+        return LossForm("own", 0.0, self.per_component, self._value_and_slope, self.graduation)
 
     def _value_and_slope(self, q: Array) -> Array:
         return np.stack((self._value(q), self._slope(q)))
@@ -76,19 +84,34 @@ class Loss(ABC):
         The weight is the one of the loss, reduced to the observed components where some are
         missing.
         """
+        if self._widening != 1.0:
+            weight = weight / self._widening
         if self.per_component:
             diagonal = np.diagonal(weight, axis1=-2, axis2=-1)
             value: Array = np.sum(self._value(diagonal * s * s), axis=-1)
-            return value
-        return self._value(quadratic_form(s, weight))
+        else:
+            value = self._value(quadratic_form(s, weight))
+        return value if self._widening == 1.0 else self._widening * value
 
     def majorise(self, s: Array, weight: Array) -> Array:
         """Weights (K, d, d) of quadratic forms that touch the loss at each row s; see `cost`."""
         if self.per_component:
             diagonal = np.diagonal(weight, axis1=-2, axis2=-1)
-            scaled = diagonal * self._slope(diagonal * s * s)
+            scaled = diagonal * self._slope(diagonal * s * s / self._widening)
             return scaled[:, :, None] * np.eye(s.shape[1])
-        return self._slope(quadratic_form(s, weight))[:, None, None] * weight
+        slope = self._slope(quadratic_form(s, weight) / self._widening)
+        return slope[:, None, None] * weight
+
+    def widened(self, factor: float) -> Loss:
+        r"""The loss :math:`\mu \rho(q / \mu)`, whose thresholds are ``factor`` times as large.
+
+        :math:`\mu` is the square of the factor. Near zero it is the loss itself.
+        """
+        if factor == 1.0:
+            return self
+        found = copy(self)
+        found._widening = factor * factor
+        return found
 
     def hessian(self, s: Array, weight: Array) -> Array:
         """Second derivatives (K, d, d) of the loss at each row s; see `cost`."""
@@ -260,3 +283,134 @@ class Power(Loss):
     def _curvature(self, q: Array) -> Array:
         half = 0.5 * self.exponent
         return np.where(q < 1e-8, 0.0, half * (half - 1.0) * np.maximum(q, 1e-8) ** (half - 2.0))
+
+class Barron(Loss):
+    r"""Barron's family of losses: the smaller the shape, the less an outlier weighs.
+
+    .. math::
+        \rho = \frac{2 c^2 (2 - \alpha)}{\alpha}
+        \left(\Bigl(1 + \frac{r^2}{c^2 (2 - \alpha)}\Bigr)^{\alpha / 2} - 1\right),
+        \qquad r = |s|_W
+
+    and its limits: :math:`r^2` for :math:`\alpha = 2`, :math:`2 c^2 \log(1 + r^2 / (2 c^2))` for 0
+    (`Cauchy`), :math:`2 c^2 (1 - e^{-r^2 / (2 c^2)})` for :math:`-\infty` (Welsch). The shape -2
+    is `GemanMcClure`, 1 a smooth form of `Huber`. All are close to :math:`r^2` for r well below c.
+
+    It has **no** constants in the sense of (eq:exp_bounds). The theorem does not apply with it; the
+    cost decrease (eq:estimator) holds all the same.
+
+    Parameters
+    ----------
+    weight, per_component
+        As for `Loss`.
+    shape : float
+        alpha <= 2; ``-math.inf`` for Welsch.
+    threshold : float
+        c, in standard deviations, > 0.
+    graduation : float
+        While the first window fills, the sequence of QPs minimises a surrogate: the loss with a
+        threshold that is this many times as large at the first sample and decreases to c as the
+        window fills. The estimate is the surrogate's minimiser only where its true cost, that of
+        the loss itself, is below the candidate's. 1 for none.
+
+    Raises
+    ------
+    WeightError, ShapeError, OptionError
+        As for `Loss`; if shape, threshold or graduation are out of range, or graduation is not 1
+        for a shape of 1 or more.
+
+    Notes
+    -----
+    For a shape below 1 the loss is not convex: its slope goes to zero far away, and the problem
+    has several minima. Which one is found depends on where the QPs start. The widened losses
+    lead from a nearly quadratic problem to it, so that the first estimate matters less; later on
+    the estimator follows its minimum from sample to sample with ``warm_start=True``.
+
+    References
+    ----------
+    Barron, A general and adaptive robust loss function, CVPR 2019. Blake and Zisserman, Visual
+    Reconstruction, 1987, on graduated non-convexity.
+    """
+
+    def __init__(
+        self, weight: ArrayLike, shape: float, threshold: float, per_component: bool = False,
+        graduation: float = 1.0,
+    ) -> None:
+        super().__init__(weight, per_component)
+        number = isinstance(shape, (int, float, np.number)) and not isinstance(shape, bool)
+        if not number or not shape <= 2.0:
+            raise OptionError(f"shape is {shape!r}; expected a number <= 2, or -math.inf.")
+        self.shape = float(shape)
+        self.threshold = positive("threshold", threshold)
+        self.graduation = positive("graduation", graduation)
+        if self.graduation < 1.0 or (self.graduation > 1.0 and self.shape >= 1.0):
+            raise OptionError(
+                f"graduation is {graduation!r} for the shape {shape!r}; expected 1, or a larger "
+                "factor for a shape below 1: other losses are convex and need none."
+            )
+
+    def _value(self, q: Array) -> Array:
+        alpha, square = self.shape, self.threshold**2
+        if alpha == 2.0:
+            return q
+        if alpha == 0.0:
+            return 2.0 * square * np.log1p(q / (2.0 * square))
+        if alpha == -math.inf:
+            return -2.0 * square * np.expm1(-q / (2.0 * square))
+        width = 2.0 - alpha
+        exponent = 0.5 * alpha * np.log1p(q / (square * width))
+        return (2.0 * square * width / alpha) * np.expm1(exponent)
+
+    def _slope(self, q: Array) -> Array:
+        alpha, square = self.shape, self.threshold**2
+        if alpha == 2.0:
+            return np.ones_like(q)
+        if alpha == -math.inf:
+            return np.exp(-q / (2.0 * square))
+        return np.exp((0.5 * alpha - 1.0) * np.log1p(q / (square * (2.0 - alpha))))
+
+    def _curvature(self, q: Array) -> Array:
+        alpha, square = self.shape, self.threshold**2
+        if alpha == 2.0:
+            return np.zeros_like(q)
+        if alpha == -math.inf:
+            return -np.exp(-q / (2.0 * square)) / (2.0 * square)
+        width = square * (2.0 - alpha)
+        steep = 0.5 * alpha - 1.0
+        return steep / width * np.exp((steep - 1.0) * np.log1p(q / width))
+
+
+class Cauchy(Barron):
+    r"""The loss :math:`2 c^2 \log(1 + r^2 / (2 c^2))`, `Barron` with the shape 0.
+
+    Parameters
+    ----------
+    weight, per_component, graduation
+        As for `Barron`.
+    threshold : float
+        c, in standard deviations; 1.686 keeps 95 % efficiency on normal noise.
+    """
+
+    def __init__(
+        self, weight: ArrayLike, threshold: float = 1.686, per_component: bool = False,
+        graduation: float = 10.0,
+    ) -> None:
+        super().__init__(weight, 0.0, threshold, per_component, graduation)
+
+
+class GemanMcClure(Barron):
+    r"""The bounded loss :math:`r^2 / (1 + r^2 / (4 c^2))`, `Barron` with the shape -2.
+
+    Parameters
+    ----------
+    weight, per_component, graduation
+        As for `Barron`.
+    threshold : float
+        c, in standard deviations; 1.894 keeps 95 % efficiency on normal noise.
+    """
+
+    def __init__(
+        self, weight: ArrayLike, threshold: float = 1.894, per_component: bool = False,
+        graduation: float = 10.0,
+    ) -> None:
+        super().__init__(weight, -2.0, threshold, per_component, graduation)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -54,6 +56,7 @@ class RobustCost(Cost):
         else:
             self.prior_loss = _loss("prior", prior)
             weight = check_prior_size(positive_definite("prior", self.prior_loss.weight), r)
+        self.graduation = max(self.disturbance_loss.graduation, self.noise_loss.graduation)
         super().__init__(weight, self.disturbance_loss.weight, self.noise_loss.weight, discount)
 
     @property
@@ -106,6 +109,14 @@ class RobustCost(Cost):
             self.noise_loss.check_weight(noise)
         if disturbance is not None:
             self.disturbance_loss.check_weight(disturbance)
+
+    def graduated(self, progress: float) -> RobustCost:
+        """The cost with widened losses; see `Cost.graduated`."""
+        found = copy(self)
+        for name in ("disturbance_loss", "noise_loss"):
+            loss: Loss = getattr(self, name)
+            setattr(found, name, loss.widened(loss.graduation ** (1.0 - progress)))
+        return found
 
     def prior_cost(self, offset: Array, weight: Array) -> float:
         """The loss of the initial error; see `Cost.prior_cost`."""

@@ -305,7 +305,7 @@ class PythonEngine:
         if window.newest_failed and outcome.improved:
             window.restart(estimate.state)
         # The estimate's arrays are the user's.
-        self._trajectory = trajectory.copy()
+        self._trajectory = (trajectory if outcome.followed is None else outcome.followed).copy()
         estimate.step_time = perf_counter() - began
         return estimate
 

@@ -36,6 +36,7 @@ class Status(enum.Flag):
     METRIC_SINGULAR = enum.auto()
     OBSERVER_FAR = enum.auto()
     TIME_UP = enum.auto()
+    GRADUATED = enum.auto()
 
     def explain(self) -> str:
         """What happened, and what can be done about it, in sentences."""
@@ -93,6 +94,10 @@ _TEXTS = {
         "observer, or candidate='reinitialized', which starts it anew from the estimates."
     ),
     Status.TIME_UP: "The time budget was spent; the best trajectory so far is the estimate.",
+    Status.GRADUATED: (
+        "The first window was not full: the QPs minimised the cost with a widened loss, whose "
+        "minimiser is the estimate where its true cost is below the candidate's."
+    ),
 }
 
 

@@ -44,6 +44,8 @@ class Outcome:
         Whether it is an estimate better than the candidate.
     events : Status
         Why the sequence stopped, and what happened.
+    followed : array or None
+        The minimiser of a surrogate of the cost, from which the next step starts.
     dropped, message, qps, corrections, nearest_points, solver_iterations, solve_time
         As in `Estimate`.
     """
@@ -58,6 +60,7 @@ class Outcome:
     solver_iterations: int | None = 0
     solve_time: float = 0.0
     dropped: tuple[DroppedRow, ...] = ()
+    followed: Array | None = None
 
     def __init__(self, candidate: Trial, deadline: float = math.inf) -> None:
         self.trial, self.deadline = candidate, deadline
@@ -201,6 +204,23 @@ class Optimizer:
                 outcome.events |= Status.ROWS_DROPPED
 
     def _search(self, problem: Problem, outcome: Outcome, start: Array | None, limit: int) -> None:
+        """Lower the cost by at most ``limit`` QPs, from the start if that is better.
+
+        With a surrogate of the cost, its minimiser counts where the true cost is lower.
+        """
+        if problem.surrogate is None:
+            self._descend(problem, outcome, start, limit)
+            return
+        best, surrogate = outcome.trial, problem.with_cost(problem.surrogate)
+        outcome.trial = surrogate.judged(best)
+        self._descend(surrogate, outcome, start, limit)
+        found = problem.judged(outcome.trial)
+        if found.cost < math.inf:
+            outcome.followed = found.trajectory
+        outcome.trial = found if found.cost < _target(best) else best
+        outcome.events |= Status.GRADUATED
+
+    def _descend(self, problem: Problem, outcome: Outcome, start: Array | None, limit: int) -> None:
         """Solve at most ``limit`` QPs, each around the best trajectory so far."""
         if start is not None:
             trial = problem.evaluate(problem.clipped(start.copy()))

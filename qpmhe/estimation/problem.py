@@ -93,6 +93,13 @@ class Formulation:
         #: Whether trials have values of nonlinear constraints, or penalties.
         self.extended = self.functions is not None or self.penalties is not None
 
+    def with_cost(self, cost: Cost) -> Formulation:
+        """The formulation with another cost of the stages."""
+        other = copy(self)
+        other.evaluate_costs = contained(cost.stage_costs)
+        other.majorise = contained(cost.majorise)
+        return other
+
     def problem(self, window: Window) -> Problem:
         """The problem of the present window."""
         return Problem(self, window)
@@ -146,6 +153,8 @@ class Problem:
         The candidate's linearised stages.
     penalties : WindowPenalties or None
         The rows of soft sets and soft constraints, with their penalties.
+    surrogate : Cost or None
+        The cost that the QPs minimise while the first window fills, if it is another.
     time : int
         Time of the first state.
     wraps : bool
@@ -156,14 +165,17 @@ class Problem:
         "_candidate_residuals", "_clip", "_counting", "_formulation", "_has_noise_free",
         "_prior_band", "candidate", "constrained", "constraints", "discounts", "distance_weight",
         "inputs", "measurements", "model", "observed", "penalties", "prior", "prior_moved",
-        "prior_weight", "rolled_out", "span", "stage_weights", "time", "usual_disturbances",
-        "wraps",
+        "prior_weight", "rolled_out", "span", "stage_weights", "surrogate", "time",
+        "usual_disturbances", "wraps",
     )
 
     _clip: tuple[Array, Array] | None
 
     def __init__(self, formulation: Formulation, window: Window) -> None:
         self._formulation, view, cost = formulation, window.view, formulation.cost
+        self.surrogate: Cost | None = None
+        if cost.graduation > 1.0 and window.time < window.horizon:
+            self.surrogate = cost.graduated(window.time / window.horizon)
         self.wraps = formulation.wraps
         self.prior, self.measurements, self.span = view.prior, view.measurements, view.span
         self.time = window.time - window.length
@@ -336,6 +348,26 @@ class Problem:
             if trial.violation > FEASIBLE:
                 trial.cost = math.inf
         return trial
+
+    def with_cost(self, cost: Cost) -> Problem:
+        """The problem with a surrogate of the cost; the candidate keeps its true one."""
+        other = copy(self)
+        other._formulation = self._formulation.with_cost(cost)
+        # The terms that the window holds are those of the true cost: this is another trajectory.
+        other.candidate = replace(self.candidate, trajectory=self.candidate.trajectory.copy())
+        return other
+
+    def judged(self, trial: Trial) -> Trial:
+        """A trial of the problem with another cost, by the cost of this one."""
+        if not math.isfinite(trial.cost):
+            return trial
+        try:
+            weights, cost = self._weights_and_cost(trial.residuals)
+            prior = self._formulation.prior_cost(self.offset(trial.trajectory), self.prior_weight)
+        except Exception as error:  # a user's loss
+            return replace(trial, cost=math.inf, error=error)
+        cost += prior if self.discounts is None else float(self.discounts[0]) * prior
+        return replace(trial, weights=weights, cost=cost + trial.penalty)
 
     def failure(self, trial: Trial) -> str:
         """What the model or the cost raised at a trial, as a message; blank if nothing."""

@@ -291,6 +291,10 @@ def _huber(threshold: float, per_component: bool = False) -> Callable[[Any], qpm
     return functools.partial(qpmhe.Huber, threshold=threshold, per_component=per_component)
 
 
+def _barron(shape: float, threshold: float = 1.0) -> Callable[[Any], qpmhe.Barron]:
+    return functools.partial(qpmhe.Barron, shape=shape, threshold=threshold)
+
+
 def _power(exponent: float, per_component: bool = False) -> Callable[[Any], qpmhe.Power]:
     return functools.partial(qpmhe.Power, exponent=exponent, per_component=per_component)
 
@@ -715,6 +719,23 @@ CASES: dict[str, Callable[[], Case]] = {
         functools.partial(Heavier, threshold=0.4, per_component=True), _huber(0.2),
         functools.partial(PseudoHuber, per_component=True), discount=0.95,
     ).with_options(max_qps=4, warm_start=True),
+    "cauchy": lambda: _robust(
+        None, _barron(0.0), functools.partial(qpmhe.Cauchy, graduation=1.0, per_component=True)
+    ).with_gaps(),
+    "redescending": lambda: _robust(
+        functools.partial(qpmhe.GemanMcClure, graduation=1.0), _barron(-np.inf), _barron(-3.0, 1.5),
+        discount=0.95,
+    ).with_options(max_qps=4, warm_start=True),
+    "graduated": lambda: _robust(
+        None, None, functools.partial(qpmhe.GemanMcClure, per_component=True)
+    ).with_gaps().with_options(warm_start=True, max_qps=3),
+    "graduated, both terms": lambda: _weighed(_robust(
+        _huber(0.5), qpmhe.Cauchy, functools.partial(qpmhe.GemanMcClure, graduation=30.0),
+        discount=0.9,
+    )).with_options(warm_start=True, max_qps=1),
+    "graduated in sets": lambda: _boxed(_robust(
+        None, None, functools.partial(qpmhe.Cauchy, threshold=0.8, per_component=True)
+    )).with_options(warm_start=True),
     "power failing": lambda: replace(
         _failing(1.8), observer=qpmhe.Luenberger([[0.5], [0.3]]), cost=qpmhe.RobustCost(
             prior=_power(1.5)(10.0 * np.eye(2)), disturbance=_power(1.2)(100.0 * np.eye(2)),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.costs import Huber, Power, Quadratic
+from qpmhe.costs import Barron, Cauchy, GemanMcClure, Huber, Power, Quadratic
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError, WeightError
 
 from . import plain
@@ -36,9 +36,25 @@ LOSSES = {
     "power 4 each": (
         Power(DIAGONAL, 4.0, per_component=True), plain.each(plain.power(4.0)), False
     ),
+    "barron 1.5": (Barron(FULL, 1.5, 0.8), plain.barron(1.5, 0.8), True),
+    "barron 2": (Barron(FULL, 2.0, 0.8), plain.quadratic, True),
+    "cauchy": (Cauchy(FULL), plain.barron(0.0, 1.686), True),
+    "cauchy each": (
+        Cauchy(DIAGONAL, 0.7, per_component=True), plain.each(plain.barron(0.0, 0.7)), True
+    ),
+    "geman-mcclure": (GemanMcClure(FULL), plain.geman_mcclure(1.894), True),
+    "geman-mcclure each": (
+        GemanMcClure(DIAGONAL, 0.5, per_component=True), plain.each(plain.geman_mcclure(0.5)), True
+    ),
+    "barron -5": (Barron(FULL, -5.0, 1.0), plain.barron(-5.0, 1.0), True),
+    "welsch": (Barron(FULL, -math.inf, 1.5), plain.barron(-math.inf, 1.5), True),
+    "widened": (Cauchy(FULL, 0.5).widened(3.0), plain.barron(0.0, 1.5), True),
 }
+REDESCENDING = [
+    name for name, (loss, *_) in LOSSES.items() if isinstance(loss, Barron) and loss.shape < 1.0
+]
 MAJORISED = [name for name, (_, _, above) in LOSSES.items() if above]
-WITH_CONSTANTS = [name for name in LOSSES if "huber" not in name]
+WITH_CONSTANTS = [name for name in LOSSES if "quadratic" in name or "power" in name]
 
 
 def points(count, seed=2):
@@ -125,7 +141,7 @@ def test_above_the_exponent_two_a_form_cannot_lie_above(name):
     assert loss.cost(10.0 * near, loss.weight) > loss.cost(near, loss.weight) + change
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", [name for name in LOSSES if name not in REDESCENDING])
 def test_losses_are_convex_and_even(name):
     loss = LOSSES[name][0]
     one, other = points(200, 6), points(200, 7)
@@ -171,6 +187,46 @@ def test_huber_has_no_constants():
     assert Huber(DIAGONAL, per_component=True).constants() is None
 
 
+@pytest.mark.parametrize("name", [*REDESCENDING, "barron 1.5"])
+def test_barrons_losses_have_no_constants(name):
+    loss = LOSSES[name][0]
+    assert loss.constants() is None
+    assert loss.exponent is None
+
+
+@pytest.mark.parametrize("name", REDESCENDING)
+def test_the_weight_of_an_outlier_goes_to_zero_and_near_zero_it_is_the_given_one(name):
+    loss = LOSSES[name][0]
+    direction = np.array([[1.0, -0.5, 2.0]])
+    far = loss.majorise(1e6 * direction, loss.weight)[0]
+    assert np.abs(far).max() <= 1e-9 * np.abs(loss.weight).max()
+    near = loss.majorise(1e-6 * direction, loss.weight)[0]
+    np.testing.assert_allclose(near, loss.weight, rtol=1e-9, atol=1e-12)
+    farther = loss.cost(np.array([[1.0], [1e3]]) * direction, loss.weight)
+    assert farther[1] - farther[0] < 40.0 * farther[0]  # a quadratic loss: a million times
+
+
+@pytest.mark.parametrize("kind", [Cauchy, GemanMcClure, lambda W, c: Barron(W, -math.inf, c)])
+def test_a_widened_loss_has_a_larger_threshold(kind):
+    s = points(100)
+    for factor in (1.0, 2.0, 37.0):
+        wide, large = kind(FULL, 1.2).widened(factor), kind(FULL, 1.2 * factor)
+        np.testing.assert_allclose(wide.cost(s, FULL), large.cost(s, FULL), rtol=1e-12)
+        np.testing.assert_allclose(wide.majorise(s, FULL), large.majorise(s, FULL), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "default"), [("cauchy", Cauchy), ("geman", GemanMcClure)])
+def test_default_thresholds_keep_95_percent_of_the_efficiency(kind, default):
+    """The asymptotic variance of a location's estimate from normal noise of variance 1."""
+    one = np.eye(1)
+    x, dx = np.linspace(-12.0, 12.0, 200001, retstep=True)
+    density = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi)
+    influence = default(one).majorise(x[:, None], one)[:, 0, 0] * x
+    slope = np.gradient(influence, x)
+    efficiency = (slope @ density * dx) ** 2 / (influence**2 @ density * dx)
+    assert efficiency == pytest.approx(0.95, abs=2e-4)
+
+
 def test_huber_is_smooth_at_its_threshold():
     loss = Huber([[4.0]], 0.6)
     at = np.array([[0.3], [-0.3]])
@@ -198,6 +254,9 @@ KINDS = {
     "quadratic": Quadratic,
     "huber": Huber,
     "power": lambda weight, **more: Power(weight, 1.5, **more),
+    "barron": lambda weight, **more: Barron(weight, 0.5, 1.0, **more),
+    "cauchy": Cauchy,
+    "geman-mcclure": GemanMcClure,
 }
 
 
@@ -217,7 +276,7 @@ def test_weights_of_losses(loss, weight, kind, fragments):
     check(kind, fragments, lambda: KINDS[loss](weight))
 
 
-@pytest.mark.parametrize("loss", ["huber", "power"])
+@pytest.mark.parametrize("loss", ["huber", "power", "barron", "cauchy", "geman-mcclure"])
 def test_a_loss_per_component_needs_a_diagonal_weight(loss):
     KINDS[loss](SMALL, per_component=True)
     check(
@@ -230,6 +289,31 @@ def test_a_loss_per_component_needs_a_diagonal_weight(loss):
 def test_thresholds_out_of_range(value):
     check(
         OptionError, [f"threshold is {value!r}", "finite number > 0"], lambda: Huber(SMALL, value)
+    )
+
+
+@pytest.mark.parametrize("value", [2.1, math.inf, math.nan, True, "1", None, 1j])
+def test_shapes_out_of_range(value):
+    check(
+        OptionError, [f"shape is {value!r}", "a number <= 2", "-math.inf"],
+        lambda: Barron(SMALL, value, 1.0),
+    )
+
+
+@pytest.mark.parametrize("value", [0, -1.0, math.nan, math.inf, True, "1", None])
+def test_graduations_that_are_no_positive_number(value):
+    check(
+        OptionError, [f"graduation is {value!r}", "finite number > 0"],
+        lambda: Cauchy(SMALL, graduation=value),
+    )
+
+
+@pytest.mark.parametrize(("shape", "value"), [(0.0, 0.5), (1.0, 2.0), (2.0, 10.0)])
+def test_graduations_out_of_range(shape, value):
+    check(
+        OptionError,
+        [f"graduation is {value!r}", f"the shape {shape!r}", "expected 1, or a larger"],
+        lambda: Barron(SMALL, shape, 1.0, graduation=value),
     )
 
 

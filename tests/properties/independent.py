@@ -465,10 +465,13 @@ class Price:
         self.discount = float(one_of(rng, (1.0, 1.0, 1.0, 0.95, 0.6)))
         self.names, self.weights, self.numbers, self.single = [], [], [], []
         for size in (n, n, p):
-            kind = "quadratic" if quadratic else one_of(rng, ("quadratic", "huber", "power"))
+            kind = "quadratic" if quadratic else one_of(
+                rng, ("quadratic", "huber", "power", "cauchy", "geman")
+            )
             alone = kind != "quadratic" and rng.random() < 0.4
             weight = np.diag(10.0 ** rng.uniform(-1, 2, size)) if alone else spd(rng, size)
-            number = {"quadratic": 2.0, "huber": float(rng.uniform(0.3, 2.0)),
+            threshold = float(rng.uniform(0.3, 2.0))
+            number = {"quadratic": 2.0, "huber": threshold, "cauchy": threshold, "geman": threshold,
                       "power": float(one_of(rng, (1.0, 1.3, 1.5, 2.0)))}[kind]
             self.names.append(kind)
             self.weights.append(weight)
@@ -488,6 +491,9 @@ class Price:
                 losses.append(weight)
             elif kind == "huber":
                 losses.append(qpmhe.Huber(weight, number, per_component=alone))
+            elif kind in ("cauchy", "geman"):
+                loss = {"cauchy": qpmhe.Cauchy, "geman": qpmhe.GemanMcClure}[kind]
+                losses.append(loss(weight, number, per_component=alone))
             else:
                 losses.append(qpmhe.Power(weight, number, per_component=alone))
         if self.prior_of_observer:
@@ -504,6 +510,10 @@ class Price:
             if self.names[which] == "huber":
                 r = math.sqrt(q)
                 return q if r <= number else 2.0 * number * r - number * number
+            if self.names[which] == "cauchy":
+                return 2.0 * number**2 * math.log1p(q / (2.0 * number**2))
+            if self.names[which] == "geman":
+                return q / (1.0 + q / (4.0 * number**2))
             return math.sqrt(q) ** number
 
         size = len(residual)

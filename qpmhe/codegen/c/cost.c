@@ -84,34 +84,55 @@ static real mhe_loss_slope(const mhe_loss *loss, real q)
 }
 #endif
 
-/* The loss of s. */
-static real mhe_lost(const mhe_loss *loss, int n, const real *W, const real *s)
+/* The loss of s, widened: m rho(q / m). */
+static real mhe_lost(const mhe_loss *loss, real m, int n, const real *W, const real *s)
 {
 #if MHE_LOSS
     real sum = 0;
-    if (!loss->per_component) return mhe_loss_value(loss, mhe_form(n, W, s));
-    for (int j = 0; j < n; j++) sum += mhe_loss_value(loss, W[j * n + j] * s[j] * s[j]);
-    return sum;
+    if (!loss->per_component) return m * mhe_loss_value(loss, mhe_form(n, W, s) / m);
+    for (int j = 0; j < n; j++) sum += mhe_loss_value(loss, W[j * n + j] * s[j] * s[j] / m);
+    return m * sum;
 #else
-    (void)loss;
+    (void)loss; (void)m;
     return mhe_form(n, W, s);
 #endif
 }
 
-/* What the rows of W are multiplied with in the form that touches the loss at s; a loss of each
- * component has a diagonal W. */
-static void mhe_set_scale(const mhe_loss *loss, int n, const real *W, const real *s, real *scale)
+/* What the rows of W are multiplied with in the form that touches the widened loss at s; a loss of
+ * each component has a diagonal W. */
+static void mhe_set_scale(const mhe_loss *loss, real m, int n, const real *W, const real *s,
+                          real *scale)
 {
 #if MHE_LOSS
     if (loss->per_component)
-        for (int j = 0; j < n; j++) scale[j] = mhe_loss_slope(loss, W[j * n + j] * s[j] * s[j]);
+        for (int j = 0; j < n; j++)
+            scale[j] = mhe_loss_slope(loss, W[j * n + j] * s[j] * s[j] / m);
     else {
-        const real slope = mhe_loss_slope(loss, mhe_form(n, W, s));
+        const real slope = mhe_loss_slope(loss, mhe_form(n, W, s) / m);
         for (int j = 0; j < n; j++) scale[j] = slope;
     }
 #else
-    (void)loss; (void)n; (void)W; (void)s; (void)scale;
+    (void)loss; (void)m; (void)n; (void)W; (void)s; (void)scale;
 #endif
+}
+
+/* By what the losses of w and of v are widened now. Without a workspace: not at all. */
+static real mhe_w_widening(const mhe_workspace *k)
+{
+#if MHE_WIDENED
+    if (k) return k->w_widening;
+#endif
+    (void)k;
+    return 1;
+}
+
+static real mhe_v_widening(const mhe_workspace *k)
+{
+#if MHE_WIDENED
+    if (k) return k->v_widening;
+#endif
+    (void)k;
+    return 1;
 }
 
 static real mhe_scaled(real weight, const real *scale, int row)
@@ -124,18 +145,19 @@ static real mhe_scaled(real weight, const real *scale, int row)
 #endif
 }
 
-/* l(w, v) of a stage. */
-static real mhe_stage_cost(const mhe_settings *s, const mhe_stage *stage, const real *w,
-                           const real *v)
+/* l(w, v) of a stage; without a workspace that of the losses themselves. */
+static real mhe_stage_cost(const mhe_settings *s, const mhe_workspace *k, const mhe_stage *stage,
+                           const real *w, const real *v)
 {
-    return mhe_lost(&s->disturbance_loss, NX, mhe_disturbance_weight(s, stage), w) +
-           mhe_lost(&s->noise_loss, NY, stage->noise_weight, v);
+    return mhe_lost(&s->disturbance_loss, mhe_w_widening(k), NX, mhe_disturbance_weight(s, stage),
+                    w) +
+           mhe_lost(&s->noise_loss, mhe_v_widening(k), NY, stage->noise_weight, v);
 }
 
 /* Gamma of an offset from the prior. */
 static real mhe_prior_cost(const mhe_settings *s, const mhe_workspace *k, const real *offset)
 {
-    return mhe_lost(&s->prior_loss, NX, k->prior.weight, offset);
+    return mhe_lost(&s->prior_loss, 1, NX, k->prior.weight, offset);
 }
 
 #if MHE_LAPACK
@@ -160,8 +182,8 @@ static int mhe_dense_terms(const real *Q, const real *w, mhe_terms *t)
 
 /* hessian = A' Q A + C' R C (upper half), coupling = -A' Q, own = -(A' Q w + C' R v),
  * following = Q w; A and C are in place. Q and R are of the form that touches the cost. */
-static void mhe_set_terms(const mhe_settings *s, const mhe_stage *stage, const real *w,
-                          const real *v, mhe_terms *t)
+static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *k, const mhe_stage *stage,
+                          const real *w, const real *v, mhe_terms *t)
 {
     const real *A = t->f_jacobian, *C = t->h_jacobian;
     const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
@@ -171,8 +193,8 @@ static void mhe_set_terms(const mhe_settings *s, const mhe_stage *stage, const r
         for (int j = 0; j < NX; j++) t->disturbance_scale[MHE_LOSS ? j : 0] = 1;
         for (int j = 0; j < NY; j++) t->noise_scale[MHE_LOSS ? j : 0] = 1;
     } else {
-        mhe_set_scale(&s->disturbance_loss, NX, Q, w, t->disturbance_scale);
-        mhe_set_scale(&s->noise_loss, NY, R, v, t->noise_scale);
+        mhe_set_scale(&s->disturbance_loss, mhe_w_widening(k), NX, Q, w, t->disturbance_scale);
+        mhe_set_scale(&s->noise_loss, mhe_v_widening(k), NY, R, v, t->noise_scale);
     }
     mhe_times(NX, Q, w, t->following);
     for (int i = 0; i < NX; i++)

@@ -43,6 +43,7 @@ typedef $real mhe_real;
 #define MHE_W_ROWS $w_rows  /* general inequalities in each */
 #define MHE_V_ROWS $v_rows
 #define MHE_LOSS $loss    /* whether a term of the cost has a loss that is not quadratic */
+#define MHE_WIDENED $widened   /* whether a loss is widened while the first window fills */
 #define MHE_OWN_LOSSES $own_losses /* users' functions: 1 of the prior, 2 of w, 4 of v */
 #define MHE_LAPACK $lapack /* 1: needs mhe_set_lapack */
 #define MHE_CLOCK $clock /* whether time_budget is kept */
@@ -120,10 +121,11 @@ enum {
     MHE_OWN_PRIOR = 3, MHE_OWN_DISTURBANCE = 4, MHE_OWN_NOISE = 5 /* the user's function */
 };
 
-/* A term of the cost: a convex function of the quadratic form s'W s, or the sum of that of each
+/* A term of the cost: a function of the quadratic form s'W s, or the sum of that of each
  * W[j][j] s[j]^2. */
 typedef struct {
     mhe_real parameter;        /* threshold in standard deviations, or exponent */
+    mhe_real graduation;       /* by what it is widened at the first sample; 1 for none */
     int32_t kind, per_component;
 } mhe_loss;
 
@@ -297,6 +299,11 @@ typedef struct {
 
 typedef struct {
     mhe_trial trials[4], bent;
+#if MHE_WIDENED
+    mhe_trial kept;                   /* the best trial by the cost itself */
+    mhe_real w_widening, v_widening;  /* of the losses; 1 of the cost itself */
+    mhe_real followed[(MHE_HORIZON + 1) * MHE_NX]; /* where the next step starts */
+#endif
     mhe_terms terms[MHE_HORIZON];
     const mhe_terms *at[MHE_HORIZON]; /* the terms of the present QP */
     mhe_real factors[MHE_HORIZON + 1]; /* discounts: of the prior, then of each stage */

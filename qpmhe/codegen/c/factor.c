@@ -20,7 +20,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     const int count = e->length;
     const real *factors = k->factors;
     real prior_scale[NX];
-    mhe_set_scale(&s->prior_loss, NX, k->prior.weight, offset, prior_scale);
+    mhe_set_scale(&s->prior_loss, 1, NX, k->prior.weight, offset, prior_scale);
     for (int i = 0; i <= count; i++) {
         real *panel = k->panels + i * NX * WIDTH, *g = k->gradient + i * NX;
         const real *weight = i == 0 ? k->prior.weight

@@ -9,6 +9,7 @@ typedef struct {
     mhe_trial *candidate, *best, *spare, *other; /* best may be the candidate */
     int outside; /* the candidate misses rows: as a trial, it has no finite cost */
     int events, qps, iterations, corrections, nearest_points, rows_dropped;
+    int followed;   /* the next step starts from a surrogate's minimiser */
     int factorised; /* the QP's matrix, with its active rows, is in the panels */
 } mhe_outcome;
 
@@ -95,7 +96,7 @@ static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *
         mhe_h_jacobian(around->x + i * NX, stage->u, output, t->h_jacobian);
         if (!mhe_all_finite(NX * NX, t->f_jacobian) || !mhe_all_finite(NY * NX, t->h_jacobian))
             return 0;
-        mhe_set_terms(e->settings, stage, around->w + i * NX, around->v + i * NY, t);
+        mhe_set_terms(e->settings, k, stage, around->w + i * NX, around->v + i * NY, t);
     }
 #if CONSTRAINED
     mhe_set_limits(e, k, around->x, around->w, around->v);
@@ -342,7 +343,7 @@ static void mhe_shift(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int be
 
 /* At most so many QPs, each around the best trajectory so far. `before`: as for the shift, -1 not
  * to start there. */
-static void mhe_search(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before, int limit)
+static void mhe_descend(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before, int limit)
 {
     if (before >= 0) {
         mhe_shift(e, k, o, before);
@@ -350,6 +351,65 @@ static void mhe_search(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int b
     }
     while (limit-- > 0 && !mhe_is_late(k, o) && mhe_improve_once(e, k, o)) continue;
 }
+
+#if MHE_WIDENED
+/* The cost of a trial, from its residuals: of a surrogate, or the cost itself again. */
+static void mhe_weigh(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
+{
+    real offset[NX], cost = 0;
+    if (!isfinite(trial->cost)) return;
+    for (int i = 0; i < e->length; i++)
+        cost += k->factors[i + 1] * mhe_stage_cost(e->settings, k, mhe_stage_at(e, i),
+                                                   trial->w + i * NX, trial->v + i * NY);
+    for (int j = 0; j < NX; j++) offset[j] = trial->x[j] - k->prior.mean[j];
+    mhe_wrap_state(e->settings, trial->x, offset);
+    cost += k->factors[0] * mhe_prior_cost(e->settings, k, offset);
+    trial->cost = isfinite(cost) ? cost : INFINITY;
+}
+
+static void mhe_set_widening(mhe_workspace *k, const mhe_settings *s, real rest)
+{
+    k->w_widening = pow(s->disturbance_loss.graduation, 2 * rest);
+    k->v_widening = pow(s->noise_loss.graduation, 2 * rest);
+}
+
+/* Lower the cost with widened losses as long as the first window is not full. What is found counts
+ * where the cost itself is lower; the next step starts from it in any case. */
+static void mhe_search(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before, int limit)
+{
+    if (e->time >= MHE_HORIZON) {
+        mhe_descend(e, k, o, before, limit);
+        return;
+    }
+    const real target = mhe_target(o);
+    const int from_candidate = o->best == o->candidate;
+    const size_t size = sizeof(real) * (size_t)(e->length + 1) * NX;
+    k->kept = *o->best;
+    if (from_candidate) {
+        *o->spare = *o->candidate;
+        if (o->outside) o->spare->cost = INFINITY;
+        mhe_take(k, o);
+    }
+    mhe_set_widening(k, e->settings, 1 - e->time / (real)MHE_HORIZON);
+    mhe_weigh(e, k, o->best);
+    mhe_descend(e, k, o, before, limit);
+    mhe_set_widening(k, e->settings, 0);
+    mhe_weigh(e, k, o->best);
+    o->events |= MHE_GRADUATED;
+    if (isfinite(o->best->cost)) {
+        memcpy(k->followed, o->best->x, size);
+        o->followed = 1;
+    }
+    if (o->best->cost < target) return;
+    if (from_candidate) {
+        o->spare = o->best;
+        o->best = o->candidate;
+    } else
+        *o->best = k->kept;
+}
+#else
+#define mhe_search mhe_descend
+#endif
 
 #if CONSTRAINED
 /* The candidate's disturbances: its corrections, as far as they are in directions that have some. */
@@ -478,6 +538,9 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     k->factors[0] = factor;
     mhe_set_prior(e, k);
     memset(o, 0, sizeof *o);
+#if MHE_WIDENED
+    mhe_set_widening(k, s, 0);
+#endif
 #if CONSTRAINED
     memcpy(k->rows.place, e->places, sizeof e->places);
 #endif

@@ -33,7 +33,11 @@ static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
         if (!(o->events & MHE_MODEL_FAILED)) o->events |= MHE_FAILED_STAGE;
     }
     mhe_watch(e, k, o);
+#if MHE_WIDENED
+    memcpy(e->trajectory, o->followed ? k->followed : o->best->x, size);
+#else
     memcpy(e->trajectory, o->best->x, size);
+#endif
     e->has_trajectory = 1;
     if (!isfinite(newest->cost) && o->best != o->candidate)
         memcpy(e->z_end, o->best->x + e->length * NX, sizeof e->z_end);

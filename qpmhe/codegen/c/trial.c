@@ -44,7 +44,7 @@ static void mhe_judge(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial
         for (int j = 0; j < NY; j++) v[j] = stage->y[j] - output[j];
         mhe_wrap_state(s, x + NX, w);
         mhe_wrap_output(s, stage->y, v);
-        cost += factors[i + 1] * mhe_stage_cost(s, stage, w, v);
+        cost += factors[i + 1] * mhe_stage_cost(s, k, stage, w, v);
     }
     for (int j = 0; j < NX; j++) offset[j] = trial->x[j] - prior[j];
     mhe_wrap_state(s, trial->x, offset);
@@ -78,8 +78,10 @@ static real mhe_rounding_cost(mhe_estimator *e, const mhe_workspace *k, const mh
         const real *Q = mhe_disturbance_weight(e->settings, stage), *R = stage->noise_weight;
         const real *x = trial->x + (i + 1) * NX, *y = stage->y;
         real sum = 0, w_scale[NX], v_scale[NY];
-        mhe_set_scale(&e->settings->disturbance_loss, NX, Q, trial->w + i * NX, w_scale);
-        mhe_set_scale(&e->settings->noise_loss, NY, R, trial->v + i * NY, v_scale);
+        mhe_set_scale(&e->settings->disturbance_loss, mhe_w_widening(k), NX, Q, trial->w + i * NX,
+                      w_scale);
+        mhe_set_scale(&e->settings->noise_loss, mhe_v_widening(k), NY, R, trial->v + i * NY,
+                      v_scale);
         for (int j = 0; j < NX; j++)
             for (int l = 0; l < NX; l++)
                 sum += fabs(x[j] * mhe_scaled(Q[j * NX + l], w_scale, j) * x[l]);

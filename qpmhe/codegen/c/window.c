@@ -55,7 +55,7 @@ static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *ne
 #else
     (void)events;
 #endif
-    const real cost = mhe_stage_cost(s, stage, w, v);
+    const real cost = mhe_stage_cost(s, 0, stage, w, v);
     return isfinite(cost) ? cost : INFINITY;
 }
 
@@ -92,7 +92,7 @@ static int mhe_enter(mhe_estimator *e, int i)
         memset(t->h_jacobian, 0, sizeof t->h_jacobian);
         for (int j = 0; j < NX; j++) t->f_jacobian[j * NX + j] = 1;
     }
-    mhe_set_terms(s, stage, stage->w, stage->v, t);
+    mhe_set_terms(s, 0, stage, stage->w, stage->v, t);
     return held || !finite ? events | MHE_MODEL_FAILED : events;
 }
 
