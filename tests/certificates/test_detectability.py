@@ -160,11 +160,13 @@ def test_undetectable_system_is_told_its_mode():
 
 def test_what_intervals_cannot_run_is_sampled_with_the_reason():
     system = qpmhe.System(
-        lambda x: np.array([0.5 * math.sin(x[0])]), lambda x: x[:1], n=1, p=1
+        lambda x: np.array([0.5 * math.sin(float(x[0]))]), lambda x: x[:1], n=1, p=1
     )
     found = certify_detectability(system, unit_box(1), eta=0.8)
     assert found.evidence is Evidence.SAMPLED
     assert "cannot be run with intervals" in found.notes[0]
+    assert "float() of a symbol" in found.notes[0]
+    assert "numpy.where in place of branches" in found.notes[0]
     assert "holds at 4" in found.notes[0]
     assert found.cells == 0
 
