@@ -177,17 +177,20 @@ class Graph:
 
     def root(self, a: int) -> int:
         """The square root; of a sum of squares, the length of a vector."""
-        operation, arguments, k = self.nodes[a]
-        if operation == "add" and all(self.nodes[one][::2] == ("pow", 2) for one in arguments):
-            return self.of("length", *(self.nodes[one][1][0] for one in arguments))
-        if operation == "add":
-            for one, other in (arguments, arguments[::-1]):
-                rest = self.root(other)
-                if self.nodes[one][::2] == ("pow", 2) and self.nodes[rest][0] == "length":
-                    return self.of("length", rest, self.nodes[one][1][0])
-        if operation == "pow" and k == 2:
-            return self.of("abs", arguments[0])
-        return self.of("sqrt", a)
+        legs = self._legs(a)
+        if not legs or self.value(a) is not None:
+            return self.of("sqrt", a)
+        return self.of("length", *legs) if len(legs) > 1 else self.of("abs", *legs)
+
+    def _legs(self, a: int) -> list[int]:
+        """Nodes whose squares sum up to a node; none if it is no such sum."""
+        operation, arguments, parameter = self.nodes[a]
+        if operation == "constant" and parameter > 0.0:
+            return [self.of("sqrt", a)]
+        if operation == "pow" and parameter > 0 and parameter % 2 == 0:
+            return [self.power(arguments[0], parameter // 2)]
+        parts = [self._legs(one) for one in arguments] if operation == "add" else [[]]
+        return sum(parts, []) if all(parts) else []
 
     # Conditions, and choices by them.
 
@@ -387,24 +390,18 @@ class Graph:
             return [first, self.neg(one) if operation == "sub" else one][: len(arguments)], {}
         if operation == "mul":
             return [arguments[1], arguments[0]], {(0, 1): one}
-        if operation in ("angle", "length"):
-            return self._of_two(node, *arguments)
+        if operation == "angle":
+            return self._of_angle(node, *arguments)
+        if operation == "length":
+            return self._of_length(node, arguments)
         if operation in _STEPS or operation in _CONDITIONS:
             zero = self.constant(0.0)
             return [zero] * len(arguments), {}
         slope, curvature = self._of_one(operation, arguments[0], node, parameter)
         return [slope], {(0, 0): curvature}
 
-    def _of_two(self, node: int, a: int, b: int) -> tuple[list[int], Pairs]:
-        if self.nodes[node][0] == "length":
-            first, second = self.of("share", a, b), self.of("share", b, a)
-            inverse = self.power(node, -1)
-            return [first, second], {
-                (0, 0): self.mul(self.power(second, 2), inverse),
-                (1, 1): self.mul(self.power(first, 2), inverse),
-                (0, 1): self.neg(self.mul(self.mul(first, second), inverse)),
-            }
-        inverse = self.power(self.of("length", b, a), -1)
+    def _of_angle(self, node: int, b: int, a: int) -> tuple[list[int], Pairs]:
+        inverse = self.power(self.of("length", a, b), -1)
         twice, square = self.mul(self.constant(2.0), node), self.power(inverse, 2)
         bent = self.mul(self.of("sin", twice), square)
         return [
@@ -413,6 +410,20 @@ class Graph:
             (0, 0): self.neg(bent), (1, 1): bent,
             (0, 1): self.neg(self.mul(self.of("cos", twice), square)),
         }
+
+    def _of_length(self, node: int, legs: tuple[int, ...]) -> tuple[list[int], Pairs]:
+        inverse, others = self.power(node, -1), []
+        for k in range(len(legs)):
+            rest = legs[:k] + legs[k + 1 :]
+            others.append(self.of("length", *rest) if len(rest) > 1 else rest[0])
+        shares = [self.of("share", *pair) for pair in zip(legs, others, strict=True)]
+        bends = {
+            (k, j): self.neg(self.mul(self.mul(shares[k], shares[j]), inverse))
+            for j in range(len(legs)) for k in range(j)
+        }
+        for k, pair in enumerate(zip(others, legs, strict=True)):
+            bends[k, k] = self.mul(self.power(self.of("share", *pair), 2), inverse)
+        return shares, bends
 
     def _of_one(self, operation: str, a: int, v: int, k: Any) -> tuple[int, int]:
         """First and second derivative of a function v of one argument a."""
@@ -634,7 +645,7 @@ class Program:
         nodes = graph.ancestors(roots)
         self._order: list[int] = []
         waiting, users = {}, defaultdict(list)
-        ready: dict[tuple[str, Any], list[int]] = defaultdict(list)
+        ready: dict[tuple[str, Any, int], list[int]] = defaultdict(list)
         leaves = []
         for node in nodes:
             operation, arguments, parameter = graph.nodes[node]
@@ -643,7 +654,7 @@ class Program:
                 users[one].append(node)
             if operation in ("variable", "constant", "unknown"):
                 leaves.append(node)
-        groups: list[tuple[tuple[str, Any], list[int]]] = []
+        groups: list[tuple[tuple[str, Any, int], list[int]]] = []
         done = leaves
         while True:
             self._order += done
@@ -651,8 +662,8 @@ class Program:
                 for user in users[one]:
                     waiting[user] -= 1
                     if not waiting[user]:
-                        operation, _, parameter = graph.nodes[user]
-                        ready[operation, parameter].append(user)
+                        operation, arguments, parameter = graph.nodes[user]
+                        ready[operation, parameter, len(arguments)].append(user)
             if not ready:
                 break
             key = max(ready, key=lambda one: len(ready[one]))
@@ -670,10 +681,10 @@ class Program:
             for node in leaves
         ])
         self._groups = []
-        for (operation, parameter), members in groups:
+        for (operation, parameter, count), members in groups:
             arguments = [
                 np.array([place[graph.nodes[node][1][j]] for node in members], np.intp)
-                for j in range(len(graph.nodes[members[0]][1]))
+                for j in range(count)
             ]
             self._groups.append((
                 OPERATIONS[operation], arguments, () if parameter is None else (parameter,),

@@ -210,9 +210,10 @@ def angle(y: Interval, x: Interval) -> Interval:
     return found.where((x.low > 0.0) | (y.low > 0.0) | (y.high < 0.0))
 
 
-def length(x: Interval, y: Interval) -> Interval:
-    """The length of the vectors (x, y)."""
-    return (x.power(2) + y.power(2)).increasing(np.sqrt, 0.0)
+def length(*legs: Interval) -> Interval:
+    """The length of vectors."""
+    squares = [leg.power(2) for leg in legs]
+    return sum(squares[1:], squares[0]).increasing(np.sqrt, 0.0)
 
 
 def share(x: Interval, y: Interval) -> Interval:

@@ -140,7 +140,7 @@ class ModelTrace:
     def watched(self, name: str) -> Traced:
         """The trace of a function that is watched meanwhile: see `qpmhe.model.tracing`."""
         source = self._functions[name] if self._sources is None else self._sources[name]
-        return expressed(source, (self._n, self._m), name)
+        return expressed(source, (self._n, self._m), name, watched=True)
 
     def _pin(self, found: dict[str, Traced]) -> None:
         self._now = Pinned(found, self._n, self._p, self._m, self.dt, self.method)
