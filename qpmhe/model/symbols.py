@@ -209,8 +209,9 @@ class Symbol:
         return np.bool_ if self.logical else np.float64
 
     def __getattr__(self, name: str) -> Any:
+        # NumPy's compiled code asks for how the number lies in memory, and takes no for an answer.
         if (
-            hasattr(np.float64, name) and not self.record.closed
+            hasattr(np.float64, name) and not name.startswith("__array") and not self.record.closed
             and not sys._getframe(1).f_code.co_filename.startswith(_MACHINERY)
         ):
             self.record.refuse(f"the attribute {name} of a symbol")
