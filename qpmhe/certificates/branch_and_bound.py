@@ -99,7 +99,7 @@ def cover(
         if shown.all():
             continue
         left = np.flatnonzero(~shown)
-        low, high, centres = low[left], high[left], enclosure.centre[left]
+        low, high, centres = low[left], high[left], enclosure.jacobian[left]
         middle = 0.5 * (low + high)
         broken = _broken(form, centres) & region.contains(middle[:, : model.n])
         if broken.any():
@@ -183,7 +183,7 @@ def output_lipschitz(
         bounds, middles = _norm_bounds(enclosure), 0.5 * low + 0.5 * high
         inside = region.contains(middles[:, :n])
         if inside.any():
-            largest, where = _largest(enclosure.centre[inside], middles[inside], -np.inf)
+            largest, where = _largest(enclosure.jacobian[inside], middles[inside], -np.inf)
             if largest > attained:
                 attained, at = largest, where
         goal = np.inf if model.affine_output else attained * (1.0 + _TOLERANCE)

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import itertools
-import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from .._checks import Array
-from ..codegen.graph import model_graph
 from ..errors import ModelError
+from ..model.expressions import CasadiModel, import_casadi
 from ..model.system import System
-from .intervals import Interval, Jet, OutsideDomainError, variables
+from ..model.tracing import Traced
+from .graph import Graph, Program, read
+from .intervals import Interval
 from .regions import Region
 
 _REMEDY = "Take a smaller region, or make the model defined on all of it."
+_SAMPLES, _SEED = 400, 20210829
+# Computed values may be so many times as far from the expression's as rounding errors, bounded
+# one by one, explain: sums may be made in another order, functions come from another library.
+_ROUNDING = 64.0
+_TRACEABLE = "Write it with NumPy's functions of x and u, numpy.where in place of branches"
 
 
 def evaluated(name: str, function: Any, x: Array, u: Array) -> Array:
@@ -105,6 +112,7 @@ class Enclosure:
     slopes: Array  # (B, N, q, n): H_j times the half-width of the cell
     error: Array  # (B, q, n): E, rounded up; NaN where it could not be enclosed
     excess: Array  # (B, N): what the width of each coordinate contributes to E
+    jacobian: Array  # (B, q, n): J at the cell's middle; NaN where it has none
 
     def corners(self) -> tuple[Array, Array]:
         """Matrices whose convex hull, widened by an error, holds J on each cell."""
@@ -127,62 +135,86 @@ class Enclosure:
 
 
 class SmoothModel:
-    """f and h of a system, to be enclosed over cells of states and inputs.
+    """f and h of a system as one expression graph, to be enclosed over cells of states and inputs.
 
-    ``reason`` says why f and h cannot be run with intervals, ``output_reason`` why h alone
-    cannot; empty if they can. ``affine_output``: the Jacobian of h is constant on the region.
+    What is enclosed is f and h as expressions in real arithmetic, with the constants that they
+    have in double precision. Functions in NumPy are traced, under watch (`qpmhe.model.tracing`).
+    At samples of the region, the functions' values must lie where the expressions' values do.
+
+    ``reason`` says why f and h have no enclosure, ``output_reason`` why h alone has none; empty
+    if they have. ``affine_output``: the Jacobian of h is constant on the region.
     """
 
     def __init__(self, system: System, region: Region) -> None:
         self._system, self._region = system, region
-        self._graph = self._output_graph = None
-        # A trace has been compared at points only, which proves nothing of the function.
-        if system.tracing is None and system.symbolic is not None:
-            self._graph = model_graph(system.symbolic)
-            self._output_graph = model_graph(system.symbolic, output_only=True)
         self.n, self.p = system.n, system.p
-        self.affine_output = False
-        middle = 0.5 * (region.lower + region.upper)[None]
-        self.output_reason = self._refused(middle, output_only=True)
-        self.reason = self.output_reason or self._refused(middle, output_only=False)
-        if self.output_reason:
-            return
-        try:
-            outputs = self._jets(region.lower[None], region.upper[None], output_only=True)
-        except Exception:  # whatever a user's function makes of unusual numbers
-            return
-        self.affine_output = all(
-            isinstance(jet, float) or not (jet.hessian.low.any() or jet.hessian.high.any())
-            for jet in outputs
+        self._graph = Graph(system.n + system.m, system.n)
+        self._programs: dict[Any, Program] = {}
+        self.output_reason, self._output = self._read("h")
+        self.reason, following = (
+            (self.output_reason, []) if self.output_reason else self._read("f")
+        )
+        self._rows = following + self._output
+        self.affine_output = not (
+            self.output_reason
+            or any(self._graph.second(root) for root in self._output)
+            or self._obstacle("h", region.lower, region.upper)
         )
 
-    def _refused(self, point: Array, *, output_only: bool) -> str:
-        """Why the functions cannot be run with intervals; empty if they can."""
-        try:
-            self._jets(point, point, output_only=output_only)
-        except Exception as error:  # whatever a user's function makes of unusual numbers
-            return f"{type(error).__name__}: {error}"
+    def _read(self, name: str) -> tuple[str, list[int]]:
+        """Why a function has no enclosure, or the nodes of its values."""
+        expression = expression_of(self._system, name)
+        if expression.function is None:
+            return f"{name} is not traced: {expression.reason}. {_TRACEABLE}", []
+        roots = read(self._graph, expression.function)
+        self._programs[name] = Program(self._graph, roots)
+        middle = 0.5 * self._region.lower + 0.5 * self._region.upper
+        obstacle = self._obstacle(name, middle, middle)
+        if obstacle:
+            return f"{name} has {obstacle}", []
+        return self._differs(name), roots
+
+    def _obstacle(self, name: str, lower: Array, upper: Array) -> str:
+        return self._programs[name].obstacle(lower, upper)
+
+    def obstacle(self, lower: Array, upper: Array) -> str:
+        """What has no enclosure on a cell (N,), in words; blank if all has."""
+        for name in ("f", "h"):
+            found = self._obstacle(name, lower, upper) if name in self._programs else ""
+            if found:
+                return f"{name} has {found}"
         return ""
 
-    def _jets(self, lower: Array, upper: Array, *, output_only: bool) -> list[Any]:
-        """Values of f and h, or h, over cells: a list of jets, or floats where constant."""
-        made = variables(lower, upper)
-        graph = self._output_graph if output_only else self._graph
-        with np.errstate(all="ignore"):
-            if graph is not None:
-                values = graph(list(made))
-            else:
-                x, u = made[: self.n], made[self.n :]
-                functions = ((self._system.f, self.n), (self._system.h, self.p))
-                values = [
-                    entry
-                    for function, size in functions[output_only:]
-                    for entry in np.asarray(function(x, u), dtype=object).reshape(size)
-                ]
-        entries = [value if isinstance(value, Jet) else float(value) for value in values]
-        if any(isinstance(value, float) and not math.isfinite(value) for value in entries):
-            raise OutsideDomainError("a value that is not finite on the set")
-        return entries
+    def _differs(self, name: str) -> str:
+        """Where a function differs from its expression by more than rounding; blank if nowhere."""
+        points = self._region.sample(_SAMPLES, np.random.default_rng(_SEED))
+        function, n = getattr(self._system, name), self.n
+        # In a thread of its own: a function may know those of others by name.
+        with ThreadPoolExecutor(1) as pool:
+            values = pool.submit(_at_each, function, points[:, :n], points[:, n:]).result()
+        found = self._programs[name](points, points)
+        middle, room = found.middle.T, _ROUNDING * found.radius.T
+        with np.errstate(invalid="ignore"):
+            same = (np.abs(values - middle) <= room) | ~(np.isfinite(values) & np.isfinite(middle))
+        # Not known of the expression may be what the function has a value for.
+        same &= np.isfinite(values) >= np.isfinite(middle)
+        if same.all():
+            return ""
+        k = int(np.argmin(same.all(axis=1)))
+        return (
+            f"{name} is {values[k].tolist()} at {place(points[k, :n], points[k, n:])}, but its "
+            f"expression is {middle[k].tolist()}: it depends on more than its arguments"
+        )
+
+    def values(self, lower: Array, upper: Array) -> Interval:
+        """Enclosures (B, n + p) of f and h over cells (B, N); NaN where there are none."""
+        found = self._program("values", self._rows)(lower, upper)
+        return Interval(found.low.T, found.high.T)
+
+    def _program(self, key: Any, roots: list[int]) -> Program:
+        if key not in self._programs:
+            self._programs[key] = Program(self._graph, roots)
+        return self._programs[key]
 
     def enclose(self, lower: Array, upper: Array, *, output_only: bool = False) -> Enclosure:
         """The joint Jacobian over cells."""
@@ -196,55 +228,113 @@ class SmoothModel:
         return found
 
     def _enclosed(self, lower: Array, upper: Array, output_only: bool) -> Enclosure:
+        roots = self._output if output_only else self._rows
+        cells, N, q, n = *lower.shape, len(roots), self.n
+        graph = self._graph
+        first = [
+            (row, i, node) for row, root in enumerate(roots)
+            for i, node in graph.first(root).items() if i < n
+        ]
+        second = [
+            (row, i, j, node) for row, root in enumerate(roots)
+            for (i, j), node in graph.second(root).items()
+        ]
+        slope_nodes = [node for _, _, node in first]
         centre = 0.5 * lower + 0.5 * upper
         half = np.nextafter(np.maximum(upper - centre, centre - lower), np.inf)
         half = np.where(upper == lower, 0.0, half)
         centre = np.where(upper == lower, lower, centre)
-        at_centre = Interval(*self._derivatives(centre, centre, output_only)[0])
-        second = Interval(*self._derivatives(lower, upper, output_only)[1])
-        # Cells first, then coordinates; rows and columns of the Jacobian last.
-        slopes = second.middle.transpose(3, 2, 0, 1) * half[:, :, None, None]
-        spread = second.radius.transpose(3, 2, 0, 1) * half[:, :, None, None]
-        jacobian, rounding = (
-            part.transpose(2, 0, 1) for part in (at_centre.middle, at_centre.radius)
-        )
+
+        choices = graph.conditions(slope_nodes)
+        point = self._program(
+            ("first", output_only), roots + slope_nodes + choices
+        )(centre, centre)
+        cell = self._program(
+            ("second", output_only), roots + slope_nodes + [one[-1] for one in second]
+        )(lower, upper)
+        # What is not finite has no derivative, whatever its parts have.
+        lost = np.zeros((q, cells), np.bool_)
+        lost |= ~cell[:q].known
+
+        def dense(values: Array) -> Array:
+            matrix = np.zeros((cells, q, n))
+            for (row, i, _), each in zip(first, values, strict=True):
+                matrix[:, row, i] = each
+            return matrix
+
+        count = q + len(first)
+        at_centre, over_cell, bends = point[q:count], cell[q:count], cell[count:]
+        kinks = (point.low[count:] != point.high[count:]).any(axis=0)
+        jacobian, rounding = dense(at_centre.middle), dense(at_centre.radius)
+        slopes, spread = np.zeros((2, cells, N, q, n))
+        middles, radii = bends.middle, bends.radius
+        for k, (row, i, j, _) in enumerate(second):
+            for this, other in {(i, j), (j, i)}:
+                if this < n:
+                    slopes[:, other, row, this] = middles[k] * half[:, other]
+                    spread[:, other, row, this] = radii[k] * half[:, other]
+        # Fixed coordinates bend nothing, whatever is known of it.
+        fixed = half == 0.0
+        slopes[fixed], spread[fixed] = 0.0, 0.0
         error = (spread.sum(axis=1) + rounding + 1e-15 * np.abs(slopes).sum(axis=1)) * (
-            1.0 + 1e-14 * (half.shape[1] + 4)
+            1.0 + 1e-14 * (N + 4)
         )
-        unknown = ~(
-            np.isfinite(jacobian).all(axis=(1, 2)) & np.isfinite(error).all(axis=(1, 2))
-            & np.isfinite(slopes).all(axis=(1, 2, 3))
+        # Without second derivatives, as at kinks, an entry is where its values over the cell are.
+        middle, radius = dense(over_cell.middle), dense(over_cell.radius)
+        kinked = ~np.isfinite(error) & np.isfinite(radius)
+        at, row, i = np.nonzero(kinked)
+        culprits = np.isnan(spread[at, :, row, i]) | np.isnan(slopes[at, :, row, i])
+        share = culprits / np.maximum(culprits.sum(axis=1, keepdims=True), 1)
+        slopes[at, :, row, i] = 0.0
+        spread[at, :, row, i] = share * radius[at, row, i][:, None]
+        error[kinked] = radius[kinked]
+        enclosed = np.where(kinked, middle, jacobian)
+        unknown = lost.any(axis=0) | ~(
+            np.isfinite(enclosed).all(axis=(1, 2)) & np.isfinite(error).all(axis=(1, 2))
         )
         # NaN alone: infinities would make invalid operations later on.
         slopes[unknown], error[unknown] = np.nan, np.nan
-        jacobian = np.where(np.isfinite(jacobian).all(axis=(1, 2), keepdims=True), jacobian, np.nan)
-        return Enclosure(jacobian, slopes, error, spread.sum(axis=(2, 3)))
+        # At a kink itself there is no Jacobian.
+        sure = np.isfinite(jacobian).all(axis=(1, 2)) & ~kinks
+        jacobian = np.where(sure[:, None, None], jacobian, np.nan)
+        return Enclosure(
+            np.where(unknown[:, None, None], jacobian, enclosed), slopes, error,
+            spread.sum(axis=(2, 3)), jacobian,
+        )
 
-    def _derivatives(self, lower: Array, upper: Array, output_only: bool) -> tuple[Array, Array]:
-        """Ends of gradients (2, q, n, B) and of their derivatives (2, q, n, N, B).
 
-        NaN where undefined.
-        """
-        cells, N = lower.shape
-        q, n = self.p if output_only else self.n + self.p, self.n
-        gradient, hessian = np.zeros((2, q, n, cells)), np.zeros((2, q, n, N, cells))
-        try:
-            jets = self._jets(lower, upper, output_only=output_only)
-        except Exception:  # outside the domain, or whatever a user's function makes of it
-            if cells == 1:
-                return np.full_like(gradient, np.nan), np.full_like(hessian, np.nan)
-            half = cells // 2
-            first = self._derivatives(lower[:half], upper[:half], output_only)
-            second = self._derivatives(lower[half:], upper[half:], output_only)
-            return (
-                np.concatenate((first[0], second[0]), axis=-1),
-                np.concatenate((first[1], second[1]), axis=-1),
-            )
-        for row, jet in enumerate(jets):
-            if isinstance(jet, Jet):
-                gradient[0, row], gradient[1, row] = jet.gradient.low[:n], jet.gradient.high[:n]
-                hessian[0, row], hessian[1, row] = jet.hessian.low[:n], jet.hessian.high[:n]
-                # What is not finite has no derivative, whatever its parts had.
-                lost = ~(np.isfinite(jet.value.low) & np.isfinite(jet.value.high))
-                gradient[:, row, :, lost] = hessian[:, row, :, :, lost] = np.nan
-        return gradient, hessian
+def expression_of(system: System, name: str) -> Traced:
+    """f or h of a system as a CasADi function of one column of states and inputs."""
+    tracing, model = system.tracing, system.symbolic if system.tracing is None else None
+    if tracing is not None:
+        found = tracing.watched(name)
+        if found.function is None:
+            return found
+        model = CasadiModel(
+            found.function, found.function, system.n, system.p, system.m, tracing.dt,
+            tracing.method,
+        )
+    if model is None:
+        return Traced(None, "it was not made of functions that are known")
+    ca = import_casadi()
+    x, u = ca.SX.sym("x", system.n), ca.SX.sym("u", system.m)
+    try:
+        value = (
+            model.step().expand()(x, u, model.dt or 0.0) if name == "f"
+            else model.h.expand()(x, u)
+        )
+    except RuntimeError as error:
+        return Traced(None, f"CasADi has no scalar form of it ({str(error).splitlines()[-1]})")
+    return Traced(ca.Function(name, [ca.vertcat(x, u)], [ca.densify(value)]), "")
+
+
+def _at_each(function: Any, x: Array, u: Array) -> Array:
+    """A function's values, state by state; NaN where it raises."""
+    values = np.full((len(x), *function.shape), np.nan)
+    with np.errstate(all="ignore"):
+        for k in range(len(x)):
+            try:
+                values[k] = np.asarray(function(x[k].copy(), u[k].copy()), np.float64)
+            except Exception:  # whatever a user's function does: others report it
+                continue
+    return values

@@ -1,8 +1,7 @@
-"""Interval arithmetic with outward rounding, and derivatives by it, over many cells at once."""
+"""Interval arithmetic with outward rounding, over many cells at once."""
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -17,36 +16,23 @@ _LIBRARY_ULPS = 8
 _TWO_PI = 2.0 * np.pi
 # How far below the real phase the rounded one may lie, relative to it; pi itself is rounded.
 _PHASE_ERROR = 1e-14
+# One unit in the last place is this share of a number at most, or this much of a subnormal one.
+_ULP, _LEAST = 2.0**-52, 2.3e-308
 
 
-class OutsideDomainError(ArithmeticError):
-    """An operation that is not defined, or not smooth, on all of an interval."""
-
-
-def _down(value: Array, ulps: int = 1) -> Array:
-    for _ in range(ulps):
-        value = np.nextafter(value, -np.inf)
-    return value
-
-
-def _up(value: Array, ulps: int = 1) -> Array:
-    for _ in range(ulps):
-        value = np.nextafter(value, np.inf)
-    return value
-
-
-def _sum(a: Array, b: Array, direction: float) -> Array:
-    total = a + b
-    # Adding zero is exact: what is constant or absent stays so.
-    return np.where((a == 0.0) | (b == 0.0), total, np.nextafter(total, direction))
+def _outward(low: Array, high: Array, ulps: int = 1) -> Interval:
+    """The interval moved outward by so many units in the last place, in new arrays."""
+    share = ulps * _ULP
+    return Interval(low - (np.abs(low) * share + _LEAST), high + (np.abs(high) * share + _LEAST))
 
 
 class Interval:
     r"""Intervals :math:`[\ell, u]`, elementwise over arrays of equal shape.
 
     The result of every operation holds the exact results for all members of its operands:
-    each is computed in the nearest rounding, and then moved outward by the next floating
-    point number, or by a few of them for functions of the C library.
+    each is computed in the nearest rounding, and then moved outward by more than the distance of
+    the next floating point number, or of a few of them for functions of the C library. Where an
+    operation is not defined for all members, or not finite, the ends are NaN.
     """
 
     __slots__ = ("high", "low")
@@ -75,124 +61,117 @@ class Interval:
     def radius(self) -> Array:
         """How far from `middle` members can be, rounded up."""
         middle = self.middle
-        return _up(np.maximum(_up(self.high - middle), _up(middle - self.low)))
+        return np.maximum(
+            _outward(middle, self.high - middle).high, _outward(middle, middle - self.low).high
+        )
 
     @property
     def magnitude(self) -> Array:
         """The largest absolute value of a member."""
         return np.maximum(np.abs(self.low), np.abs(self.high))
 
-    def positive(self) -> bool:
-        """Whether every member is above zero."""
-        return bool(np.all(self.low > 0.0))
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Where both ends are finite."""
+        return np.isfinite(self.low) & np.isfinite(self.high)
 
-    def negative(self) -> bool:
-        """Whether every member is below zero."""
-        return bool(np.all(self.high < 0.0))
+    def hull(self, other: Interval, where: Any = True) -> Interval:
+        """The smallest interval that holds both; the first alone elsewhere."""
+        return Interval(
+            np.where(where, np.minimum(self.low, other.low), self.low),
+            np.where(where, np.maximum(self.high, other.high), self.high),
+        )
+
+    def where(self, holds: Any) -> Interval:
+        """The same, and NaN where this does not hold."""
+        return Interval(np.where(holds, self.low, np.nan), np.where(holds, self.high, np.nan))
 
     def __neg__(self) -> Interval:
         return Interval(-self.high, -self.low)
 
     def __add__(self, other: Any) -> Interval:
         other = Interval.of(other)
-        return Interval(_sum(self.low, other.low, -np.inf), _sum(self.high, other.high, np.inf))
+        return _outward(self.low + other.low, self.high + other.high)
 
     __radd__ = __add__
 
     def __sub__(self, other: Any) -> Interval:
-        return self + (-Interval.of(other))
+        other = Interval.of(other)
+        return _outward(self.low - other.high, self.high - other.low)
 
     def __rsub__(self, other: Any) -> Interval:
-        return Interval.of(other) + (-self)
+        return Interval.of(other) - self
 
     def __mul__(self, other: Any) -> Interval:
         if other is self:
-            squared: Interval = self.square()
-            return squared
+            return self.power(2)
         other = Interval.of(other)
-        products = (
-            self.low * other.low, self.low * other.high,
-            self.high * other.low, self.high * other.high,
+        first, second = self.low * other.low, self.low * other.high
+        third, fourth = self.high * other.low, self.high * other.high
+        return _outward(
+            np.minimum(np.minimum(first, second), np.minimum(third, fourth)),
+            np.maximum(np.maximum(first, second), np.maximum(third, fourth)),
         )
-        low = np.minimum(np.minimum(*products[:2]), np.minimum(*products[2:]))
-        high = np.maximum(np.maximum(*products[:2]), np.maximum(*products[2:]))
-        # Zero times anything is exactly zero: sparse derivatives stay sparse.
-        zero = ((self.low == 0.0) & (self.high == 0.0)) | ((other.low == 0.0) & (other.high == 0.0))
-        # But for NaN, which is no number at all.
-        zero &= ~(np.isnan(self.low) | np.isnan(other.low))
-        return Interval(np.where(zero, 0.0, _down(low)), np.where(zero, 0.0, _up(high)))
 
     __rmul__ = __mul__
 
     def __truediv__(self, other: Any) -> Interval:
-        return self * Interval.of(other).reciprocal()
+        return self * Interval.of(other).power(-1)
 
     def __rtruediv__(self, other: Any) -> Interval:
-        quotient: Interval = self.reciprocal() * other
-        return quotient
-
-    def reciprocal(self) -> Interval:
-        """1 / s."""
-        if np.any((self.low <= 0.0) & (self.high >= 0.0)):
-            raise OutsideDomainError(f"division by a value that may be zero on the set ({self})")
-        return Interval(_down(1.0 / self.high), _up(1.0 / self.low))
-
-    def square(self) -> Interval:
-        """s^2, which is not s times s of two different members."""
-        least = np.where(
-            (self.low <= 0.0) & (self.high >= 0.0), 0.0,
-            np.minimum(np.abs(self.low), np.abs(self.high)),
-        )
-        most = self.magnitude
-        return Interval(np.maximum(0.0, _down(least * least)), _up(most * most))
+        return self.power(-1) * other
 
     def power(self, exponent: int) -> Interval:
-        """s^k for an integer k, by squares."""
+        """s^k for an integer k, of which k < 0 excludes zero."""
         if exponent < 0:
-            return self.power(-exponent).reciprocal()
-        if exponent == 0:
-            return Interval(np.ones_like(self.low), np.ones_like(self.low))
-        if exponent % 2 == 0:
-            return self.power(exponent // 2).square()
+            base = self.power(-exponent)
+            return _outward(1.0 / base.high, 1.0 / base.low).where(
+                (base.low > 0.0) | (base.high < 0.0)
+            )
         if exponent == 1:
             return self
-        # Odd powers increase: the ends are those of the ends.
-        low, high = Interval.of(self.low), Interval.of(self.high)
-        return Interval((low * low.power(exponent - 1)).low, (high * high.power(exponent - 1)).high)
+        if exponent % 2:  # it increases: the ends are those of the ends
+            low, high = Interval.of(self.low), Interval.of(self.high)
+            return Interval(
+                (low * low.power(exponent - 1)).low, (high * high.power(exponent - 1)).high
+            )
+        size = abs(self).power(exponent // 2)
+        square = _outward(size.low * size.low, size.high * size.high)
+        return Interval(np.maximum(square.low, 0.0), square.high)
 
-    def _increasing(self, function: Callable[[Array], Any], ulps: int = _LIBRARY_ULPS) -> Interval:
-        with np.errstate(over="ignore", under="ignore"):
-            low, high = np.asarray(function(self.low)), np.asarray(function(self.high))
-        if not (np.isfinite(low).all() and np.isfinite(high).all()):
-            raise OutsideDomainError(f"a value that may be infinite on the set ({self})")
-        return Interval(_down(low, ulps), _up(high, ulps))
+    def __abs__(self) -> Interval:
+        least = np.maximum(np.maximum(self.low, -self.high), 0.0)
+        return Interval(least, self.magnitude)
 
-    def sqrt(self) -> Interval:
-        """The square root, of positive members."""
-        if np.any(self.low < 0.0):
-            raise OutsideDomainError(f"a square root of a value that may be negative ({self})")
-        root = self._increasing(np.sqrt, 1)
-        return Interval(np.maximum(root.low, 0.0), root.high)
+    def raised(self, exponent: float) -> Interval:
+        """s^c for any number c, of members that are not negative; not of zero if c < 0."""
+        value = self.increasing(lambda s: np.power(s, exponent)) if exponent > 0 else -(
+            (self.increasing(lambda s: -np.power(s, exponent)))
+        )
+        return Interval(np.maximum(value.low, 0.0), value.high).where(self.low >= 0.0)
 
-    def exp(self) -> Interval:
-        """The exponential."""
-        value = self._increasing(np.exp)
-        return Interval(np.maximum(value.low, 0.0), value.high)
+    def increasing(
+        self, function: Callable[[Array], Any], least: float = -np.inf, most: float = np.inf,
+        ulps: int = _LIBRARY_ULPS,
+    ) -> Interval:
+        """An increasing function with values between two numbers; NaN where it is not finite."""
+        low, high = np.asarray(function(self.low)), np.asarray(function(self.high))
+        moved = _outward(low, high, ulps)
+        return Interval(np.maximum(moved.low, least), np.minimum(moved.high, most)).where(
+            np.isfinite(low) & np.isfinite(high)
+        )
 
-    def log(self) -> Interval:
-        """The natural logarithm, of positive members."""
-        if np.any(self.low <= 0.0):
-            raise OutsideDomainError(f"a logarithm of a value that may not be positive ({self})")
-        return self._increasing(np.log)
+    def pieces(self, function: Callable[[Interval], Interval], *turns: float) -> Interval:
+        """A function that is monotone between the numbers at which it turns.
 
-    def arctan(self) -> Interval:
-        """The arc tangent."""
-        return self._increasing(np.arctan)
-
-    def tanh(self) -> Interval:
-        """The hyperbolic tangent."""
-        value = self._increasing(np.tanh)
-        return Interval(np.maximum(value.low, -1.0), np.minimum(value.high, 1.0))
+        ``function`` encloses it; between the numbers beside these ones it turns.
+        """
+        found = function(Interval.of(self.low)).hull(function(Interval.of(self.high)))
+        for turn in turns:
+            about = _outward(np.float64(turn), np.float64(turn))
+            reached = (self.low <= about.high) & (self.high >= about.low)
+            found = found.hull(function(about), reached)
+        return found
 
     def sin(self) -> Interval:
         """The sine."""
@@ -206,267 +185,132 @@ class Interval:
         """Sine or cosine: 1 at the phases top + integers, -1 half a turn away."""
         low, high = self.low / _TWO_PI, self.high / _TWO_PI
         slack = _PHASE_ERROR * (1.0 + np.maximum(np.abs(low), np.abs(high)))
-        ends = np.asarray(function(self.low)), np.asarray(function(self.high))
-        least = _down(np.minimum(*ends), _LIBRARY_ULPS)
-        most = _up(np.maximum(*ends), _LIBRARY_ULPS)
+        first, second = np.asarray(function(self.low)), np.asarray(function(self.high))
+        ends = _outward(np.minimum(first, second), np.maximum(first, second), _LIBRARY_ULPS)
 
         def reached(phase: float) -> NDArray[np.bool_]:
-            first = np.ceil(low - slack - phase)
-            return first <= high + slack - phase
+            return np.asarray(np.ceil(low - slack - phase) <= high + slack - phase)
 
         return Interval(
-            np.where(reached(top + 0.5), -1.0, np.maximum(least, -1.0)),
-            np.where(reached(top), 1.0, np.minimum(most, 1.0)),
-        )
+            np.where(reached(top + 0.5), -1.0, np.maximum(ends.low, -1.0)),
+            np.where(reached(top), 1.0, np.minimum(ends.high, 1.0)),
+        ).where(np.isfinite(first + second))
+
+    def tan(self) -> Interval:
+        """The tangent, between two of its poles."""
+        cosine = self.cos()
+        return self.increasing(np.tan).where((cosine.low > 0.0) | (cosine.high < 0.0))
 
 
-class Jet:
-    r"""Enclosures of a function, its gradient and its Hessian over cells.
+def angle(y: Interval, x: Interval) -> Interval:
+    """The angle of the points (x, y), off the cut along negative abscissas and the origin."""
+    # Along each edge of the box it is monotone, and inside its gradient is never zero.
+    corners = [np.arctan2(b, a) for a in (x.low, x.high) for b in (y.low, y.high)]
+    found = _outward(np.minimum.reduce(corners), np.maximum.reduce(corners), _LIBRARY_ULPS)
+    return found.where((x.low > 0.0) | (y.low > 0.0) | (y.high < 0.0))
 
-    NumPy calls the methods of the entries of an object array: functions that are written
-    with NumPy's arithmetic, indexing, ``dot``, ``stack``, ``sin`` and the like take object
-    arrays of jets as they take floats. What needs a decision that is not the same on a whole
-    cell (a comparison, a rounding, a conversion to float) raises.
+
+def length(*legs: Interval) -> Interval:
+    """The length of vectors."""
+    squares = [leg.power(2) for leg in legs]
+    return sum(squares[1:], squares[0]).increasing(np.sqrt, 0.0)
+
+
+def share(x: Interval, y: Interval) -> Interval:
+    """x / length(x, y), which grows with x, and towards zero with the size of y.
+
+    At the origin anything between -1 and 1: the generalised derivatives of the length there.
     """
+    near, far = Interval.of(abs(y).low), Interval.of(abs(y).high)
 
-    __slots__ = ("gradient", "hessian", "value")
+    def at(end: Array, outer: NDArray[np.bool_]) -> Interval:
+        point = Interval.of(end)
+        size = [length(point, side) for side in (near, far)]
+        with np.errstate(all="ignore"):
+            one, other = (point / each for each in size)
+        return Interval(np.where(outer, one.low, other.low), np.where(outer, one.high, other.high))
 
-    def __init__(self, value: Interval, gradient: Interval, hessian: Interval) -> None:
-        self.value, self.gradient, self.hessian = value, gradient, hessian
-
-    def __repr__(self) -> str:
-        return f"Jet({self.value})"
-
-    def __neg__(self) -> Jet:
-        return Jet(-self.value, -self.gradient, -self.hessian)
-
-    def __pos__(self) -> Jet:
-        return self
-
-    def __add__(self, other: Any) -> Any:
-        if isinstance(other, Jet):
-            return Jet(
-                self.value + other.value, self.gradient + other.gradient,
-                self.hessian + other.hessian,
-            )
-        number = _number(other)
-        if number is None:
-            return NotImplemented
-        if isinstance(number, float) and number == 0.0:
-            return self
-        return Jet(self.value + number, self.gradient, self.hessian)
-
-    __radd__ = __add__
-
-    def __sub__(self, other: Any) -> Any:
-        return NotImplemented if _number(other, jets=True) is None else self + (-other)
-
-    def __rsub__(self, other: Any) -> Any:
-        return NotImplemented if _number(other) is None else (-self) + other
-
-    def __mul__(self, other: Any) -> Any:
-        if other is self:
-            return self**2
-        if isinstance(other, Jet):
-            mixed = _outer(self.gradient, other.gradient)
-            return Jet(
-                self.value * other.value,
-                self.gradient * other.value + other.gradient * self.value,
-                self.hessian * other.value + other.hessian * self.value + mixed + _turned(mixed),
-            )
-        number = _number(other)
-        if number is None:
-            return NotImplemented
-        return Jet(self.value * number, self.gradient * number, self.hessian * number)
-
-    __rmul__ = __mul__
-
-    def __truediv__(self, other: Any) -> Any:
-        if isinstance(other, Jet):
-            return self * other._reciprocal()
-        number = _number(other)
-        if number is None:
-            return NotImplemented
-        return self * Interval.of(number).reciprocal()
-
-    def __rtruediv__(self, other: Any) -> Any:
-        return NotImplemented if _number(other) is None else self._reciprocal() * other
-
-    def _reciprocal(self) -> Jet:
-        inverse = self.value.reciprocal()
-        square = inverse.square()
-        return self._composed(inverse, -square, 2.0 * (square * inverse))
-
-    def __pow__(self, exponent: Any) -> Any:
-        if isinstance(exponent, Jet):
-            return (exponent * self.log()).exp()
-        number = _number(exponent)
-        if number is None:
-            return NotImplemented
-        if float(number).is_integer() and abs(number) < 64:
-            k = int(number)
-            if k == 0:
-                return self * 0.0 + 1.0
-            if k == 1:
-                return self
-            first = float(k) * self.value.power(k - 1)
-            return self._composed(
-                self.value.power(k), first, float(k * (k - 1)) * self.value.power(k - 2)
-            )
-        return (number * self.log()).exp()
-
-    def __rpow__(self, base: Any) -> Any:
-        number = _number(base)
-        if number is None:
-            return NotImplemented
-        if not isinstance(number, float) or number <= 0.0:
-            raise OutsideDomainError(f"a power of {number}")
-        return (self * Interval.of(number).log()).exp()
-
-    def _composed(self, value: Interval, first: Interval, second: Interval) -> Jet:
-        """A function of this jet, from its values and two derivatives over the jet's value."""
-        return Jet(
-            value, self.gradient * first,
-            self.hessian * first + _outer(self.gradient, self.gradient) * second,
-        )
-
-    def sqrt(self) -> Jet:
-        """The square root; its derivatives need values above zero."""
-        if not self.value.positive():
-            raise OutsideDomainError("a square root that may be of zero has no derivative there")
-        root = self.value.sqrt()
-        first = (2.0 * root).reciprocal()
-        return self._composed(root, first, -(first / (2.0 * self.value)))
-
-    def exp(self) -> Jet:
-        """The exponential."""
-        value = self.value.exp()
-        return self._composed(value, value, value)
-
-    def log(self) -> Jet:
-        """The natural logarithm."""
-        inverse = self.value.log(), self.value.reciprocal()
-        return self._composed(*inverse, -inverse[1].square())
-
-    def sin(self) -> Jet:
-        """The sine."""
-        sine, cosine = self.value.sin(), self.value.cos()
-        return self._composed(sine, cosine, -sine)
-
-    def cos(self) -> Jet:
-        """The cosine."""
-        sine, cosine = self.value.sin(), self.value.cos()
-        return self._composed(cosine, -sine, -cosine)
-
-    def tanh(self) -> Jet:
-        """The hyperbolic tangent."""
-        value = self.value.tanh()
-        first = 1.0 - value.square()
-        first = Interval(np.maximum(first.low, 0.0), first.high)
-        return self._composed(value, first, -2.0 * (value * first))
-
-    def arctan(self) -> Jet:
-        """The arc tangent."""
-        first = (1.0 + self.value.square()).reciprocal()
-        return self._composed(self.value.arctan(), first, -2.0 * (self.value * first.square()))
-
-    def arctan2(self, other: Any) -> Jet:
-        """The angle of the point (other, self), off the cut along negative abscissas."""
-        abscissa = other if isinstance(other, Jet) else self * 0.0 + other
-        if abscissa.value.positive():
-            angle: Jet = (self / abscissa).arctan()
-            return angle
-        quarter = Interval(np.nextafter(0.5 * np.pi, 0.0), np.nextafter(0.5 * np.pi, 2.0))
-        if not (self.value.positive() or self.value.negative()):
-            raise OutsideDomainError("an angle that may jump, or be of a point at the origin")
-        side = quarter if self.value.positive() else -quarter
-        return Jet.__add__(-(abscissa / self).arctan(), side)  # type: ignore[no-any-return]
-
-    @property
-    def real(self) -> Jet:
-        """The jet itself."""
-        return self
-
-    def __abs__(self) -> Jet:
-        if self.value.positive():
-            return self
-        if self.value.negative():
-            return -self
-        raise OutsideDomainError("an absolute value that may be of zero has no derivative there")
-
-    def _compared(self, other: Any, holds: Callable[[Any, Any], Any]) -> bool:
-        bound = other.value if isinstance(other, Jet) else Interval.of(_number(other))
-        ends = self.value.low, self.value.high, bound.low, bound.high
-        if any(np.isnan(end).any() for end in ends):
-            raise OutsideDomainError("a comparison with what is not a number")
-        # Both orders of the ends must agree, on all cells, and with room: at equality there
-        # may be a kink.
-        outcomes = {
-            bool(outcome)
-            for ends in ((self.value.low, bound.high), (self.value.high, bound.low))
-            for outcome in np.atleast_1d(holds(*ends)).tolist()
-        }
-        touching = np.any((self.value.low <= bound.high) & (bound.low <= self.value.high))
-        if len(outcomes) != 1 or touching:
-            raise OutsideDomainError("a comparison whose outcome is not the same on the set")
-        return outcomes.pop()
-
-    def __bool__(self) -> bool:
-        raise OutsideDomainError("a truth value of something that is not one number")
-
-    def __float__(self) -> float:
-        raise OutsideDomainError("a conversion to float, as by math functions or float arrays")
+    low, high = at(x.low, x.low <= 0.0).low, at(x.high, x.high >= 0.0).high
+    # Division by a length that may be zero says nothing.
+    low = np.where(np.isnan(low), np.where(x.low > 0.0, 0.0, -1.0), low)
+    high = np.where(np.isnan(high), np.where(x.high < 0.0, 0.0, 1.0), high)
+    known = x.known & y.known
+    return Interval(np.maximum(low, -1.0), np.minimum(high, 1.0)).where(known)
 
 
-# What NumPy calls by name, composed of the above.
-for _name, _function in {
-    "square": lambda s: s**2,
-    "expm1": lambda s: s.exp() - 1.0,
-    "log1p": lambda s: (s + 1.0).log(),
-    "tan": lambda s: s.sin() / s.cos(),
-    "sinh": lambda s: (s.exp() - (-s).exp()) * 0.5,
-    "cosh": lambda s: (s.exp() + (-s).exp()) * 0.5,
-    "conjugate": lambda s: s,
-}.items():
-    setattr(Jet, _name, _function)
-for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
-    _holds = getattr(operator, _name)
-    setattr(Jet, f"__{_name}__", lambda s, other, holds=_holds: s._compared(other, holds))
+def _truth(sure: NDArray[np.bool_], possible: NDArray[np.bool_], *operands: Interval) -> Interval:
+    """1 where something surely holds, 0 where it cannot, [0, 1] in between."""
+    nothing = sum(0.0 * (one.low + one.high) for one in operands)
+    return Interval(sure + nothing, possible + nothing)
 
 
-def _number(value: Any, *, jets: bool = False) -> Any:
-    """A real number as a float; intervals (and jets, if wanted) as they are; else None."""
-    if isinstance(value, Interval) or (jets and isinstance(value, Jet)):
-        return value
-    if isinstance(value, (bool, int, float, np.number, np.bool_)) and not np.iscomplexobj(value):
-        return float(value)
-    return None
+def _decided(truth: Interval) -> NDArray[np.bool_]:
+    return np.asarray(truth.low == truth.high)
 
 
-def _outer(a: Interval, b: Interval) -> Interval:
-    if a is b:
-        # The diagonal as squares, which are not negative.
-        product = a[:, None] * b[None]
-        squares, which = a.square(), np.arange(len(a.low))
-        low, high = product.low.copy(), product.high.copy()
-        low[which, which], high[which, which] = squares.low, squares.high
-        return Interval(low, high)
-    return a[:, None] * b[None]
+def either(truth: Interval, first: Interval, second: Interval) -> Interval:
+    """One of two, or what holds both where the truth is not known."""
+    low = np.where(truth.low == 1.0, first.low, np.where(
+        truth.high == 0.0, second.low, np.minimum(first.low, second.low) + 0.0 * truth.low))
+    high = np.where(truth.low == 1.0, first.high, np.where(
+        truth.high == 0.0, second.high, np.maximum(first.high, second.high) + 0.0 * truth.low))
+    return Interval(low, high)
 
 
-def _turned(a: Interval) -> Interval:
-    return Interval(np.swapaxes(a.low, 0, 1), np.swapaxes(a.high, 0, 1))
+def _step(function: Callable[[Array], Any]) -> Callable[[Interval], Interval]:
+    """A function that is constant in steps, where there is one value only."""
+
+    def steps(s: Interval) -> Interval:
+        low, high = np.asarray(function(s.low)), np.asarray(function(s.high))
+        return Interval(low, high).where(low == high)
+
+    return steps
 
 
-def variables(lower: Array, upper: Array) -> NDArray[np.object_]:
-    """The coordinates of cells as jets."""
-    cells, count = lower.shape
-    made = np.empty(count, dtype=object)
-    none = np.zeros((count, count, cells))
-    for j in range(count):
-        gradient = np.zeros((count, cells))
-        gradient[j] = 1.0
-        made[j] = Jet(
-            Interval(lower[:, j], upper[:, j]), Interval(gradient, gradient), Interval(none, none)
-        )
-    return made
+def _erf(s: Interval) -> Interval:
+    from scipy.special import erf
+
+    return s.increasing(erf, -1.0, 1.0, 4 * _LIBRARY_ULPS)
+
+
+#: What is defined where, as `Graph` names it: elementwise functions of intervals.
+OPERATIONS: dict[str, Callable[..., Interval]] = {
+    "add": lambda s, t: s + t, "sub": lambda s, t: s - t, "mul": lambda s, t: s * t,
+    "neg": lambda s: -s, "abs": abs, "pow": lambda s, k: s.power(k),
+    "raised": lambda s, c: s.raised(c),
+    "sqrt": lambda s: s.increasing(np.sqrt, 0.0, ulps=1),
+    "exp": lambda s: s.increasing(np.exp, 0.0), "expm1": lambda s: s.increasing(np.expm1, -1.0),
+    "log": lambda s: s.increasing(np.log), "log1p": lambda s: s.increasing(np.log1p),
+    "sin": Interval.sin, "cos": Interval.cos, "tan": Interval.tan,
+    "asin": lambda s: s.increasing(np.arcsin),
+    "acos": lambda s: -s.increasing(lambda one: -np.arccos(one)),
+    "atan": lambda s: s.increasing(np.arctan), "sinh": lambda s: s.increasing(np.sinh),
+    "cosh": lambda s: abs(s).increasing(np.cosh, 1.0),
+    "tanh": lambda s: s.increasing(np.tanh, -1.0, 1.0),
+    "asinh": lambda s: s.increasing(np.arcsinh), "acosh": lambda s: s.increasing(np.arccosh, 0.0),
+    "atanh": lambda s: s.increasing(np.arctanh), "erf": _erf,
+    "sigmoid": lambda s: (1.0 + (-s).increasing(np.exp, 0.0)).power(-1),
+    "near": lambda s, distance: s + Interval(-distance, distance),
+    # Second derivatives, or parts of them, whose factors would be enclosed one by one.
+    "atan''": lambda s: s.pieces(
+        lambda t: -2.0 * (t * (1.0 + t.power(2)).power(-2)), -(3.0**-0.5), 3.0**-0.5),
+    "t-t^3": lambda s: s.pieces(lambda t: t - t.power(3), -(3.0**-0.5), 3.0**-0.5),
+    "t-t^2": lambda s: s.pieces(lambda t: t - t.power(2), 0.5),
+    "t-3t^2+2t^3": lambda s: s.pieces(
+        lambda t: t * ((1.0 - t) * (1.0 - 2.0 * t)), 0.5 - 12.0**-0.5, 0.5 + 12.0**-0.5),
+    "angle": angle, "length": length, "share": share,
+    "max": lambda s, t: Interval(np.maximum(s.low, t.low), np.maximum(s.high, t.high)),
+    "min": lambda s, t: Interval(np.minimum(s.low, t.low), np.minimum(s.high, t.high)),
+    "less": lambda s, t: _truth(s.high < t.low, s.low < t.high, s, t),
+    "atmost": lambda s, t: _truth(s.high <= t.low, s.low <= t.high, s, t),
+    "equal": lambda s, t: _truth(
+        (s.low == t.high) & (s.high == t.low), (s.low <= t.high) & (t.low <= s.high), s, t),
+    "not": lambda s: Interval(1.0 - s.high, 1.0 - s.low),
+    "and": lambda s, t: Interval(np.minimum(s.low, t.low), np.minimum(s.high, t.high)),
+    "or": lambda s, t: Interval(np.maximum(s.low, t.low), np.maximum(s.high, t.high)),
+    "either": either, "jump": lambda c, s, t: either(c.where(_decided(c)), s, t),
+    "truth": lambda c: c.where(_decided(c)),
+    "smooth": lambda c, s: s.where(_decided(c)),
+    "floor": _step(np.floor), "ceil": _step(np.ceil), "sign": _step(np.sign),
+    "trunc": _step(np.trunc), "unknown": lambda: Interval(np.nan, np.nan),
+}

@@ -148,7 +148,7 @@ class BatchedFunction:
             value = self.function(x, u) if self.takes_input else self.function(x)
             return np.asarray(value).reshape(self.shape) if self._short else value
         raw = self.function(x.copy(), u.copy()) if self.takes_input else self.function(x.copy())
-        if x.dtype == np.object_:  # intervals, as certificates call it with, come back as such
+        if x.dtype == np.object_:  # symbols of a trace come back as such
             return np.asarray(raw, np.object_).reshape(self.shape)
         return self._as_value(raw)
 

@@ -40,10 +40,11 @@ class ExpressionRecord(MakingRecord):
     """Symbols carry scalar expressions (casadi.SX)."""
 
     most_operations = 50_000
+    as_numbers = True
 
-    def __init__(self, casadi: Any) -> None:
+    def __init__(self, casadi: Any, watched: bool = False) -> None:
         super().__init__()
-        self.casadi = casadi
+        self.casadi, self.watched = casadi, watched
 
     @without_symbols
     def symbols(self, column: Any) -> SymbolArray:
@@ -191,6 +192,8 @@ class ExpressionRecord(MakingRecord):
         """What goes back to the function: arrays of this trace, and symbols alone."""
         if isinstance(value, (tuple, list)):
             return type(value)(self.finished(one) for one in value)
+        if isinstance(value, np.dtype) and value == np.object_:
+            return np.dtype(np.float64)
         if isinstance(value, np.ndarray) and value.dtype == np.object_:
             return value[()] if value.ndim == 0 else self.array(value)
         return value

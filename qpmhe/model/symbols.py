@@ -54,6 +54,10 @@ class Record(ABC):
 
     #: A function that does more with single symbols than this is not traced any further.
     most_operations = 200_000
+    #: Whether arrays of symbols say that they hold numbers in double precision.
+    as_numbers = False
+    #: Whether nothing may differ from a call with numbers: see `qpmhe.model.tracing.watched`.
+    watched = False
 
     def __init__(self) -> None:
         #: Why it was refused, the first time; blank if never. Whatever the function catches.
@@ -199,6 +203,20 @@ class Symbol:
         """Return the symbol itself: a state is real."""
         return self
 
+    @property
+    def __class__(self) -> Any:
+        """The type of an array's entry, for who asks by ``isinstance``."""
+        return np.bool_ if self.logical else np.float64
+
+    def __getattr__(self, name: str) -> Any:
+        # NumPy's compiled code asks for how the number lies in memory, and takes no for an answer.
+        if (
+            hasattr(np.float64, name) and not name.startswith("__array") and not self.record.closed
+            and not sys._getframe(1).f_code.co_filename.startswith(_MACHINERY)
+        ):
+            self.record.refuse(f"the attribute {name} of a symbol")
+        raise AttributeError(f"a symbol has no attribute {name}")
+
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         return _apply(self.record, ufunc, method, inputs, options)
 
@@ -224,6 +242,15 @@ class SymbolArray(np.ndarray[Any, Any]):
         if hasattr(source, "record"):
             self.record = source.record
 
+    @property
+    def dtype(self) -> Any:
+        """Double precision, for the user's code, where that is what the array stands for."""
+        if self.record.as_numbers and not sys._getframe(1).f_code.co_filename.startswith(
+            _MACHINERY
+        ):
+            return np.dtype(np.float64)
+        return np.ndarray.dtype.__get__(self)
+
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         return _apply(self.record, ufunc, method, inputs, options)
 
@@ -238,6 +265,8 @@ class SymbolArray(np.ndarray[Any, Any]):
     def __setitem__(self, key: Any, value: Any) -> None:
         if not self.record.closed and _holds_symbols(key):
             raise self.record.refuse("an entry by a symbol as index, or by a mask of symbols")
+        if not self.record.closed and not self.flags.writeable:
+            raise self.record.refuse("a change of its argument")
         plain(self)[key] = plain(value)
 
     def dot(self, other: Any, out: Any = None) -> Any:
@@ -338,8 +367,9 @@ def run(
     refused, or writes into an argument.
     """
     before = [plain(one).copy() for one in arguments]
+    # Numbers could be written to; what is done to symbols is seen below.
     for one in arguments:
-        one.flags.writeable = False
+        one.flags.writeable = record.watched
     try:
         with np.errstate(all="ignore"):
             value = function(*arguments)

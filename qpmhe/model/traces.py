@@ -118,7 +118,7 @@ class ModelTrace:
         self._sources = sources
         self._functions = {"f": _of_both(f), "h": _of_both(h)}
         self._n, self._p, self._m, self._states = n, p, m, states
-        self.dt, self._method = dt, method
+        self.dt, self.method = dt, method
         self._lock = threading.RLock()
         self._now: Pinned | None = None
 
@@ -137,8 +137,13 @@ class ModelTrace:
         """The model, if both functions are traced and still agree with their traces."""
         return self.confirm(None).model
 
+    def watched(self, name: str) -> Traced:
+        """The trace of a function that is watched meanwhile: see `qpmhe.model.tracing`."""
+        source = self._functions[name] if self._sources is None else self._sources[name]
+        return expressed(source, (self._n, self._m), name, watched=True)
+
     def _pin(self, found: dict[str, Traced]) -> None:
-        self._now = Pinned(found, self._n, self._p, self._m, self.dt, self._method)
+        self._now = Pinned(found, self._n, self._p, self._m, self.dt, self.method)
 
     def _traced(self, name: str, where: Points) -> Traced:
         function = self._functions[name]
@@ -162,7 +167,7 @@ class ModelTrace:
         if name == "f" and self._sources is not None and self.dt is not None:
             ca, n = import_casadi(), self._n
             x, u = ca.SX.sym("x", n), ca.SX.sym("u", self._m)
-            model = CasadiModel(found.function, None, n, 0, self._m, self.dt, self._method)
+            model = CasadiModel(found.function, None, n, 0, self._m, self.dt, self.method)
             stepped = ca.Function("f", [x, u], [ca.densify(model.step()(x, u, self.dt))])
             found = Traced(stepped, "", (n,))
         return difference(found, self._functions[name], where)

@@ -1,9 +1,21 @@
-"""Traces of users' functions: on labels, what each value depends on; in CasADi, the expression."""
+"""Traces of users' functions: on labels, what each value depends on; in CasADi, the expression.
+
+A trace that estimators rely on is compared with its function again and again. A proof cannot rest
+on comparisons, so there a trace is watched: it is refused where the function could notice that it
+is not called with numbers, whatever it then does. Symbols refuse whatever asks for a value. Beyond
+that, no exception may occur in the user's code, be it caught, and this code may not look at types,
+identities or memory.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import dis
+import functools
+import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +24,7 @@ from numpy.typing import NDArray
 from .operations import ExpressionRecord
 from .stand_ins import numpy_on_symbols
 from .symbols import (
+    _MACHINERY,
     NotTraceableError,
     Record,
     Symbol,
@@ -240,13 +253,16 @@ def traced(
     return Traced(None, reason) if reason else found._replace(original=function, points=points)
 
 
-def expressed(function: Callable[..., Any], sizes: Sequence[int], name: str = "traced") -> Traced:
+def expressed(
+    function: Callable[..., Any], sizes: Sequence[int], name: str = "traced",
+    watched: bool = False,
+) -> Traced:
     """The expression that a function computes from symbols, not compared with the function yet."""
     import casadi  # late: `import qpmhe` does without
 
-    record = ExpressionRecord(casadi)
+    record = ExpressionRecord(casadi, watched)
     columns = [casadi.SX.sym(f"a{k}", size) for k, size in enumerate(sizes)]
-    with numpy_on_symbols(record):
+    with numpy_on_symbols(record), _watch(record) if watched else contextlib.nullcontext():
         value, error = run(record, function, [record.symbols(one) for one in columns])
     try:
         if error is not None and not record.refused:
@@ -264,6 +280,67 @@ def expressed(function: Callable[..., Any], sizes: Sequence[int], name: str = "t
     if record.refused:
         return Traced(None, record.reason)
     return Traced(casadi.Function(name, columns, [column]), "", values.shape)
+
+
+# Functions and attributes by which code tells symbols from numbers, without their knowledge.
+_TELLING = {
+    "LOAD_GLOBAL": ("type", "id", "memoryview", "bytes", "bytearray"),
+    "LOAD_ATTR": ("__class__", "shares_memory", "may_share_memory"),
+    "LOAD_METHOD": ("_getframe", "gettrace", "currentframe", "getrefcount", "shares_memory"),
+}
+
+
+def _is_trusted(name: str) -> bool:
+    """Whether code works on symbols as on numbers: that of this module's like, and libraries."""
+    return name.startswith((*_MACHINERY, _ADAPTERS, "<frozen")) or "/casadi/" in name or (
+        name.startswith(_STANDARD) and "site-packages" not in name
+    )
+
+
+_ADAPTERS, _STANDARD = str(Path(__file__).parents[1] / "adapters"), str(Path(dis.__file__).parent)
+
+
+@contextlib.contextmanager
+def _watch(record: Record) -> Iterator[None]:
+    """Refuse, meanwhile, exceptions in the user's code, and code that tells symbols from numbers."""
+
+    def within(frame: Any, event: str, argument: Any) -> Any:
+        if event == "exception" and not issubclass(argument[0], (StopIteration, GeneratorExit)):
+            record.refuse(f"an exception on symbols, {argument[0].__name__}")
+        return within
+
+    def called(frame: Any, event: str, argument: Any) -> Any:
+        if _is_trusted(frame.f_code.co_filename):
+            return None
+        frame.f_trace_lines = False
+        telling = _telling(frame.f_code)
+        if telling:
+            record.refuse(telling)
+        return within
+
+    before = sys.gettrace()
+    sys.settrace(called)
+    try:
+        yield
+    finally:
+        sys.settrace(before)
+
+
+@functools.lru_cache(maxsize=1000)
+def _telling(code: Any) -> str:
+    """What in some code could tell symbols from numbers; blank if nothing."""
+    before = None
+    instructions = list(dis.get_instructions(code))
+    for one, after in zip(instructions, [*instructions[1:], None], strict=True):
+        if one.argval in _TELLING.get(one.opname, ()) and not (
+            # The type of the object that a method belongs to.
+            one.argval == "type" and after is not None and after.argval in ("self", "cls")
+        ):
+            return f"{one.argval}, which tells symbols from numbers"
+        if one.opname == "IS_OP" and not (before and before.opname == "LOAD_CONST"):
+            return "whether two objects are the same"
+        before = one
+    return ""
 
 
 def _failure(error: BaseException) -> str:

@@ -54,7 +54,7 @@ def test_a_function_that_raises_is_told_with_the_state(which, letter):
         ask(scalar(**{letter: picky}), box(-100.0, 100.0))
 
 
-def test_a_function_that_raises_between_the_samples_is_told():
+def test_a_function_with_a_branch_that_no_sample_takes_is_not_proved():
     def sliver(x):
         if x[0] > 0.1234 and x[0] < 0.1235:
             raise ValueError("in between")
@@ -63,8 +63,9 @@ def test_a_function_that_raises_between_the_samples_is_told():
     region = bounded_region(scalar(sliver), box(0.0, 1.0))
     points = region.sample(400, np.random.default_rng(20210829))[:, 0]
     assert not ((points > 0.1233) & (points < 0.1236)).any()
-    with pytest.raises(ModelError, match=r"f raises ValueError at x = \[0.123.*in between"):
-        certify_detectability(scalar(sliver), region)
+    found = certify_detectability(scalar(sliver), region)
+    assert found.evidence is Evidence.SAMPLED
+    assert "the truth of a comparison" in found.notes[0]
 
 
 @pytest.mark.parametrize("which", list(QUESTIONS))
@@ -81,26 +82,17 @@ def test_the_audit_names_where_f_is_not_finite():
     assert "[nan]" in found.text
 
 
-def test_nothing_is_enclosed_where_the_value_is_not_a_number():
-    def nothing(x):
-        return np.where(np.real(x) > 5.0, np.nan, 0.0)
-
-    place = np.array([[6.0]]), np.array([[10.0]])
-    for f in (lost, lambda x: np.maximum(0.5 * x, nothing(x)), lambda x: 0.5 * x + nothing(x)):
-        system = scalar(f)
-        model = SmoothModel(system, bounded_region(system, box(6.0, 10.0)))
-        with pytest.raises(ModelError, match="not finite"):
-            model.enclose(*place)
-
-
-def test_a_value_of_nan_has_no_derivative():
-    # Past the middle, where the functions are tried, a number is added that is none.
-    system = scalar(lambda x: 0.5 * x + (np.inf - np.inf if np.all(x > 3.0) else 0.0))
-    region = bounded_region(system, box(-4.0, 4.0))
-    model = SmoothModel(system, region)
+@pytest.mark.parametrize("f", [
+    lost, lambda x: np.maximum(0.5 * x, lost(x)), lambda x: 0.5 * x + 0.1 * lost(x) ** 2,
+])
+def test_nothing_is_enclosed_where_the_value_is_not_a_number(f):
+    system = scalar(f)
+    model = SmoothModel(system, bounded_region(system, box(-10.0, 10.0)))
     assert model.reason == ""
-    with pytest.raises(ModelError, match="not finite"):
-        model.enclose(np.array([[3.5]]), np.array([[4.0]]))
+    for low, high in ((6.0, 10.0), (4.0, 7.0)):
+        with pytest.raises(ModelError, match="not finite"):
+            model.enclose(np.array([[low]]), np.array([[high]]))
+    assert np.isfinite(model.enclose(np.array([[-9.0]]), np.array([[4.0]])).error).all()
 
 
 @pytest.mark.parametrize(
@@ -125,7 +117,7 @@ def test_what_is_steep_or_kinked_is_not_said_to_jump():
     found = certify_detectability(
         scalar(lambda x: 0.5 * np.abs(x), lambda x: 0.0 * x), box(-1.0, 1.0), eta=0.8
     )
-    assert found.evidence is Evidence.SAMPLED
+    assert found.evidence is Evidence.PROVED
     with pytest.raises(NotCertifiedError, match="not in the output"):
         certify_detectability(scalar(lambda x: 1e6 * x, lambda x: 0.0 * x), box(-1.0, 1.0))
 

@@ -107,6 +107,7 @@ def test_a_cell_of_which_nothing_is_known_hides_nothing_of_the_others():
         np.concatenate((np.full((1, 1, 1, 1), 0.5), nothing[None])),
         np.concatenate((np.zeros((1, 1, 1)), nothing)),
         np.zeros((2, 1)),
+        np.concatenate((np.ones((1, 1, 1)), nothing)),
     )
     corners, error = enclosure.corners()
     assert corners[0].min() - error[0].max() <= 0.5

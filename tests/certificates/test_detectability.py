@@ -137,10 +137,12 @@ def test_what_is_refused_says_why():
 
 
 def test_what_intervals_cannot_run_is_sampled_with_the_reason():
-    system = scalar(lambda x: np.array([0.5 * math.sin(x[0])]), lambda x: x[:1])
+    system = scalar(lambda x: np.array([0.5 * math.sin(float(x[0]))]), lambda x: x[:1])
     found = certify_detectability(system, unit_box(1), eta=0.8)
     assert (found.evidence, found.cells) == (Evidence.SAMPLED, 0)
     assert "cannot be run with intervals" in found.notes[0]
+    assert "float() of a symbol" in found.notes[0]
+    assert "numpy.where in place of branches" in found.notes[0]
     assert "holds at 4" in found.notes[0]
 
 
