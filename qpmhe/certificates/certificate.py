@@ -24,7 +24,12 @@ from ..model.system import System
 from ..observers import Observer
 from .audit import Audit, audit, checked_ingredients
 from .branch_and_bound import constant_output
-from .contraction import certify_detectability, certify_observer, gain_if_constant
+from .contraction import (
+    certify_detectability,
+    certify_observer,
+    constant_gain,
+    gain_if_constant,
+)
 from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import (
     CertificateError,
@@ -226,7 +231,10 @@ class Certificate:
                 f"{reason}" if reason is not None else
                 "its constants were stated, not certified: leave stability out."
             )
-            raise OptionError(f"kind is 'observer', but there is no bound of the observer: {why}")
+            others = f" Of the theorem's there are {list(self.kinds)}." if self.bounds else ""
+            raise OptionError(
+                f"kind is 'observer', but there is no bound of the observer: {why}{others}"
+            )
         return self.observer_bound
 
     def _signals(
@@ -447,8 +455,9 @@ class Certificate:
         after = self.settling_samples
         when = f" after {after} samples" if after else ""
         wide = " x ".join(f"{width:.3g}" for width in widths)
-        vacuous = "" if (limit < widths).all() else ": not all of it says something"
-        return f"{each}{when} ({proved.evidence}), on a region {wide} wide{vacuous}"
+        vacuous = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limit >= widths))
+        nothing = f": it says nothing of {vacuous}" if vacuous else ""
+        return f"{each}{when} ({proved.evidence}), on a region {wide} wide{nothing}"
 
     def summary(self) -> str:
         """The headline, for what it holds, what it rests on, and what could not be certified."""
@@ -534,13 +543,17 @@ def certify(
         If nothing bounds the error: the observer has no constant gain and no assumed constants,
         or its stability cannot be shown; the text says what may help.
     """
+    horizons, place = horizons_of(horizon), bounded_region(system, region, inputs)
+    if stability is None:  # without a gain, all else would be in vain
+        constant_gain(observer, system)
     found = examined(
-        system, observer, cost, bounded_region(system, region, inputs), horizons_of(horizon),
-        sizes, started(seconds), detectability, stability,
+        system, observer, cost, place, horizons, sizes, started(seconds), detectability, stability
     )
     if not found.holds:
+        # Where the state cannot be detected, no observer can be stable.
         raise next(
-            found.errors[what] for what in ("the observer", *found.errors) if what in found.errors
+            found.errors[what] for what in ("the theorem", "detectability", "the observer")
+            if what in found.errors
         )
     return found
 
