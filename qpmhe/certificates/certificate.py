@@ -212,6 +212,7 @@ class Certificate:
                     "the source's candidate comes from a reinitialized observer, whose states "
                     "this bound is not about; make it with candidate='observer'."
                 )
+            proved = proved.of_observer(source.observer)
         if run is not None:
             return proved.along(run, disturbances, noises, initial_error=initial_error).error
         entering = proved.entering(disturbances, noises)

@@ -14,7 +14,7 @@ No cost, horizon or detectability enters.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -31,6 +31,7 @@ from ..estimation.estimate import Status
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
+from ..observers import Observer
 from .evidence import Evidence, json_ready
 from .inequalities import Matrices, definite
 from .properties import ObserverStability
@@ -214,6 +215,10 @@ class ObserverBound:
     def projects(self) -> bool:
         """Whether a projection of the observer onto X keeps the bound: in P, it does."""
         return self.projection is not None and np.array_equal(self.projection, self.metric)
+
+    def of_observer(self, observer: Observer) -> ObserverBound:
+        """The same of an observer with this gain, which may be projected in another metric."""
+        return replace(self, projection=observer.metric)
 
     @cached_property
     def slopes(self) -> Array:

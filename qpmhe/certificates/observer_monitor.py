@@ -108,7 +108,7 @@ class ObserverMonitor:
     ) -> None:
         chosen = bound.sizes if sizes is None else sizes
         entering = bound.entering(chosen.disturbances, chosen.noises)
-        self.bound = bound
+        self.bound = bound.of_observer(estimator.observer)
         self._system: System = estimator.system
         self._entering = float(entering)
         #: What bounds w and v.
