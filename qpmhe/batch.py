@@ -260,14 +260,17 @@ class BatchEstimator:
                 self._leave_compiled(error)
         found = BatchRun(
             states=np.empty((shape[0], shape[1] + 1, n)), filtered=np.empty((*shape, n)),
+            observer_states=np.empty((shape[0], shape[1] + 1, n)),
             delayed=np.full((*shape, n), np.nan), costs=np.empty(shape),
             candidate_costs=np.empty(shape), statuses=np.empty(shape, np.int64),
             qps=np.empty(shape, np.intp),
         )
         found.states[:, 0] = self.states
+        found.observer_states[:, 0] = self._engine.observer_states
         for t in range(shape[1]):
             one = self._step(ys[:, t], us[:, t])
             found.states[:, t + 1], found.filtered[:, t] = one.states, one.filtered
+            found.observer_states[:, t + 1] = one.observer_states
             if one.delayed is not None:
                 found.delayed[:, t] = one.delayed
             found.costs[:, t], found.candidate_costs[:, t] = one.costs, one.candidate_costs
@@ -311,6 +314,10 @@ class _Looped:
         return np.array([engine.state for engine in self.engines])
 
     @property
+    def observer_states(self) -> Array:
+        return np.array([engine.observer_state for engine in self.engines])
+
+    @property
     def time(self) -> int:
         return self.engines[0].time
 
@@ -347,6 +354,7 @@ class _Looped:
                 np.array([one.status.value for one in found], np.int64),
                 np.array([one.qps for one in found], np.intp),
                 np.array([one.filtered for one in found]),
+                np.array([one.observer_state for one in found]),
                 self._delay,
             )
         except BaseException:
@@ -372,6 +380,8 @@ class BatchEstimate:
         Values of the statuses, and QPs solved.
     filtered : (K, n) array
         Estimates of x(t).
+    observer_states : (K, n) array
+        The states from which the observers go on.
     delayed : (K, n) array or None
         Estimates of x(t+1-k) for the estimator's delay k.
     engine : str
@@ -386,6 +396,7 @@ class BatchEstimate:
     flags: Flags
     qps: Index
     filtered: Array
+    observer_states: Array
     delay: InitVar[int] = 0
     engine: str = "python"
 
@@ -426,6 +437,8 @@ class BatchRun:
     ----------
     states : (K, T + 1, n) array
         Estimates of x(0), ..., x(T), each made before y of its own time.
+    observer_states : (K, T + 1, n) array
+        The observers' own states z(0), ..., z(T).
     filtered, delayed : (K, T, n) array
         Estimates with y of their own time; delayed ones, NaN until the windows reach the delay.
     costs, candidate_costs : (K, T) array
@@ -437,6 +450,7 @@ class BatchRun:
     """
 
     states: Array
+    observer_states: Array
     filtered: Array
     delayed: Array
     costs: Array

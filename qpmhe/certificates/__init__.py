@@ -11,15 +11,18 @@ from .evidence import (
     OutOfTimeError,
 )
 from .monitor import Hypotheses, Monitor, MonitorSummary, monitor, monitored_run
+from .observer_bound import Band, ObserverBound, SignalBounds
+from .observer_monitor import ObserverMonitor, Reading
 from .properties import Detectability, ObserverStability
 from .regions import Region
 from .report import Report, certify_model
 from .theorem import DecayingSums, Sizes, TheoremConstants
 
 __all__ = [
-    "Audit", "Certificate", "CertificateError", "DecayingSums", "Detectability", "Evidence",
-    "Hypotheses", "MismatchError", "Monitor", "MonitorSummary", "NotCertifiedError",
-    "ObserverStability", "OutOfTimeError", "Region", "Report", "Sizes", "Synthesis",
+    "Audit", "Band", "Certificate", "CertificateError", "DecayingSums", "Detectability",
+    "Evidence", "Hypotheses", "MismatchError", "Monitor", "MonitorSummary", "NotCertifiedError",
+    "ObserverBound", "ObserverMonitor", "ObserverStability", "OutOfTimeError", "Reading", "Region",
+    "Report", "SignalBounds", "Sizes", "Synthesis",
     "TheoremConstants", "audit", "certify", "certify_detectability", "certify_model",
     "certify_observer", "monitor", "monitored_run", "synthesise_gain",
 ]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,7 +24,12 @@ from ..model.system import System
 from ..observers import Observer
 from .audit import Audit, audit, checked_ingredients
 from .branch_and_bound import constant_output
-from .contraction import certify_detectability, certify_observer, constant_gain, gain_if_constant
+from .contraction import (
+    certify_detectability,
+    certify_observer,
+    constant_gain,
+    gain_if_constant,
+)
 from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import (
     CertificateError,
@@ -33,19 +39,25 @@ from .evidence import (
     json_ready,
     weakest,
 )
+from .observer_bound import ObserverBound, SignalBounds, Size
 from .properties import Detectability, ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
 from .theorem import Sizes, checked_length
-from .window_bounds import HorizonBounds, Kind, bounds_for
+from .window_bounds import HorizonBounds, bounds_for
+from .window_bounds import Kind as TheoremKind
 
-# The constants are upper bounds, what is computed from them is not: this covers its rounding.
-_OUTWARD = 1.0 + 1e-9
+Kind = TheoremKind | Literal["observer"]
+
+#: The constants are upper bounds, what is computed from them is not: this covers its rounding.
+OUTWARD = 1.0 + 1e-9
+# How close to its limit the observer's bound is when it is called settled.
+_SETTLED = 0.1
 
 #: What no check can see.
 ASSUMED = (
-    "the true state stays in the region, and follows the model",
-    "the bounds on disturbances and noises that are passed are true",
+    "the true state stays in the region (and in X), and follows the model",
+    "the bounds on disturbances, noises and the initial error are true",
 )
 #: A window without all its measurements has another cost.
 BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
@@ -53,7 +65,7 @@ BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """The theorem's constants for a system, an observer and a cost on a set of states.
+    """What is proved of an observer, and of an estimator beside it, on a set of states.
 
     Made by `certify`; one that is made or changed by hand is assumed.
 
@@ -61,26 +73,34 @@ class Certificate:
     ----------
     system, observer, cost
         What the estimator is made of.
-    audit : Audit
-        The assumptions, one by one.
-    detectability, stability
-        What was certified of system and observer.
+    region : Region
+        Where it holds.
+    sizes : SignalBounds
+        For which disturbances and noises the bounds are stated.
+    observer_bound : ObserverBound or None
+        The observer's own bound, and with it the set around the observer that holds the truth.
+    audit, detectability, stability : optional
+        The theorem's assumptions; None for what could not be examined.
     bounds : mapping of int to HorizonBounds
-        For each horizon.
-    sizes : Sizes
-        For which disturbances and noises the bounds are called vacuous or not.
+        The theorem's bounds for each horizon; empty where it does not apply.
+    errors : mapping of str to QpmheError
+        What could not be certified, and why.
     evidence : Evidence
-        What the bounds rest on: the weakest evidence among their ingredients'.
+        What the theorem's bounds rest on, the weakest evidence among their ingredients'; where
+        there are none, what the observer's rests on.
     """
 
     system: System
     observer: Observer
     cost: Cost
-    audit: Audit
-    detectability: Detectability
-    stability: ObserverStability
-    bounds: Mapping[int, HorizonBounds]
-    sizes: Sizes
+    region: Region
+    sizes: SignalBounds
+    observer_bound: ObserverBound | None = None
+    audit: Audit | None = None
+    detectability: Detectability | None = None
+    stability: ObserverStability | None = None
+    bounds: Mapping[int, HorizonBounds] = field(default_factory=dict)
+    errors: Mapping[str, QpmheError] = field(default_factory=dict)
     evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
 
     @cached_property
@@ -89,13 +109,8 @@ class Certificate:
         return gain_if_constant(self.observer, self.system)
 
     @property
-    def region(self) -> Region:
-        """Where it holds."""
-        return self.audit.region
-
-    @property
     def horizons(self) -> tuple[int, ...]:
-        """The horizons with bounds."""
+        """The horizons with bounds of the theorem."""
         return tuple(self.bounds)
 
     @cached_property
@@ -104,13 +119,29 @@ class Certificate:
         return self.region.diameter
 
     @property
-    def kinds(self) -> tuple[Kind, ...]:
-        """The kinds of bounds at hand, the sharpest last."""
-        return self.bounds[self.horizons[0]].kinds
+    def widths(self) -> Array:
+        """How wide the region is in each component, (n,)."""
+        n = self.system.n
+        return self.region.upper[:n] - self.region.lower[:n]
+
+    @property
+    def kinds(self) -> tuple[TheoremKind, ...]:
+        """The kinds of the theorem's bounds, the sharpest last; none without the theorem."""
+        return next((bounds.kinds for bounds in self.bounds.values()), ())
+
+    @property
+    def holds(self) -> bool:
+        """Whether anything bounds the error."""
+        return self.observer_bound is not None or bool(self.bounds)
+
+    @property
+    def failures(self) -> list[str]:
+        """What could not be certified, in words."""
+        return [f"{what}: {each}" for what, each in self.errors.items()]
 
     def bound(
-        self, run: Run | None, disturbances: ArrayLike, noises: ArrayLike, *,
-        initial_error: ArrayLike, horizon: int | None = None, kind: Kind = "paper",
+        self, run: Run | None, disturbances: Size | None = None, noises: Size | None = None, *,
+        initial_error: Size, horizon: int | None = None, kind: Kind = "observer",
         source: MovingHorizonEstimator | None = None,
     ) -> Array:
         """The bound of the error |x(t) - x_hat(t)| along a run at t = 0, ..., T, (T + 1,).
@@ -118,23 +149,25 @@ class Certificate:
         Parameters
         ----------
         run : Run or None
-            The run, whose costs ``kind="measured"`` uses. None where there is none; then
-            disturbances or noises give the length.
-        disturbances, noises : array_like
-            w(t) and v(t) as (T, n) and (T, p), their Euclidean lengths (T,), or a number:
-            a bound on the length at all times.
-        initial_error : (n,) array_like or float
-            x_0 - z_0, or a bound on its length.
+            The run. Without one, the bound is that of the observer's error for
+            ``kind="observer"``, and disturbances or noises give the number of samples.
+        disturbances, noises : array_like or set, optional
+            w(t) and v(t) as (T, n) and (T, p), their Euclidean lengths (T,), a number that bounds
+            the length at all times or, for ``kind="observer"``, a set; `sizes` if left out.
+        initial_error : (n,) array_like, float or set
+            x_0 - z_0, a bound on its length or, for ``kind="observer"``, a set that holds it.
         horizon : int, optional
-            N; the source's, or the only one, if left out.
-        kind : {"paper", "summed", "weighted", "measured"}
-            The right-hand side of (eq:RGES_result) with the paper's constants, or beyond the
-            paper: with the proof's norms kept, where those are not known with its sums kept,
-            and with the estimates' own costs in place of their bound.
+            N; the source's, or the only one, if left out. Not for ``kind="observer"``.
+        kind : {"observer", "paper", "summed", "weighted", "measured"}
+            ``observer``: the distance to the farthest point of the set around the observer that
+            holds the true state, NaN from where the run shows that it no longer does, see
+            `ObserverBound.along`. The others follow from the theorem: the right-hand side of
+            (eq:RGES_result) with the paper's constants, or beyond the paper with the proof's
+            norms kept (for other costs than quadratic ones its sums), and with the estimates'
+            own costs in place of their bound.
         source : MovingHorizonEstimator, optional
-            The estimator that made the run, as the run left it, for the horizon and cost of
-            the run. Needed for ``kind="measured"``; without one, the bound is that of an
-            estimator with this certificate's cost and this horizon, whatever the run.
+            The estimator that made the run, as the run left it; it is compared with the
+            certificate. Needed for ``kind="measured"``.
 
         Raises
         ------
@@ -144,10 +177,15 @@ class Certificate:
             If the source is of another system, observer, cost or horizon, or did not make
             the run.
         """
+        if kind == "observer":
+            return self._of_observer(run, disturbances, noises, initial_error, source)
         if source is not None and horizon is None:
             horizon = getattr(source, "horizon", None)
-        chosen = self.of(horizon)
-        start, w, v = self._signals(run, initial_error, disturbances, noises)
+        chosen, lengths = self.of(horizon), self.sizes.lengths
+        start, w, v = self._signals(
+            run, initial_error, lengths.disturbance if disturbances is None else disturbances,
+            lengths.noise if noises is None else noises,
+        )
         costs = None
         if source is not None:
             costs = self._costs(source, run, chosen.paper.horizon)
@@ -158,17 +196,59 @@ class Certificate:
             )
         if kind != "paper":
             measured = costs if kind == "measured" else None
-            return _OUTWARD * chosen.beyond(kind).bound(start, w, v, measured)
-        lengths = [x if x.ndim == 1 else np.linalg.norm(x, axis=1) for x in (w, v)]
-        return _OUTWARD * chosen.paper.result.bound(np.linalg.norm(start), *lengths)
+            return OUTWARD * chosen.beyond(kind).bound(start, w, v, measured)
+        sizes = [x if x.ndim == 1 else np.linalg.norm(x, axis=1) for x in (w, v)]
+        return OUTWARD * chosen.paper.result.bound(float(np.linalg.norm(start)), *sizes)
+
+    def _of_observer(
+        self, run: Run | None, disturbances: Size | None, noises: Size | None,
+        initial_error: Size, source: MovingHorizonEstimator | None,
+    ) -> Array:
+        proved = self._observer()
+        if source is not None:
+            self.check_estimator(source)
+            if source.settings.candidate != "observer":
+                raise MismatchError(
+                    "the source's candidate comes from a reinitialized observer, whose states "
+                    "this bound is not about; make it with candidate='observer'."
+                )
+            proved = proved.of_observer(source.observer)
+        if run is not None:
+            return proved.along(run, disturbances, noises, initial_error=initial_error).error
+        entering = proved.entering(disturbances, noises)
+        if not entering.ndim:
+            raise ShapeError(
+                "disturbances and noises are not of single samples, and there is no run; expected "
+                "a sequence for one of them, to say how many samples there are."
+            )
+        radius = proved.radii(len(entering), initial_error, entering)
+        return proved.farthest(radius, np.zeros((len(radius), self.system.n)))
+
+    def _observer(self) -> ObserverBound:
+        """The observer's bound, or an error that says why there is none."""
+        if self.observer_bound is None:
+            reason = self.errors.get("the observer")
+            why = (
+                f"{reason}" if reason is not None else
+                "its constants were stated, not certified: leave stability out."
+            )
+            others = f" Of the theorem's there are {list(self.kinds)}." if self.bounds else ""
+            raise OptionError(
+                f"kind is 'observer', but there is no bound of the observer: {why}{others}"
+            )
+        return self.observer_bound
 
     def _signals(
-        self, run: Run | None, initial_error: ArrayLike, disturbances: ArrayLike, noises: ArrayLike
+        self, run: Run | None, initial_error: Size, disturbances: Size, noises: Size
     ) -> tuple[Array, Array, Array]:
         """Initial error, disturbances and noises: vectors or lengths, at each sample."""
         n, p = self.system.n, self.system.p
-        start = numbers("initial_error", initial_error)
-        w, v = numbers("disturbances", disturbances), numbers("noises", noises)
+        start, w, v = (
+            numbers(name, self._number(name, given)) for name, given in (
+                ("initial_error", initial_error), ("disturbances", disturbances),
+                ("noises", noises),
+            )
+        )
         steps = len(run) if run is not None else next((len(x) for x in (w, v) if x.ndim), None)
         if steps is None:
             raise ShapeError(
@@ -189,6 +269,15 @@ class Certificate:
                 raise OptionError(f"{name} is {shown(x)}; expected Euclidean lengths, all >= 0.")
             found.append(x if x.ndim else np.full(lengths, x))
         return found[0], found[1], found[2]
+
+    @staticmethod
+    def _number(name: str, given: Size) -> ArrayLike:
+        """What is no set; the theorem's bounds take lengths and vectors."""
+        if isinstance(given, ConvexSet):
+            raise OptionError(
+                f"{name} is a set, which kind='observer' takes; expected lengths or vectors."
+            )
+        return given
 
     def _costs(self, source: MovingHorizonEstimator, run: Run | None, horizon: int) -> Array:
         """The costs of a run's estimates; NaN where a window is not what the bound is of."""
@@ -215,19 +304,19 @@ class Certificate:
         return costs
 
     def funnel(
-        self, w_max: float, v_max: float, *, initial_error: float, steps: int,
-        horizon: int | None = None, kind: Kind = "paper",
+        self, w_max: float | None = None, v_max: float | None = None, *, initial_error: Size,
+        steps: int, horizon: int | None = None, kind: Kind = "observer",
     ) -> Array:
-        """The bound before anything is measured, for |w| <= w_max and |v| <= v_max, (T + 1,).
+        """The bound before anything is measured, (T + 1,).
 
         Parameters
         ----------
-        w_max, v_max, initial_error : float
-            Bounds on the lengths of w(t), v(t) and x_0 - z_0.
+        w_max, v_max : float, optional
+            Bounds on the lengths of w(t) and v(t); `sizes` if left out.
+        initial_error, horizon, kind
+            As for `bound`; not "measured". For "observer", the bound is of |x(t) - z(t)|.
         steps : int
             T.
-        horizon, kind
-            As for `bound`; not "measured".
 
         Raises
         ------
@@ -235,49 +324,83 @@ class Certificate:
             If a length is negative or not finite, the steps are no integer, or there is no
             such bound.
         """
-        if kind == "measured":
-            raise OptionError(
-                "kind is 'measured', but nothing is measured yet; expected one of "
-                f"{[each for each in self.kinds if each != 'measured']}."
-            )
+        self._check_unmeasured(kind)
         length = count("steps", steps, 1)
+        w, v = self._always(w_max, v_max, kind)
+        if kind == "observer":
+            proved = self._observer()
+            radius = proved.radii(length, initial_error, proved.entering(w, v))
+            return proved.farthest(radius, np.zeros((length + 1, self.system.n)))
         return self.bound(
-            None, np.full(length, checked_length("w_max", w_max)),
-            np.full(length, checked_length("v_max", v_max)),
-            initial_error=checked_length("initial_error", initial_error), horizon=horizon,
-            kind=kind,
+            None, np.full(length, w), np.full(length, v), initial_error=initial_error,
+            horizon=horizon, kind=kind,
         )
 
     def limit(
-        self, w_max: float, v_max: float, *, horizon: int | None = None, kind: Kind = "paper"
+        self, w_max: float | None = None, v_max: float | None = None, *,
+        horizon: int | None = None, kind: Kind = "observer",
     ) -> float:
         """What the funnel tends to as t grows; arguments and errors as for `funnel`."""
-        w, v = checked_length("w_max", w_max), checked_length("v_max", v_max)
+        self._check_unmeasured(kind)
+        w, v = self._always(w_max, v_max, kind)
+        if kind == "observer":
+            proved = self._observer()
+            return float(proved.farthest(proved.limit(w, v), np.zeros(self.system.n)))
         chosen = self.of(horizon)
         bound = chosen.paper.result if kind == "paper" else chosen.beyond(kind)
-        return _OUTWARD * bound.limit(w, v)
+        return OUTWARD * bound.limit(w, v)
+
+    def _always(
+        self, w_max: float | None, v_max: float | None, kind: Kind
+    ) -> tuple[Any, Any]:
+        """What bounds w and v at all times: sets only for the observer's bound."""
+        if kind == "observer":
+            usual: tuple[Any, Any] = self.sizes.disturbances, self.sizes.noises
+        else:
+            lengths = self.sizes.lengths
+            usual = lengths.disturbance, lengths.noise
+        w, v = (
+            each if given is None else checked_length(name, given)
+            for each, given, name in zip(usual, (w_max, v_max), ("w_max", "v_max"), strict=True)
+        )
+        return w, v
+
+    def _check_unmeasured(self, kind: Kind) -> None:
+        if kind == "measured":
+            kinds = ["observer", *(each for each in self.kinds if each != "measured")]
+            raise OptionError(
+                f"kind is 'measured', but nothing is measured yet; expected one of {kinds}."
+            )
 
     def vacuous(
-        self, w_max: float | None = None, v_max: float | None = None, *, horizon: int | None = None,
-        kind: Kind = "paper",
+        self, w_max: float | None = None, v_max: float | None = None, *,
+        horizon: int | None = None, kind: Kind = "observer",
     ) -> bool:
-        """Whether the bound says nothing: its limit is no less than the region's diameter.
+        """Whether the bound says nothing: its limit is no less than the region's size.
 
-        State and estimate are both in the region, so that their distance is never more.
-        Arguments and errors are those of `funnel`; w_max and v_max are by default those of
-        the certificate's `sizes`.
+        State and estimate are both in the region, so that their distance is never more than its
+        diameter. Of the observer's bound each component must be less than the region is wide.
+        Arguments and errors are those of `funnel`.
         """
-        w = self.sizes.disturbance if w_max is None else w_max
-        v = self.sizes.noise if v_max is None else v_max
-        return not self.limit(w, v, horizon=horizon, kind=kind) < self.diameter
+        if kind == "observer":
+            w, v = self._always(w_max, v_max, kind)
+            proved = self._observer()
+            return not (proved.components(proved.limit(w, v)) < self.widths).all()
+        return not self.limit(w_max, v_max, horizon=horizon, kind=kind) < self.diameter
 
     def of(self, horizon: int | None = None) -> HorizonBounds:
         """The constants for a horizon N, which may be left out if there is only one.
 
-        An `OptionError` says which there are if there are none for this one.
+        An `OptionError` says which there are if there are none for this one, or why there are
+        none at all.
         """
         if horizon is None and len(self.bounds) == 1:
             return next(iter(self.bounds.values()))
+        if not self.bounds:
+            raise OptionError(
+                "the theorem's bounds could not be certified, so that only kind='observer' is "
+                f"there: {'; '.join(self.failures)}"
+            )
         if horizon is None or horizon not in self.bounds:
             raise OptionError(
                 f"horizon is {horizon!r}; expected one of {list(self.bounds)}, for which there "
@@ -286,13 +409,68 @@ class Certificate:
         return self.bounds[horizon]
 
     def check_estimator(self, estimator: MovingHorizonEstimator) -> None:
-        """Raise a `MismatchError` unless the estimator has this very system, observer and cost."""
+        """Raise a `MismatchError` unless the estimator has this very system, observer and cost.
+
+        An observer with the same constant gain is the same one, whatever its metric. The cost
+        matters only to the theorem's bounds.
+        """
         for name in ("system", "observer", "cost"):
-            if getattr(self, name) is not getattr(estimator, name):
+            mine, theirs = getattr(self, name), getattr(estimator, name)
+            same = mine is theirs or (
+                self._has_same_gain(theirs) if name == "observer"
+                else name == "cost" and not self.bounds
+            )
+            if not same:
                 raise MismatchError(
                     f"the certificate is of another {name} than the estimator's; certify the "
                     "very objects that the estimator is made of."
                 )
+
+    def _has_same_gain(self, observer: Observer) -> bool:
+        gain = gain_if_constant(observer, self.system)
+        return gain is not None and self.gain is not None and np.array_equal(gain, self.gain)
+
+    @property
+    def settling_samples(self) -> int | None:
+        """Samples until the observer's bound is within 10 % of its limit, from any start.
+
+        From any two states of the region, that is; None where the limit is zero.
+        """
+        proved = self._observer()
+        widths, limit = self.widths, proved.limit()
+        start = proved.initial(Box(-widths, widths))
+        if not limit > 0.0:
+            return None
+        if start <= (1.0 + _SETTLED) * limit:
+            return 0
+        return math.ceil(math.log(_SETTLED * limit / (start - limit)) / math.log(proved.rate))
+
+    @property
+    def headline(self) -> str:
+        """The sharpest thing that is certified, in the states' units, in one line."""
+        proved = self.observer_bound
+        if proved is None:
+            return "No bound of the observer's error is proved."
+        limit, widths = proved.components(proved.limit()), self.widths
+        each = ", ".join(f"|x{i + 1} - z{i + 1}| <= {size:.2g}" for i, size in enumerate(limit))
+        after = self.settling_samples
+        when = f" after {after} samples" if after else ""
+        wide = " x ".join(f"{width:.3g}" for width in widths)
+        vacuous = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limit >= widths))
+        nothing = f": it says nothing of {vacuous}" if vacuous else ""
+        return f"{each}{when} ({proved.evidence}), on a region {wide} wide{nothing}"
+
+    def summary(self) -> str:
+        """The headline, for what it holds, what it rests on, and what could not be certified."""
+        lines = [self.headline]
+        if self.observer_bound is not None:
+            lines.append(f"for {self.observer_bound.sizes}")
+            lines.append(f"while {ASSUMED[0]}")
+        lines += [f"Not certified: {each}" for each in self.failures]
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.summary()
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows; infinite numbers become None."""
@@ -300,13 +478,16 @@ class Certificate:
         content: dict[str, Any] = json_ready({
             "system": {"n": system.n, "p": system.p, "m": system.m},
             "region": self.region.to_dict(),
+            "headline": self.headline,
             "evidence": self.evidence.value,
             "assumed": list(ASSUMED),
-            "assumptions": self.audit.to_dict(),
-            "detectability": self.detectability.to_dict(),
-            "observer": self.stability.to_dict(),
-            "sizes": vars(self.sizes),
-            "horizons": [each.to_dict(self.sizes) for each in bounds.values()],
+            "failures": self.failures,
+            "observer_bound": self.observer_bound and self.observer_bound.to_dict(),
+            "assumptions": self.audit and self.audit.to_dict(),
+            "detectability": self.detectability and self.detectability.to_dict(),
+            "observer": self.stability and self.stability.to_dict(),
+            "sizes": self.sizes.to_dict(),
+            "horizons": [each.to_dict(self.sizes.lengths) for each in bounds.values()],
             "vacuous": {
                 kind: {N: self.vacuous(horizon=N, kind=kind) for N in bounds}
                 for kind in self.kinds if kind != "measured"
@@ -317,17 +498,20 @@ class Certificate:
 
 Result = TypeVar("Result")
 
-# How much of the time left the audit, detectability and the observer take.
-_AUDIT, _DETECTABILITY, _OBSERVER = 0.25, 0.5, 0.9
+# How much of the time left the observer, the audit and detectability take.
+_OBSERVER, _AUDIT, _DETECTABILITY = 0.6, 0.4, 0.9
 
 
 def certify(
     system: System, observer: Observer, cost: Cost, *, horizon: int | Sequence[int],
-    region: ConvexSet | Region | None = None, inputs: Box | None = None, sizes: Sizes | None = None,
-    detectability: Detectability | None = None, stability: ObserverStability | None = None,
-    seconds: float | Deadline = DEFAULT_SECONDS,
+    region: ConvexSet | Region | None = None, inputs: Box | None = None,
+    sizes: SignalBounds | Sizes | None = None, detectability: Detectability | None = None,
+    stability: ObserverStability | None = None, seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Certificate:
-    """Check the theorem's assumptions on a set of states, and bound the estimator's error.
+    """Bound the observer's error on a set of states, then the estimator's by the theorem.
+
+    The observer comes first: its bound needs neither cost nor horizon nor detectability. What
+    else cannot be certified is in the certificate's ``errors``.
 
     Parameters
     ----------
@@ -339,10 +523,9 @@ def certify(
         A bounded set of states; the system's own if left out.
     inputs : Box, optional
         Bounds on the inputs, for a system with inputs.
-    sizes : Sizes, optional
-        For which disturbances and noises the observer's constants are to be small, and the
-        bounds are called vacuous or not; left out, those of which each alone costs 1 in its
-        cheapest direction.
+    sizes : SignalBounds or Sizes, optional
+        Which disturbances and noises the bounds are for; left out, the system's W and V, and
+        three standard deviations by the cost's weights where it has none.
     detectability, stability : optional
         Constants to take instead of looking for them, such as assumed ones, or those that
         were certified of this system and gain on a set that contains the region.
@@ -357,80 +540,94 @@ def certify(
     MismatchError
         If constants that are passed are of another system or gain, or of a set that does not
         contain the region and the inputs.
-    CertificateError
-        If the cost has no constants, h no Lipschitz constant, or the observer no constant
-        gain and no assumed constants.
-    NotCertifiedError
-        If detectability or the observer's stability cannot be shown; the text says what
-        may help.
+    CertificateError, NotCertifiedError
+        If nothing bounds the error: the observer has no constant gain and no assumed constants,
+        or its stability cannot be shown; the text says what may help.
     """
-    checked_ingredients(system, observer, cost)
-    horizons = horizons_of(horizon)
-    place = bounded_region(system, region, inputs)
-    gain = gain_if_constant(observer, system)
-    if gain is None and stability is None:  # without one, all else would be in vain
+    horizons, place = horizons_of(horizon), bounded_region(system, region, inputs)
+    if stability is None:  # without a gain, all else would be in vain
         constant_gain(observer, system)
-    if detectability is not None:
-        detectability = fitting(detectability, system, place, gain)
-    if stability is not None:
-        stability = fitting(stability, system, place, gain)
-    *_, certificate = certified(
+    found = examined(
         system, observer, cost, place, horizons, sizes, started(seconds), detectability, stability
     )
-    assert certificate is not None
-    return certificate
+    if not found.holds:
+        # Where the state cannot be detected, no observer can be stable.
+        raise next(
+            found.errors[what] for what in ("the theorem", "detectability", "the observer")
+            if what in found.errors
+        )
+    return found
 
 
-def certified(
+def examined(
     system: System, observer: Observer, cost: Cost, region: Region, horizons: Sequence[int],
-    sizes: Sizes | None, deadline: Deadline, detectability: Detectability | None = None,
-    stability: ObserverStability | None = None, errors: dict[str, QpmheError] | None = None,
-) -> tuple[Audit, Detectability | None, ObserverStability | None, Certificate | None]:
-    """Each ingredient, and the certificate that follows; None for what could not be certified.
-
-    Errors are collected by the name of what could not be, or raised where nothing collects them.
-    """
+    sizes: SignalBounds | Sizes | None, deadline: Deadline,
+    detectability: Detectability | None = None, stability: ObserverStability | None = None,
+) -> Certificate:
+    """The certificate of `certify`, also where nothing holds: its errors say why."""
+    errors: dict[str, QpmheError] = {}
 
     def attempt(what: str, question: Callable[[], Result]) -> Result | None:
         try:
             return question()
         except (NotCertifiedError, CertificateError) as error:
-            if errors is None:
-                raise
             errors[what] = error
             return None
 
-    findings = audit(system, observer, cost, region, seconds=deadline.part(_AUDIT))
-    constants = attempt("", lambda: _needed(findings))
-    weights = (1.0, 1.0) if constants is None else _cheapest(constants)
-    sizes = Sizes(*weights) if sizes is None else sizes
-    w, v = sizes.disturbance, sizes.noise
-    least = 1e-3 * max(w, v)
-    detectability = detectability or attempt("detectability", lambda: certify_detectability(
-        system, region, weights=weights, seconds=deadline.part(_DETECTABILITY)
-    ))
+    try:
+        checked_ingredients(system, observer, cost)
+    except CertificateError as error:
+        errors["the theorem"] = error
+    bounds_of_signals = SignalBounds.of(sizes, system, cost)
+    lengths = bounds_of_signals.lengths
+    gain = gain_if_constant(observer, system)
+    if detectability is not None:
+        detectability = fitting(detectability, system, region, gain)
+    if stability is not None:
+        stability = fitting(stability, system, region, gain)
+    least = 1e-3 * max(lengths.disturbance, lengths.noise)
     stability = stability or attempt("the observer", lambda: certify_observer(
-        system, observer, region, weights=(max(w, least), max(v, least)),
-        seconds=deadline.part(_OBSERVER),
+        system, observer, region, weights=(
+            max(lengths.disturbance, least), max(lengths.noise, least)
+        ), seconds=deadline.part(_OBSERVER),
     ))
-    if constants is None or detectability is None or stability is None:
-        return findings, detectability, stability, None
-    output = constant_output(system, region)
-    bounds = {
-        N: bounds_for(
-            N, detectability, stability, cost, constants, lipschitz=findings.lipschitz,
-            output=output,
-        )
-        for N in horizons
-    }
+    proved = None
+    if stability is not None and stability.P is not None and stability.gain is not None:
+        proved = ObserverBound(stability, region, bounds_of_signals, observer.metric)
+    findings: Audit | None = None
+    constants: CostConstants | None = None
+    if "the theorem" not in errors:
+        findings = attempt("the theorem", lambda: audit(
+            system, observer, cost, region, seconds=deadline.part(_AUDIT)
+        ))
+        if findings is not None:
+            constants = attempt("the theorem", lambda: _needed(findings))
+        weights = (1.0, 1.0) if constants is None else _cheapest(constants)
+        detectability = detectability or attempt("detectability", lambda: certify_detectability(
+            system, region, weights=weights, seconds=deadline.part(_DETECTABILITY)
+        ))
+    bounds: dict[int, HorizonBounds] = {}
+    used = []
+    if findings and constants and detectability is not None and stability is not None:
+        output = constant_output(system, region)
+        bounds = {
+            N: bounds_for(
+                N, detectability, stability, cost, constants, lipschitz=findings.lipschitz,
+                output=output,
+            )
+            for N in horizons
+        }
+        used = [detectability.evidence] + [
+            each.evidence for each in findings.findings
+            if each.needed and each.evidence is not None
+        ]
     certificate = Certificate(
-        system, observer, cost, findings, detectability, stability, bounds, sizes
+        system, observer, cost, region, bounds_of_signals, proved, findings, detectability,
+        stability, bounds, errors,
     )
-    used = [detectability.evidence, stability.evidence] + [
-        each.evidence for each in findings.findings if each.needed and each.evidence is not None
-    ]
-    object.__setattr__(certificate, "evidence", weakest(used))
-    return findings, detectability, stability, certificate
+    if stability is not None and (bounds or proved is not None):
+        object.__setattr__(certificate, "evidence", weakest([stability.evidence, *used]))
+    return certificate
 
 
 def _needed(findings: Audit) -> CostConstants:

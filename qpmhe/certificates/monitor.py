@@ -1,7 +1,8 @@
-"""At run time: which of the certificate's hypotheses hold at each step."""
+"""At run time: the observer's bound, and which of the theorem's hypotheses hold at each step."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, fields
 from itertools import pairwise
@@ -18,8 +19,10 @@ from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.limits import FEASIBLE
 from ..estimation.run import Run
 from ..model.system import System
-from .certificate import BROKEN, Certificate
+from .certificate import BROKEN, OUTWARD, Certificate
 from .evidence import MismatchError
+from .observer_bound import SignalBounds, Size
+from .observer_monitor import ObserverMonitor, Reading, sharper
 
 _RELATIVE = 1e-6
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
@@ -97,6 +100,10 @@ class MonitorSummary:
         At how many steps each hypothesis did not hold.
     first_failure, failed : int or None, and tuple of str
         The first step at which hypotheses failed, and which.
+    observer : str
+        How long the observer's bound held, and what ended it; empty if it was not followed.
+    barred : str
+        Why the theorem does not apply at all; empty if it may.
     """
 
     steps: int
@@ -105,6 +112,8 @@ class MonitorSummary:
     missed: dict[str, int]
     first_failure: int | None
     failed: tuple[str, ...]
+    observer: str = ""
+    barred: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows."""
@@ -116,7 +125,10 @@ class MonitorSummary:
         return content
 
     def __str__(self) -> str:
-        text = f"The certificate applied at {self.applied} of {self.steps} steps"
+        before = f"{self.observer} " if self.observer else ""
+        if self.barred:
+            return f"{before}The theorem does not apply: {self.barred}".strip()
+        text = f"{before}The certificate applied at {self.applied} of {self.steps} steps"
         either = ""
         if self.first_failure is not None:
             reasons = ", ".join(self.failed).replace("_", " ")
@@ -147,18 +159,45 @@ class Monitor:
     certificate : Certificate
         Of the estimator's system, observer and cost.
     horizon : int
-        The estimator's; an `OptionError` is raised if the certificate has no bounds for it.
+        The estimator's; an `OptionError` is raised if the certificate has bounds, but not for it.
+    observer : ObserverMonitor, optional
+        Follows the observer's bound, for `bound`.
+    barred : str
+        Why the theorem does not apply to the estimator, if it does not.
     """
 
-    def __init__(self, certificate: Certificate, horizon: int) -> None:
-        self.horizon = certificate.of(count("horizon", horizon, 1)).paper.horizon
-        self.certificate = certificate
+    def __init__(
+        self, certificate: Certificate, horizon: int, observer: ObserverMonitor | None = None,
+        barred: str = "",
+    ) -> None:
+        self.horizon = count("horizon", horizon, 1)
+        if certificate.bounds and not barred:
+            certificate.of(self.horizon)
+        elif not barred:
+            barred = "; ".join(certificate.failures)
+        self.certificate, self.observer = certificate, observer
+        self._barred = barred
         self._inputs: deque[Array] = deque(maxlen=horizon)
         self._checks: list[Hypotheses] = []
+        self._radii: deque[float] = deque(maxlen=horizon + 1)
+        self._reading: Reading | None = None
+        if observer is not None:
+            self._radii.append(observer.radius)
 
     @classmethod
-    def of(cls, certificate: Certificate, estimator: MovingHorizonEstimator) -> Monitor:
+    def of(
+        cls, certificate: Certificate, estimator: MovingHorizonEstimator, *,
+        initial_error: Size | None = None, sizes: SignalBounds | None = None,
+    ) -> Monitor:
         """A monitor for this estimator, before its first measurement.
+
+        Parameters
+        ----------
+        certificate, estimator
+            What is monitored.
+        initial_error, sizes : optional
+            What bounds x_0 - z_0, with which the monitor follows the observer's bound, and what
+            bounds w and v, see `ObserverMonitor`.
 
         Raises
         ------
@@ -167,7 +206,8 @@ class Monitor:
         InvalidInputError
             If the estimator has taken measurements already.
         OptionError
-            If it has no bounds for its horizon, or the estimator takes another candidate or prior.
+            If it has no bounds for its horizon, or there is no bound of the observer and the
+            theorem does not cover the estimator's options.
         """
         certificate.check_estimator(estimator)
         if estimator.time:
@@ -175,25 +215,31 @@ class Monitor:
                 f"the estimator has taken {estimator.time} measurements; reset it first: the "
                 "certificate's bound starts with the first one."
             )
-        if estimator.settings.candidate != "observer":
-            raise OptionError(
-                "the estimator's candidate comes from a reinitialized observer, which the "
-                "theorem does not cover; make it with candidate='observer'."
+        barred = _barred(estimator)
+        proved, observer = certificate.observer_bound, None
+        if barred and proved is None:
+            raise OptionError(barred)
+        if initial_error is not None and proved is not None:
+            observer = ObserverMonitor(
+                proved, estimator, initial_error=initial_error, sizes=sizes
             )
-        if estimator.settings.arrival != "observer":
-            raise OptionError(
-                "the estimator's prior is a smoothed estimate, which the theorem does not cover; "
-                "make it with arrival='observer'."
-            )
-        if estimator.has_changed or estimator.settings.parameters:
-            raise OptionError(
-                "the estimator has parameters, or its weights or bounds were changed by set(...); "
-                "the theorem is about what stays: make the estimator with constant ones."
-            )
-        return cls(certificate, estimator.horizon)
+        return cls(certificate, estimator.horizon, observer, barred)
 
-    def check(self, estimate: Estimate, u: ArrayLike | None = None) -> Hypotheses:
+    @property
+    def bound(self) -> Reading | None:
+        """What is known of the true state after the last check; None if nothing is followed.
+
+        The observer's bound or, where that is less, the one with the measured cost.
+        """
+        return self._reading
+
+    def check(
+        self, estimate: Estimate, u: ArrayLike | None = None, *, dt: float | None = None
+    ) -> Hypotheses:
         """Check the estimate that `MovingHorizonEstimator.update` returned for the next input u.
+
+        With ``dt``, if the step had a length of its own. A monitor that follows the observer's
+        bound also takes the estimates of `amend` and `set`, and says what became of the bound.
 
         Raises
         ------
@@ -206,25 +252,54 @@ class Monitor:
         given = np.zeros(0) if u is None else np.atleast_1d(np.asarray(u, np.float64))
         if given.shape != (m,):
             raise ShapeError(f"u has shape {given.shape}; expected ({m},).")
-        if estimate.time != t:
-            raise MismatchError(
+        again = self.observer is not None and estimate.time == t - 1
+        if estimate.time != t and not again:
+            text = (
                 f"the estimate is of the time {estimate.time}; expected {t}: a monitor sees all "
                 "estimates of a run, from the first one on."
             )
-        stages, expected = estimate.trajectory.shape[0] - 1, min(t + 1, self.horizon)
+            if self.observer is None:
+                raise MismatchError(text)
+            self._barred = text
+        stages, expected = estimate.trajectory.shape[0] - 1, min(estimate.time + 1, self.horizon)
         if stages != expected:
             raise MismatchError(
                 f"the estimate's window has {stages} stages at time {t}; expected {expected}, for "
                 f"the horizon {self.horizon}. Make the monitor for the estimator's horizon."
             )
-        self._inputs.append(given)
-        self._checks.append(monitor(self.certificate, estimate, np.array(self._inputs)))
+        if again:
+            self._checks.pop()
+            self._barred = self._barred or "a sample was estimated again (amend or set)"
+        else:
+            self._inputs.append(given)
+        inputs = np.array(self._inputs)[-stages:] if len(self._inputs) >= stages else None
+        self._checks.append(monitor(self.certificate, estimate, inputs))
+        if self.observer is not None:
+            reading = self.observer.check(estimate, None if again else given, dt=dt)
+            if not again:
+                self._radii.append(reading.radius)
+            self._reading = sharper(reading, self._measured(estimate, stages))
         return self._checks[-1]
+
+    def _measured(self, estimate: Estimate, stages: int) -> float:
+        """The bound with the estimate's own cost, from the observer's bound N samples ago."""
+        if not self.applies or self.certificate.kinds[-2:] != ("weighted", "measured"):
+            return math.inf
+        assert self.observer is not None
+        from scipy.linalg import eigh
+
+        window = self.certificate.of(self.horizon).beyond("measured")
+        weights = window.norms
+        # The initial error that counts most in detectability's norm.
+        start = eigh(weights.window, weights.observer)[1][:, -1] * self._radii[-1 - stages]
+        w, v = (np.full(stages, size) for size in self.observer.sizes.largest)
+        costs = np.append(np.full(stages - 1, np.inf), estimate.cost)
+        return OUTWARD * float(window.bound(start, w, v, costs)[-1])
 
     @property
     def applies(self) -> bool:
         """Whether the bound follows at the last step: all needed hypotheses held so far."""
-        return all(check.held for check in self._checks)
+        return not self._barred and all(check.held for check in self._checks)
 
     def summary(self) -> MonitorSummary:
         """For how many of the steps so far the certificate applied."""
@@ -237,8 +312,40 @@ class Monitor:
                 name: sum(not getattr(check, name) for check in checks)
                 for name in (*NEEDED, *UNNEEDED)
             },
-            first, () if first is None else checks[first].failed,
+            first, () if first is None else checks[first].failed, self._of_observer(),
+            self._barred,
         )
+
+    def _of_observer(self) -> str:
+        """How long the observer's bound held."""
+        if self.observer is None:
+            return ""
+        if self.observer.lost is None:
+            return f"The observer's bound held at all {len(self._checks)} samples."
+        return (
+            f"The observer's bound held up to sample {self.observer.lost}: there "
+            f"{self.observer.reason}."
+        )
+
+
+def _barred(estimator: MovingHorizonEstimator) -> str:
+    """Why the theorem does not cover an estimator's options; empty if it does."""
+    if estimator.settings.candidate != "observer":
+        return (
+            "the estimator's candidate comes from a reinitialized observer, which the theorem "
+            "does not cover; make it with candidate='observer'."
+        )
+    if estimator.settings.arrival != "observer":
+        return (
+            "the estimator's prior is a smoothed estimate, which the theorem does not cover; "
+            "make it with arrival='observer'."
+        )
+    if estimator.has_changed or estimator.settings.parameters:
+        return (
+            "the estimator has parameters, or its weights or bounds were changed by set(...); "
+            "the theorem is about what stays: make the estimator with constant ones."
+        )
+    return ""
 
 
 def monitor(
@@ -273,7 +380,8 @@ def monitor(
         )
         # What is missing is reported as that alone: the observer takes it for a fit.
         known = np.nan_to_num(fit, nan=0.0)
-        allowed = certificate.stability.kappa * np.linalg.norm(known, axis=1) * (1.0 + _RELATIVE)
+        kappa = math.inf if certificate.stability is None else certificate.stability.kappa
+        allowed = kappa * np.linalg.norm(known, axis=1) * (1.0 + _RELATIVE)
         rounding = 1e-12 * np.abs(estimate.candidate).max(axis=0)
         bounded = bool(
             (np.linalg.norm(corrections, axis=1) <= allowed + np.linalg.norm(rounding)).all()
@@ -304,7 +412,7 @@ def monitor(
 
 def monitored_run(
     certificate: Certificate, estimator: MovingHorizonEstimator, measurements: ArrayLike,
-    inputs: ArrayLike | None = None,
+    inputs: ArrayLike | None = None, *, initial_error: Size | None = None,
 ) -> tuple[Run, MonitorSummary]:
     """Run an estimator over a record, and count for how many steps the certificate applied.
 
@@ -316,18 +424,21 @@ def monitored_run(
         Before its first measurement.
     measurements, inputs
         As for `MovingHorizonEstimator.run`, which returns the same run.
+    initial_error : optional
+        What bounds x_0 - z_0, to follow the observer's bound as well.
     """
-    watch = Monitor.of(certificate, estimator)
+    watch = Monitor.of(certificate, estimator, initial_error=initial_error)
     ys = record("measurements", measurements, estimator.system.p)
     us = None if inputs is None else record("inputs", inputs, estimator.system.m)
     if us is not None and len(us) != len(ys):
         raise ShapeError(f"inputs has {len(us)} samples; expected {len(ys)}.")
     start, estimates = estimator.state.copy(), []
+    observer_start = estimator.observer_state
     for t, y in enumerate(ys):
         u = None if us is None else us[t]
         estimates.append(estimator.update(y, u))
         watch.check(estimates[-1], u)
-    return Run.of(start, estimates), watch.summary()
+    return Run.of(start, estimates, observer_start=observer_start), watch.summary()
 
 
 def _along(system: System, states: Array, u: Array) -> tuple[Array, Array]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import InvalidInputError, QpmheError, SetError
+from ..errors import InvalidInputError, SetError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
@@ -17,17 +17,16 @@ from ..models.example import Example
 from ..models.scenario import Record
 from ..plots.bounds import error_and_bounds
 from ..plots.style import save
-from .audit import Audit
-from .certificate import Certificate, certified, horizons_of
+from .certificate import Certificate, Kind, examined, horizons_of
 from .deadline import DEFAULT_SECONDS, Deadline
 from .monitor import MonitorSummary, monitored_run
-from .properties import Detectability, ObserverStability
+from .observer_bound import Band, SignalBounds
 from .regions import Region, bounded_region
 from .sdp import started
-from .theorem import Sizes
 
 #: Names of the kinds of bounds in figures and tables.
 LABELS = {
+    "observer": "set around the observer",
     "paper": "theorem, paper's constants",
     "summed": "beyond: sums kept",
     "weighted": "beyond: norms kept",
@@ -36,7 +35,6 @@ LABELS = {
 
 # Without a region: the simulated states, with this share of their extent on each side.
 _ROOM = 0.5
-_SIGMAS = 3.0
 _QPS = 2  # a sample, in the run on the simulated record
 
 
@@ -50,64 +48,44 @@ class Report:
     ----------
     name, example, record
         The model's name, the model, and its simulated record.
-    audit : Audit
-        The assumptions, one by one, on the region.
-    certificate : Certificate or None
-        None where the error could not be bounded.
-    detectability, stability : Detectability and ObserverStability, or None
-        What could be certified of the system and of its observer.
-    errors : dict of str to QpmheError
-        What could not be certified, and why; empty with a certificate.
-    run, summary, estimator : Run, MonitorSummary and MovingHorizonEstimator, or None
-        With a certificate: the estimator's run on the record, with the largest horizon and two
-        QPs a sample, what the monitor saw, and the estimator after it.
+    certificate : Certificate
+        What could be certified, with the reasons where something could not; perhaps nothing.
+    run, band, summary, estimator : Run, Band, MonitorSummary and MovingHorizonEstimator, or None
+        Where something bounds the error: the estimator's run on the record, with the largest
+        horizon and two QPs a sample, the observer's bound along it, what the monitor saw, and the
+        estimator after it.
     """
 
     name: str
     example: Example
     record: Record
-    audit: Audit
-    certificate: Certificate | None = None
-    detectability: Detectability | None = None
-    stability: ObserverStability | None = None
-    errors: dict[str, QpmheError] = field(default_factory=dict)
+    certificate: Certificate
     run: Run | None = None
+    band: Band | None = None
     summary: MonitorSummary | None = None
     estimator: MovingHorizonEstimator | None = None
 
     @property
     def region(self) -> Region:
         """Where all of it holds."""
-        return self.audit.region
-
-    @property
-    def failures(self) -> list[str]:
-        """What could not be certified, in words."""
-        return [f"{what}: {each}" if what else str(each) for what, each in self.errors.items()]
+        return self.certificate.region
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows; rates that are not known are None."""
-        content = {
-            "model": self.name, "certified": self.certificate is not None,
-            "region": self.region.to_dict(),
-        }
-        if self.certificate is not None and self.summary is not None:
-            return content | {
-                "monitor": str(self.summary), "monitored": self.summary.to_dict(),
-            } | self.certificate.to_dict()
+        certificate = self.certificate
         suggestions = [
-            text for each in self.errors.values() for text in getattr(each, "suggestions", ())
+            text for each in certificate.errors.values()
+            for text in getattr(each, "suggestions", ())
         ]
-        return content | {
-            "failures": self.failures,
+        return certificate.to_dict() | {
+            "model": self.name, "certified": certificate.holds,
+            "monitor": self.summary and str(self.summary),
+            "monitored": self.summary and self.summary.to_dict(),
             "suggestions": list(dict.fromkeys(suggestions)),
             "smallest_rates": {
-                name: getattr(self.errors.get(what), "smallest_rate", None)
+                name: getattr(certificate.errors.get(what), "smallest_rate", None)
                 for name, what in (("eta", "detectability"), ("rho", "the observer"))
             },
-            "assumptions": self.audit.to_dict(),
-            "detectability": self.detectability and self.detectability.to_dict(),
-            "observer": self.stability and self.stability.to_dict(),
         }
 
     def draw(self, axes: Any = None) -> Any:
@@ -116,25 +94,28 @@ class Report:
         Without a certificate there is no run: an `InvalidInputError` is raised.
         """
         certificate, run = self.certificate, self.run
-        if certificate is None or run is None:
+        if run is None or self.estimator is None:
             raise InvalidInputError("there is no certificate, hence no bound to draw.")
         system, scenario, record = self.example.system, self.example.scenario, self.record
         steps = len(record.measurements)
         u = np.zeros((steps, 0)) if record.inputs is None else record.inputs
         w = record.states[1:] - system.f.batch(record.states[:-1], u)
         v = record.measurements - system.h.batch(record.states[:-1], u)
+        kinds: list[Kind] = list(certificate.kinds)
+        if certificate.observer_bound is not None:
+            kinds.insert(0, "observer")
+        start = record.states[0] - run.observer_states[0]
         bounds = {
             LABELS[kind]: certificate.bound(
-                run, w, v, initial_error=record.states[0] - run.states[0], kind=kind,
-                source=self.estimator,
+                run, w, v, initial_error=start, kind=kind, source=self.estimator
             )
-            for kind in certificate.kinds
+            for kind in kinds
         }
         return error_and_bounds(
             scenario.dt * np.arange(steps + 1.0),
             np.linalg.norm(record.states - run.states, axis=1), bounds,
             diameter=certificate.diameter, time_label=f"time t ({scenario.time_unit})",
-            error_label=f"error, N = {certificate.horizons[-1]}, {_QPS} QPs a sample", axes=axes,
+            error_label=f"error, N = {self.estimator.horizon}, {_QPS} QPs a sample", axes=axes,
         )
 
     def save(self, path: str | Path) -> list[Path]:
@@ -145,7 +126,7 @@ class Report:
         """
         path = Path(path)
         written: list[Path] = []
-        if self.certificate is not None:
+        if self.run is not None:
             written += save(self.draw().get_figure(), path.with_suffix(""))
         text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
         try:
@@ -162,8 +143,8 @@ def certify_model(
 ) -> Report:
     """Certify a model as far as possible, and monitor its estimator on a simulated record.
 
-    The assumptions, detectability and the observer are each examined, whatever is found of the
-    others; the certificate is made from them.
+    The observer, the assumptions and detectability are each examined, whatever is found of the
+    others.
 
     Parameters
     ----------
@@ -194,21 +175,21 @@ def certify_model(
     record = scenario.simulate(seed)
     place = _region(example, record, region, inputs)
     horizons = horizons_of(scenario.horizon if horizon is None else horizon)
-    errors: dict[str, QpmheError] = {}
-    findings, detected, observed, certificate = certified(
-        system, observer, cost, place, horizons, _sizes(example), deadline, errors=errors
-    )
-    report = Report(
-        name or scenario.title, example, record, findings, certificate, detected, observed, errors
-    )
-    if certificate is not None:
+    certificate = examined(system, observer, cost, place, horizons, _sizes(example), deadline)
+    report = Report(name or scenario.title, example, record, certificate)
+    if certificate.holds:
         report.estimator = MovingHorizonEstimator(
             system, observer, cost, horizon=horizons[-1],
             initial_state=scenario.initial_estimate, max_qps=_QPS, engine="python",
         )
         report.run, report.summary = monitored_run(
-            certificate, report.estimator, record.measurements, record.inputs
+            certificate, report.estimator, record.measurements, record.inputs,
+            initial_error=initial_error(example),
         )
+        if certificate.observer_bound is not None:
+            report.band = certificate.observer_bound.along(
+                report.run, initial_error=initial_error(example)
+            )
     return report
 
 
@@ -236,11 +217,17 @@ def _region(
     )
 
 
-def _sizes(example: Example) -> Sizes:
-    """Three standard deviations of the scenario's noises."""
+def _sizes(example: Example) -> SignalBounds:
+    """The system's W and V, or three standard deviations of the scenario's noises."""
     scenario = example.scenario
-    w, v = (
-        _SIGMAS * float(np.sqrt(np.linalg.eigvalsh(matrix)[-1]))
-        for matrix in (scenario.disturbance_covariance, scenario.noise_covariance)
+    return SignalBounds.usual(
+        example.system, scenario.disturbance_covariance, scenario.noise_covariance,
+        "the model's scenario",
     )
-    return Sizes(w, v)
+
+
+def initial_error(example: Example) -> Box:
+    """As far as the scenario's first state is from its first estimate, in each component."""
+    scenario = example.scenario
+    away = np.abs(scenario.initial_state - scenario.initial_estimate)
+    return Box(-away, away)

@@ -118,12 +118,16 @@ def certify(
     seconds: Annotated[
         float, typer.Option(help="How long the search may take, about.")
     ] = 60.0,
+    details: Annotated[
+        bool, typer.Option("--details", help="The theorem's assumptions and constants as well.")
+    ] = False,
 ) -> None:
-    """What the theorem guarantees for a model: its assumptions checked, its constants computed."""
+    """What is proved of a model: the observer's error, and what the theorem guarantees."""
     from .certify import certify as run
 
     certified = run(
-        Console(), model, box, horizon, report, input_box=input_box, seed=seed, seconds=seconds
+        Console(), model, box, horizon, report, input_box=input_box, seed=seed, seconds=seconds,
+        details=details,
     )
     if not certified:
         raise typer.Exit(1)

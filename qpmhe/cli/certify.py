@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich import box as boxes
 from rich.console import Console
 from rich.markup import escape
@@ -25,7 +26,7 @@ from ..models.loading import find, load
 def certify(
     console: Console, model: str, box: str | None = None, horizon: str | None = None,
     report: Path | None = None, *, input_box: str | None = None, seed: int = 0,
-    seconds: float = 60.0,
+    seconds: float = 60.0, details: bool = False,
 ) -> bool:
     """Certify a model with `qpmhe.certificates.certify_model`, and show the result."""
     horizons = _horizons(horizon)
@@ -40,32 +41,85 @@ def certify(
             example, horizon=horizons or None, region=region, inputs=inputs, seed=seed,
             seconds=seconds, name=model,
         )
-    console.print(f"[bold]{title}[/], on {_words(found.region)}", highlight=False)
-    console.print(_assumptions_table(found.audit))
-    if found.detectability is not None or found.stability is not None:
-        console.print(_ingredients_table(found.detectability, found.stability))
-    if found.certificate is None:
-        _show_failures(console, found)
-    else:
-        console.print(_bounds_table(found.certificate))
-        console.print(f"Simulated record, seed {seed}: {found.summary}", highlight=False)
-        names = f"The bounds need: {', '.join(NEEDED)}. Reported only: {', '.join(UNNEEDED)}."
-        console.print(names.replace("_", " "), highlight=False)
-        for text in ASSUMED:
-            console.print(f"Assumed: {text}.", highlight=False)
+    certificate = found.certificate
+    _print(console, f"[bold]{escape(certificate.headline)}[/]")
+    rows = Table.grid(padding=(0, 2))
+    for name, text in (
+        ("model", title), ("states", _words(found.region)), *_findings(found, seed),
+    ):
+        rows.add_row(f"[dim]  {name}[/]", escape(text))
+    console.print(rows, highlight=False)
+    for text in certificate.failures:
+        _print(console, f"[bold red]Not certified:[/] {escape(text)}")
+    if not certificate.holds:
+        _print(
+            console, "What holds without any certificate: the estimate costs no more than the "
+            "observer's candidate, at each step and with any solver.",
+        )
+    if details:
+        _show_details(console, found)
+    elif certificate.bounds or certificate.audit is not None:
+        _print(console, "[dim]The theorem's assumptions and constants: --details[/]")
     if report is not None:
         for path in found.save(report):
-            console.print(f"wrote {path}", highlight=False)
-    return found.certificate is not None
+            console.print(f"wrote {escape(str(path))}", highlight=False, soft_wrap=True)
+    return certificate.holds
 
 
-def _show_failures(console: Console, found: Report) -> None:
-    for text in found.failures:
-        console.print(f"[bold red]Not certified:[/] {escape(text)}", highlight=False)
-    console.print(
-        "What holds without any certificate: the estimate costs no more than the observer's "
-        "candidate, at each step and with any solver.", highlight=False,
-    )
+def _print(console: Console, text: str) -> None:
+    console.print(text, highlight=False)
+
+
+def _findings(found: Report, seed: int) -> list[tuple[str, str]]:
+    """What the bounds are for, what they need, and what they came to on the simulated record."""
+    certificate, proved, rows = found.certificate, found.certificate.observer_bound, []
+    if proved is not None:
+        rows.append(("for", str(proved.sizes)))
+        rows.append(("while", ASSUMED[0]))
+        if found.example.system.states is not None and not proved.projects:
+            rows.append((
+                "projection", "the observer is projected onto X in another metric than the "
+                "certified one: samples at which it is end the bound. Luenberger(gain, "
+                f"metric={np.array2string(proved.metric, separator=', ', floatmode='unique')})"
+                .replace("\n", "") + " keeps it",
+            ))
+    if found.band is not None and found.run is not None:
+        errors = np.linalg.norm(found.record.states - found.run.states, axis=1)
+        held = np.isfinite(found.band.error)
+        rows.append((
+            "simulated", f"seed {seed}: |x - x_hat| <= {found.band.error[held].max():.3g} was "
+            f"guaranteed, and {errors[held].max():.3g} was the largest; {found.band}",
+        ))
+    for N in certificate.horizons:
+        limits = ", ".join(
+            f"{certificate.limit(horizon=N, kind=kind):.3g} ({LABELS[kind]})"
+            for kind in certificate.kinds if kind != "measured"
+        )
+        nothing = all(
+            certificate.vacuous(horizon=N, kind=kind)
+            for kind in certificate.kinds if kind != "measured"
+        )
+        rows.append((
+            f"N = {N}", f"|x - x_hat| <= {limits} in the limit ({certificate.evidence})"
+            + (f": vacuous, the region's diameter is {certificate.diameter:.3g}" if nothing
+               else ""),
+        ))
+    return rows
+
+
+def _show_details(console: Console, found: Report) -> None:
+    certificate = found.certificate
+    if certificate.audit is not None:
+        console.print(_assumptions_table(certificate.audit))
+    if certificate.detectability is not None or certificate.stability is not None:
+        console.print(_ingredients_table(certificate.detectability, certificate.stability))
+    if certificate.bounds:
+        console.print(_bounds_table(certificate))
+        _print(console, f"Simulated record: {found.summary}")
+        names = f"The bounds need: {', '.join(NEEDED)}. Reported only: {', '.join(UNNEEDED)}."
+        _print(console, names.replace("_", " "))
+    for text in ASSUMED:
+        _print(console, f"Assumed: {text}.")
 
 
 def _horizons(text: str | None) -> list[int]:
@@ -156,7 +210,7 @@ def _ingredients_table(
 
 def _bounds_table(certificate: Certificate) -> Table:
     """The constants of the bounds, and what they come to."""
-    sizes = certificate.sizes
+    sizes = certificate.sizes.lengths
     table = _table(
         "Bounds of the error (eq:RGES_result)",
         f"Limit: for |w| <= {sizes.disturbance:.3g} and |v| <= {sizes.noise:.3g} at all "
@@ -170,7 +224,7 @@ def _bounds_table(certificate: Certificate) -> Table:
                 continue
             paper = bounds.paper.result
             constants = (*paper.constants, paper.rate) if kind == "paper" else ("",) * 4
-            limit = certificate.limit(sizes.disturbance, sizes.noise, horizon=N, kind=kind)
+            limit = certificate.limit(horizon=N, kind=kind)
             vacuous = certificate.vacuous(horizon=N, kind=kind)
             rows.append((
                 str(N) if kind == "paper" else "", LABELS[kind], *constants, limit,

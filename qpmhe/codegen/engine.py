@@ -157,6 +157,12 @@ class CompiledEngine:
         return state
 
     @property
+    def observer_state(self) -> Array:
+        """The state from which the observer goes on."""
+        state: Array = self._memory[0]["z_end"].copy()
+        return state
+
+    @property
     def length(self) -> int:
         """Number of samples in the window."""
         return int(self._memory[0]["length"])
@@ -262,6 +268,7 @@ class CompiledEngine:
         """Take a whole record in without leaving C; times are means over some samples."""
         samples = len(ys)
         log, start = self._library.log((samples,)), self.state
+        observer_start = self.observer_state
         dropped = self._memory["dropped"][0].copy()
         times = np.empty(samples)
         ys = np.ascontiguousarray(ys)
@@ -286,6 +293,7 @@ class CompiledEngine:
             solve_times=np.full(samples, np.nan), qps=log.qps.astype(np.intp),
             solver_iterations=log.iterations.astype(np.intp), delayed=log.delayed,
             flags=log.flags, engine=self.name,
+            observer_states=np.vstack((observer_start, log.observer_states)),
         )
 
     def covariances(self) -> Array:

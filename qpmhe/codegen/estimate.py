@@ -132,6 +132,12 @@ class CompiledEstimate(Estimate):
         return self._block[self._block.size - self._sizes[0] :]
 
     @property
+    def observer_state(self) -> Array:  # type: ignore[override]
+        """z(t+1), the state from which the observer goes on."""
+        n = self._sizes[0]
+        return self._block[-2 * n : self._block.size - n]
+
+    @property
     def delayed(self) -> Array | None:  # type: ignore[override]
         """Estimate of x(t+1-k) for the estimator's delay k."""
         at = self._numbers[0] - self._delay

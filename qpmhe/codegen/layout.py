@@ -189,8 +189,8 @@ class Layout:
         return _struct([
             ("cost", r), ("candidate_cost", r), ("trajectory", r, (count + 1, n)),
             ("candidate", r, (count + 1, n)), ("disturbances", r, (count, n)),
-            ("noises", r, (count, p)), ("filtered", r, n), ("time", np.int64),
-            ("length", np.int32), ("status", np.int32), ("qps", np.int32),
+            ("noises", r, (count, p)), ("observer_state", r, n), ("filtered", r, n),
+            ("time", np.int64), ("length", np.int32), ("status", np.int32), ("qps", np.int32),
             ("iterations", np.int32), ("corrections", np.int32), ("nearest_points", np.int32),
             ("dropped", np.uint8, self.rows),
         ])

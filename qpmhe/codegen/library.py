@@ -218,7 +218,9 @@ class RunLog:
     """Arrays for what `mhe_run` writes, and the structure that points to them."""
 
     def __init__(self, shape: tuple[int, ...], n: int) -> None:
-        self.states, self.filtered, self.delayed = (np.empty((*shape, n)) for _ in range(3))
+        self.states, self.filtered, self.delayed, self.observer_states = (
+            np.empty((*shape, n)) for _ in range(4)
+        )
         self.costs, self.candidate_costs = np.empty(shape), np.empty(shape)
         self.flags, self.qps, self.iterations = (np.empty(shape, np.int32) for _ in range(3))
 
@@ -226,7 +228,7 @@ class RunLog:
         """The C structure of pointers to the entries from an index on."""
         arrays = (
             self.states, self.filtered, self.delayed, self.costs, self.candidate_costs,
-            self.flags, self.qps, self.iterations,
+            self.flags, self.qps, self.iterations, self.observer_states,
         )
         addresses = [array.ctypes.data + first * array.strides[0] for array in arrays]
         return (ctypes.c_void_p * len(addresses))(*addresses)

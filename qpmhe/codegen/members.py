@@ -97,6 +97,12 @@ class CompiledMembers:
         states: Array = self._memory["history"][np.arange(len(newest)), newest]
         return states
 
+    @property
+    def observer_states(self) -> Array:
+        """The states (K, n) from which the observers go on."""
+        states: Array = self._memory["z_end"].copy()
+        return states
+
     def step(self, y: Array, u: Array) -> dict[str, Any]:
         """Take a sample of each member in, and estimate."""
         ys, us = np.ascontiguousarray(y), np.ascontiguousarray(u)
@@ -117,6 +123,7 @@ class CompiledMembers:
         states = slice(0, int(found["length"][0]) + 1)
         return {
             "time": self.time - 1, "filtered": found["filtered"],
+            "observer_states": found["observer_state"],
             "trajectories": found["trajectory"][:, states], "costs": found["cost"],
             "candidates": found["candidate"][:, states],
             "candidate_costs": found["candidate_cost"],
@@ -126,6 +133,7 @@ class CompiledMembers:
     def run(self, y: Array, u: Array) -> dict[str, Any]:
         """Take records (K, T, p) and (K, T, m) in without leaving C."""
         ys, us, start = np.ascontiguousarray(y), np.ascontiguousarray(u), self.states
+        observers = self.observer_states
         samples, dropped = ys.shape[1], self._memory["dropped"].copy()
         before = None if self._next_check == math.inf or not samples else self._memory.copy()
         log = self._library.log(ys.shape[:2])
@@ -150,6 +158,7 @@ class CompiledMembers:
         return {
             "states": np.concatenate((start[:, None], log.states), axis=1),
             "filtered": log.filtered, "delayed": log.delayed,
+            "observer_states": np.concatenate((observers[:, None], log.observer_states), axis=1),
             "costs": log.costs, "candidate_costs": log.candidate_costs,
             "statuses": log.flags.astype(np.int64), "qps": log.qps.astype(np.intp),
         }

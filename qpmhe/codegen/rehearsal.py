@@ -338,6 +338,7 @@ class _Rehearsal:
         outputs = np.nan_to_num(abs(expected.noises)).max(axis=0) + np.nan_to_num(abs(y))
         for name, sizes in (
             ("candidate", states), ("trajectory", states), ("filtered", states),
+            ("observer_state", states),
             ("disturbances", states if width == states.size else states.max()),
             ("noises", outputs),
         ):
@@ -358,7 +359,10 @@ class _Rehearsal:
             us.ctypes.data if us.size else None, log.pointers(0),
         )
         made = [
-            (log.states[t], log.filtered[t], log.costs[t], log.candidate_costs[t])
+            (
+                log.states[t], log.filtered[t], log.observer_states[t], log.costs[t],
+                log.candidate_costs[t],
+            )
             for t in range(count)
         ]
         for t in range(count, min(count + _BY_MEMBERS, len(estimates))):
@@ -368,11 +372,13 @@ class _Rehearsal:
             )
             one = out[0].copy()
             made.append((
-                one["trajectory"][one["length"]], one["filtered"], one["cost"],
-                one["candidate_cost"],
+                one["trajectory"][one["length"]], one["filtered"], one["observer_state"],
+                one["cost"], one["candidate_cost"],
             ))
         for found, one in zip(made, estimates, strict=False):
-            expected = one.state, one.filtered, one.cost, one.candidate_cost
+            expected = (
+                one.state, one.filtered, one.observer_state, one.cost, one.candidate_cost
+            )
             for got, true in zip(found, map(np.asarray, expected), strict=True):
                 if _differs(np.asarray(got), true, ROUNDING * abs(true).max()):
                     return "samples of a run differ from single ones"

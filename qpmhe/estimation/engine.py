@@ -179,6 +179,11 @@ class PythonEngine:
         return self._history[-1].copy()
 
     @property
+    def observer_state(self) -> Array:
+        """The state from which the observer goes on."""
+        return self._window.observer_state.copy()
+
+    @property
     def time(self) -> int:
         """Number of measurements taken so far."""
         return self._window.time
@@ -301,9 +306,11 @@ class PythonEngine:
             outcome.nearest_points,
             filtered,
             self._disturbances,
+            window.observer_state.copy(),
         )
         if window.newest_failed and outcome.improved:
             window.restart(estimate.state)
+            estimate.observer_state = estimate.state.copy()
         # The estimate's arrays are the user's.
         self._trajectory = (trajectory if outcome.followed is None else outcome.followed).copy()
         estimate.step_time = perf_counter() - began

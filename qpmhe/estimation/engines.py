@@ -41,6 +41,10 @@ class Engine(Protocol):
         """The current estimate, a copy."""
 
     @property
+    def observer_state(self) -> Array:
+        """The state from which the observer goes on, a copy."""
+
+    @property
     def time(self) -> int:
         """Number of measurements taken so far."""
 

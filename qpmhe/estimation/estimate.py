@@ -157,6 +157,9 @@ class Estimate:
         included; cost <= candidate_cost.
     candidate : (N_t + 1, n) array
         The observer's trajectory.
+    observer_state : (n,) array
+        z(t+1), the state from which the observer goes on. With ``candidate="reinitialized"`` it
+        is that of the observer that started anew at the window's first estimate.
     delayed : (n,) array or None
         Estimate of x(t+1-k) for the estimator's delay k; None until the window reaches it.
     dropped : tuple of DroppedRow
@@ -181,7 +184,7 @@ class Estimate:
 
     __slots__ = (
         "_filtered", "_residuals", "_width", "candidate", "candidate_cost", "corrections", "cost",
-        "delayed", "dropped", "message", "nearest_points", "qps", "solve_time",
+        "delayed", "dropped", "message", "nearest_points", "observer_state", "qps", "solve_time",
         "solver_iterations", "state", "status", "step_time", "time", "trajectory",
     )
 
@@ -206,6 +209,7 @@ class Estimate:
         nearest_points: int = 0,
         filtered: Array | None = None,
         disturbances: int | None = None,
+        observer_state: Array | None = None,
     ) -> None:
         self.time = time
         self._width = trajectory.shape[1] if disturbances is None else disturbances
@@ -214,6 +218,7 @@ class Estimate:
         self._residuals = residuals
         self.cost, self.candidate_cost = cost, candidate_cost
         self.candidate = candidate
+        self.observer_state: Array = candidate[-1] if observer_state is None else observer_state
         self.status, self.message = status, message
         self.qps, self.solver_iterations = qps, solver_iterations
         self.corrections, self.nearest_points, self.dropped = corrections, nearest_points, dropped

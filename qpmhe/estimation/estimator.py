@@ -244,6 +244,11 @@ class MovingHorizonEstimator:
         return self._engine.state
 
     @property
+    def observer_state(self) -> Array:
+        """z(t+1), the state from which the observer goes on; at first the initial state."""
+        return self._engine.observer_state
+
+    @property
     def engine(self) -> str:
         """What runs the step: ``python`` or ``compiled``, also where ``engine="auto"`` chose."""
         return self._engine.name
@@ -547,14 +552,15 @@ class MovingHorizonEstimator:
         if at_once is not None:
             at_once.source = self.run_source(ys, whole)
             return at_once
-        start, estimates, collected = self.state.copy(), [], []
+        start, observer_start = self.state.copy(), self.observer_state
+        estimates, collected = [], []
         for y, u in zip(ys, [None] * len(ys) if us is None else us, strict=True):
             estimates.append(self.update(y, u))
             if covariances:
                 collected.append(self._newest_covariance())
         n = self.system.n
         blocks = np.array(collected).reshape(-1, n, n) if covariances else None
-        run = Run.of(start, estimates, blocks)
+        run = Run.of(start, estimates, blocks, observer_start=observer_start)
         run.source = self.run_source(ys, whole)
         return run
 

@@ -66,6 +66,8 @@ class Run:
         Delayed estimates, NaN until the window reaches the delay.
     flags : (T,) array
         Values of the statuses.
+    observer_states : (T + 1, n) array
+        The observer's own states z(0), ..., z(T).
     covariances : (T, n, n) array, optional
         Covariances of the estimates of x(1), ..., x(T), if requested; NaN where the model
         could not be linearised.
@@ -97,6 +99,7 @@ class Run:
         solver_iterations: Integers,
         delayed: Array,
         flags: NDArray[np.integer[Any]],
+        observer_states: Array,
         covariances: Array | None = None,
         engine: str = "python",
     ) -> None:
@@ -105,10 +108,12 @@ class Run:
         self.times, self.solve_times = times, solve_times
         self.qps, self.solver_iterations = qps, solver_iterations
         self.flags, self.covariances, self.engine = flags, covariances, engine
+        self.observer_states = observer_states
 
     @classmethod
     def of(
-        cls, start: Array, estimates: Sequence[Estimate], covariances: Array | None = None
+        cls, start: Array, estimates: Sequence[Estimate], covariances: Array | None = None, *,
+        observer_start: Array | None = None,
     ) -> Run:
         """Collect the estimates of single updates.
 
@@ -120,8 +125,11 @@ class Run:
             One for each update.
         covariances : (T, n, n) array, optional
             Covariances of their states.
+        observer_start : (n,) array, optional
+            The observer's state before the first update; the estimate if left out, as at time 0.
         """
         n = start.size
+        first = start if observer_start is None else observer_start
         nothing = np.full(n, np.nan)
         return cls(
             states=np.array([start, *(e.state for e in estimates)]),
@@ -139,6 +147,7 @@ class Run:
                 [nothing if e.delayed is None else e.delayed for e in estimates]
             ).reshape(-1, n),
             flags=np.array([e.status.value for e in estimates], dtype=np.intp),
+            observer_states=np.array([first, *(e.observer_state for e in estimates)]),
             covariances=covariances,
             engine=", then ".join(dict.fromkeys(one.engine for one in estimates)) or "python",
         )

@@ -561,6 +561,11 @@ class Window(Stages):
         if self._with_terms:
             self.terms.set_stage(stage, self._weights[k])
 
+    @property
+    def observer_state(self) -> Array:
+        """z(t), the observer's newest state: a view."""
+        return self._z[self.end]
+
     def restart(self, state: Array) -> None:
         """Set z(t), the observer's newest state, after a failed stage."""
         self._z[self.end] = state

@@ -9,7 +9,10 @@ from .cases import CASES, case
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 
-ARRAYS = ("state", "filtered", "trajectory", "candidate", "disturbances", "noises", "delayed")
+ARRAYS = (
+    "state", "filtered", "trajectory", "candidate", "observer_state", "disturbances", "noises",
+    "delayed",
+)
 EVENTS = ("status", "qps", "dropped", "time", "corrections", "nearest_points")
 
 
@@ -65,7 +68,7 @@ def test_the_same_runs(name):
     U = np.array([sample["u"] for sample in one.samples]) if one.system.m else None
     expected, found = (one.estimator(engine).run(Y, U) for engine in ("python", "compiled"))
     np.testing.assert_array_equal(found.flags, expected.flags)
-    for array in ("states", "filtered", "costs", "candidate_costs"):
+    for array in ("states", "filtered", "observer_states", "costs", "candidate_costs"):
         a, b = getattr(expected, array), getattr(found, array)
         largest = np.abs(a[np.isfinite(a)]).max(initial=0.0)
         np.testing.assert_allclose(

@@ -61,7 +61,7 @@ static void tell(const mhe_estimate *o)
     put(o->cost); put(o->candidate_cost);
     show((n + 1) * MHE_NX, o->trajectory); show((n + 1) * MHE_NX, o->candidate);
     show(n * MHE_NX, o->disturbances); show(n * MHE_NY, o->noises);
-    show(MHE_NX, o->filtered);
+    show(MHE_NX, o->filtered); show(MHE_NX, o->observer_state);
 }
 
 static mhe_settings settings;
@@ -74,7 +74,8 @@ static void run(mhe_workspace *k)
     mhe_real *u = numbers((size_t)count * MHE_NU), *out = malloc(sizeof *out * (size_t)count * 99);
     int32_t *flags = malloc(sizeof *flags * (size_t)count * 3);
     mhe_log log = {out, out + count * MHE_NX, out + 2 * count * MHE_NX, out + 3 * count * MHE_NX,
-                   out + (3 * MHE_NX + 1) * count, flags, flags + count, flags + 2 * count};
+                   out + (3 * MHE_NX + 1) * count, flags, flags + count, flags + 2 * count,
+                   out + (3 * MHE_NX + 2) * count};
     const mhe_log nothing = {0};
     for (int silent = 0; silent < 2; silent++) {
         for (int i = 0; i < members; i++)
@@ -82,6 +83,7 @@ static void run(mhe_workspace *k)
         mhe_run(es, members, k, samples, y, MHE_NU ? u : 0, silent ? &nothing : &log);
     }
     for (int j = 0; j < 3 * MHE_NX; j++) show(count, out + j * count);
+    show(count * MHE_NX, log.observer_states);
     show(2 * count, log.costs);
     for (int i = 0; i < 2 * count; i++) put(flags[i]);
     mhe_estimate *os = malloc(sizeof *os * (size_t)members);
@@ -237,14 +239,14 @@ def play(program, mhe, commands, options=None):
             numbers = numbers[1:]
         head, numbers = numbers[:7], numbers[7:]
         K = int(head[0])
-        shapes = [(K + 1, n), (K + 1, n), (K, n), (K, p), (n,)]
+        shapes = [(K + 1, n), (K + 1, n), (K, n), (K, p), (n,), (n,)]
         parts = np.split(numbers, np.cumsum([np.prod(shape) for shape in shapes]))
         numbers = parts.pop()
         arrays = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
         estimates.append(SimpleNamespace(
             time=int(head[1]), status=Status(int(head[2])), qps=int(head[3]), cost=head[5],
             candidate_cost=head[6], trajectory=arrays[0], candidate=arrays[1],
-            disturbances=arrays[2], noises=arrays[3], filtered=arrays[4],
+            disturbances=arrays[2], noises=arrays[3], filtered=arrays[4], observer_state=arrays[5],
             nearest_points=int(head[4]),
         ))
     assert numbers.size == 0
@@ -304,7 +306,9 @@ def check(found, expected, tolerance, statuses=True):
         assert one.cost <= one.candidate_cost
         if statuses:
             assert one.status == other.status
-        for name in ("trajectory", "candidate", "disturbances", "noises", "filtered"):
+        for name in (
+            "trajectory", "candidate", "disturbances", "noises", "filtered", "observer_state"
+        ):
             np.testing.assert_allclose(
                 getattr(one, name), getattr(other, name), rtol=0, atol=tolerance, err_msg=name
             )
@@ -475,8 +479,10 @@ def test_records_of_several_members(with_sets):
     ys[1, 4], ys[2, 5, 0] = np.nan, np.nan
     numbers = answers(with_sets, mhe.settings, np.zeros(n), 3, members, samples, x0, ys, us)
     count = members * samples
-    states, filtered, delayed = numbers[: 3 * n * count].reshape(3, members, samples, n)
-    costs, candidates, flags, qps = numbers[3 * n * count : -members * n].reshape(
+    states, filtered, delayed, observers = numbers[: 4 * n * count].reshape(
+        4, members, samples, n
+    )
+    costs, candidates, flags, qps = numbers[4 * n * count : -members * n].reshape(
         4, members, samples
     )
     together = numbers[-members * n :].reshape(members, n)
@@ -489,6 +495,7 @@ def test_records_of_several_members(with_sets):
         np.testing.assert_allclose(states[i], run.states[1:], atol=1e-5)
         np.testing.assert_allclose(filtered[i], run.filtered, atol=1e-5)
         np.testing.assert_allclose(delayed[i], run.delayed, atol=1e-5)
+        np.testing.assert_allclose(observers[i], run.observer_states[1:], atol=1e-5)
         np.testing.assert_allclose(costs[i], run.costs, rtol=1e-5, atol=1e-8)
         assert (costs[i] <= candidates[i]).all()
         assert (qps[i] >= 1).all()
@@ -503,7 +510,7 @@ def test_late_beyond_the_window(time, with_sets):
     numbers = answers(
         with_sets, mhe.settings, np.zeros(3), *itertools.chain(*commands), 2, time, 0.1, 0.1
     )
-    size = 7 + 2 * 5 * 3 + 4 * 3 + 4 * 2 + 3  # of an estimate of a full window
+    size = 7 + 2 * 5 * 3 + 4 * 3 + 4 * 2 + 6  # of an estimate of a full window
     assert numbers[-size - 1] == -1.0
     assert np.array_equal(numbers[-size:], numbers[-2 * size - 1 : -size - 1])  # as it was
 

@@ -219,13 +219,16 @@ def test_records_and_samples_in_turn():
     assert empty.statuses == []
     for first, last in ((0, 3), (3, 4), (4, 4), (4, 15), (15, STEPS)):
         Y, U = model.Y[first:last], model.U[first:last]
-        kept = other.state.copy()
+        kept, start = other.state.copy(), other.observer_state
         if first == 3:
-            run = qpmhe.Run.of(kept, [other.update(Y[0], U[0])])
+            run = qpmhe.Run.of(kept, [other.update(Y[0], U[0])], observer_start=start)
         else:
             run = other.run(Y[::-1][::-1], np.asfortranarray(U))
         expected = [one.update(y, u) for y, u in zip(Y, U, strict=True)]
         np.testing.assert_array_equal(run.states, [kept, *(e.state for e in expected)])
+        np.testing.assert_array_equal(
+            run.observer_states, [start, *(e.observer_state for e in expected)]
+        )
         np.testing.assert_array_equal(other.state, one.state)
         assert other.time == one.time
     equal(other.amend(STEPS - 2, [0.3]), one.amend(STEPS - 2, [0.3]))

@@ -108,6 +108,7 @@ def test_shares_of_steps_that_fail_are_fallback():
             candidate_costs=ones, times=ones, solve_times=ones, qps=np.arange(len(flags)),
             solver_iterations=np.array([-1, 4] + [-1] * (len(flags) - 2)),
             delayed=ones[:, None], flags=np.array([flag.value for flag in flags]),
+            observer_states=np.zeros((len(flags) + 1, 1)),
         )
 
     status = qpmhe.Status

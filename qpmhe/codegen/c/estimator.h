@@ -260,6 +260,7 @@ typedef struct {
     mhe_real candidate[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real disturbances[MHE_HORIZON * MHE_NX];
     mhe_real noises[MHE_HORIZON * MHE_NY];
+    mhe_real observer_state[MHE_NX]; /* from which the observer goes on, at t+1 */
     mhe_real filtered[MHE_NX];     /* estimate of x(t) that has used y(t) */
     int64_t time;                  /* of the newest sample */
     int32_t length, status, qps, iterations, corrections, nearest_points;
@@ -340,6 +341,7 @@ typedef struct {
     mhe_real *states, *filtered, *delayed;   /* MHE_NX each */
     mhe_real *costs, *candidate_costs;
     int32_t *status, *qps, *iterations;
+    mhe_real *observer_states;     /* MHE_NX each */
 } mhe_log;
 
 /* Forget all samples and start at x0, or at the nearest point of X. The settings are not copied:

@@ -111,6 +111,7 @@ static void mhe_fill(mhe_estimator *e, const mhe_workspace *k, const mhe_outcome
     out->iterations = o->iterations;
     out->corrections = o->corrections;
     out->nearest_points = o->nearest_points;
+    memcpy(out->observer_state, e->z_end, sizeof e->z_end);
     mhe_filtered(e, o, out->filtered);
 #if CONSTRAINED
     if (o->rows_dropped)
@@ -272,6 +273,8 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64
                 if (log->delayed)
                     log->delayed[at * NX + j] = delay <= count ? newest[j - delay * NX] : NAN;
             }
+            if (log->observer_states)
+                memcpy(log->observer_states + at * NX, e->z_end, sizeof e->z_end);
             if (log->filtered) mhe_filtered(e, &o, log->filtered + at * NX);
             if (log->costs) log->costs[at] = o.best->cost;
             if (log->candidate_costs) log->candidate_costs[at] = o.candidate->cost;

@@ -1,0 +1,616 @@
+r"""The proved bound of the observer's error, and the set around its state that holds the truth.
+
+Where the observer is shown to contract on a region (`ErrorContraction`), any two x, z of it have
+
+.. math::
+    |e^+|_P \le \rho |e|_P + |w - L v|_P, \qquad e = x - z,
+
+so that :math:`b(t+1) = \rho\, b(t) + |w(t) - L v(t)|_P` bounds :math:`|x(t) - z(t)|_P` from a
+bound of the initial error on, and x(t) is in :math:`\{\xi : |\xi - z(t)|_P \le b(t)\}`. Every
+estimate beside the observer is at most as far from x(t) as from the farthest point of this set.
+No cost, horizon or detectability enters.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qpmhe_solvers.values import shown
+
+from .._checks import Array, numbers
+from .._linalg import inverse
+from ..costs import Cost
+from ..errors import OptionError, SetError, ShapeError
+from ..estimation.estimate import Status
+from ..estimation.run import Run
+from ..model.sets import Box, ConvexSet
+from ..model.system import System
+from ..observers import Observer
+from .evidence import Evidence, json_ready
+from .inequalities import Matrices, definite
+from .properties import ObserverStability
+from .regions import Region, stated_region
+from .theorem import Sizes, checked_length
+
+#: What bounds w or v: a length, a set, or lengths (T,) or vectors (T, n) at each sample.
+Size = ArrayLike | ConvexSet
+
+_UNIT = float(np.finfo(np.float64).eps)
+# More than the rounding of a sum, a product and a root, each.
+_OUTWARD = 1.0 + 16.0 * _UNIT
+_SIGMAS = 3.0
+# Boxes with more corners are bounded by sums over their sides.
+_MOST_CORNERS = 4096
+# Halvings of the bracket of a multiplier, each value of which gives a bound.
+_HALVINGS = 20
+_SLACKS = (1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
+
+#: Samples after which the inequality says nothing of the observer's next state, and why.
+_BREAKS = (
+    (Status.MISSING, "a measurement was missing"),
+    (Status.MODEL_FAILED, "the model failed, and the observer started again"),
+)
+
+
+@dataclass(frozen=True)
+class SignalBounds:
+    """What bounds disturbances and noises at all times, and where that comes from.
+
+    Parameters
+    ----------
+    disturbances, noises : float or ConvexSet
+        The largest |w| and |v|, or sets that hold w and v; of a set, the box around it is used.
+    source : str
+        In words, for reports.
+    """
+
+    disturbances: float | ConvexSet
+    noises: float | ConvexSet
+    source: str = "as stated"
+
+    def __post_init__(self) -> None:
+        for name in ("disturbances", "noises"):
+            _read(name, getattr(self, name))
+
+    @classmethod
+    def usual(
+        cls, system: System, w_covariance: Array, v_covariance: Array, origin: str
+    ) -> SignalBounds:
+        """The system's W and V, and three standard deviations where these are not bounded."""
+        found: list[ConvexSet] = []
+        sources: list[str] = []
+        spread = system.state_covariance(w_covariance)
+        for letter, stated, covariance in (
+            ("W", system.disturbances, spread), ("V", system.noises, v_covariance),
+        ):
+            of_states = letter == "V" or system.disturbance_matrix is None
+            if stated is not None and of_states and np.isfinite(_bounds(stated)).all():
+                found.append(stated)
+                sources.append(f"the system's {letter}")
+            else:
+                half = _SIGMAS * np.sqrt(np.diag(covariance))
+                found.append(Box(-half, half))
+                sources.append(f"three standard deviations of {origin}")
+        return cls(found[0], found[1], " and ".join(dict.fromkeys(sources)))
+
+    @classmethod
+    def of(cls, sizes: SignalBounds | Sizes | None, system: System, cost: Cost) -> SignalBounds:
+        """Those that are stated, or the usual ones with the weights as inverse covariances."""
+        if isinstance(sizes, Sizes):
+            return cls(sizes.disturbance, sizes.noise)
+        if sizes is not None:
+            return sizes
+        covariance, factor = inverse(cost.disturbance), cost.disturbance_factor
+        if factor is not None:
+            covariance = factor @ covariance @ factor.T
+        return cls.usual(system, covariance, inverse(cost.noise), "the cost's inverse weights")
+
+    @property
+    def largest(self) -> tuple[float, float]:
+        """The largest |w| and |v|."""
+        w, v = (
+            float(given) if not isinstance(given, ConvexSet)
+            else float(np.linalg.norm(np.abs(_sides(name, given)).max(axis=0))) * _OUTWARD
+            for name, given in (("disturbances", self.disturbances), ("noises", self.noises))
+        )
+        return w, v
+
+    @property
+    def lengths(self) -> Sizes:
+        """The largest |w| and |v|; 1 each where there are neither disturbances nor noises."""
+        return Sizes(*self.largest) if max(self.largest) > 0.0 else Sizes()
+
+    def __str__(self) -> str:
+        return f"{_words('w', self.disturbances)}, {_words('v', self.noises)} ({self.source})"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything in types that JSON knows."""
+        return {"source": self.source} | {
+            name: _sides(name, given).tolist() if isinstance(given, ConvexSet) else float(given)
+            for name, given in (("disturbances", self.disturbances), ("noises", self.noises))
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The bound along a run, at the times 0, ..., T.
+
+    Attributes
+    ----------
+    radius : (T + 1,) array
+        b(t), which bounds |x(t) - z(t)|_P; NaN from where the bound no longer holds.
+    lower, upper : (T + 1, n) array
+        Sides of a box that holds the true state.
+    error : (T + 1,) array
+        What |x(t) - x_hat(t)| is at most.
+    lost : int or None
+        The sample after which it no longer holds.
+    reason : str
+        Why; empty while it holds.
+    """
+
+    radius: Array
+    lower: Array
+    upper: Array
+    error: Array
+    lost: int | None = None
+    reason: str = ""
+
+    def __str__(self) -> str:
+        if self.lost is None:
+            return f"the bound holds at all {len(self.radius) - 1} samples"
+        return f"the bound holds up to sample {self.lost}: there {self.reason}"
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverBound:
+    """What is proved of the observer alone; it needs no cost, horizon or detectability.
+
+    Parameters
+    ----------
+    stability : ObserverStability
+        The certified contraction, with its P and gain.
+    region : Region
+        The set in which state and observer must stay.
+    sizes : SignalBounds
+        What bounds w and v unless something else is passed.
+    projection : ndarray or None
+        The metric in which the observer is projected onto X, if it has one of its own.
+    """
+
+    stability: ObserverStability
+    region: Region
+    sizes: SignalBounds
+    projection: Array | None = None
+
+    @property
+    def evidence(self) -> Evidence:
+        """What it rests on."""
+        return self.stability.evidence
+
+    @property
+    def rate(self) -> float:
+        """The contraction per step in the norm of `metric`."""
+        return self.stability.rho
+
+    @property
+    def metric(self) -> Array:
+        """P; an observer that is to be projected onto X takes it as its ``metric``."""
+        assert self.stability.P is not None
+        return self.stability.P
+
+    @property
+    def gain(self) -> Array:
+        """L, the observer's constant gain."""
+        assert self.stability.gain is not None
+        return self.stability.gain
+
+    @property
+    def projects(self) -> bool:
+        """Whether a projection of the observer onto X keeps the bound: in P, it does."""
+        return self.projection is not None and np.array_equal(self.projection, self.metric)
+
+    def of_observer(self, observer: Observer) -> ObserverBound:
+        """The same of an observer with this gain, which may be projected in another metric."""
+        return replace(self, projection=observer.metric)
+
+    @cached_property
+    def slopes(self) -> Array:
+        """The roots of P^-1's diagonal, (n,): |e_i| <= slopes[i] |e|_P, rounded outward."""
+        n = len(self.metric)
+        guess = np.diag(np.linalg.inv(self.metric))
+        for slack in _SLACKS:
+            found = guess * (1.0 + slack)
+            # e_i e_i^T / c < P exactly where (P^-1)_ii < c, by Schur's complement.
+            less = np.zeros((n, n, n))
+            less[range(n), range(n), range(n)] = 1.0 / found
+            rest = Matrices.exact(np.broadcast_to(self.metric, (n, n, n))) - Matrices(
+                less, 2.0 * _UNIT * less
+            )
+            if (found > 0.0).all() and definite(rest)[0].all():
+                return np.sqrt(found) * _OUTWARD
+        return np.full(n, math.inf)
+
+    @cached_property
+    def _axes(self) -> tuple[Array, Array]:
+        """Half axes of an ellipsoid around {|e|_P <= 1}, the longest first, and directions."""
+        n = len(self.metric)
+        ball = np.full(n, float(np.linalg.norm(self.slopes)) * _OUTWARD), np.eye(n)
+        try:
+            factor = np.linalg.cholesky(self.metric)
+            left, sizes, _ = np.linalg.svd(np.linalg.inv(factor).T)
+        except np.linalg.LinAlgError:
+            return ball
+        vectors = Matrices.exact(left)
+        turned = vectors.T @ (Matrices.exact(self.metric) @ vectors)
+        for slack in _SLACKS:
+            axes = (sizes + slack * sizes[0]) * (1.0 + slack)
+            least = np.diag(1.0 / axes**2)
+            rest = turned - Matrices(least, 4.0 * _UNIT * least)
+            if definite(Matrices(rest.middle[None], rest.radius[None]))[0].all():
+                # The directions are orthonormal up to rounding.
+                return axes * (1.0 + 16.0 * n * _UNIT), left
+        return ball
+
+    def length(self, errors: ArrayLike) -> Array:
+        """|e|_P of errors (..., n), rounded up."""
+        return _lengths(numbers("errors", errors), self.metric)
+
+    def initial(self, error: Size) -> float:
+        """b(0) from x(0) - z(0): a vector (n,), a bound on its length, or a set that holds it."""
+        given, n = _read("initial_error", error), len(self.metric)
+        if isinstance(given, ConvexSet):
+            return _largest("initial_error", given, n, self.metric)
+        if given.shape not in ((), (n,)):
+            raise ShapeError(
+                f"initial_error has shape {given.shape}; expected ({n},), a length, or a qpmhe.Box."
+            )
+        if given.shape == (n,):
+            return float(self.length(given))
+        return checked_length("initial_error", given) * _root(self.metric)
+
+    def entering(
+        self, disturbances: Size | None = None, noises: Size | None = None
+    ) -> Array:
+        """|w - L v|_P at most, at each sample (T,) or always (), rounded up.
+
+        Parameters
+        ----------
+        disturbances, noises : optional
+            Vectors (T, n) and (T, p), lengths (T,), a length or a set; `sizes` if left out.
+        """
+        w = _read("disturbances", self.sizes.disturbances if disturbances is None else disturbances)
+        v = _read("noises", self.sizes.noises if noises is None else noises)
+        n, p = self.gain.shape
+        if isinstance(w, ConvexSet) and isinstance(v, ConvexSet):
+            ws, vs = _corners("disturbances", w, n), _corners("noises", v, p)
+            if len(ws) * len(vs) in range(1, _MOST_CORNERS + 1):
+                return np.array(
+                    self._joint(np.repeat(ws, len(vs), 0), np.tile(vs, (len(ws), 1))).max()
+                )
+        first = _alone("disturbances", w, n, self.metric)
+        assert self.stability.V is not None
+        second = _alone("noises", v, p, self.stability.V)  # no less than L^T P L
+        if first.ndim and second.ndim and len(first) != len(second):
+            raise ShapeError(
+                f"disturbances has {len(first)} samples, and noises {len(second)}; expected the "
+                "same."
+            )
+        if not isinstance(w, ConvexSet) and not isinstance(v, ConvexSet) and w.ndim == v.ndim == 2:
+            return self._joint(w, v)
+        return (first + second) * _OUTWARD
+
+    def _joint(self, w: Array, v: Array) -> Array:
+        sizes = np.abs(w) + np.abs(v) @ np.abs(self.gain.T)
+        error = (self.gain.shape[1] + 2) * _UNIT * sizes
+        return (
+            _lengths(w - v @ self.gain.T, self.metric) + _lengths(error, np.abs(self.metric))
+        ) * _OUTWARD
+
+    def radii(self, steps: int, initial_error: Size, entering: Array) -> Array:
+        """b(0), ..., b(T), from what enters at each sample or always."""
+        if entering.ndim and len(entering) != steps:
+            raise ShapeError(
+                f"disturbances and noises have {len(entering)} samples; expected {steps}."
+            )
+        found, each = np.empty(steps + 1), np.broadcast_to(entering, steps)
+        found[0] = self.initial(initial_error)
+        for t in range(steps):
+            found[t + 1] = self.advanced(found[t], each[t])
+        return found
+
+    def advanced(self, radius: float, entering: float) -> float:
+        """b(t+1) from b(t), rounded up."""
+        return (self.rate * radius + float(entering)) * _OUTWARD
+
+    def at(
+        self, time: int, initial_error: Size, disturbances: Size | None = None,
+        noises: Size | None = None,
+    ) -> float:
+        """b(t) for bounds on w and v that hold at all times; arguments as of `along`."""
+        return float(self.radii(time, initial_error, self.entering(disturbances, noises))[-1])
+
+    def limit(self, disturbances: Size | None = None, noises: Size | None = None) -> float:
+        """What b(t) tends to as t grows, for bounds on w and v that hold at all times."""
+        entering = self.entering(disturbances, noises)
+        if entering.ndim:
+            raise OptionError(
+                "disturbances and noises are of single samples; expected bounds for all times."
+            )
+        return float(entering) / (1.0 - self.rate * _OUTWARD) * _OUTWARD
+
+    def components(self, radius: ArrayLike) -> Array:
+        """What each |x_i - z_i| is at most where |x - z|_P <= radius: (..., n) for (...)."""
+        return np.multiply.outer(np.asarray(radius, np.float64), self.slopes) * _OUTWARD
+
+    def around(self, radius: ArrayLike, observer: Array) -> tuple[Array, Array]:
+        """Sides (..., n) of a box that holds the true state: around z, and within the region."""
+        half = self.components(radius)
+        n = self.region.n
+        margin = _UNIT * (np.abs(observer) + half)
+        return (
+            np.maximum(observer - half - margin, self.region.lower[:n]),
+            np.minimum(observer + half + margin, self.region.upper[:n]),
+        )
+
+    def farthest(
+        self, radius: ArrayLike, offset: ArrayLike, observer: ArrayLike | None = None
+    ) -> Array:
+        r"""The largest |x_hat - xi| over the set around z, or a little more, (...).
+
+        Over :math:`|\xi - z|_P \le b` it is, by duality, the least value of
+
+        .. math::
+            \nu (b a_1)^2 + \sum_i o_i^2 \frac{\nu r_i}{\nu r_i - 1}, \qquad \nu > 1,
+
+        with the half axes :math:`a_i` of the set for b = 1, the longest first,
+        :math:`r_i = (a_1 / a_i)^2`, and the offset's components :math:`o_i` along them. Every
+        value is a bound; the one for :math:`\nu = 1 + |o| / (b a_1)` is at most
+        :math:`(|o| + b a_1)^2`, the triangle's.
+
+        Parameters
+        ----------
+        radius : (...) array_like
+            b.
+        offset : (..., n) array_like
+            x_hat - z.
+        observer : (..., n) array_like, optional
+            z; with it, only what is within the region counts.
+        """
+        b, o = np.asarray(radius, np.float64), np.asarray(offset, np.float64)
+        axes, directions = self._axes
+        along = (o @ directions) ** 2
+        ratios = (axes[0] / axes) ** 2
+        with np.errstate(all="ignore"):
+            ball, length = b * axes[0], np.sqrt(along.sum(axis=-1))
+            high = length / ball
+            low = np.zeros_like(high)
+            for _ in range(_HALVINGS):
+                middle = 0.5 * (low + high)
+                # Where the sum is more than the ball's, the multiplier is too small.
+                slope = (along * ratios / (ratios * (1.0 + middle)[..., None] - 1.0) ** 2).sum(-1)
+                small = slope > ball * ball
+                low, high = np.where(small, middle, low), np.where(small, high, middle)
+            nu = (1.0 + high)[..., None]
+            terms = np.where(along > 0.0, along * (nu * ratios) / (nu * ratios - 1.0), 0.0)
+            found = np.sqrt(nu[..., 0] * ball * ball + terms.sum(-1))
+            found = np.fmin(found, length + ball)
+            found = np.where(ball > 0.0, np.where(length > 0.0, found, ball), length)
+            # Of a bound without end, the region's sides are left.
+            found = np.where(np.isnan(b), np.nan, np.where(np.isfinite(found), found, np.inf))
+        found = found * (1.0 + 64.0 * len(axes) * _UNIT)
+        if observer is not None:
+            z = np.asarray(observer, np.float64)
+            lower, upper = self.around(b, z)
+            away = np.maximum(np.abs(z + o - lower), np.abs(upper - z - o))
+            found = np.minimum(found, np.linalg.norm(away, axis=-1) * _OUTWARD)
+        result: Array = found
+        return result
+
+    def along(
+        self, run: Run, disturbances: Size | None = None, noises: Size | None = None, *,
+        initial_error: Size,
+    ) -> Band:
+        """The bound along a run from its first sample, as far as the run shows that it holds.
+
+        Parameters
+        ----------
+        run : Run
+            Of an estimator with this observer, with the usual steps and inputs in the region.
+        disturbances, noises : optional
+            w(t) and v(t) as (T, n) and (T, p), their lengths (T,), or bounds for all times: a
+            number for the length or a set, such as ``qpmhe.Box``. Left out, `sizes`.
+        initial_error : float, (n,) array_like or set
+            x - z at the run's first sample, a bound on its length, or a set that holds it.
+
+        Raises
+        ------
+        ShapeError, OptionError, SetError
+            If an argument does not fit.
+        """
+        radius = self.radii(len(run), initial_error, self.entering(disturbances, noises))
+        z = run.observer_states
+        lost, reason = self._lost(run, radius)
+        if lost is not None:
+            radius[lost + 1 :] = np.nan
+        lower, upper = self.around(radius, z)
+        return Band(
+            radius, lower, upper, self.farthest(radius, run.states - z, z), lost, reason
+        )
+
+    def _lost(self, run: Run, radius: Array) -> tuple[int | None, str]:
+        """The first sample after which the bound does not follow, and why."""
+        away = ~self.region.contains(run.observer_states[:-1])
+        reasons = [(self.event(status), t) for t, status in _marked(run, self.projects)]
+        if away.any():
+            reasons.append((self.left(run.observer_states[t := int(away.argmax())]), t))
+        empty = self.is_empty(radius[1:], run.observer_states[1:])
+        if empty.any():
+            reasons.append((CONTRADICTION, int(empty.argmax())))
+        reason, first = min(reasons, key=lambda one: one[1], default=("", None))
+        return first, reason
+
+    def is_empty(self, radius: Array, observer: Array) -> NDArray[np.bool_]:
+        """Whether no state of the region is in the set around z."""
+        lower, upper = self.around(radius, observer)
+        return np.asarray(np.any(lower > upper, axis=-1))
+
+    def left(self, observer: Array) -> str:
+        """What to say of an observer outside of the region; empty within it."""
+        if self.region.contains(observer):
+            return ""
+        return f"the observer was outside of the region, at {np.round(observer, 6).tolist()}"
+
+    def projected(self, status: Status) -> bool:
+        """Whether the observer was projected onto X in this step."""
+        return Status.OBSERVER_PROJECTED in status
+
+    def event(self, status: Status) -> str:
+        """Which event of a step ends the bound, in words; empty if none does."""
+        for flag, text in _BREAKS:
+            if flag in status:
+                return text
+        if Status.METRIC_SINGULAR in status:
+            return "the observer was projected in a metric of the projection's own"
+        if self.projected(status) and not self.projects:
+            return (
+                "the observer was projected onto X in another metric than the certified one, "
+                "metric=observer_bound.metric"
+            )
+        return ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything in types that JSON knows."""
+        limit = self.limit()
+        length = self.farthest(limit, np.zeros(len(self.gain)))
+        content: dict[str, Any] = json_ready({
+            "evidence": self.evidence.value, "rate": self.rate, "metric": self.metric,
+            "gain": self.gain, "sizes": self.sizes.to_dict(), "limit": limit,
+            "components": self.components(limit), "length": length,
+        })
+        return content
+
+
+#: Where the data contradict what is assumed.
+CONTRADICTION = (
+    "no state of the region fits the bound: the disturbances, the noises or the initial error were "
+    "larger than stated, or the model is another one"
+)
+
+
+def _marked(run: Run, projects: bool) -> list[tuple[int, Status]]:
+    """Samples of a run with an event that ends the bound, the first of each kind."""
+    flags = [flag for flag, _ in _BREAKS] + [Status.METRIC_SINGULAR]
+    if not projects:
+        flags.append(Status.OBSERVER_PROJECTED)
+    found = []
+    for flag in flags:
+        there = (run.flags & flag.value) != 0
+        if there.any():
+            t = int(there.argmax())
+            found.append((t, run.statuses[t]))
+    return found
+
+
+def _read(name: str, value: Any) -> Array | ConvexSet:
+    """A set, or numbers."""
+    if isinstance(value, ConvexSet):
+        _sides(name, value)
+        return value
+    found = numbers(name, value)
+    if found.ndim == 0:
+        checked_length(name, found)
+    return found
+
+
+def _bounds(given: ConvexSet) -> Array:
+    """Sides (2, n) of a box around a set, which may be infinite."""
+    around = stated_region(given)
+    assert around is not None
+    return np.stack((around.lower, around.upper))
+
+
+def _sides(name: str, given: ConvexSet) -> Array:
+    sides = _bounds(given)
+    if not np.isfinite(sides).all():
+        raise SetError(
+            f"{name} is an unbounded set; expected bounds on each component, such as "
+            "qpmhe.Box(lower, upper) has."
+        )
+    return sides
+
+
+def _corners(name: str, given: ConvexSet, size: int) -> Array:
+    """The corners (K, n) of the box around a set; none of them where there are too many."""
+    lower, upper = _sides(name, given)
+    if lower.size != size:
+        raise ShapeError(f"{name} is a set of dimension {lower.size}; expected {size}.")
+    wide = np.flatnonzero(upper > lower)
+    if 2**wide.size > _MOST_CORNERS:
+        return np.empty((0, size))
+    found = np.tile(lower, (2**wide.size, 1))
+    for k, j in enumerate(wide):
+        found[(np.arange(len(found)) >> k) % 2 == 1, j] = upper[j]
+    return found
+
+
+def _largest(name: str, given: ConvexSet, size: int, weight: Array) -> float:
+    """The largest |s|_W in the box around a set, or a little more."""
+    corners = _corners(name, given, size)
+    if len(corners):
+        return float(_lengths(corners, weight).max())
+    largest = np.abs(_sides(name, given)).max(axis=0)
+    return float(_lengths(largest, np.abs(weight)))
+
+
+def _alone(name: str, given: Array | ConvexSet, size: int, weight: Array) -> Array:
+    """|s|_W at most, always () or at each sample (T,)."""
+    if isinstance(given, ConvexSet):
+        return np.array(_largest(name, given, size, weight))
+    if given.ndim > 2 or (given.ndim == 2 and given.shape[1] != size):
+        raise ShapeError(
+            f"{name} has shape {given.shape}; expected vectors (T, {size}), lengths (T,), a "
+            "length, or a set such as qpmhe.Box."
+        )
+    if given.ndim == 2:
+        return _lengths(given, weight)
+    if (given < 0.0).any():
+        raise OptionError(f"{name} is {shown(given)}; expected Euclidean lengths, all >= 0.")
+    return given * _root(weight)
+
+
+def _lengths(vectors: Array, weight: Array) -> Array:
+    """|s|_W of vectors (..., n), rounded up."""
+    sizes = np.abs(vectors)
+    squares = np.einsum("...i,ij,...j->...", vectors, weight, vectors)
+    slack = np.einsum("...i,ij,...j->...", sizes, np.abs(weight), sizes)
+    squares = np.maximum(squares, 0.0) + (2 * len(weight) + 4) * _UNIT * slack
+    found: Array = np.sqrt(squares) * _OUTWARD
+    return found
+
+
+def _root(weight: Array) -> float:
+    """The largest |s|_W of |s| = 1, rounded up."""
+    n = len(weight)
+    top = float(np.linalg.eigvalsh(weight)[-1])
+    slack = 16.0 * n * n * _UNIT * float(np.linalg.norm(weight))
+    return math.sqrt(max(top, 0.0) + slack) * _OUTWARD
+
+
+def _words(letter: str, given: float | ConvexSet) -> str:
+    """Bounds of one signal in words."""
+    if not isinstance(given, ConvexSet):
+        return f"|{letter}| <= {given:.4g}"
+    lower, upper = _sides(letter, given)
+    several = lower.size > 1
+    return ", ".join(
+        f"|{letter}{j + 1 if several else ''}| <= {high:.4g}" if low == -high
+        else f"{letter}{j + 1 if several else ''} in [{low:.4g}, {high:.4g}]"
+        for j, (low, high) in enumerate(zip(lower, upper, strict=True))
+    )
