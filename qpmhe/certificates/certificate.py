@@ -410,7 +410,7 @@ def certified(
         system, region, weights=weights, seconds=deadline.part(_DETECTABILITY)
     ))
     stability = stability or attempt("the observer", lambda: certify_observer(
-        system, observer, region, weights=(max(w, least), max(v, least)),
+        system, observer, region, sizes=(max(w, least), max(v, least)),
         seconds=deadline.part(_OBSERVER),
     ))
     if constants is None or detectability is None or stability is None:
