@@ -216,12 +216,12 @@ class Certificate:
         if run is not None:
             return proved.along(run, disturbances, noises, initial_error=initial_error).error
         entering = proved.entering(disturbances, noises)
-        if not entering.ndim:
+        if entering.samples is None:
             raise ShapeError(
                 "disturbances and noises are not of single samples, and there is no run; expected "
                 "a sequence for one of them, to say how many samples there are."
             )
-        radius = proved.radii(len(entering), initial_error, entering)
+        radius = proved.radii(entering.samples, initial_error, entering)
         return proved.farthest(radius, np.zeros((len(radius), self.system.n)))
 
     def _observer(self) -> ObserverBound:
@@ -585,11 +585,10 @@ def examined(
         detectability = fitting(detectability, system, region, gain)
     if stability is not None:
         stability = fitting(stability, system, region, gain)
-    least = 1e-3 * max(lengths.disturbance, lengths.noise)
     stability = stability or attempt("the observer", lambda: certify_observer(
-        system, observer, region, weights=(
-            max(lengths.disturbance, least), max(lengths.noise, least)
-        ), seconds=deadline.part(_OBSERVER),
+        system, observer, region,
+        sizes=bounds_of_signals.typical(system),
+        seconds=deadline.part(_OBSERVER),
     ))
     proved = None
     if stability is not None and stability.P is not None and stability.gain is not None:

@@ -23,7 +23,7 @@ from .inequalities import (
 )
 from .properties import Detectability, ObserverStability, sealed
 from .regions import Region, bounded_region
-from .sdp import started
+from .sdp import NoiseSizes, started
 from .search import Search
 
 # Of an output in its own size, for a state in the region's.
@@ -191,22 +191,27 @@ def gain_if_constant(observer: Observer, system: System) -> Array | None:
 
 def certify_observer(
     system: System, observer: Observer, region: ConvexSet | Region | None = None, *,
-    rho: float | None = None, inputs: Box | None = None, weights: tuple[float, float] = (1.0, 1.0),
+    rho: float | None = None, inputs: Box | None = None, sizes: NoiseSizes = (1.0, 1.0),
     seconds: float | Deadline = PART_SECONDS,
 ) -> ObserverStability:
     """Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
 
     A constant P with the inequality of `qpmhe.certificates.inequalities.ErrorContraction` is sought
-    and verified as in `certify_detectability`. It serves linear and nonlinear outputs.
+    and verified as in `certify_detectability`. It serves linear and nonlinear outputs. Among all
+    P, and all rates, it is the one for which disturbances and noises of the given sizes leave the
+    smallest error in the limit, in the size of the region.
 
     Parameters
     ----------
-    system, region, inputs, weights, seconds
-        As for `certify_detectability`; the weights are those of C_w and C_v.
+    system, region, inputs, seconds
+        As for `certify_detectability`.
     observer : Observer
         A `Luenberger` observer or one of its kind, or a `SteadyStateKalman`.
     rho : float, optional
-        The rate; left out, it is chosen as for `certify_detectability`.
+        The rate; left out, the best one.
+    sizes : (float or (r,) array_like, float or (p,) array_like)
+        The largest disturbance w and noise v: each a length, or half-widths by component. The
+        certificate holds for any; for these, it is best.
 
     Raises
     ------
@@ -220,7 +225,7 @@ def certify_observer(
     """
     gain = constant_gain(observer, checked_system(system))
     search = Search(
-        system, bounded_region(system, region, inputs), "observer", weights, gain, started(seconds)
+        system, bounded_region(system, region, inputs), "observer", sizes, gain, started(seconds)
     )
     _check_stability(search)
     return _stability(search, rho)
@@ -241,8 +246,8 @@ def _stability(search: Search, rho: float | None) -> ObserverStability:
     return sealed(
         ObserverStability(
             form.rate, *euclidean_constants(form.P, V, form.rate), kappa, gain=form.gain,
-            region=search.region, notes=(*found.notes, _RUN_STAYS), P=form.P, V=V,
-            margin=found.margin, cells=found.cells,
+            region=search.region, notes=(*found.notes, _RUN_STAYS), P=form.P, V=V, Q=form.Q,
+            R=form.R, margin=found.margin, cells=found.cells,
         ),
         search.system, found.evidence,
     )
@@ -295,43 +300,38 @@ class Synthesis:
 
 def synthesise_gain(
     system: System, region: ConvexSet | Region | None = None, *, rho: float | None = None,
-    inputs: Box | None = None, weights: tuple[float, float] = (1.0, 1.0),
+    inputs: Box | None = None, sizes: NoiseSizes = (1.0, 1.0),
     seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Synthesis:
     r"""Find a constant gain L whose observer contracts on a region, and verify it.
 
-    With Y = P L, the inequality of `qpmhe.certificates.inequalities.ErrorContraction` and the bound
-    :math:`L^\top P L \preceq r I` on the amplification of noise are both linear:
+    With Y = P L, the two inequalities of `qpmhe.certificates.inequalities.ErrorContraction` are
+    jointly linear in P, Y, Q and R:
 
     .. math::
-        \begin{pmatrix} P & P A - Y C \\ \cdot & \rho^2 P \end{pmatrix} \succ 0, \qquad
-        \begin{pmatrix} P & Y \\ \cdot & r I \end{pmatrix} \succeq 0,
-        \qquad I \preceq P \preceq \kappa I .
+        \begin{pmatrix} P & P A - Y C & P G & -Y \\ \cdot & \rho^2 P & 0 & 0 \\
+        \cdot & \cdot & Q & 0 \\ \cdot & \cdot & \cdot & R \end{pmatrix} \succ 0 .
 
-    Minimised is :math:`d^2 \kappa + v^2 r`, that is the squares of :math:`\rho\, C_w` and
-    :math:`\rho\, C_v`, weighted. The rounded gain is then verified like any other.
+    Minimised is the trace of the inverse of P, in states of the region's size, for which
+    disturbances and noises of the given sizes leave :math:`|e|_P \le 1` in the limit. The rounded
+    gain is then verified like any other.
 
     Parameters
     ----------
-    system, region, inputs, seconds
-        As for `certify_detectability`.
-    rho : float, optional
-        The rate; left out, the one for which lasting disturbances and noise are bounded best,
-        :math:`\sqrt{d^2 \kappa + v^2 r} / (1 - \rho)`.
-    weights : (float, float)
-        d and v, such as typical sizes of disturbance and noise.
+    system, region, inputs, rho, sizes, seconds
+        As for `certify_observer`.
 
     Raises
     ------
     OptionError
-        If rho or the weights are out of range.
+        If rho or the sizes are out of range.
     SetError, ModelError
         As for `certify_detectability`.
     NotCertifiedError
         If there is no such gain, or none was found.
     """
     search = Search(
-        system, bounded_region(system, region, inputs), "synthesis", weights,
+        system, bounded_region(system, region, inputs), "synthesis", sizes,
         seconds=started(seconds),
     )
     made = _stability(search, rho)

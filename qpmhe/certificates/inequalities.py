@@ -47,6 +47,9 @@ class Form(Protocol):
     def matrices(self, jacobian: Matrices) -> Matrices:
         """The matrices that must be positive definite."""
 
+    def constants(self) -> tuple[Matrices, ...]:
+        """Matrices that must be, too, whatever the Jacobian: each a stack of one."""
+
     def excess(self, dx: Array, df: Array, dh: Array) -> Array:
         """By how much differences violate the conclusion; positive beyond rounding."""
 
@@ -115,6 +118,10 @@ class OutputWeight:
         lower = _square(self.P, self.rate) + C.T @ (Matrices.exact(self.R) @ C)
         return _assemble([[P, P @ A], [(P @ A).T, lower]])
 
+    def constants(self) -> tuple[Matrices, ...]:
+        """P; see `Form.constants`."""
+        return (Matrices.exact(self.P[None]),)
+
     def excess(self, dx: Array, df: Array, dh: Array) -> Array:
         """The first inequality's left-hand side less its right-hand one; see `Form.excess`."""
         left = norms(df, self.P) * (1.0 - _ROUNDING)
@@ -159,6 +166,7 @@ class OutputInjection:
         noise = Matrices.exact(self.R) - N - N.T
         return _assemble([[P, side, -Y], [side.T, lower, mixed], [-Y.T, mixed.T, noise]])
 
+    constants = OutputWeight.constants
     excess = OutputWeight.excess
 
 
@@ -169,23 +177,54 @@ class ErrorContraction:
     With e = x - z, of the system (eq:system) and the observer (eq:observer),
 
     .. math::
-        e^+ = (A - L C)\, e + w - L v, \qquad
-        \begin{pmatrix} P & P (A - L C) \\ \cdot & \rho^2 P \end{pmatrix} \succeq 0
+        e^+ = (A - L C)\, e + G w - L v, \qquad
+        \begin{pmatrix} S & S (A - L C) \\ \cdot & \rho^2 P \end{pmatrix} \succeq 0,
+        \quad S \succeq P,
 
-    is affine in (A, C) jointly, for linear and for nonlinear h, and gives
-    :math:`|e^+|_P \le \rho |e|_P + |w|_P + |L v|_P`.
+    is affine in (A, C) jointly, for linear and for nonlinear h. It is
+    :math:`|(A - L C) e|_S \le \rho |e|_P`, and gives, as :math:`|\cdot|_P \le |\cdot|_S`,
+
+    .. math:: |e^+|_P \le \rho |e|_P + |G w|_P + |L v|_P .
+
+    With S above P, there is room for a sum of squares, whose limit is smaller where disturbance
+    and error do not point in one direction: with :math:`B = (G, -L)`,
+
+    .. math::
+        \begin{pmatrix} S - P & -P B \\ \cdot & \operatorname{diag}(Q, R) - B^\top P B
+        \end{pmatrix} \succ 0 \quad \Rightarrow \quad
+        |e^+|_P^2 \le \rho^2 |e|_P^2 + |w|_Q^2 + |v|_R^2,
+
+    as the matrix is of the form :math:`|a|_S^2 + |d|_{Q, R}^2 - |a + B d|_P^2`, at
+    :math:`a = (A - L C) e`, d = (w, v).
     """
 
     P: Array
     gain: Array
     rate: float
+    S: Array | None = None  # P where left out, and then there are no Q and R
+    G: Array | None = None
+    Q: Array | None = None
+    R: Array | None = None
 
     def matrices(self, jacobian: Matrices) -> Matrices:
-        """The matrix above; see `Form.matrices`."""
+        """The first matrix above; see `Form.matrices`."""
         A, C = _parts(jacobian, self.P.shape[0])
-        P = Matrices.exact(self.P)
-        closed = P @ (A - Matrices.exact(self.gain) @ C)
-        return _assemble([[P, closed], [closed.T, _square(self.P, self.rate)]])
+        S = Matrices.exact(self.P if self.S is None else self.S)
+        closed = S @ (A - Matrices.exact(self.gain) @ C)
+        return _assemble([[S, closed], [closed.T, _square(self.P, self.rate)]])
+
+    def constants(self) -> tuple[Matrices, ...]:
+        """P and the second matrix above; see `Form.constants`."""
+        only = (Matrices.exact(self.P[None]),)
+        if self.S is None or self.G is None or self.Q is None or self.R is None:
+            return only
+        P, S = Matrices.exact(self.P[None]), Matrices.exact(self.S[None])
+        B = Matrices.exact(np.hstack((self.G, -self.gain))[None])
+        r = self.Q.shape[0]
+        D = np.zeros((1, r + self.R.shape[0], r + self.R.shape[0]))
+        D[:, :r, :r], D[:, r:, r:] = self.Q, self.R
+        side = -(P @ B)
+        return *only, _assemble([[S - P, side], [side.T, Matrices.exact(D) - B.T @ P @ B]])
 
     def excess(self, dx: Array, df: Array, dh: Array) -> Array:
         """What the error grows to less what it may; see `Form.excess`."""

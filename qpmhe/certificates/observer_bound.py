@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -126,6 +126,25 @@ class SignalBounds:
         """The largest |w| and |v|; 1 each where there are neither disturbances nor noises."""
         return Sizes(*self.largest) if max(self.largest) > 0.0 else Sizes()
 
+    def typical(self, system: System) -> tuple[float | Array, float | Array]:
+        """Sizes of w and v to choose a certificate for: of each component, or lengths.
+
+        Where there is nothing of one kind, a thousandth of the other keeps the choice bounded.
+        """
+        found: list[float | Array] = []
+        least = 1e-3 * max(self.lengths.disturbance, self.lengths.noise)
+        for name, given, size in (
+            ("disturbances", self.disturbances, system.r), ("noises", self.noises, system.p),
+        ):
+            if isinstance(given, ConvexSet):
+                largest = np.abs(_sides(name, given)).max(axis=0)
+                if largest.size == size:
+                    found.append(np.maximum(largest, least))
+                    continue
+            length = self.lengths.disturbance if name == "disturbances" else self.lengths.noise
+            found.append(max(length, least))
+        return found[0], found[1]
+
     def __str__(self) -> str:
         return f"{_words('w', self.disturbances)}, {_words('v', self.noises)} ({self.source})"
 
@@ -135,6 +154,25 @@ class SignalBounds:
             name: _sides(name, given).tolist() if isinstance(given, ConvexSet) else float(given)
             for name, given in (("disturbances", self.disturbances), ("noises", self.noises))
         }
+
+
+class Entering(NamedTuple):
+    """What disturbances and noises add to the bound: at each sample (T,), or always ().
+
+    Attributes
+    ----------
+    length, square : array
+        |w - L v|_P and |w|_Q^2 + |v|_R^2 at most, rounded up; the latter is infinite where the sum
+        of squares is not certified.
+    """
+
+    length: Array
+    square: Array
+
+    @property
+    def samples(self) -> int | None:
+        """How many samples these are; None for bounds that hold at all times."""
+        return max((len(each) for each in self if each.ndim), default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,8 +315,8 @@ class ObserverBound:
 
     def entering(
         self, disturbances: Size | None = None, noises: Size | None = None
-    ) -> Array:
-        """|w - L v|_P at most, at each sample (T,) or always (), rounded up.
+    ) -> Entering:
+        """What disturbances and noises add to the bound at each sample, or always.
 
         Parameters
         ----------
@@ -291,9 +329,8 @@ class ObserverBound:
         if isinstance(w, ConvexSet) and isinstance(v, ConvexSet):
             ws, vs = _corners("disturbances", w, n), _corners("noises", v, p)
             if len(ws) * len(vs) in range(1, _MOST_CORNERS + 1):
-                return np.array(
-                    self._joint(np.repeat(ws, len(vs), 0), np.tile(vs, (len(ws), 1))).max()
-                )
+                joint = self._joint(np.repeat(ws, len(vs), 0), np.tile(vs, (len(ws), 1))).max()
+                return Entering(np.array(joint), self._square(w, v))
         first = _alone("disturbances", w, n, self.metric)
         assert self.stability.V is not None
         second = _alone("noises", v, p, self.stability.V)  # no less than L^T P L
@@ -303,8 +340,16 @@ class ObserverBound:
                 "same."
             )
         if not isinstance(w, ConvexSet) and not isinstance(v, ConvexSet) and w.ndim == v.ndim == 2:
-            return self._joint(w, v)
-        return (first + second) * _OUTWARD
+            return Entering(self._joint(w, v), self._square(w, v))
+        return Entering((first + second) * _OUTWARD, self._square(w, v))
+
+    def _square(self, w: Array | ConvexSet, v: Array | ConvexSet) -> Array:
+        """|w|_Q^2 + |v|_R^2 at most; infinite where the sum of squares is not certified."""
+        Q, R = self.stability.Q, self.stability.R
+        if Q is None or R is None or len(Q) != len(self.metric):
+            return np.array(math.inf)
+        first, second = _alone("disturbances", w, len(Q), Q), _alone("noises", v, len(R), R)
+        return (first * first + second * second) * _OUTWARD
 
     def _joint(self, w: Array, v: Array) -> Array:
         sizes = np.abs(w) + np.abs(v) @ np.abs(self.gain.T)
@@ -313,21 +358,25 @@ class ObserverBound:
             _lengths(w - v @ self.gain.T, self.metric) + _lengths(error, np.abs(self.metric))
         ) * _OUTWARD
 
-    def radii(self, steps: int, initial_error: Size, entering: Array) -> Array:
+    def radii(self, steps: int, initial_error: Size, entering: Entering) -> Array:
         """b(0), ..., b(T), from what enters at each sample or always."""
-        if entering.ndim and len(entering) != steps:
+        samples = entering.samples
+        if samples is not None and samples != steps:
             raise ShapeError(
-                f"disturbances and noises have {len(entering)} samples; expected {steps}."
+                f"disturbances and noises have {samples} samples; expected {steps}."
             )
-        found, each = np.empty(steps + 1), np.broadcast_to(entering, steps)
+        found = np.empty(steps + 1)
+        lengths, squares = (np.broadcast_to(each, steps) for each in entering)
         found[0] = self.initial(initial_error)
         for t in range(steps):
-            found[t + 1] = self.advanced(found[t], each[t])
+            found[t + 1] = self.advanced(found[t], Entering(lengths[t], squares[t]))
         return found
 
-    def advanced(self, radius: float, entering: float) -> float:
-        """b(t+1) from b(t), rounded up."""
-        return (self.rate * radius + float(entering)) * _OUTWARD
+    def advanced(self, radius: float, entering: Entering) -> float:
+        """b(t+1) from b(t), rounded up: the smaller of the two that are certified."""
+        reached = self.rate * radius
+        linear = reached + float(entering.length)
+        return min(linear, math.hypot(reached, math.sqrt(entering.square))) * _OUTWARD
 
     def at(
         self, time: int, initial_error: Size, disturbances: Size | None = None,
@@ -339,11 +388,13 @@ class ObserverBound:
     def limit(self, disturbances: Size | None = None, noises: Size | None = None) -> float:
         """What b(t) tends to as t grows, for bounds on w and v that hold at all times."""
         entering = self.entering(disturbances, noises)
-        if entering.ndim:
+        if entering.samples is not None:
             raise OptionError(
                 "disturbances and noises are of single samples; expected bounds for all times."
             )
-        return float(entering) / (1.0 - self.rate * _OUTWARD) * _OUTWARD
+        rate = self.rate * _OUTWARD
+        linear = float(entering.length) / (1.0 - rate)
+        return min(linear, math.sqrt(float(entering.square) / (1.0 - rate * rate))) * _OUTWARD
 
     def components(self, radius: ArrayLike) -> Array:
         """What each |x_i - z_i| is at most where |x - z|_P <= radius: (..., n) for (...)."""

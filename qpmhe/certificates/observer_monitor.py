@@ -110,7 +110,7 @@ class ObserverMonitor:
         entering = bound.entering(chosen.disturbances, chosen.noises)
         self.bound = bound.of_observer(estimator.observer)
         self._system: System = estimator.system
-        self._entering = float(entering)
+        self._entering = entering
         #: What bounds w and v.
         self.sizes = chosen
         self._time, self._z = estimator.time, estimator.observer_state

@@ -123,7 +123,13 @@ class ObserverStability(_Certified):
     Where P is given, this follows from the sharper contraction
 
     .. math::
-        |x^+ - z^+|_P \le \rho |x - z|_P + |w|_P + |v|_V .
+        |x^+ - z^+|_P \le \rho |x - z|_P + |w|_P + |v|_V ,
+
+    and where Q and R are given, the sum of squares holds as well, whose limit
+    :math:`\sqrt{(|w|_Q^2 + |v|_R^2) / (1 - \rho^2)}` is in general smaller:
+
+    .. math::
+        |x^+ - z^+|_P^2 \le \rho^2 |x - z|_P^2 + |w|_Q^2 + |v|_R^2 .
 
     Parameters
     ----------
@@ -137,6 +143,8 @@ class ObserverStability(_Certified):
         L, the observer's constant gain.
     P, V : (n, n) and (p, p) array or None
         Norms of error and disturbance, and of noise: V is L^T P L.
+    Q, R : (r, r) and (p, p) array or None
+        Diagonal weights of disturbance and noise in the sum of squares.
     evidence, region, notes, margin, cells, system
         As for `Detectability`.
     """
@@ -147,6 +155,8 @@ class ObserverStability(_Certified):
     C_v: float
     kappa: float
     gain: Array | None = field(default=None, kw_only=True)
+    Q: Array | None = field(default=None, kw_only=True)
+    R: Array | None = field(default=None, kw_only=True)
 
     @classmethod
     def assumed(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,7 +17,17 @@ from .enclosures import SmoothModel, evaluated, joint_jacobians
 from .evidence import Evidence, NotCertifiedError, OutOfTimeError
 from .inequalities import Form, Matrices, definite
 from .regions import Region
-from .sdp import Answer, Kind, Program, Scales, expected_seconds
+from .sdp import (
+    Answer,
+    DetectabilityProgram,
+    GainProgram,
+    Kind,
+    NoiseSizes,
+    ObserverProgram,
+    Program,
+    Scales,
+    expected_seconds,
+)
 from .theorem import checked_rate
 
 _SAMPLES = 400
@@ -29,6 +40,7 @@ _LARGEST_RATE = 0.9999
 _ABOVE, _ATTEMPTS = 0.01, 4
 # Between the smallest rate, where constants grow without bound, and 1, where they last.
 _SHARES = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
+_REFINEMENTS = 3  # of the best of them, each by two more programs
 _SEED = 20210829
 _PAIRS = 2000
 # How much of the time the choice of a rate may take, and one verification; how many programs
@@ -56,18 +68,19 @@ class _BrokenPairError(NotCertifiedError):
 class Search:
     """Programs at some states, verification at all of them, and more states where it fails.
 
-    ``kind=None`` takes the form of detectability that the output allows; the weights say how
-    much disturbance and noise matter.
+    ``kind=None`` takes the form of detectability that the output allows. The sizes are those of
+    disturbance and noise; for detectability, two numbers that say how much they matter.
     """
 
     def __init__(
-        self, system: System, region: Region, kind: Kind | None, weights: tuple[float, float],
+        self, system: System, region: Region, kind: Kind | None, sizes: NoiseSizes,
         gain: Array | None = None, seconds: float | Deadline = PART_SECONDS,
     ) -> None:
         self._deadline = Deadline.of(seconds)
-        self.system, self.region, self.gain = system, region, gain
-        first, second = vector("weights", weights, 2).tolist()
-        self._weights = positive("weights[0]", first), positive("weights[1]", second)
+        self.system, self.region, self.gain, self._sizes = system, region, gain, sizes
+        if kind is None:
+            first, second = vector("weights", np.asarray(sizes), 2).tolist()
+            self._weights = positive("weights[0]", first), positive("weights[1]", second)
         self.model = SmoothModel(system, region)
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
         self.jacobians = joint_jacobians(system, self.points)
@@ -97,9 +110,13 @@ class Search:
     def program(self) -> Program:
         """The program at the states chosen so far."""
         if self._program is None:
-            self._program = Program(
-                self.kind, self.jacobians[self._chosen], self.scales, self._weights, self.gain
-            )
+            at, matrix = (self.jacobians[self._chosen], self.scales), self.system.disturbance_matrix
+            if self.gain is not None:
+                self._program = ObserverProgram(*at, self._sizes, self.gain, matrix)
+            elif self.kind == "synthesis":
+                self._program = GainProgram(*at, self._sizes, matrix)
+            else:
+                self._program = DetectabilityProgram(self.kind, *at, self._weights)
         return self._program
 
     def _smallest_rate(self) -> float:
@@ -172,20 +189,31 @@ class Search:
         )
 
     def _best_rate(self, smallest: float) -> float:
-        r"""The rate with the smallest :math:`\sqrt{d^2 \kappa + v^2 r} / (1 - \rho)`.
+        """The rate with the smallest measure of what lasting disturbances and noises make."""
+        deadline, room = self._deadline.part(_CHOICE), 1.0 - smallest
+        measures: dict[float, float] = {}
 
-        That is what lasting disturbances and noise of sizes d and v make, up to a factor.
-        """
-        deadline = self._deadline.part(_CHOICE)
-        best = np.inf, smallest
-        for share in _SHARES:
-            rate = smallest + share * (1.0 - smallest)
-            try:
-                objective = self._feasible(rate, deadline).objective
-            except OutOfTimeError:
-                break
-            best = min(best, (np.sqrt(max(objective, 0.0)) / (1.0 - rate), rate))
-        return best[1]
+        def measure(share: float) -> float:
+            if share not in measures:
+                measures[share] = self._feasible(smallest + share * room, deadline).objective
+            return measures[share]
+
+        with contextlib.suppress(OutOfTimeError):
+            best = min(_SHARES, key=measure)
+            around = (0.0, *_SHARES, 1.0)
+            low, high = (around[around.index(best) + step] for step in (-1, 1))
+            for _ in range(_REFINEMENTS):
+                sides = 0.5 * (low + best), 0.5 * (best + high)
+                nearest = min((best, *sides), key=measure)
+                if nearest == sides[0]:
+                    high = best
+                elif nearest == sides[1]:
+                    low = best
+                else:
+                    low, high = sides
+                best = nearest
+        known = {share: value for share, value in measures.items() if np.isfinite(value)}
+        return smallest + min(known, key=known.__getitem__, default=0.0) * room
 
     def _find_best(self) -> Found:
         """An inequality with the best rate found."""
@@ -214,6 +242,10 @@ class Search:
         for turn in range(1, _ROUNDS + 1):
             try:
                 answer = self._solved(rate, _MARGINS[level] * size, self._deadline)
+                if isinstance(self.program, GainProgram):
+                    answer = self.program.improved(
+                        answer, _MARGINS[level] * size, self._deadline.left
+                    )
             except OutOfTimeError:
                 if best is None:
                     raise
@@ -242,7 +274,7 @@ class Search:
 
     def _verified(self, form: Form) -> Found | Cover:
         """What was shown, or the cover with the states where the inequality fails."""
-        if not definite(Matrices.exact(form.P[None]))[0].all():
+        if not all(definite(each)[0].all() for each in form.constants()):
             return Cover(False, 0, 0.0, np.empty((0, 0)), np.empty((0, 0, 0)))
         if self.model.reason:
             return self._sampled(

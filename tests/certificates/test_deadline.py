@@ -29,7 +29,7 @@ from qpmhe.certificates.evidence import (
 )
 from qpmhe.certificates.inequalities import OutputWeight
 from qpmhe.certificates.regions import bounded_region
-from qpmhe.certificates.sdp import Program, Scales
+from qpmhe.certificates.sdp import DetectabilityProgram, Scales
 from qpmhe.certificates.search import Search
 from qpmhe.errors import OptionError
 
@@ -181,7 +181,7 @@ def test_seconds_out_of_range(seconds):
 
 
 def test_no_search_is_begun_in_vain(monkeypatch):
-    monkeypatch.setattr(Program, "solve", lambda *_, **__: pytest.fail("it was begun"))
+    monkeypatch.setattr(DetectabilityProgram, "solve", lambda *_, **__: pytest.fail("it was begun"))
     n = 40
     with pytest.raises(OutOfTimeError, match=r"40 states takes about .* s were left"):
         certify_detectability(linear(0.9 * np.eye(n), np.ones((1, n))), unit_box(n))
@@ -195,7 +195,7 @@ def test_solver_keeps_to_its_time():
     n = 6
     A = 0.9 * np.eye(n) + 0.1 * np.random.default_rng(2).standard_normal((n, n))
     J = np.vstack((A, np.eye(n)[:2]))[None].repeat(4, axis=0)
-    program = Program("output weight", J, Scales(np.ones(n), np.ones(2)), (1.0, 1.0))
+    program = DetectabilityProgram("output weight", J, Scales(np.ones(n), np.ones(2)), (1.0, 1.0))
     assert program.solve(0.9, 1e-6).form is not None
     assert program.solve(0.9, 1e-6, seconds=1e-4).status == "user_limit"
 

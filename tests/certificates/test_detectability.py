@@ -11,7 +11,7 @@ from qpmhe.certificates.contraction import certify_detectability
 from qpmhe.certificates.evidence import Evidence, NotCertifiedError, weakest
 from qpmhe.certificates.inequalities import Matrices, OutputWeight, definite, norms
 from qpmhe.certificates.properties import Detectability
-from qpmhe.certificates.sdp import Answer, Program
+from qpmhe.certificates.sdp import Answer, DetectabilityProgram
 from qpmhe.errors import OptionError
 
 from .attacks import attack_detectability
@@ -165,7 +165,7 @@ def test_too_many_cells_are_sampled(monkeypatch):
     )],
 )
 def test_solvers_that_lie_or_stop_early_prove_nothing(monkeypatch, answer, words):
-    monkeypatch.setattr(Program, "solve", lambda *_, **__: answer)
+    monkeypatch.setattr(DetectabilityProgram, "solve", lambda *_, **__: answer)
     with pytest.raises(NotCertifiedError, match=words):
         certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=0.9)
 
