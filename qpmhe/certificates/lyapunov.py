@@ -258,10 +258,10 @@ class Design:
         for t in np.flatnonzero(run.flags & flags.value).tolist():
             spoilt[t : t + N if restarts else steps] = True
         bound, errors = np.full(steps + 1, math.nan), np.zeros(steps + 1)  # of the running observer
-        bound[0] = float(norms(start[None], self.prior)[0])
+        bound[0] = float(norms(start[None], self.prior)[0]) * _OUTWARD
         if not restarts:
             part = self._observer()
-            errors[0] = float(norms(start[None], part.norm)[0])
+            errors[0] = float(norms(start[None], part.norm)[0]) * _OUTWARD
             for t in range(steps):
                 errors[t + 1] = part.rate * errors[t] + signals[2][t]
         for t in (np.flatnonzero(~spoilt) + 1).tolist():

@@ -1,0 +1,155 @@
+"""Runs that look for an error above the bounds of a Lyapunov design."""
+
+import itertools
+
+import numpy as np
+
+import qpmhe
+from qpmhe.certificates import Sizes
+from qpmhe.certificates.contraction import synthesise_gain
+from qpmhe.certificates.lyapunov import design
+from qpmhe.estimation.run import Run
+
+from .attacks import NOISES, inside
+
+
+def scalar():
+    system = qpmhe.System(lambda x: 1.2 * x, lambda x: x, n=1, p=1)
+    return system, qpmhe.Box([-10.0], [10.0]), Sizes(0.1, 0.2)
+
+
+def swap():
+    A = np.array([[0.0, 1.0], [1.1, 0.0]])
+    system = qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1)
+    return system, qpmhe.Box([-10.0, -10.0], [10.0, 10.0]), Sizes(0.1, 0.2)
+
+
+def reactor():
+    system = qpmhe.models.batch_reactor().system
+    return system, qpmhe.Box([0.1, -1.0], [9.0, 9.0]), Sizes(0.03, 0.06)
+
+
+def fitzhugh_nagumo():
+    def f(x):
+        a, b = x[..., 0], x[..., 1]
+        return np.stack([a + 0.1 * (a - a**3 / 3 - b + 0.5), b + 0.008 * (a + 0.7 - 0.8 * b)], -1)
+
+    system = qpmhe.System(f, lambda x: x[..., :1], n=2, p=1)
+    return system, qpmhe.Box([-2.5, -1.0], [2.5, 2.0]), Sizes(0.01, 0.02)
+
+
+def van_der_pol():
+    system = qpmhe.models.van_der_pol().system
+    return system, qpmhe.Box([-2.5, -3.0], [2.5, 3.0]), Sizes(0.01, 0.02)
+
+
+def coupled():
+    def f(x):
+        return 0.8 * x + 0.1 * np.sin(np.roll(x, 1, axis=-1)) + 0.1 * np.roll(x, -1, axis=-1)
+
+    system = qpmhe.System(f, lambda x: x[..., ::2], n=4, p=2)
+    return system, qpmhe.Box(-2.0 * np.ones(4), 2.0 * np.ones(4)), Sizes(0.01, 0.01)
+
+
+def bent_output():
+    def f(x):
+        return np.stack([x[..., 0] + 0.1 * x[..., 1], 0.9 * x[..., 1] - 0.1 * np.sin(x[..., 0])], -1)
+
+    system = qpmhe.System(f, lambda x: x[..., :1] + 0.1 * np.sin(x[..., :1]), n=2, p=1)
+    return system, qpmhe.Box([-2.0, -2.0], [2.0, 2.0]), Sizes(0.01, 0.02)
+
+
+SYSTEMS = (scalar, swap, reactor, fitzhugh_nagumo, van_der_pol, coupled, bent_output)
+
+
+def designed(make, seconds=60.0):
+    """A design with an observer that was synthesised for the region."""
+    system, region, sizes = make()
+    observer = synthesise_gain(system, region, weights=(sizes.disturbance, sizes.noise)).observer
+    return design(system, region, observer=observer, sizes=sizes, seconds=seconds), observer
+
+
+def attack(plan, observer, *, trials, steps=25, seed=0):
+    """The largest error as a share of each bound, and how many errors were compared.
+
+    Disturbances and noises reach the sizes of the design, some push along the error. Runs count
+    as long as truth, candidates and estimates stay in the region; those of a minimiser while J is
+    at most the truth's.
+    """
+    rng, system, region = np.random.default_rng(seed), plan.system, plan.region
+    least = plan.least_horizon("minimiser")
+    horizons = sorted({1, 3, least, min(plan.horizon, 20)})
+    turns = itertools.cycle(itertools.product(
+        horizons, (0, 1, 2, None), ("reinitialized", "observer")
+    ))
+    nothing = np.zeros(system.m)
+    shares = dict.fromkeys(("measured", "decrease", "minimiser"), 0.0)
+    compared, kinds = 0, list(NOISES)
+    for (N, cap, candidate), _ in zip(turns, range(trials), strict=False):
+        points = region.sample(8, rng)[:, : system.n]
+        start, other = points[rng.integers(len(points), size=2)]
+        start, guess = (
+            inside(region, 0.7 * start),
+            inside(region, 0.7 * start + 10.0 ** rng.uniform(-3.0, 0.0) * (other - 0.7 * start)),
+        )
+        w, v = (
+            bounded(rng, NOISES[rng.choice(kinds)](rng, steps, width), size)
+            for width, size in ((system.n, plan.amplitudes[0]), (system.p, plan.amplitudes[1]))
+        )
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, observer, plan.cost(), horizon=N, initial_state=guess, max_qps=cap,
+            candidate=candidate, engine="python", project_observer=False,
+        )
+        pushing, x, estimates, lasts = rng.random() < 0.5, [start], [], steps
+        lowest = np.zeros(steps, bool)
+        for t in range(steps):
+            if pushing and plan.amplitudes[0] > 0.0:
+                gap = mhe.state - x[-1]
+                w[t] = -plan.amplitudes[0] * gap / max(float(np.linalg.norm(gap)), 1e-300)
+            ahead = np.asarray(system.f(x[-1], nothing))
+            estimates.append(mhe.update(system.h(x[-1], nothing) + v[t]))
+            x.append(ahead + w[t])
+            latest = estimates[-1]
+            seen = np.vstack((x[-1:], latest.candidate, latest.trajectory))
+            lowest[t] = latest.cost <= true_cost(plan, latest, x, w, v)
+            if not region.contains(seen).all():
+                lasts = t
+                break
+        run = Run.of(guess, estimates)
+        if not lasts:
+            continue
+        x, count = np.array(x), len(estimates)
+        error = np.sqrt(np.einsum(
+            "ti,ij,tj->t", run.states - x, plan.prior, run.states - x
+        ))[: lasts + 1]
+        for kind in shares:
+            until = lasts
+            if kind == "minimiser":
+                until = int(np.argmin(np.append(lowest[:lasts], False)))
+            bound = plan.along(
+                run, mhe, initial_error=start - guess, disturbances=w[:count], noises=v[:count],
+                kind=kind,
+            )[: until + 1]
+            there = bound[1:] > 1e-9
+            ratio = error[1 : until + 1][there] / bound[1:][there]
+            shares[kind] = max(shares[kind], float(ratio.max(initial=0.0)))
+            compared += int(there.sum())
+    return shares, compared
+
+
+def bounded(rng, noise, size):
+    """Vectors whose lengths are at most a size, and often this size."""
+    lengths = np.linalg.norm(noise, axis=1, keepdims=True)
+    full = noise / np.maximum(lengths, 1e-300) * (lengths > 0.0)
+    return float(size) * (full if rng.random() < 0.5 else noise / max(1e-300, float(lengths.max())))
+
+
+def true_cost(plan, estimate, x, w, v):
+    """J of the truth, with the prior of an estimate's window."""
+    K = len(estimate.trajectory) - 1
+    t = estimate.time + 1
+    ages = plan.discount ** np.arange(K - 1.0, -1.0, -1.0)
+    own = x[t - K] - estimate.candidate[0]
+    stages = np.einsum("ti,ij,tj->t", w[t - K : t], plan.disturbance, w[t - K : t])
+    stages = stages + np.einsum("ti,ij,tj->t", v[t - K : t], plan.noise, v[t - K : t])
+    return float(plan.discount**K * own @ plan.prior @ own + ages @ stages)
