@@ -11,9 +11,11 @@ from typing import Any, Literal
 import numpy as np
 
 from .._checks import Array
+from ..model.sets import ConvexSet
 from .deadline import Deadline
 from .evidence import OutOfTimeError
 from .inequalities import Matrices, OutputInjection, OutputWeight, definite, norms
+from .observer_bound import SignalBounds, _alone, _read, _sides
 from .regions import Region
 from .sdp import Answer, Scales, expected_seconds
 from .search import Search
@@ -24,6 +26,7 @@ _FLOOR = 1e-6  # of the noise's weight: a cost needs a positive one
 _DIGITS = 8  # of the weights: as they are verified, so they are printed
 _ROUNDING = _NOTHING = 1e-6
 _MARGIN = 1e-4  # of gamma: it saves the verification most of its cells, and costs as much
+_LEAST_SIZE = 1e-3  # of the other: what never occurs has a weight all the same
 _SHARES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.92)
 
 
@@ -97,13 +100,13 @@ class DesignProgram:
 
     def __init__(
         self, kind: Literal["output weight", "output injection"], jacobians: Array,
-        scales: Scales, directions: Array, amplitudes: tuple[Array, Array],
+        scales: Scales, directions: Array, sizes: SignalBounds,
     ) -> None:
         cp: Any = importlib.import_module("cvxpy")
 
         n = jacobians.shape[2]
         p, r = jacobians.shape[1] - n, directions.shape[1]
-        self._kind, self._directions, self._amplitudes = kind, directions, amplitudes
+        self._kind, self._directions, self._sizes = kind, directions, sizes
         self._d, self._s = d, s = scales.states, scales.outputs
         self._g = g = 1.0 / np.abs(directions / d[:, None]).max(axis=0)
         self.expected_seconds = jacobians.shape[0] * expected_seconds(n, p, kind)
@@ -135,13 +138,17 @@ class DesignProgram:
                 ]
             matrix = cp.bmat(rows)
             constraints.append(0.5 * (matrix + matrix.T) >> 0)
-        sizes = [np.broadcast_to(a, u.shape) / u for a, u in zip(amplitudes, (g, s), strict=True)]
-        most = max(float(size.max()) for size in sizes)
+        # A length bounds all components as one, a set each of them.
+        given = [
+            np.abs(_sides(name, each)).max(axis=0) if isinstance(each, ConvexSet) else each
+            for name, each in (("disturbances", sizes.disturbances), ("noises", sizes.noises))
+        ]
+        relative = [np.broadcast_to(a, u.shape) / u for a, u in zip(given, (g, s), strict=True)]
+        most = max(float(each.max()) for each in relative) or 1.0
         terms = []
-        for sides, size, amplitude in zip((w_sides, v_sides), sizes, amplitudes, strict=True):
-            squares = np.square(np.maximum(size / most, 1e-3))
-            each = cp.multiply(squares, sides)
-            terms.append(cp.sum(each) if amplitude.ndim else cp.max(each))
+        for sides, each, side in zip((w_sides, v_sides), relative, given, strict=True):
+            cost = cp.multiply(np.square(np.maximum(each / most, _LEAST_SIZE)), sides)
+            terms.append(cp.sum(cost) if np.ndim(side) else cp.max(cost))
         self._problem = cp.Problem(cp.Minimize(terms[0] + terms[1]), constraints)
 
     def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
@@ -177,8 +184,10 @@ class DesignProgram:
                 (self._P, d, d), (self._X, d, d), (self._Q, g, g), (self._R, s, s)
             )
         )
-        w, v = self._amplitudes
-        scale = 1.0 / (largest_norm(Q, w) ** 2 + largest_norm(R, v) ** 2)
+        sizes = self._sizes
+        w = _alone("disturbances", _read("disturbances", sizes.disturbances), len(Q), Q)
+        v = _alone("noises", _read("noises", sizes.noises), len(R), R)
+        scale = 1.0 / (float(w**2 + v**2) or 1.0)
         P, Q, R = (_rounded(scale * each) for each in (P, Q, R))
         X = 0.5 * scale * (X + X.T)
         inner: OutputWeight | OutputInjection = OutputWeight(P, R, rate)
@@ -200,13 +209,13 @@ class DesignSearch(Search):
     """`Search` with the design's program; the best rate is that of the smallest limit."""
 
     def __init__(
-        self, system: Any, region: Region, amplitudes: tuple[Array, Array], horizon: int | None,
+        self, system: Any, region: Region, sizes: SignalBounds, horizon: int | None,
         seconds: float | Deadline,
     ) -> None:
         super().__init__(system, region, None, (1.0, 1.0), seconds=seconds)
         matrix = system.disturbance_matrix
         self._directions = np.eye(system.n) if matrix is None else np.asarray(matrix, np.float64)
-        self._amplitudes, self._horizon = amplitudes, horizon
+        self._sizes, self._horizon = sizes, horizon
 
     @property
     def program(self) -> Any:
@@ -214,7 +223,7 @@ class DesignSearch(Search):
         if self._program is None:
             self._program = DesignProgram(  # type: ignore[assignment]
                 self.kind, self.jacobians[self._chosen], self.scales,  # type: ignore[arg-type]
-                self._directions, self._amplitudes,
+                self._directions, self._sizes,
             )
         return self._program
 
@@ -250,16 +259,6 @@ def growth(gamma: float, horizon: int | None) -> float:
     if 4.0 * left >= 1.0:
         return math.inf
     return 4.0 * (1.0 - left) / ((1.0 - gamma) * (1.0 - 4.0 * left))
-
-
-def largest_norm(weight: Array, amplitude: Array) -> float:
-    """The largest |s|_W of vectors of a length, or of those in a box |s_j| <= amplitude_j."""
-    if not amplitude.ndim:
-        return float(norms(amplitude[None], weight)[0])
-    if amplitude.size > 12:  # the corners are too many
-        return math.sqrt(float(amplitude @ np.abs(weight) @ amplitude))
-    signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * amplitude.size)).reshape(amplitude.size, -1)
-    return float(norms(signs.T * amplitude, weight).max())
 
 
 def _rounded(matrix: Array) -> Array:

@@ -1,10 +1,14 @@
-"""Weights, discount and horizon from a Lyapunov function of detectability, and what they bound."""
+r"""Weights, discount and horizon from a Lyapunov function of detectability, and what they bound.
+
+`docs/explanation/lyapunov.md` derives every inequality.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -22,7 +26,7 @@ from ..observers import Observer
 from .branch_and_bound import constant_output, output_lipschitz
 from .contraction import _undetectable, certify_observer, constant_gain
 from .deadline import DEFAULT_SECONDS, Deadline
-from .dissipation import DesignSearch, Dissipation, growth, largest_norm
+from .dissipation import DesignSearch, Dissipation, growth
 from .evidence import (
     CertificateError,
     Evidence,
@@ -32,11 +36,12 @@ from .evidence import (
     weakest,
 )
 from .inequalities import norms
+from .observer_bound import ObserverBound, SignalBounds, Size, _alone, _read
 from .properties import ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
 from .theorem import Sizes
-from .window_bounds import _slope, largest
+from .window_bounds import _slope, fit_weight, largest
 
 Kind = Literal["minimiser", "measured", "decrease"]
 KINDS: tuple[Kind, ...] = ("minimiser", "measured", "decrease")
@@ -49,56 +54,26 @@ _BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE  # J is ano
 
 
 @dataclass(frozen=True, eq=False)
-class CandidateCost:
-    """What bounds the cost of an observer's trajectory by its error at the window's start.
-
-    Parameters
-    ----------
-    rate : float
-        The contraction of the observer's error e, in the norm O.
-    norm, gain : (n, n) and (n, p) array
-        O and the gain K: |e+|_O <= rate |e|_O + |w|_O + |K v|_O.
-    fit : (p, p) array
-        M = K^T Q K + R, what a fitting error of the observer costs.
-    slope : float
-        The largest |h(x) - h(z)|_M / |x - z|_O.
-    entry, exit : float
-        From the design's norm to the observer's, and back.
-    evidence : Evidence
-        What it rests on.
-    """
-
-    rate: float
-    norm: Array
-    gain: Array
-    fit: Array
-    slope: float
-    entry: float
-    exit: float
-    evidence: Evidence
-
-
-@dataclass(frozen=True, eq=False)
 class Design:
     r"""A discounted cost that fits a Lyapunov function of detectability, made by `design`.
 
-    With the weights P, Q, R and the discount :math:`\gamma`, for states of the region,
+    With the weights P, Q, R and the discount :math:`\gamma`, for any two states of the region,
 
     .. math::
         |f(x_1) + w_1 - f(x_2) - w_2|_P^2 \le \gamma |x_1 - x_2|_P^2 + |w_1 - w_2|_Q^2
-        + |h(x_1) - h(x_2)|_R^2,
+        + |h(x_1) - h(x_2)|_R^2 .
 
-    whence, with the window's length K and the cost J of these weights, for the truth x with its
-    disturbances and noises and for any trajectory :math:`\hat x` that fits the measurements,
+    So for the truth x, any trajectory :math:`\hat x` that fits the window's measurements, and the
+    cost J of these weights, :math:`|\hat x - x|_P \le \sqrt{J(\hat x)} + \sqrt{J(x)}` at the
+    window's end. What bounds :math:`J(\hat x)` is the ``kind``:
 
-    .. math::
-        |\hat x(t) - x(t)|_P \le \sqrt{J(\hat x)} + \sqrt{J(x)} .
+    - ``minimiser``: it is at most J(x), as for a global minimiser. That the QPs have converged
+      does not prove it.
+    - ``measured``: it is known. For any number of QPs.
+    - ``decrease``: it is at most the cost of the observer's trajectory. For any number of QPs.
 
-    What bounds :math:`J(\hat x)` is the ``kind``: ``minimiser``, it is no more than J(x);
-    ``measured``, it is known; ``decrease``, it is no more than the candidate's. Only the last
-    two hold for any number of QPs, and converged QPs do not prove the first. All bounds are of
-    :math:`|\hat x - x|_P`; `components` has them in the states' units. They hold while truth,
-    estimates and, for ``decrease``, the observer stay in the region.
+    Bounds are of :math:`|\hat x - x|_P`; `components` has them in the states' units. They hold
+    while truth, estimates and, for ``decrease``, observers stay in the region.
 
     Parameters
     ----------
@@ -108,14 +83,18 @@ class Design:
         The inequality that was verified.
     discount : float
         gamma.
-    amplitudes : (array, array)
-        The largest disturbances and noises: a length, or one for each component.
+    sizes : SignalBounds
+        The largest disturbances and noises.
     horizon : int
-        The horizon given, or the least one whose limit is at most a tenth above the smallest.
-    candidate : CandidateCost or None
-        For the kind ``decrease``, and for candidates of the running observer.
+        The horizon given, or the least one whose limit for a minimiser is at most a tenth above
+        that of endless horizons.
+    observer : ObserverBound or None
+        For ``decrease``, and for candidates of the running observer.
+    slope : float
+        The largest |h(x) - h(z)|_M / |x - z|_O, with M = K^T Q K + R, the observer's gain K and
+        its norm O.
     evidence : Evidence
-        What the inequality rests on.
+        The weakest of what it rests on.
     notes : tuple of str
         What else there is to say.
     """
@@ -124,9 +103,10 @@ class Design:
     region: Region
     form: Dissipation
     discount: float
-    amplitudes: tuple[Array, Array]
+    sizes: SignalBounds
     horizon: int
-    candidate: CandidateCost | None
+    observer: ObserverBound | None
+    slope: float
     evidence: Evidence
     notes: tuple[str, ...] = ()
 
@@ -145,12 +125,20 @@ class Design:
         """R, the weight of the noise, (p, p)."""
         return self.form.R
 
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kinds of bounds at hand for a re-initialised candidate."""
+        return KINDS if self.observer is not None else KINDS[:2]
+
     def cost(self) -> QuadraticCost:
         """The cost of the design, for an estimator with ``candidate="reinitialized"``."""
-        return QuadraticCost(
-            prior=self.prior, disturbance=self.disturbance, noise=self.noise,
-            discount=self.discount,
-        )
+        return _cost(self.form, self.discount)
+
+    @cached_property
+    def _changes(self) -> tuple[float, float]:
+        """From the design's norm to the observer's at most, and back."""
+        O = self._observer().metric  # noqa: E741
+        return math.sqrt(largest(O, self.prior)), math.sqrt(largest(self.prior, O))
 
     def contraction(self, horizon: int | None = None, kind: Kind = "decrease") -> float:
         """The factor on the error over a window whose prior is an estimate.
@@ -161,9 +149,9 @@ class Design:
         own = math.sqrt(self.discount**N)
         if _checked(kind) != "decrease":
             return own if kind == "measured" else 2.0 * own
-        part, lags = self._observer(), np.arange(N)
-        decay = float(self.discount ** (N - 1.0 - lags) @ part.rate ** (2.0 * lags))
-        return _OUTWARD * (own + part.slope * part.entry * math.sqrt(decay))
+        lags = np.arange(N)
+        decay = self.discount ** (N - 1.0 - lags) @ self._observer().rate ** (2.0 * lags)
+        return _OUTWARD * (own + self.slope * self._changes[0] * math.sqrt(float(decay)))
 
     def least_horizon(self, kind: Kind = "decrease") -> int:
         """The least N whose contraction is below 1."""
@@ -183,11 +171,10 @@ class Design:
                 "kind is 'measured', but nothing is measured yet; expected 'minimiser' or "
                 "'decrease'."
             )
-        signals = [np.full(N, value) for value in self._signals(None, None)]
+        signals = self._signals(None, None, N)
         if not _restarts(candidate):
-            part = self._observer()
-            error = float(signals[2][0]) / (1.0 - part.rate)
-            return self._step(kind, part.exit * error, *signals, observed=error)
+            error = self._observer().limit(self.sizes.disturbances, self.sizes.noises)
+            return self._step(kind, self._changes[1] * error, *signals, observed=error)
         factor, first = self.contraction(N, kind), self._step(kind, 0.0, *signals)
         if factor >= 1.0 or first == 0.0:
             return 0.0 if first == 0.0 else math.inf
@@ -199,25 +186,27 @@ class Design:
             lambda bound: self._step(kind, bound, *signals) - bound, 0.0, most, rtol=1e-12
         ))
 
+    @cached_property
+    def _slopes(self) -> Array:
+        return np.sqrt([largest(np.outer(e, e), self.prior) for e in np.eye(len(self.prior))])
+
     def components(self, bound: ArrayLike) -> Array:
         """Bounds of each component's error, (..., n), from bounds in the design's norm."""
-        squares = np.diag(np.linalg.inv(self.prior))
-        return np.multiply.outer(numbers("bound", bound, finite=False), np.sqrt(squares))
+        return np.multiply.outer(numbers("bound", bound, finite=False), self._slopes)
 
     def length(self, bound: ArrayLike) -> Array:
         """Bounds of the error's Euclidean length, from bounds in the design's norm."""
-        least = float(np.linalg.eigvalsh(self.prior)[0])
-        return numbers("bound", bound, finite=False) / math.sqrt(least)
+        whole = math.sqrt(largest(np.eye(len(self.prior)), self.prior))
+        return whole * numbers("bound", bound, finite=False)
 
     def along(
         self, run: Run, source: MovingHorizonEstimator, *, initial_error: ArrayLike,
-        disturbances: ArrayLike | None = None, noises: ArrayLike | None = None,
-        kind: Kind = "measured",
+        disturbances: Size | None = None, noises: Size | None = None, kind: Kind = "measured",
     ) -> Array:
         r"""The bound of :math:`|\hat x(t) - x(t)|_P` along a run at t = 0, ..., T, (T + 1,).
 
         NaN from where something broke it: a missing measurement, a failed model, or a projected
-        observer where kind or candidate need the observer.
+        observer where kind or candidate need it as it is.
 
         Parameters
         ----------
@@ -228,9 +217,9 @@ class Design:
             are those of the bound.
         initial_error : (n,) array_like or float
             x(0) minus the first guess, or a bound on its length.
-        disturbances, noises : array_like, optional
-            w(t) and v(t) as vectors (T, r) and (T, p), lengths (T,), or a number; the design's
-            largest ones if left out.
+        disturbances, noises : optional
+            w(t) and v(t) as vectors (T, r) and (T, p), lengths (T,), or bounds for all times: a
+            number for the length or a set, such as ``qpmhe.Box``. Left out, `sizes`.
         kind : {"measured", "minimiser", "decrease"}
             What bounds the estimate's cost.
 
@@ -238,7 +227,7 @@ class Design:
         ------
         MismatchError
             If the estimator has another system, cost, observer or arrival than the bound is of.
-        ShapeError, OptionError
+        ShapeError, OptionError, SetError
             If an argument does not fit.
         """
         self._check(kind, source)
@@ -248,29 +237,23 @@ class Design:
             raise ShapeError(
                 f"initial_error has shape {start.shape}; expected ({self.system.n},) or a number."
             )
-        signals = [np.broadcast_to(each, (steps,)) for each in self._signals(
-            _sized("disturbances", disturbances, steps, self.disturbance.shape[0]),
-            _sized("noises", noises, steps, self.system.p),
-        )]
+        signals = self._signals(disturbances, noises, steps)
         flags, spoilt = _BROKEN, np.zeros(steps, np.bool_)
         if kind == "decrease" or not restarts:
             flags |= Status.OBSERVER_PROJECTED
         for t in np.flatnonzero(run.flags & flags.value).tolist():
             spoilt[t : t + N if restarts else steps] = True
-        bound, errors = np.full(steps + 1, math.nan), np.zeros(steps + 1)  # of the running observer
+        bound, errors = np.full(steps + 1, math.nan), np.zeros(steps + 1)
         bound[0] = float(norms(start[None], self.prior)[0]) * _OUTWARD
         if not restarts:
-            part = self._observer()
-            errors[0] = float(norms(start[None], part.norm)[0]) * _OUTWARD
-            for t in range(steps):
-                errors[t + 1] = part.rate * errors[t] + signals[2][t]
+            errors = self._observer().radii(steps, start, signals[2])
         for t in (np.flatnonzero(~spoilt) + 1).tolist():
             first = max(t - N, 0)
-            window, cost = [each[first:t] for each in signals], float(run.costs[t - 1])
-            own, observed = float(bound[first]), None
+            window, own, observed = [each[first:t] for each in signals], float(bound[first]), None
             if not restarts:
                 observed = float(errors[first])
-                own = self._observer().exit * observed if first else own
+                own = self._changes[1] * observed if first else own
+            cost = float(run.costs[t - 1])
             bound[t] = self._step(kind, own, *window, cost=cost, observed=observed)
         return bound
 
@@ -280,7 +263,7 @@ class Design:
     ) -> float:
         """sqrt(J(estimate)) + sqrt(J(truth)) at a window's end, from the error of its prior.
 
-        In the observer's norm, too, where it is not the error of an estimate.
+        In the observer's norm, too, where that is not the error of an estimate.
         """
         ages = self.discount ** np.arange(len(truth) - 1.0, -1.0, -1.0)
         root = math.sqrt(self.discount ** len(truth) * error**2 + float(ages @ truth))
@@ -288,39 +271,42 @@ class Design:
             return 2.0 * root * _OUTWARD
         if kind == "measured":
             return (root + math.sqrt(cost)) * _OUTWARD
-        part = self._observer()
-        errors = np.empty(len(truth))
-        following = part.entry * error if observed is None else observed
-        for k, enters in enumerate(driving):
-            errors[k], following = following, part.rate * following + enters
-        costs = np.square(part.slope * errors + fit)
+        errors, rate = np.empty(len(truth)), self._observer().rate
+        following = self._changes[0] * error if observed is None else observed
+        for k, enters in enumerate(driving.tolist()):
+            errors[k], following = following, rate * following + enters
+        costs = np.square(self.slope * errors + fit)
         return (root + math.sqrt(float(ages @ costs))) * _OUTWARD
 
-    def _signals(self, w: Array | None, v: Array | None) -> tuple[Array, Array, Array]:
-        """The truth's stage costs, its noises in the candidate's fit, what drives the observer.
+    def _signals(self, w: Size | None, v: Size | None, steps: int) -> list[Array]:
+        """At each sample: the truth's cost, its noise in the candidate's, what drives the observer.
 
-        Of vectors or lengths at each time, or of the largest ones.
+        The last two are zero without an observer.
         """
+        w = _read("disturbances", self.sizes.disturbances if w is None else w)
+        v = _read("noises", self.sizes.noises if v is None else v)
+        p, found = self.system.p, [np.zeros(())] * 3
+        found[0] = (
+            _alone("disturbances", w, len(self.disturbance), self.disturbance) ** 2
+            + _alone("noises", v, p, self.noise) ** 2
+        )
+        if self.observer is not None:
+            fit = fit_weight(self.cost(), self.observer.gain)
+            found[1:] = _alone("noises", v, p, fit), self.observer.entering(w, v)
+        if any(each.shape not in ((), (steps,)) for each in found):
+            raise ShapeError(
+                f"disturbances or noises are not of {steps} samples, as the run is; expected "
+                f"({steps}, {len(self.disturbance)}) and ({steps}, {p}), or lengths ({steps},)."
+            )
+        return [np.broadcast_to(each, (steps,)) for each in found]
 
-        def size(values: Array | None, weight: Array, which: int) -> Array:
-            if values is None:
-                return np.array(largest_norm(weight, self.amplitudes[which]))
-            return norms(values, weight)
-
-        truth = size(w, self.disturbance, 0) ** 2 + size(v, self.noise, 1) ** 2
-        part, none = self.candidate, np.zeros_like(truth)
-        if part is None:
-            return truth, none, none
-        corrected = size(v, part.gain.T @ part.norm @ part.gain, 1)
-        return truth, none + size(v, part.fit, 1), none + size(w, part.norm, 0) + corrected
-
-    def _observer(self) -> CandidateCost:
-        if self.candidate is None:
+    def _observer(self) -> ObserverBound:
+        if self.observer is None:
             raise OptionError(
                 "the design has no observer whose error contracts, which this bound needs; pass "
                 "one with a constant gain that certify_observer accepts: design(..., observer=...)."
             )
-        return self.candidate
+        return self.observer
 
     def _check(self, kind: str, source: MovingHorizonEstimator) -> None:
         """Raise a `MismatchError` unless the bound is of this estimator."""
@@ -361,22 +347,22 @@ class Design:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows; infinite numbers become None."""
-        kinds: tuple[Kind, ...] = KINDS if self.candidate is not None else KINDS[:2]
-        found: dict[str, Any] = {
+        content: dict[str, Any] = json_ready({
             "prior": self.prior, "disturbance": self.disturbance, "noise": self.noise,
             "discount": self.discount, "horizon": self.horizon, "region": self.region.to_dict(),
-            "amplitudes": list(self.amplitudes), "evidence": self.evidence.value,
-            "notes": self.notes,
-            "contraction": {kind: self.contraction(kind=kind) for kind in kinds},
-            "least_horizon": {kind: self.least_horizon(kind) for kind in kinds},
+            "sizes": self.sizes.to_dict(), "evidence": self.evidence.value, "notes": self.notes,
+            "contraction": {kind: self.contraction(kind=kind) for kind in self.kinds},
+            "least_horizon": {kind: self.least_horizon(kind) for kind in self.kinds},
             "limit": {
-                kind: self.components(self.limit(kind=kind)) for kind in kinds if kind != "measured"
+                kind: self.components(self.limit(kind=kind))
+                for kind in self.kinds if kind != "measured"
             },
-        }
-        if self.candidate is not None:
-            found["observer"] = vars(self.candidate) | {"evidence": str(self.candidate.evidence)}
-        content: dict[str, Any] = json_ready(found)
+        } | ({} if self.observer is None else {"observer": self.observer.to_dict()}))
         return content
+
+
+def _cost(form: Dissipation, discount: float) -> QuadraticCost:
+    return QuadraticCost(prior=form.P, disturbance=form.Q, noise=form.R, discount=discount)
 
 
 def _restarts(candidate: str) -> bool:
@@ -396,24 +382,11 @@ def _first(wanted: Callable[[int], bool]) -> int:
     return next((N for N in range(1, _MOST) if wanted(N)), _MOST)
 
 
-def _sized(name: str, values: ArrayLike | None, steps: int, width: int) -> Array | None:
-    """Vectors or lengths at each sample; None where none are given."""
-    if values is None:
-        return None
-    found = numbers(name, values)
-    if found.shape not in ((), (steps,), (steps, width)):
-        raise ShapeError(
-            f"{name} has shape {found.shape}; expected ({steps}, {width}), lengths ({steps},), "
-            "or a number."
-        )
-    return found if found.ndim else np.full(steps, found)
-
-
 def design(
     system: System, region: ConvexSet | Region | None = None, *, observer: Observer | None = None,
-    inputs: Box | None = None, sizes: Sizes | None = None, horizon: int | None = None,
-    discount: float | None = None, stability: ObserverStability | None = None,
-    seconds: float | Deadline = DEFAULT_SECONDS,
+    inputs: Box | None = None, sizes: SignalBounds | Sizes | None = None,
+    horizon: int | None = None, discount: float | None = None,
+    stability: ObserverStability | None = None, seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Design:
     """Find weights, discount and horizon for which the discounted cost bounds the error.
 
@@ -422,11 +395,11 @@ def design(
     system, region, inputs
         As for `certify`.
     observer : Observer, optional
-        The candidate's, with a constant gain: for bounds that hold with any number of QPs
-        before anything is measured. If its error is not shown to contract, the notes say so.
-    sizes : Sizes, optional
-        Largest disturbances and noises, for which the limit is to be small; the boxes W and V
-        of the system if left out.
+        The candidate's, with a constant gain: for what holds in advance with any number of QPs.
+        If its error is not shown to contract, the notes say so.
+    sizes : SignalBounds or Sizes, optional
+        Largest disturbances and noises, for which the limit is to be small; W and V of the
+        system if left out.
     horizon : int, optional
         N, for which the limit is to be small; proposed if left out.
     discount : float, optional
@@ -444,70 +417,57 @@ def design(
         If the system is not shown detectable with a Lyapunov function of this kind.
     """
     checked_system(system)
-    place, amplitudes = bounded_region(system, region, inputs), _amplitudes(system, sizes)
+    place, known = bounded_region(system, region, inputs), _sizes(system, sizes)
     if horizon is not None:
         count("horizon", horizon, 1)
     if discount is not None and not 0.0 < discount < 1.0:
         raise OptionError(f"discount is {discount!r}; expected a number in (0, 1).")
     deadline = started(seconds)
-    search = DesignSearch(system, place, amplitudes, horizon, deadline.part(_DESIGN))
+    search = DesignSearch(system, place, known, horizon, deadline.part(_DESIGN))
     rate = None if discount is None else math.sqrt(discount) * (1.0 - 1e-12)
     found = search.answer("the root of the discount", rate, (), _undetectable)
     form = found.form
     assert isinstance(form, Dissipation)
     gamma = discount if discount is not None else _short(form.rate**2)
-    part: CandidateCost | None = None
-    why: tuple[str, ...] = ()
+    proposed = _first(lambda N: growth(gamma, N) <= _ROOM**2 * growth(gamma, None))
+    cost = _cost(form, gamma)
+    bound, slope, evidence, notes = None, math.nan, found.evidence, found.notes
     if observer is not None:
         try:
-            part = _candidate_cost(system, place, form, observer, stability, deadline)
-        except (CertificateError, NotCertifiedError) as error:
-            why = (f"nothing holds in advance for any number of QPs: {error}",)
-    proposed = _first(lambda N: growth(gamma, N) <= _ROOM**2 * growth(gamma, None))
-    return Design(
-        system, place, form, gamma, amplitudes, horizon or proposed, part, found.evidence,
-        (*found.notes, *why),
-    )
-
-
-def _candidate_cost(
-    system: System, region: Region, form: Dissipation, observer: Observer,
-    stability: ObserverStability | None, deadline: Deadline,
-) -> CandidateCost:
-    """What bounds the observer's trajectory and its cost."""
-    if system.disturbance_matrix is not None:
-        raise CertificateError("its corrections need not lie in the system's disturbance_matrix")
-    K = constant_gain(observer, system)
-    if stability is None:
-        stability = certify_observer(system, observer, region, seconds=deadline.part(_OBSERVER))
-    stability = fitting(stability, system, region, K)
-    O, P = stability.P, form.P  # noqa: E741
-    if O is None:
-        raise CertificateError("its constants are assumed, without a norm that contracts")
-    lipschitz = output_lipschitz(system, region, seconds=deadline)
-    fit = K.T @ form.Q @ K + form.R
-    slope = _slope(fit, O, lipschitz.value, constant_output(system, region))
-    entry, leaving = math.sqrt(largest(O, P)), math.sqrt(largest(P, O))
-    return CandidateCost(
-        stability.rho, O, K, fit, slope, entry, leaving,
-        weakest((stability.evidence, lipschitz.evidence)),
-    )
-
-
-def _amplitudes(system: System, sizes: Sizes | None) -> tuple[Array, Array]:
-    """The largest disturbances and noises: lengths, or one for each component."""
-    if sizes is not None:
-        return np.asarray(sizes.disturbance, np.float64), np.asarray(sizes.noise, np.float64)
-    found = []
-    for name, known in (("disturbances", system.disturbances), ("noises", system.noises)):
-        size = np.full(1, np.inf) if known is None else np.maximum(-known.lower, known.upper)
-        if not np.isfinite(size).all():
-            raise SetError(
-                f"it is not known how large the {name} may be: the system has no bounded set of "
-                "them. Pass sizes=Sizes(disturbance=..., noise=...)."
+            if system.disturbance_matrix is not None:
+                raise CertificateError("the system has a disturbance_matrix, not its corrections")
+            K = constant_gain(observer, system)
+            stability = stability or certify_observer(
+                system, observer, place, seconds=deadline.part(_OBSERVER)
             )
-        found.append(np.asarray(size, np.float64))
-    return found[0], found[1]
+            stability = fitting(stability, system, place, K)
+            if stability.P is None:
+                raise CertificateError("its constants are assumed, without a norm that contracts")
+            bound = ObserverBound(stability, place, known)
+            lipschitz = output_lipschitz(system, place, seconds=deadline)
+            slope = _slope(
+                fit_weight(cost, K), stability.P, lipschitz.value, constant_output(system, place)
+            )
+            evidence = weakest((evidence, stability.evidence, lipschitz.evidence))
+        except (CertificateError, NotCertifiedError) as error:
+            notes = (*notes, f"nothing holds in advance for any number of QPs: {error}")
+    return Design(
+        system, place, form, gamma, known, horizon or proposed, bound, slope, evidence, notes
+    )
+
+
+def _sizes(system: System, sizes: SignalBounds | Sizes | None) -> SignalBounds:
+    """What is stated, or else the system's W and V."""
+    if isinstance(sizes, SignalBounds):
+        return sizes
+    if sizes is not None:
+        return SignalBounds(sizes.disturbance, sizes.noise)
+    if system.disturbances is None or system.noises is None:
+        raise SetError(
+            "it is not known how large disturbances and noises may be: the system has no sets of "
+            "them. Pass sizes=Sizes(disturbance=..., noise=...), or SignalBounds with boxes."
+        )
+    return SignalBounds(system.disturbances, system.noises, "the system's W and V")
 
 
 def _short(gamma: float) -> float:

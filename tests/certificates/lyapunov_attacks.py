@@ -94,7 +94,7 @@ def attack(plan, observer, *, trials, steps=25, seed=0):
         )
         w, v = (
             bounded(rng, NOISES[rng.choice(kinds)](rng, steps, width), size)
-            for width, size in ((system.n, plan.amplitudes[0]), (system.p, plan.amplitudes[1]))
+            for width, size in ((system.n, plan.sizes.disturbances), (system.p, plan.sizes.noises))
         )
         mhe = qpmhe.MovingHorizonEstimator(
             system, observer, plan.cost(), horizon=N, initial_state=guess, max_qps=cap,
@@ -103,9 +103,9 @@ def attack(plan, observer, *, trials, steps=25, seed=0):
         pushing, x, estimates, lasts = rng.random() < 0.5, [start], [], steps
         lowest = np.zeros(steps, bool)
         for t in range(steps):
-            if pushing and plan.amplitudes[0] > 0.0:
+            if pushing and plan.sizes.disturbances > 0.0:
                 gap = mhe.state - x[-1]
-                w[t] = -plan.amplitudes[0] * gap / max(float(np.linalg.norm(gap)), 1e-300)
+                w[t] = -plan.sizes.disturbances * gap / max(float(np.linalg.norm(gap)), 1e-300)
             ahead = np.asarray(system.f(x[-1], nothing))
             estimates.append(mhe.update(system.h(x[-1], nothing) + v[t]))
             x.append(ahead + w[t])
