@@ -10,6 +10,7 @@ from .evidence import (
     NotCertifiedError,
     OutOfTimeError,
 )
+from .lyapunov import Design, design
 from .monitor import Hypotheses, Monitor, MonitorSummary, monitor, monitored_run
 from .observer_bound import Band, ObserverBound, SignalBounds
 from .observer_monitor import ObserverMonitor, Reading
@@ -19,10 +20,10 @@ from .report import Report, certify_model
 from .theorem import DecayingSums, Sizes, TheoremConstants
 
 __all__ = [
-    "Audit", "Band", "Certificate", "CertificateError", "DecayingSums", "Detectability",
+    "Audit", "Band", "Certificate", "CertificateError", "DecayingSums", "Design", "Detectability",
     "Evidence", "Hypotheses", "MismatchError", "Monitor", "MonitorSummary", "NotCertifiedError",
     "ObserverBound", "ObserverMonitor", "ObserverStability", "OutOfTimeError", "Reading", "Region",
     "Report", "SignalBounds", "Sizes", "Synthesis",
     "TheoremConstants", "audit", "certify", "certify_detectability", "certify_model",
-    "certify_observer", "monitor", "monitored_run", "synthesise_gain",
+    "certify_observer", "design", "monitor", "monitored_run", "synthesise_gain",
 ]

@@ -331,18 +331,19 @@ class Design:
                 )
 
     def code(self) -> str:
-        """Python that makes the cost, ready to be pasted."""
+        """Python that makes the cost and says which horizon and candidate belong to it."""
 
         def text(matrix: Array) -> str:
-            return "[" + ", ".join(
-                "[" + ", ".join(f"{value:.8g}" for value in row) + "]" for row in matrix
-            ) + "]"
+            rows = (", ".join(f"{value:.8g}" for value in row) for row in matrix)
+            return f"[{', '.join(f'[{row}]' for row in rows)}]"
 
         return (
-            "cost = qpmhe.QuadraticCost(\n"
-            f"    prior={text(self.prior)},\n    disturbance={text(self.disturbance)},\n"
-            f"    noise={text(self.noise)},\n    discount={self.discount!r},\n)\n"
-            f"horizon = {self.horizon}\n"
+            f"cost = qpmhe.QuadraticCost(\n    prior={text(self.prior)},\n"
+            f"    disturbance={text(self.disturbance)},\n    noise={text(self.noise)},\n"
+            f"    discount={self.discount!r},\n)\n"
+            "mhe = qpmhe.MovingHorizonEstimator(\n"
+            f'    system, observer, cost, horizon={self.horizon}, candidate="reinitialized",\n'
+            "    initial_state=initial_state,\n)\n"
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from ..plots.bounds import error_and_bounds
 from ..plots.style import save
 from .certificate import Certificate, Kind, examined, horizons_of
 from .deadline import DEFAULT_SECONDS, Deadline
+from .lyapunov import Design
 from .monitor import MonitorSummary, monitored_run
 from .observer_bound import Band, SignalBounds
 from .regions import Region, bounded_region
@@ -54,6 +55,8 @@ class Report:
         Where something bounds the error: the estimator's run on the record, with the largest
         horizon and two QPs a sample, the observer's bound along it, what the monitor saw, and the
         estimator after it.
+    design : Design or None
+        Weights that fit each other, where they were asked for.
     """
 
     name: str
@@ -64,6 +67,7 @@ class Report:
     band: Band | None = None
     summary: MonitorSummary | None = None
     estimator: MovingHorizonEstimator | None = None
+    design: Design | None = None
 
     @property
     def region(self) -> Region:
@@ -81,6 +85,7 @@ class Report:
             "model": self.name, "certified": certificate.holds,
             "monitor": self.summary and str(self.summary),
             "monitored": self.summary and self.summary.to_dict(),
+            "design": self.design and self.design.to_dict(),
             "suggestions": list(dict.fromkeys(suggestions)),
             "smallest_rates": {
                 name: getattr(certificate.errors.get(what), "smallest_rate", None)

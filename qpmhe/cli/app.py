@@ -121,13 +121,17 @@ def certify(
     details: Annotated[
         bool, typer.Option("--details", help="The theorem's assumptions and constants as well.")
     ] = False,
+    design: Annotated[
+        bool, typer.Option("--design", help="Weights, discount and horizon of a Lyapunov design, "
+                                            "ready to be pasted.")
+    ] = False,
 ) -> None:
     """What is proved of a model: the observer's error, and what the theorem guarantees."""
     from .certify import certify as run
 
     certified = run(
         Console(), model, box, horizon, report, input_box=input_box, seed=seed, seconds=seconds,
-        details=details,
+        details=details, design=design,
     )
     if not certified:
         raise typer.Exit(1)

@@ -21,12 +21,13 @@ from ..certificates.report import LABELS, Report, certify_model
 from ..errors import OptionError
 from ..model.sets import Box
 from ..models.loading import find, load
+from .design import show_design
 
 
 def certify(
     console: Console, model: str, box: str | None = None, horizon: str | None = None,
     report: Path | None = None, *, input_box: str | None = None, seed: int = 0,
-    seconds: float = 60.0, details: bool = False,
+    seconds: float = 60.0, details: bool = False, design: bool = False,
 ) -> bool:
     """Certify a model with `qpmhe.certificates.certify_model`, and show the result."""
     horizons = _horizons(horizon)
@@ -60,6 +61,8 @@ def certify(
         _show_details(console, found)
     elif certificate.bounds or certificate.audit is not None:
         _print(console, "[dim]The theorem's assumptions and constants: --details[/]")
+    if design:
+        found.design = show_design(console, found, horizons, seconds)
     if report is not None:
         for path in found.save(report):
             console.print(f"wrote {escape(str(path))}", highlight=False, soft_wrap=True)
