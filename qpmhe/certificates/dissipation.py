@@ -213,6 +213,10 @@ class DesignSearch(Search):
         seconds: float | Deadline,
     ) -> None:
         super().__init__(system, region, None, (1.0, 1.0), seconds=seconds)
+        half = 0.5 * (region.upper - region.lower)[: system.n]
+        states = np.where(half > 0.0, half, 1.0) / (half.max() or 1.0)
+        self.scales = Scales(states, np.abs(self.jacobians[:, system.n :] * states).sum(2).max(0))
+        self.scales.outputs[self.scales.outputs == 0.0] = 1.0
         matrix = system.disturbance_matrix
         self._directions = np.eye(system.n) if matrix is None else np.asarray(matrix, np.float64)
         self._sizes, self._horizon = sizes, horizon

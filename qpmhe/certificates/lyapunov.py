@@ -138,7 +138,7 @@ class Design:
     def _changes(self) -> tuple[float, float]:
         """From the design's norm to the observer's at most, and back."""
         O = self._observer().metric  # noqa: E741
-        return math.sqrt(largest(O, self.prior)), math.sqrt(largest(self.prior, O))
+        return _ratio(O, self.prior), _ratio(self.prior, O)
 
     def contraction(self, horizon: int | None = None, kind: Kind = "decrease") -> float:
         """The factor on the error over a window whose prior is an estimate.
@@ -188,7 +188,7 @@ class Design:
 
     @cached_property
     def _slopes(self) -> Array:
-        return np.sqrt([largest(np.outer(e, e), self.prior) for e in np.eye(len(self.prior))])
+        return np.array([_ratio(np.outer(e, e), self.prior) for e in np.eye(len(self.prior))])
 
     def components(self, bound: ArrayLike) -> Array:
         """Bounds of each component's error, (..., n), from bounds in the design's norm."""
@@ -196,8 +196,7 @@ class Design:
 
     def length(self, bound: ArrayLike) -> Array:
         """Bounds of the error's Euclidean length, from bounds in the design's norm."""
-        whole = math.sqrt(largest(np.eye(len(self.prior)), self.prior))
-        return whole * numbers("bound", bound, finite=False)
+        return _ratio(np.eye(len(self.prior)), self.prior) * numbers("bound", bound, finite=False)
 
     def along(
         self, run: Run, source: MovingHorizonEstimator, *, initial_error: ArrayLike,
@@ -364,6 +363,13 @@ class Design:
 
 def _cost(form: Dissipation, discount: float) -> QuadraticCost:
     return QuadraticCost(prior=form.P, disturbance=form.Q, noise=form.R, discount=discount)
+
+
+def _ratio(one: Array, other: Array) -> float:
+    """The largest |s|_one / |s|_other, rounded up, whatever the units of s."""
+    units = 1.0 / np.sqrt(other.diagonal())
+    scale = np.outer(units, units)
+    return math.sqrt(largest(scale * one, scale * other)) * _OUTWARD
 
 
 def _restarts(candidate: str) -> bool:

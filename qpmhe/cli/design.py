@@ -35,12 +35,13 @@ def show_design(
             console.print(f"[bold red]No design:[/] {escape(str(error))}", highlight=False)
             return None
     console.print(
-        f"\n[bold]Lyapunov design ({made.evidence}): the error of the re-initialised candidate's "
-        f"estimates contracts over a window[/], for {escape(str(made.sizes))}", highlight=False,
+        f"\n[bold]Lyapunov design ({made.evidence})[/], for {escape(str(made.sizes))}",
+        highlight=False,
     )
     console.print(_table(made), highlight=False)
     for note in made.notes:
         console.print(f"Note: {escape(note)}", highlight=False)
+    console.print()
     console.print(made.code(), highlight=False, markup=False, soft_wrap=True)
     return made
 
@@ -48,20 +49,24 @@ def show_design(
 def _table(made: Design) -> Table:
     table = Table(
         box=boxes.SIMPLE, padding=(0, 1, 0, 0), caption_justify="left",
-        caption="Contraction: of the error, from one window's start to its end. Least N: from "
-        "which it is below 1. Limits: of each state's error, for noises that always act in the "
-        "worst direction.",
+        caption="Contraction: by which factor the error shrinks over a window that starts at an "
+        "estimate. Least N: from which it is below 1. Limit: of each state's error, for noises "
+        "that always act in the worst direction; -, none in advance for this N.",
     )
     table.add_column("what bounds J(estimate)", overflow="fold", vertical="bottom")
-    names = [f"x{j + 1}" for j in range(made.region.n)]
-    for name in (f"contraction\nN = {made.horizon}", "least\nN", *(f"limit\n{x}" for x in names)):
-        table.add_column(name, justify="right", no_wrap=True)
+    numbers = f"contraction\nN = {made.horizon}", "least\nN"
+    for name in numbers:
+        table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
+    table.add_column(
+        f"limit\nx1{f', ..., x{n}' if (n := made.region.n) > 1 else ''}", overflow="fold"
+    )
     for kind in made.kinds:
-        limits = [""] * len(names)
-        if kind != "measured":
-            limits = [f"{x:.3g}" for x in made.components(made.limit(kind=kind)).tolist()]
+        limits = "-"
+        if kind != "measured" and made.contraction(kind=kind) < 1.0:
+            found = made.components(made.limit(kind=kind))
+            limits = ", ".join(f"{value:.3g}" for value in found.tolist())
         table.add_row(
             _MEANING[kind], f"{made.contraction(kind=kind):.3g}", str(made.least_horizon(kind)),
-            *limits,
+            limits,
         )
     return table

@@ -53,7 +53,8 @@ def coupled():
 
 def bent_output():
     def f(x):
-        return np.stack([x[..., 0] + 0.1 * x[..., 1], 0.9 * x[..., 1] - 0.1 * np.sin(x[..., 0])], -1)
+        a, b = x[..., 0], x[..., 1]
+        return np.stack([a + 0.1 * b, 0.9 * b - 0.1 * np.sin(a)], -1)
 
     system = qpmhe.System(f, lambda x: x[..., :1] + 0.1 * np.sin(x[..., :1]), n=2, p=1)
     return system, qpmhe.Box([-2.0, -2.0], [2.0, 2.0]), Sizes(0.01, 0.02)
