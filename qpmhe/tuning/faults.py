@@ -199,12 +199,14 @@ def _drifted(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Fau
     for late in _DRIFTS:
         if abs(late) > total / 10:
             continue
-        when = np.arange(total) * (1.0 + late / total)
-        nearest = np.rint(when).astype(np.intp)
-        there = nearest < total
-        nearest, when = nearest[there], when[there]
+        # Right at the beginning of the record, which may be before the filter's.
+        times = np.arange(total)
+        when = times + late * (times + bank.before) / (total + bank.before)
+        before = np.floor(when).astype(np.intp)  # whose input acts at the time
+        there = (before >= 0) & (before < total)
+        before, when = before[there], when[there]
         moved = np.full_like(y, np.nan)
-        moved[nearest] = y[there] - (when - nearest)[:, None] * moves[nearest]
+        moved[before] = y[there] - (when - before)[:, None] * moves[before]
         yield Fault("clock", float(late), replace(base, measurements=moved))
 
 
