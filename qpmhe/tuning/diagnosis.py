@@ -204,7 +204,7 @@ def diagnose(
     Notes
     -----
     The weights count as inverse covariances, also with a discount. A fault is reported if it
-    makes the record more likely by a factor of :math:`e^{12}`, and by 5 % for each measurement
+    makes the record more likely by a factor of :math:`e^{12}`, and by 4 % for each measurement
     where it concerns all of them; and if it is large enough to matter. Inputs that a controller
     computes from states that it does not measure can look like delays.
 
@@ -344,7 +344,7 @@ class _Examination:
             row = np.zeros(column.size, np.bool_)
             row[first : last + 1] = True
             alone = is_dead(column, first, last)
-            if is_rounded(column) and (alone or is_saturated):
+            if (alone or is_saturated) and is_rounded(column[~(row | at_end)]):
                 # A sensor with coarse steps repeats its numbers where little moves.
                 alone &= self._contradicts(row, j)
                 is_saturated &= self._contradicts(at_end, j)

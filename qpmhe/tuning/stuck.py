@@ -39,7 +39,7 @@ def is_dead(y: Array, first: int, last: int) -> bool:
 def is_rounded(y: Array) -> bool:
     """Whether a sensor takes few enough values to repeat some of them by chance."""
     there = y[np.isfinite(y)]
-    return bool(np.unique(there).size < 0.5 * there.size)
+    return bool(there.size > 1 and np.unique(there).size < 0.5 * there.size)
 
 
 def at_end_of_range(y: Array) -> tuple[Mask, bool]:
