@@ -634,7 +634,7 @@ class _Examination:
                 f"With N = {horizon} the prior carries {percent(share)} of the variance of {state}'s "
                 "estimate, and less of the others'"
             )
-            text += f"; N = {enough[0]} would do for 10 %." if enough[0] < 0.7 * horizon else "."
+            text += f"; from N = {enough[0]} on it is below 10 %."
             return Finding("prior", text, "", "note")
         text = f"With N = {horizon} the prior still carries {percent(share)} of the variance of {state}'s "
         text += "estimate; "
