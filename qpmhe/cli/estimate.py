@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from ..errors import OptionError
+from ..errors import InvalidInputError, OptionError
 
 
 def estimate(
@@ -92,6 +93,10 @@ def estimate(
         list[str] | None,
         typer.Option(metavar="WORD", help="Word for a missing value; may be repeated."),
     ] = None,
+    diagnose: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.html", help="Look for faults, and write what was found."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
 ) -> None:
     """Estimate the states of a measured record; in a pipe, line by line."""
@@ -110,10 +115,14 @@ def estimate(
 
 
 def run(
-    console: Console, model: str, record: str, out: str, *, quiet: bool = False, **options: Any
+    console: Console, model: str, record: str, out: str, *, diagnose: str | None = None,
+    quiet: bool = False, **options: Any,
 ) -> None:
     """Call `qpmhe.records.estimate_record` with the options, and print what happened."""
     from ..records import estimate_record
+
+    if diagnose is not None:
+        _check_page(diagnose)
 
     # A bar would stand among the rows.
     mixed = out == "-" and sys.stdout is not None and sys.stdout.isatty()
@@ -125,7 +134,7 @@ def run(
         ) as bar:
             task = bar.add_task("", total=None)
             summary = estimate_record(
-                model, record, out, **options,
+                model, record, out, keep_run=diagnose is not None, **options,
                 progress=lambda done, total: bar.update(task, completed=done, total=total),
                 report=None if quiet else lambda text: _warn(console, text),
             )
@@ -139,10 +148,36 @@ def run(
     is_broken = summary.model_is_wrong or most_failed
     if not quiet:
         _print(console, summary, out)
+    if diagnose is not None:
+        _diagnose(console, summary, diagnose, quiet)
     if summary.failure and (is_broken or not quiet):
         _warn(console, summary.failure)
     if is_broken:
         raise SystemExit(3)
+
+
+def _check_page(path: str) -> None:
+    if Path(path).suffix.lower() not in (".html", ".htm") or Path(path).is_dir():
+        raise OptionError(f"--diagnose is {path!r}; expected the name of an .html file to write.")
+
+
+def _diagnose(console: Console, summary: Any, path: str, quiet: bool) -> None:
+    """Look for faults in the run, and write the page."""
+    from ..tuning import diagnose
+
+    model = summary.model
+    try:
+        found = diagnose(
+            summary.run, labels=model.states, outputs=model.outputs, inputs=model.inputs,
+            dt=model.dt, time_unit=model.time_unit,
+        )
+    except InvalidInputError as error:  # the estimates are written all the same
+        _warn(console, f"no diagnosis: {error}")
+        return
+    found.report(path)
+    if not quiet:
+        console.print(escape(str(found)), highlight=False, soft_wrap=True)
+        console.print(f"wrote {escape(path)}", highlight=False, soft_wrap=True)
 
 
 def _warn(console: Console, text: str) -> None:

@@ -20,7 +20,7 @@ _EXPECTED = (
 
 @dataclass(frozen=True, eq=False)
 class RecordModel:
-    """An estimator, the names of its signals, its usual step, and what identifies it."""
+    """An estimator, its signals' names, its usual step and the unit, and what identifies it."""
 
     estimator: MovingHorizonEstimator
     states: tuple[str, ...]
@@ -28,6 +28,7 @@ class RecordModel:
     inputs: tuple[str, ...]
     dt: float | None
     identity: dict[str, Any]
+    time_unit: str = "s"
 
 
 def load_record_model(text: str, engine_at_work: str | None = None, **options: Any) -> RecordModel:
@@ -39,7 +40,7 @@ def load_record_model(text: str, engine_at_work: str | None = None, **options: A
     name = source.name
     parts, given = _parts(name, build(source))
     signals = {kind: given.pop(kind, None) for kind in _SIZES}
-    dt = given.pop("dt", None)
+    dt, unit = given.pop("dt", None), str(given.pop("time_unit", "s"))
     chosen = given | options
     for key in ("horizon", "initial_state"):
         if key not in chosen:
@@ -70,7 +71,7 @@ def load_record_model(text: str, engine_at_work: str | None = None, **options: A
     system = estimator.system
     sizes = {"states": system.n, "outputs": system.p, "inputs": estimator.inputs}
     names = {kind: _names(name, kind, signals[kind], size) for kind, size in sizes.items()}
-    return RecordModel(estimator, **names, dt=dt, identity=identity)
+    return RecordModel(estimator, **names, dt=dt, identity=identity, time_unit=unit)
 
 
 def _parts(name: str, made: Any) -> tuple[tuple[Any, ...], dict[str, Any]]:
@@ -87,7 +88,7 @@ def _parts(name: str, made: Any) -> tuple[tuple[Any, ...], dict[str, Any]]:
         if isinstance(extra, Scenario):
             options |= {
                 "horizon": extra.horizon, "initial_state": extra.initial_estimate,
-                "states": extra.labels, "dt": extra.dt,
+                "states": extra.labels, "dt": extra.dt, "time_unit": extra.time_unit,
             }
         elif isinstance(extra, Mapping):
             options |= {str(key): value for key, value in extra.items()}

@@ -19,7 +19,9 @@ import numpy as np
 from .._checks import count
 from ..errors import InvalidInputError, OptionError
 from ..estimation.estimate import Estimate, Status
+from ..estimation.run import Run
 from .checkpoints import Checkpoint, CheckpointError, WriteError, load, plain, save, versions
+from .kept_run import KeptRun
 from .measurements import ColumnNames, FieldReader, Measurement, RecordReader, seconds_between
 from .output import Output, RowFormat, standard_output_for_rows
 from .record_model import RecordModel, load_record_model
@@ -59,6 +61,10 @@ class Summary:
         Whether the model's code is wrong, rather than undefined at some states.
     notes : list of str
         What else the user should know.
+    run : Run or None
+        The samples of this run, inserted ones included, where they were to be kept.
+    model : RecordModel or None
+        What made them.
     """
 
     engine: str = "python"
@@ -74,6 +80,8 @@ class Summary:
     failure: str = ""
     model_is_wrong: bool = False
     notes: list[str] = field(default_factory=list)
+    run: Run | None = None
+    model: RecordModel | None = None
 
 
 def estimate_record(
@@ -99,6 +107,7 @@ def estimate_record(
     overwrite: bool = False,
     checkpoint_every: int | None = None,
     checkpoint_seconds: float = 1.0,
+    keep_run: bool = False,
     progress: Callable[[int, int | None], None] | None = None,
     report: Callable[[str], None] | None = None,
     **options: Any,
@@ -140,6 +149,8 @@ def estimate_record(
         Samples from checkpoint to checkpoint, 100 by default, and the least time between two
         writes. A solver forgets its warm start at a checkpoint, so their number affects the last
         bits of the results.
+    keep_run : bool
+        Whether the summary has all samples as a `qpmhe.Run`, for `qpmhe.diagnose`.
     progress, report : callable, optional
         Called after each sample with the bytes (or rows) read and their total, if it is known;
         called with a text when the model fails for the first time.
@@ -191,7 +202,7 @@ def estimate_record(
         })
         session = _Session(
             loaded, rows, steps, reader, output, Checkpoint(identity, every),
-            seconds=checkpoint_seconds, report=report, progress=progress,
+            seconds=checkpoint_seconds, report=report, progress=progress, keep=keep_run,
         )
         return session.run(found)
 
@@ -247,7 +258,10 @@ class _Session:
         self, model: RecordModel, rows: RowFormat, steps: Steps, reader: RecordReader,
         output: Output, checkpoint: Checkpoint, *, seconds: float,
         report: Callable[[str], None] | None, progress: Callable[[int, int | None], None] | None,
+        keep: bool,
     ) -> None:
+        self._model, self._keep = model, keep
+        self._kept: KeptRun | None = None
         self._mhe, self._rows, self._steps = model.estimator, rows, steps
         self._reader, self._output = reader, output
         self._report, self._progress = report, progress
@@ -264,6 +278,8 @@ class _Session:
     def run(self, found: Checkpoint | None) -> Summary:
         reader, output = self._reader, self._output
         samples, last = self._begin() if found is None else self._resume(found)
+        if self._keep:
+            self._kept = KeptRun(self._mhe, self._steps)
         try:
             self._estimate(samples, last)
             if not self._taken:
@@ -409,6 +425,8 @@ class _Session:
 
     def _update(self, y: Any, sample: Measurement, length: float | None) -> Any:
         estimate = self._mhe.update(y, sample.u if sample.u.size else None, dt=length)
+        if self._kept is not None:
+            self._kept.add(y, sample.u, length, estimate)
         if Status.MODEL_FAILED in estimate.status:
             self._count_failure(estimate, sample)
         else:
@@ -477,6 +495,8 @@ class _Session:
         if self._mhe.engine != summary.engine:
             summary.engine += f", then {self._mhe.engine}"
         summary.held, summary.repeated = reader.held, reader.repeated
+        summary.model = self._model
+        summary.run = None if self._kept is None else self._kept.run()
         if summary.failed:
             stale = (
                 f", which affects the windows of {summary.stale} more (FAILED_STAGE)"

@@ -21,7 +21,7 @@ from .faults import search
 from .filter_bank import Filtered, FilterBank, Hypothesis
 from .findings import Finding, Names, describe, listed, number, percent
 from .observability import Observability, observability, prior_shares
-from .stuck import at_end_of_range, comes_back, is_dead, longest_repetition
+from .stuck import at_end_of_range, comes_back, is_dead, is_rounded, longest_repetition
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,6 +38,8 @@ _OUTLIER = 4.0
 _UNSEEN, _UNLEARNT, _REMAINS = 0.1, 0.5, 0.5
 # By how much the estimator's predictions may be worse than those of a Kalman filter.
 _WORSE = 1.4
+# A repeated number contradicts the filter if innovations are so many deviations off.
+_OTHERWISE = 1.7
 _FAILING, _KEPT, _WEAK_PRIOR = 0.02, 0.5, 0.1
 # Correlations of innovations that matter, and how sure they must be.
 _CORRELATED, _SURE = 0.2, 1e-6
@@ -202,7 +204,7 @@ def diagnose(
     Notes
     -----
     The weights count as inverse covariances, also with a discount. A fault is reported if it
-    makes the record more likely by a factor of :math:`e^{12}`, and by 5 % for each measurement
+    makes the record more likely by a factor of :math:`e^{12}`, and by 4 % for each measurement
     where it concerns all of them; and if it is large enough to matter. Inputs that a controller
     computes from states that it does not measure can look like delays.
 
@@ -288,16 +290,17 @@ class _Examination:
         self.inputs = _held(u)
         self.measurements = source.measurements.copy()
         self.clipped = np.zeros(system.p)
-        self.certain = [*self._failures(), *self._stuck()]
         part = slice(self.first, total)
         steps = None if source.steps is None else source.steps[part]
         start = run.states[self.first]
         if not np.isfinite(start).all():
             start = run.states[0]
-        self.bank = FilterBank(system, steps, start, self.prior)
+        self.bank = FilterBank(system, steps, start, self.prior, self.first)
         self.base = Hypothesis(
             self.measurements[part], self.inputs[part], self.noise, self.disturbance
         )
+        self.certain = [*self._failures(), *self._stuck()]
+        self.base = replace(self.base, measurements=self.measurements[part])
         with np.errstate(all="ignore"):
             self.null = self.bank.run([self.base])
             self.found, self.best = self._search()
@@ -341,6 +344,10 @@ class _Examination:
             row = np.zeros(column.size, np.bool_)
             row[first : last + 1] = True
             alone = is_dead(column, first, last)
+            if (alone or is_saturated) and is_rounded(column[~(row | at_end)]):
+                # A sensor with coarse steps repeats its numbers where little moves.
+                alone &= self._contradicts(row, j)
+                is_saturated &= self._contradicts(at_end, j)
             if is_saturated and (
                 (at_end & ~row).any() or (at_end[first] and comes_back(column, first, last))
             ):
@@ -367,6 +374,13 @@ class _Examination:
                 )
                 column[row] = np.nan
 
+    def _contradicts(self, repeated: Mask, sensor: int) -> bool:
+        """Whether the filter expects other numbers than those a sensor repeats."""
+        part = repeated[self.first :]
+        with np.errstate(all="ignore"):
+            errors = _normalised(self.bank.run([self.base]))[part, sensor]
+        return bool(part.any() and np.sqrt(np.nanmean(errors**2)) > _OTHERWISE)
+
     def _search(self) -> tuple[list[Any], Filtered]:
         """Faults of the whole record, or of the part of a long one that fits least."""
         total = len(self.base.measurements)
@@ -379,7 +393,7 @@ class _Examination:
         part = slice(begin, begin + _MOST_SAMPLES)
         steps = None if self.source.steps is None else self.source.steps[self.first :][part]
         start = self.run.states[self.first + begin]
-        bank = FilterBank(self.source.system, steps, start, self.prior)
+        bank = FilterBank(self.source.system, steps, start, self.prior, self.first + begin)
         base = replace(
             self.base, measurements=self.base.measurements[part], inputs=self.base.inputs[part]
         )
@@ -431,6 +445,8 @@ class _Examination:
         limits = tuple(chi2.ppf((0.005, 0.995), components) / components)
         mean = float(np.nansum(nis) / components)
         notes += self._notes(mean, limits, outliers, shares)
+        if not findings:
+            notes += self._input_notes(correlations)
         before = np.full((first, p), np.nan)
         return Diagnosis(
             findings, notes, self.run, names, first, np.vstack((before, self.normalised)),
@@ -456,9 +472,9 @@ class _Examination:
         both = np.hstack((signals, changes))
         inputs = np.zeros((lags + 1, p, both.shape[1]))
         for j in range(p):
-            for lag in range(lags + 1):
-                if lag:
-                    own[lag, j] = _correlation(bounded[lag:, j], bounded[: total - lag, j])
+            # A controller may use y(t) for u(t): only earlier inputs are evidence.
+            for lag in range(1, lags + 1):
+                own[lag, j] = _correlation(bounded[lag:, j], bounded[: total - lag, j])
                 for k in range(both.shape[1]):
                     inputs[lag, j, k] = _correlation(bounded[lag:, j], both[: total - lag, k])
         return Correlations(own, inputs, 1.96 / np.sqrt(total))
@@ -478,17 +494,22 @@ class _Examination:
                     f"{number(found.limit)} is the limit.",
                     "The model lacks something slow: a bias, a parameter or a state.", "warning",
                 )
+
+    def _input_notes(self, found: Correlations) -> Iterator[Finding]:
+        names = self.names
         signals = [*names.inputs, *(f"the change of {one}" for one in names.inputs)]
-        sure = np.sqrt(chi2.isf(_SURE, 1) / total)
-        strong = np.abs(found.inputs).max(axis=0, initial=0.0) if found.inputs.size else np.zeros((0, 0))
-        for j, k in np.argwhere(strong > max(_CORRELATED, sure)):
-            yield Finding(
-                "correlated",
-                f"The innovations of sensor {names.outputs[j]} are correlated with {signals[k]}, by "
-                f"{number(strong[j, k])}, where {number(found.limit)} is the limit.",
-                "The model lacks an effect of this input: its gain, sign or delay may be wrong.",
-                "warning",
-            )
+        sure = np.sqrt(chi2.isf(_SURE, 1) / len(self.normalised))
+        for j, k in np.ndindex(*found.inputs.shape[1:]):
+            strongest = float(np.abs(found.inputs[:, j, k]).max())
+            if strongest > max(_CORRELATED, sure):
+                yield Finding(
+                    "correlated",
+                    f"The innovations of sensor {names.outputs[j]} are correlated with "
+                    f"{signals[k]}, by {number(strongest)}, where {number(found.limit)} is the "
+                    "limit.",
+                    "The model may lack an effect of this input, unless a controller computes it "
+                    "from states that are not measured.", "note",
+                )
 
     def _unseen(self) -> Iterator[Finding]:
         """Directions that the data do not see, that no filter has learnt, and that stay."""
@@ -613,7 +634,7 @@ class _Examination:
                 f"With N = {horizon} the prior carries {percent(share)} of the variance of {state}'s "
                 "estimate, and less of the others'"
             )
-            text += f"; N = {enough[0]} would do for 10 %." if enough[0] < 0.7 * horizon else "."
+            text += f"; from N = {enough[0]} on it is below 10 %."
             return Finding("prior", text, "", "note")
         text = f"With N = {horizon} the prior still carries {percent(share)} of the variance of {state}'s "
         text += "estimate; "

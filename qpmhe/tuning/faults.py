@@ -22,7 +22,7 @@ _MOST = 8
 # What a fault must gain in log likelihood, in all and for each measurement that it concerns; and the
 # least effect worth a word: factors of covariances, deviations of a bias, shares of a step and of an
 # input, samples.
-_GAIN, _GAIN_EACH, _LOCAL = 12.0, 0.05, ("bias", "outliers")
+_GAIN, _GAIN_EACH, _LOCAL = 12.0, 0.04, ("bias", "outliers")
 _LEAST = {
     "noise": np.log(2.0), "disturbance": np.log(2.0), "bias": 0.5, "step": 0.02, "sign": 0.1,
     "input": 0.1, "shift": 0.3, "clock": 0.5, "outliers": 0.0, "swapped": 0.0,
@@ -178,7 +178,7 @@ def _exchanged(base: Hypothesis) -> Iterator[Fault]:
 
 def _shifted(base: Hypothesis) -> Iterator[Fault]:
     total, p = base.measurements.shape
-    parts: list[tuple[int, ...]] = [()]
+    parts: list[tuple[int, ...]] = [()] if base.inputs.shape[1] else []  # late for what?
     if 1 < p <= _MOST:
         parts += [(j,) for j in range(p)]
     for part in parts:
@@ -195,16 +195,20 @@ def _shifted(base: Hypothesis) -> Iterator[Fault]:
 def _drifted(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Fault]:
     """The record as of clocks of the sensors that gain or lose samples until its end."""
     y, total = base.measurements, len(base.measurements)
+    if not base.inputs.shape[1]:
+        return  # there is no other clock: it would be the step
     _, moves = bank.moves(null.states, bank.full_inputs(base.inputs, base.step))
     for late in _DRIFTS:
         if abs(late) > total / 10:
             continue
-        when = np.arange(total) * (1.0 + late / total)
-        nearest = np.rint(when).astype(np.intp)
-        there = nearest < total
-        nearest, when = nearest[there], when[there]
+        # Right at the beginning of the record, which may be before the filter's.
+        times = np.arange(total)
+        when = times + late * (times + bank.before) / (total + bank.before)
+        before = np.floor(when).astype(np.intp)  # whose input acts at the time
+        there = (before >= 0) & (before < total)
+        before, when = before[there], when[there]
         moved = np.full_like(y, np.nan)
-        moved[nearest] = y[there] - (when - nearest)[:, None] * moves[nearest]
+        moved[before] = y[there] - (when - before)[:, None] * moves[before]
         yield Fault("clock", float(late), replace(base, measurements=moved))
 
 
@@ -226,7 +230,8 @@ def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[
     inputs = bank.full_inputs(base.inputs, base.step)
     # At each sample from those before it alone: else noise would look like a fault.
     expected, moves = bank.moves(null.states, inputs)
-    yield _Signature("shift", (), -moves, none_x)
+    if base.inputs.shape[1]:
+        yield _Signature("shift", (), -moves, none_x)
     if 1 < p <= _MOST:
         for j in range(p):
             yield _Signature("shift", (j,), -moves * (np.arange(p) == j), none_x)

@@ -83,9 +83,14 @@ class FilterBank:
         Lengths of the steps; None for the usual one.
     start, prior : (n,) and (n, n) array
         The first estimate and its covariance.
+    before : int
+        Samples before this record, with the same clocks.
     """
 
-    def __init__(self, system: System, steps: Array | None, start: Array, prior: Array) -> None:
+    def __init__(
+        self, system: System, steps: Array | None, start: Array, prior: Array, before: int = 0
+    ) -> None:
+        self.before = before
         self.system, self._start, self._prior = system, start, prior
         #: Takes the length of the step as its last input where it can.
         self.model = system if system.make_timed is None else system.timed

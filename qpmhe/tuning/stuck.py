@@ -36,6 +36,12 @@ def is_dead(y: Array, first: int, last: int) -> bool:
     return bool(inside >= max(_LEAST, rare))
 
 
+def is_rounded(y: Array) -> bool:
+    """Whether a sensor takes few enough values to repeat some of them by chance."""
+    there = y[np.isfinite(y)]
+    return bool(there.size > 1 and np.unique(there).size < 0.5 * there.size)
+
+
 def at_end_of_range(y: Array) -> tuple[Mask, bool]:
     """The samples at the largest or smallest number, and whether so many are stuck there."""
     for sign in (1.0, -1.0):

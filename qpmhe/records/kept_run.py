@@ -1,0 +1,69 @@
+"""The samples of an estimation that writes rows, kept as a run."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..estimation.estimate import Estimate, Status
+from ..estimation.estimator import MovingHorizonEstimator
+from ..estimation.run import Run
+from .steps import Steps
+
+Array = NDArray[np.float64]
+
+
+class _Kept(NamedTuple):
+    """What a run has of an estimate, without its trajectory."""
+
+    state: Array
+    filtered: Array
+    delayed: Array | None
+    cost: float
+    candidate_cost: float
+    step_time: float
+    solve_time: float
+    qps: int
+    solver_iterations: int | None
+    status: Status
+    engine: str
+
+
+class KeptRun:
+    """Collects samples and estimates, of steps of any length."""
+
+    def __init__(self, estimator: MovingHorizonEstimator, steps: Steps) -> None:
+        self._estimator, self._steps = estimator, steps
+        self._start = estimator.state.copy()
+        self._estimates: list[Any] = []
+        self._y: list[Array] = []
+        self._u: list[Array] = []
+        self._lengths: list[float | None] = []
+
+    def add(self, y: Any, u: Array, length: float | None, estimate: Estimate) -> None:
+        """Take a sample; its measurement is None where it was inserted."""
+        system, usual = self._estimator.system, self._estimator.usual
+        self._y.append(np.full(system.p, np.nan) if y is None else np.array(y, np.float64))
+        parameters = np.zeros(0) if usual.parameters is None else usual.parameters
+        self._u.append(np.append(u, parameters))
+        self._lengths.append(length)
+        self._estimates.append(_Kept(
+            estimate.state.copy(), estimate.filtered.copy(),
+            None if estimate.delayed is None else estimate.delayed.copy(),
+            *(getattr(estimate, name) for name in _Kept._fields[3:]),
+        ))
+
+    def run(self) -> Run:
+        """All samples so far."""
+        run = Run.of(self._start, self._estimates)
+        system = self._estimator.system
+        usual = self._steps.usual
+        steps = None
+        if usual is not None and any(one not in (None, usual) for one in self._lengths):
+            steps = np.array([usual if one is None else one for one in self._lengths])
+        inputs = np.array(self._u).reshape(len(run), system.m) if system.m else None
+        y = np.array(self._y).reshape(len(run), system.p)
+        run.source = self._estimator.run_source(y, inputs, steps)
+        return run
