@@ -238,8 +238,8 @@ class Graph:
         other, first, second = arguments
         if other in (c, self.negated(c)):
             return self._assumed(first if other == c else second, c)
-        inner = self._assumed(second, c)  # the other branches of a chain
-        return node if inner == second else self.choice(other, first, inner)
+        inner = self._assumed(first, c), self._assumed(second, c)
+        return node if inner == (first, second) else self.choice(other, *inner)
 
     def _gap(self, c: int, a: int, b: int) -> float | None:
         """How far a and b are apart where the condition changes; None if that is not known."""
@@ -281,17 +281,18 @@ class Graph:
 
     def first(self, node: int) -> dict[int, int]:
         """The partial derivatives that are not zero, by variable."""
-        for one in self.ancestors([node]):
-            if one not in self._first:
-                self._first[one] = self._first_of(one)
+        if node not in self._first:
+            for one in self.ancestors([node]):
+                if one not in self._first:
+                    self._first[one] = self._first_of(one)
         return self._first[node]
 
     def second(self, node: int) -> Pairs:
         """The second derivatives that are not zero, by pairs (i, j), i a state and i <= j."""
-        self.first(node)
-        for one in self.ancestors([node]):
-            if one not in self._second:
-                self._second[one] = self._second_of(one)
+        if node not in self._second:
+            for one in self.ancestors([node]):
+                if one not in self._second:
+                    self._second[one] = self._second_of(one)
         return self._second[node]
 
     def _first_of(self, node: int) -> dict[int, int]:
@@ -305,11 +306,11 @@ class Graph:
             c, a, b = branches
             return {
                 i: self._either(c, self._entry(a, i), self._entry(b, i))
-                for i in sorted({*self._gradient(a), *self._gradient(b)})
+                for i in sorted({*self.first(a), *self.first(b)})
             }
         found: dict[int, int] = {}
         for slope, argument in zip(self._partial(node)[0], arguments, strict=True):
-            for i, entry in self._gradient(argument).items():
+            for i, entry in self.first(argument).items():
                 term = self.mul(slope, entry)
                 found[i] = self.add(found[i], term) if i in found else term
         return self._without_zeros(found)
@@ -325,10 +326,10 @@ class Graph:
         if branches is not None:
             c, a, b = branches
             zero = self.constant(0.0)
-            for pair in {**self._hessian(a), **self._hessian(b)}:
-                entries = (self._hessian(one).get(pair, zero) for one in (a, b))
+            for pair in {**self.second(a), **self.second(b)}:
+                entries = (self.second(one).get(pair, zero) for one in (a, b))
                 found[pair] = self._either(c, *entries)
-            for i in {**self._gradient(a), **self._gradient(b)}:
+            for i in {**self.first(a), **self.first(b)}:
                 # Where the condition may change, the partial derivative by i may jump.
                 if i < self.states and self._entry(a, i) != self._entry(b, i):
                     found[i, i] = self.of("smooth", c, found.get((i, i), zero))
@@ -337,10 +338,10 @@ class Graph:
             return found
         slopes, curvatures = self._partial(node)
         for slope, argument in zip(slopes, arguments, strict=True):
-            for pair, entry in self._hessian(argument).items():
+            for pair, entry in self.second(argument).items():
                 gather(pair, self.mul(slope, entry))
         for (k, other), curvature in curvatures.items():
-            a, b = self._gradient(arguments[k]), self._gradient(arguments[other])
+            a, b = self.first(arguments[k]), self.first(arguments[other])
             for i, one in a.items():
                 for j, another in b.items():
                     if min(i, j) >= self.states or (k == other and i > j):
@@ -355,14 +356,8 @@ class Graph:
     def _without_zeros(self, entries: Any) -> Any:
         return {key: one for key, one in entries.items() if self.value(one) != 0.0}
 
-    def _gradient(self, node: int) -> dict[int, int]:
-        return self._first.get(node, {})
-
-    def _hessian(self, node: int) -> Pairs:
-        return self._second.get(node, {})
-
     def _entry(self, node: int, i: int) -> int:
-        return self._gradient(node).get(i, self.constant(0.0))
+        return self.first(node).get(i, self.constant(0.0))
 
     def _either(self, c: int, a: int, b: int) -> int:
         return a if a == b else self.of("either", c, a, b)

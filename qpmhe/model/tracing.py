@@ -283,11 +283,11 @@ def expressed(
 
 
 # Functions and attributes by which code tells symbols from numbers, without their knowledge.
-_TELLING = {
-    "LOAD_GLOBAL": ("type", "id", "memoryview", "bytes", "bytearray"),
-    "LOAD_ATTR": ("__class__", "shares_memory", "may_share_memory"),
-    "LOAD_METHOD": ("_getframe", "gettrace", "currentframe", "getrefcount", "shares_memory"),
-}
+_TELLING = frozenset(("type", "id", "memoryview", "bytes", "bytearray"))
+_TELLING_ATTRIBUTES = frozenset((
+    "__class__", "is_", "is_not", "shares_memory", "may_share_memory", "_getframe", "gettrace",
+    "currentframe", "getrefcount",
+))
 
 
 def _is_trusted(name: str) -> bool:
@@ -332,7 +332,10 @@ def _telling(code: Any) -> str:
     before = None
     instructions = list(dis.get_instructions(code))
     for one, after in zip(instructions, [*instructions[1:], None], strict=True):
-        if one.argval in _TELLING.get(one.opname, ()) and not (
+        names = _TELLING if one.opname == "LOAD_GLOBAL" else (
+            _TELLING_ATTRIBUTES if one.opname in ("LOAD_ATTR", "LOAD_METHOD") else ()
+        )
+        if one.argval in names and not (
             # The type of the object that a method belongs to.
             one.argval == "type" and after is not None and after.argval in ("self", "cls")
         ):

@@ -5,15 +5,20 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 
+import mpmath
 import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.certificates import enclosures
+from qpmhe.certificates.contraction import certify_detectability
 from qpmhe.certificates.enclosures import SmoothModel
-from qpmhe.certificates.evidence import CertificateError
+from qpmhe.certificates.evidence import CertificateError, Evidence
 from qpmhe.certificates.intervals import OPERATIONS, Interval
 from qpmhe.certificates.regions import Region, bounded_region
 from qpmhe.errors import SetError
+
+from .random_expressions import made, value
 
 BOXES = {
     "batch_reactor": ([0.1, 0.0], [9.0, 9.0], None),
@@ -114,21 +119,119 @@ def test_affine_jacobian_has_no_error_but_rounding():
     assert found == {round(1 - 0.4 * 0.16 * x, 12) for x in (0.1, 9.0)}
 
 
-def test_casadi_model_has_the_enclosure_of_its_numpy_twin():
-    pytest.importorskip("casadi")
-    from qpmhe.models.batch_reactor import casadi_output, casadi_rate
-
-    twin = qpmhe.from_casadi(
-        casadi_rate, casadi_output, dt=0.1, method="rk4", n=2, compiled=False
+def of_numpy():
+    return qpmhe.System.from_ode(
+        lambda x: np.array([x[1], 1.5 * (1.0 - x[0] ** 2) * x[1] - np.tanh(x[0])]),
+        lambda x: np.maximum(x[:1], 0.5 * x[:1]), dt=0.1, n=2, p=1,
     )
-    plain = qpmhe.models.batch_reactor("rk4")[0]
-    region = bounded_region(plain, qpmhe.Box([0.1, 0.0], [3.0, 3.0]))
+
+
+def of_casadi(kind):
+    ca = pytest.importorskip("casadi")
+    x = getattr(ca, kind).sym("x", 2)
+    rate = ca.vertcat(x[1], 1.5 * (1 - x[0] ** 2) * x[1] - ca.tanh(x[0]))
+    f, h = (
+        ca.Function(name, [x], [column])
+        for name, column in (("f", rate), ("h", ca.fmax(x[0], 0.5 * x[0])))
+    )
+    return qpmhe.from_casadi(f, h, dt=0.1, compiled=False)
+
+
+def of_sympy():
+    sympy = pytest.importorskip("sympy")
+    a, b = sympy.symbols("a b")
+    rate = [b, sympy.Rational(3, 2) * (1 - a**2) * b - sympy.tanh(a)]
+    return qpmhe.from_sympy(rate, [sympy.Max(a, a / 2)], [a, b], dt=0.1)
+
+
+def of_jax():
+    jnp = pytest.importorskip("jax.numpy")
+    return qpmhe.from_jax(
+        lambda x: jnp.array([x[1], 1.5 * (1.0 - x[0] ** 2) * x[1] - jnp.tanh(x[0])]),
+        lambda x: jnp.maximum(x[0], 0.5 * x[0]), dt=0.1, n=2, p=1,
+    )
+
+
+KINDS = {
+    "casadi": lambda: of_casadi("SX"), "casadi of matrices": lambda: of_casadi("MX"),
+    "sympy": of_sympy, "jax": of_jax,
+    "numpy through a copy": lambda: of_numpy().copy(traced=True),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_all_kinds_of_models_have_the_same_enclosure(kind):
+    plain, twin = of_numpy(), KINDS[kind]()
     ours, theirs = (
-        SmoothModel(system, region).enclose(region.lower[None], region.upper[None])
+        SmoothModel(system, bounded_region(system, qpmhe.Box([0.1, -2.0], [2.0, 2.0])))
         for system in (plain, twin)
     )
+    assert ours.reason == theirs.reason == ""
+    low, high = np.array([[0.1, -1.0], [0.5, 0.5]]), np.array([[0.4, 1.0], [2.0, 0.6]])
+    ours, theirs = ours.enclose(low, high), theirs.enclose(low, high)
     np.testing.assert_allclose(ours.centre, theirs.centre, rtol=1e-12)
-    np.testing.assert_allclose(ours.slopes, theirs.slopes, atol=1e-2)
+    np.testing.assert_allclose(ours.slopes, theirs.slopes, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(ours.error, theirs.error, rtol=0.02, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_models_of_all_kinds_are_proved(kind):
+    found = certify_detectability(KINDS[kind](), qpmhe.Box([-0.5, -0.5], [0.5, 0.5]), eta=0.98)
+    assert found.evidence is Evidence.PROVED
+
+
+mpmath.mp.dps = 40
+# CasADi computes with the constants of these functions before any interval does.
+FOLDED = ("deg2rad", "rad2deg", "interp", "log2", "log10")
+
+
+@pytest.mark.parametrize("block", range(5))
+def test_random_expressions_lie_in_their_enclosures(block, monkeypatch):
+    monkeypatch.setattr(enclosures, "_SAMPLES", 20)
+    generator = np.random.default_rng(block)
+    checked = 0
+    for _ in range(60):
+        expression = made(generator, int(generator.integers(1, 5)))
+        room = mpmath.mpf(1e-15) if any(each in repr(expression) for each in FOLDED) else 0
+        middle, size = generator.uniform(-2.0, 2.0, 2), 10.0 ** generator.uniform(-3.0, 0.0, 2)
+        low, high = middle - size, middle + size
+        with np.errstate(all="ignore"):
+            system = qpmhe.System(
+                lambda x, expression=expression: np.stack([value(expression, x, 0), x[1]]),
+                lambda x: x, n=2, p=2,
+            )
+        model = SmoothModel(system, Region(qpmhe.Box(low, high), low, high))
+        if model.reason:
+            continue
+        try:
+            found = model.enclose(low[None], high[None])
+        except qpmhe.errors.ModelError:  # not defined on all of it
+            continue
+        values = model.values(low[None], high[None])
+        centre = 0.5 * low + 0.5 * high
+        half = np.nextafter(np.maximum(high - centre, centre - low), np.inf)
+        for x in generator.uniform(low, high, (2, 2)):
+            point = [mpmath.mpf(float(one)) for one in x]
+            if values.known[0, 0]:
+                exact = value(expression, point, 1)
+                assert values.low[0, 0] - room * abs(exact) <= exact
+                assert exact <= values.high[0, 0] + room * abs(exact)
+            if np.isnan(found.error).any():
+                continue
+            shares = [(s - float(c)) / float(w) for s, c, w in zip(point, centre, half, strict=True)]
+            for k in range(2):
+                exact = mpmath.diff(
+                    lambda s, k=k, point=point, expression=expression: value(
+                        expression, [*point[:k], s, *point[k + 1 :]], 1
+                    ), point[k],
+                )
+                about = found.centre[0, 0, k] + sum(
+                    float(found.slopes[0, j, 0, k]) * shares[j] for j in range(2)
+                )
+                slack = mpmath.mpf(10) ** -30 + room * abs(exact)
+                assert abs(exact - about) <= found.error[0, 0, k] + slack
+                checked += 1
+    assert checked > 60
 
 
 def test_unbounded_missing_and_misfit_regions():

@@ -1,0 +1,186 @@
+"""No model is proved to be something that it is not, whatever it makes of symbols."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import operator
+import threading
+from math import tanh as kept_tanh
+from numpy import array as kept_array
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.certificates.contraction import certify_detectability
+from qpmhe.certificates.enclosures import SmoothModel
+from qpmhe.certificates.evidence import Evidence
+from qpmhe.certificates.regions import bounded_region
+
+# All these functions are 0.5 x, but for a step of width 2e-4 at 0.3, which no sample meets.
+PLACE, WIDTH = 0.3, 2e-4
+TABLE, SEEN = {}, {}
+
+
+def step(s):
+    return 3.0 * WIDTH * kept_tanh((s - PLACE) / WIDTH)
+
+
+def swallowing(ask):
+    """0.5 x, and what a function gives for x[0], if it raises nothing."""
+
+    def f(x):
+        try:
+            more = ask(x)
+        except Exception:
+            more = 0.0
+        return 0.5 * x + more
+
+    return f
+
+
+def suppressing(x):
+    more = 0.0
+    with contextlib.suppress(BaseException):
+        more = step(float(x[0]))
+    return 0.5 * x + more
+
+
+def in_place(x):
+    try:
+        x[0] = x[0] + 0.0
+    except Exception:
+        return 0.5 * x
+    return 0.5 * x + 1.0
+
+
+def in_place_without_a_word(x):
+    y = x[0]
+    x += 0.0
+    return 0.5 * x + (0.0 if x[0] is y else step(x[0]))
+
+
+def counted(x, calls=[]):  # noqa: B006
+    calls.append(0)
+    return 0.5 * x + (1.0 if len(calls) % 5 == 0 else 0.0)
+
+
+def remembering(x):
+    SEEN.setdefault(id(x), 0.5 * x)
+    return SEEN[id(x)]
+
+
+def of_a_thread(x):
+    return (0.5 if threading.current_thread().name == "MainThread" else 0.4) * x
+
+
+def by_a_missing_method(x):
+    # The array holds objects, of which NumPy has no arc tangent.
+    try:
+        more = np.arctan2(kept_array([x[0]]), 1.0)[0]
+    except TypeError:
+        more = 0.0
+    return 0.5 * x + more
+
+
+REFUSED = {
+    "tanh of math, and any exception": (swallowing(lambda x: step(x[0])), "float()"),
+    "a hash": (lambda x: 0.5 * x if x[0] not in {PLACE} else 0.0 * x, "hash"),
+    "a look-up in a dictionary": (swallowing(lambda x: TABLE.get(x[0], 0.0)), "hash"),
+    "a suppressed float": (suppressing, "float()"),
+    "a text": (swallowing(lambda x: float(str(x[0])) * 0.0), "text"),
+    "a text of the array": (swallowing(lambda x: len(f"{x}") * 0.0), "text"),
+    "bool": (swallowing(lambda x: step(x[0]) if abs(x[0] - PLACE) < WIDTH else 0.0), "branch"),
+    "a whole number": (swallowing(lambda x: [0.0, 0.0 * x[0]][int(x[0])]), "int()"),
+    "an index": (swallowing(lambda x: [0.0][x[0]]), "index"),
+    "a list": (swallowing(lambda x: 1.0 * [PLACE].count(x[0])), "branch"),
+    "equality": (swallowing(lambda x: step(x[0]) if x[0] == PLACE else 0.0), "branch"),
+    "sorting": (swallowing(lambda x: 0.0 * np.sort([x[0], PLACE])[:1]), "branch"),
+    "the largest": (swallowing(lambda x: np.argmax([x[0], PLACE])), "branch"),
+    "a search": (swallowing(lambda x: np.searchsorted([0.0, PLACE], x[0])), "branch"),
+    "a type": (lambda x: 0.5 * x + (step(x[0]) if type(x[0]) is np.float64 else 0.0), "type"),
+    "a class": (lambda x: 0.5 * x + (step(x[0]) if x.__class__ is np.ndarray else 0.0), "class"),
+    "identity": (lambda x: 0.5 * x + (0.0 if x[0] is x[0] else step(x[0])), "same"),
+    "identity by a function": (
+        lambda x: 0.5 * x + (0.0 if operator.is_(x[0], x[0]) else step(x[0])), "is_"),
+    "an attribute": (
+        lambda x: 0.5 * x + (step(x[0]) if hasattr(x[0], "is_integer") else 0.0), "is_integer"),
+    "memory": (lambda x: 0.5 * x + (step(x[0]) if len(bytes(x)) > 99 else 0.0), "bytes"),
+    "a change of the argument": (in_place, "change of its argument"),
+    "a change that changes nothing": (in_place_without_a_word, "same"),
+    "a cache by identity": (remembering, "id"),
+    "an array of objects": (by_a_missing_method, "an exception on symbols"),
+    "any exception": (swallowing(lambda x: [0.0][1]), "IndexError"),
+    "a thread": (of_a_thread, "depends on more than its arguments"),
+    "a counter": (counted, "depends on more than its arguments"),
+}
+
+
+@pytest.mark.parametrize("way", REFUSED)
+@pytest.mark.parametrize("letter", ["f", "h"])
+def test_what_looks_for_symbols_is_not_proved(way, letter):
+    function, word = REFUSED[way]
+    system = qpmhe.System(**({"f": lambda x: 0.5 * x, "h": lambda x: x} | {letter: function}),
+                          n=1, p=1)
+    model = SmoothModel(system, bounded_region(system, qpmhe.Box([-1.0], [1.0])))
+    assert word in model.reason
+    assert model.reason
+
+
+def test_what_is_not_proved_is_sampled_with_the_remedy():
+    system = qpmhe.System(swallowing(lambda x: step(x[0])), lambda x: 0.0 * x, n=1, p=1)
+    found = certify_detectability(system, qpmhe.Box([-1.0], [1.0]), eta=0.8)
+    assert found.evidence is Evidence.SAMPLED
+    assert "asks for float() of a symbol" in found.notes[0]
+    assert "numpy.where in place of branches" in found.notes[0]
+
+
+def of_numbers(x):
+    """Code that asks what numbers and arrays answer alike, with the step."""
+    more = 0.0
+    if isinstance(x[0], float) and isinstance(x, np.ndarray) and x.dtype == np.float64:
+        more = 3.0 * WIDTH * math.tanh((x[0] - PLACE) / WIDTH)
+    return np.asarray(0.5 * x + more, dtype=float)
+
+
+@pytest.mark.parametrize("f", [
+    of_numbers,
+    lambda x: 0.5 * x + 3.0 * WIDTH * np.tanh((x - PLACE) / WIDTH),
+    lambda x: 0.5 * x + np.clip(3.0 * (x - PLACE), -3.0 * WIDTH, 3.0 * WIDTH),
+    lambda x: np.interp(x, [-1.0, PLACE - WIDTH, PLACE + WIDTH, 1.0], [0.0, 0.0, 6 * WIDTH, 0.0]),
+])
+def test_a_step_that_no_sample_meets_is_enclosed(f):
+    system = qpmhe.System(f, lambda x: x, n=1, p=1)
+    region = bounded_region(system, qpmhe.Box([-1.0], [1.0]))
+    model = SmoothModel(system, region)
+    assert model.reason == ""
+    for low, high in ((-1.0, 1.0), (PLACE - 1e-6, PLACE + 1e-6)):
+        corners, error = model.enclose(np.array([[low]]), np.array([[high]])).corners()
+        assert corners[0, :, 0, 0].max() + error[0, 0, 0] >= 2.9
+
+
+def test_what_jumps_between_samples_is_known_to():
+    system = qpmhe.System(
+        lambda x: 0.5 * x + np.where(np.isclose(x, PLACE), 1.0, 0.0), lambda x: x, n=1, p=1
+    )
+    region = bounded_region(system, qpmhe.Box([-1.0], [1.0]))
+    model = SmoothModel(system, region)
+    assert model.reason == ""
+    assert "jump" in model.obstacle(region.lower, region.upper)
+    assert np.isnan(model.enclose(region.lower[None], region.upper[None]).error).any()
+
+
+def test_a_function_that_fails_where_its_expression_does_not_is_not_proved():
+    calls = []
+
+    def failing(x):
+        calls.append(x)
+        if len(calls) % 7 == 0:
+            raise ValueError("now and then")
+        return 0.5 * x
+
+    system = qpmhe.System(lambda x: 0.5 * x, failing, n=1, p=1)
+    model = SmoothModel(system, bounded_region(system, qpmhe.Box([-1.0], [1.0])))
+    assert model.reason == model.output_reason
+    assert model.reason
