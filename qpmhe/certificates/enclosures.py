@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .._checks import Array
 from ..errors import ModelError
@@ -23,6 +24,8 @@ _SAMPLES, _SEED = 400, 20210829
 # Computed values may be so many times as far from the expression's as rounding errors, bounded
 # one by one, explain: sums may be made in another order, functions come from another library.
 _ROUNDING = 64.0
+# Conditions that change on one cell, of which each combination is enclosed by itself.
+_MOST_KINKS = 3
 _TRACEABLE = "Write it with NumPy's functions of x and u, numpy.where in place of branches"
 
 
@@ -113,25 +116,43 @@ class Enclosure:
     error: Array  # (B, q, n): E, rounded up; NaN where it could not be enclosed
     excess: Array  # (B, N): what the width of each coordinate contributes to E
     jacobian: Array  # (B, q, n): J at the cell's middle; NaN where it has none
+    others: tuple[Enclosure, ...] = ()  # where J is in this one, or else in one of these
 
     def corners(self) -> tuple[Array, Array]:
         """Matrices whose convex hull, widened by an error, holds J on each cell."""
+        parts = (self, *self.others)
         # Cells of which nothing is known must not hide how the others vary.
         known = np.isfinite(self.error).all(axis=(1, 2))
-        weight = np.abs(self.slopes[known]).max(axis=(0, 2, 3), initial=0.0)
+        weight = np.max([
+            np.abs(part.slopes[known]).max(axis=(0, 2, 3), initial=0.0) for part in parts
+        ], axis=0)
         order = np.argsort(weight)[::-1]
         active = order[:MOST_ACTIVE][weight[order[:MOST_ACTIVE]] > 0.0]
-        error = self.error
         rest = np.setdiff1d(np.arange(weight.size), active)
-        if np.any(weight[rest] > 0.0):
-            error = (error + np.abs(self.slopes[:, rest]).sum(axis=1)) * (1.0 + 1e-12)
         signs = np.array(list(itertools.product((-1.0, 1.0), repeat=active.size)))
         signs = signs.reshape(2**active.size, active.size)
-        moved = self.centre[:, None] + np.einsum("kj,bjqn->bkqn", signs, self.slopes[:, active])
-        rounding = 1e-15 * (active.size + 2) * (
-            np.abs(self.centre) + np.abs(self.slopes[:, active]).sum(axis=1)
-        )
-        return moved, error + rounding
+        moved, errors = [], []
+        for part in parts:
+            error = part.error
+            if np.any(weight[rest] > 0.0):
+                error = (error + np.abs(part.slopes[:, rest]).sum(axis=1)) * (1.0 + 1e-12)
+            moved.append(part.centre[:, None] + np.einsum(
+                "kj,bjqn->bkqn", signs, part.slopes[:, active]
+            ))
+            rounding = 1e-15 * (active.size + 2) * (
+                np.abs(part.centre) + np.abs(part.slopes[:, active]).sum(axis=1)
+            )
+            errors.append(error + rounding)
+        return np.concatenate(moved, axis=1), np.max(errors, axis=0)
+
+    def with_rows(self, at: NDArray[np.intp], other: Enclosure, rows: NDArray[np.bool_]) -> Enclosure:
+        """The same, and some rows of another enclosure in place of its own at these cells."""
+        parts = [self.centre.copy(), self.slopes.copy(), self.error.copy(), self.excess.copy()]
+        for mine, theirs in zip(
+            parts, (other.centre, other.slopes, other.error, other.excess), strict=True
+        ):
+            mine[at] = theirs[rows]
+        return Enclosure(*parts, self.jacobian)
 
 
 class SmoothModel:
@@ -149,7 +170,8 @@ class SmoothModel:
         self._system, self._region = system, region
         self.n, self.p = system.n, system.p
         self._graph = Graph(system.n + system.m, system.n)
-        self._programs: dict[Any, Program] = {}
+        self._programs: dict[str, Program] = {}
+        self._plans: dict[bool, _Plan] = {}
         self.output_reason, self._output = self._read("h")
         self.reason, following = (
             (self.output_reason, []) if self.output_reason else self._read("f")
@@ -208,13 +230,10 @@ class SmoothModel:
 
     def values(self, lower: Array, upper: Array) -> Interval:
         """Enclosures (B, n + p) of f and h over cells (B, N); NaN where there are none."""
-        found = self._program("values", self._rows)(lower, upper)
+        if "values" not in self._programs:
+            self._programs["values"] = Program(self._graph, self._rows)
+        found = self._programs["values"](lower, upper)
         return Interval(found.low.T, found.high.T)
-
-    def _program(self, key: Any, roots: list[int]) -> Program:
-        if key not in self._programs:
-            self._programs[key] = Program(self._graph, roots)
-        return self._programs[key]
 
     def enclose(self, lower: Array, upper: Array, *, output_only: bool = False) -> Enclosure:
         """The joint Jacobian over cells."""
@@ -228,51 +247,94 @@ class SmoothModel:
         return found
 
     def _enclosed(self, lower: Array, upper: Array, output_only: bool) -> Enclosure:
-        roots = self._output if output_only else self._rows
-        cells, N, q, n = *lower.shape, len(roots), self.n
-        graph = self._graph
+        if output_only not in self._plans:
+            roots = self._output if output_only else self._rows
+            self._plans[output_only] = _Plan(self._graph, roots, self.n)
+        plan = self._plans[output_only]
+        found, open_ends = plan.enclosed(lower, upper)
+        count = open_ends.sum(axis=1)
+        kinked = (count > 0) & (count <= _MOST_KINKS) & np.isfinite(found.error).all(axis=(1, 2))
+        if not kinked.any():
+            return found
+        # At almost every point of a segment, what depends on a condition has the derivatives of
+        # the side that the condition is on there: those of both sides are enclosed one by one.
+        order = np.cumsum(open_ends[kinked], axis=1) - 1
+        sides = [
+            plan.enclosed(
+                lower[kinked], upper[kinked],
+                np.where(open_ends[kinked], (k >> order) & 1, np.nan),
+            )[0]
+            for k in range(2 ** int(count[kinked].max()))
+        ]
+        known = np.all([np.isfinite(side.error).all(axis=(1, 2)) for side in sides], axis=0)
+        at = np.flatnonzero(kinked)[known]
+        return replace(found.with_rows(at, sides[0], known), others=tuple(
+            found.with_rows(at, side, known) for side in sides[1:]
+        ))
+
+
+class _Plan:
+    """The programs for the Jacobian of some nodes by the first n variables, over cells."""
+
+    def __init__(self, graph: Graph, roots: list[int], n: int) -> None:
+        self._q, self._n = len(roots), n
         first = [
             (row, i, node) for row, root in enumerate(roots)
             for i, node in graph.first(root).items() if i < n
         ]
+        # Each second derivative in all places that it has.
         second = [
-            (row, i, j, node) for row, root in enumerate(roots)
+            (row, this, other, node) for row, root in enumerate(roots)
             for (i, j), node in graph.second(root).items()
+            for this, other in sorted({(i, j), (j, i)}) if this < n
         ]
-        slope_nodes = [node for _, _, node in first]
+        self._first = _columns(first, 2)
+        self._second = _columns(second, 3)
+        slopes = [one[-1] for one in first]
+        self._conditions = graph.open_conditions([*slopes, *(one[-1] for one in second)])
+        decisions = [pair[0] for pair in self._conditions]
+        self._point = Program(graph, roots + slopes + decisions)
+        self._cell = Program(graph, roots + slopes + [one[-1] for one in second] + decisions)
+
+    def enclosed(
+        self, lower: Array, upper: Array, truths: Array | None = None
+    ) -> tuple[Enclosure, NDArray[np.bool_]]:
+        """The Jacobian over cells, and which conditions (B, C) are not the same on all of a cell.
+
+        Those for which truths (B, C) are given are taken to be so.
+        """
+        cells, N, q, n = *lower.shape, self._q, self._n
+        forced = {} if truths is None else {
+            node: truths[:, k] if sign else 1.0 - truths[:, k]
+            for k, pair in enumerate(self._conditions)
+            for node, sign in zip(pair, (True, False), strict=False)
+        }
         centre = 0.5 * lower + 0.5 * upper
         half = np.nextafter(np.maximum(upper - centre, centre - lower), np.inf)
         half = np.where(upper == lower, 0.0, half)
         centre = np.where(upper == lower, lower, centre)
-
-        choices = graph.conditions(slope_nodes)
-        point = self._program(
-            ("first", output_only), roots + slope_nodes + choices
-        )(centre, centre)
-        cell = self._program(
-            ("second", output_only), roots + slope_nodes + [one[-1] for one in second]
-        )(lower, upper)
+        point, cell = self._point(centre, centre, forced), self._cell(lower, upper, forced)
         # What is not finite has no derivative, whatever its parts have.
-        lost = np.zeros((q, cells), np.bool_)
-        lost |= ~cell[:q].known
+        lost = ~cell[:q].known.all(axis=0)
+        rows, columns = self._first
+        count = q + rows.size
 
         def dense(values: Array) -> Array:
             matrix = np.zeros((cells, q, n))
-            for (row, i, _), each in zip(first, values, strict=True):
-                matrix[:, row, i] = each
+            matrix[:, rows, columns] = values.T
             return matrix
 
-        count = q + len(first)
-        at_centre, over_cell, bends = point[q:count], cell[q:count], cell[count:]
-        kinks = (point.low[count:] != point.high[count:]).any(axis=0)
-        jacobian, rounding = dense(at_centre.middle), dense(at_centre.radius)
+        jacobian, rounding = dense(point[q:count].middle), dense(point[q:count].radius)
+        at_kink, open_ends = (
+            (one.low != one.high).T for one in (
+                point[count:], cell[count + self._second[0].size :]
+            )
+        )
+        bends = cell[count : count + self._second[0].size]
         slopes, spread = np.zeros((2, cells, N, q, n))
-        middles, radii = bends.middle, bends.radius
-        for k, (row, i, j, _) in enumerate(second):
-            for this, other in {(i, j), (j, i)}:
-                if this < n:
-                    slopes[:, other, row, this] = middles[k] * half[:, other]
-                    spread[:, other, row, this] = radii[k] * half[:, other]
+        row, this, other = self._second
+        slopes[:, other, row, this] = bends.middle.T * half[:, other]
+        spread[:, other, row, this] = bends.radius.T * half[:, other]
         # Fixed coordinates bend nothing, whatever is known of it.
         fixed = half == 0.0
         slopes[fixed], spread[fixed] = 0.0, 0.0
@@ -280,27 +342,31 @@ class SmoothModel:
             1.0 + 1e-14 * (N + 4)
         )
         # Without second derivatives, as at kinks, an entry is where its values over the cell are.
-        middle, radius = dense(over_cell.middle), dense(over_cell.radius)
+        middle, radius = dense(cell[q:count].middle), dense(cell[q:count].radius)
         kinked = ~np.isfinite(error) & np.isfinite(radius)
         at, row, i = np.nonzero(kinked)
-        culprits = np.isnan(spread[at, :, row, i]) | np.isnan(slopes[at, :, row, i])
+        culprits = ~np.isfinite(spread[at, :, row, i] + slopes[at, :, row, i])
         share = culprits / np.maximum(culprits.sum(axis=1, keepdims=True), 1)
         slopes[at, :, row, i] = 0.0
         spread[at, :, row, i] = share * radius[at, row, i][:, None]
         error[kinked] = radius[kinked]
         enclosed = np.where(kinked, middle, jacobian)
-        unknown = lost.any(axis=0) | ~(
+        unknown = lost | ~(
             np.isfinite(enclosed).all(axis=(1, 2)) & np.isfinite(error).all(axis=(1, 2))
         )
         # NaN alone: infinities would make invalid operations later on.
         slopes[unknown], error[unknown] = np.nan, np.nan
-        # At a kink itself there is no Jacobian.
-        sure = np.isfinite(jacobian).all(axis=(1, 2)) & ~kinks
+        sure = np.isfinite(jacobian).all(axis=(1, 2)) & ~at_kink.any(axis=1)
         jacobian = np.where(sure[:, None, None], jacobian, np.nan)
         return Enclosure(
             np.where(unknown[:, None, None], jacobian, enclosed), slopes, error,
             spread.sum(axis=(2, 3)), jacobian,
-        )
+        ), open_ends
+
+
+def _columns(places: list[Any], count: int) -> tuple[NDArray[np.intp], ...]:
+    """The first columns of a table, as indices."""
+    return tuple(np.array([one[k] for one in places], np.intp) for k in range(count))
 
 
 def expression_of(system: System, name: str) -> Traced:

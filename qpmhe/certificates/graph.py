@@ -474,11 +474,21 @@ class Graph:
         return (neg(inverse) if operation == "acos" else inverse,
                 bent if operation == "asin" else neg(bent))
 
-    def conditions(self, roots: Iterable[int]) -> list[int]:
-        """The conditions of choices among all nodes that these are computed from."""
-        return sorted({
-            self.nodes[one][1][0] for one in self.ancestors(roots) if self.nodes[one][0] == "either"
-        })
+    def open_conditions(self, roots: Iterable[int]) -> list[tuple[int, ...]]:
+        """The comparisons that these depend on, each with its negation if there is that, too."""
+        found = {}
+        for one in self.ancestors(roots):
+            if self.nodes[one][0] in ("less", "atmost", "equal"):
+                negation = self._numbers.get(self._negation_of(one))
+                found[min(one, one if negation is None else negation)] = (
+                    (one,) if negation is None else (one, negation)
+                )
+        return list(found.values())
+
+    def _negation_of(self, c: int) -> Any:
+        operation, arguments, _ = self.nodes[c]
+        other = {"less": "atmost", "atmost": "less"}.get(operation)
+        return other, arguments[::-1], None
 
     def ancestors(self, roots: Iterable[int]) -> list[int]:
         """All nodes that these are computed from, and themselves, in order."""
@@ -664,7 +674,7 @@ class Program:
             key = max(ready, key=lambda one: len(ready[one]))
             done = ready.pop(key)
             groups.append((key, done))
-        place = {node: k for k, node in enumerate(self._order)}
+        self._place = place = {node: k for k, node in enumerate(self._order)}
         self._roots = np.array([place[root] for root in roots], np.intp)
         self._leaves = len(leaves)
         self._columns = [
@@ -686,11 +696,20 @@ class Program:
                 place[members[0]], place[members[0]] + len(members),
             ))
 
-    def __call__(self, lower: Array, upper: Array) -> Interval:
-        """The nodes (roots, B) over cells (B, N)."""
+    def __call__(
+        self, lower: Array, upper: Array, forced: dict[int, Array] | None = None
+    ) -> Interval:
+        """The nodes (roots, B) over cells (B, N), with the values (B,) of some unless NaN."""
         size = max(1, _HELD // max(1, len(self._order)))
+        rows = [
+            (self._place[node], values) for node, values in (forced or {}).items()
+            if node in self._place
+        ]
         parts = [
-            self._held(lower[k : k + size], upper[k : k + size])[self._roots]
+            self._held(
+                lower[k : k + size], upper[k : k + size],
+                [(row, values[k : k + size]) for row, values in rows],
+            )[self._roots]
             for k in range(0, len(lower), size)
         ]
         return Interval(
@@ -698,7 +717,9 @@ class Program:
             np.concatenate([one.high for one in parts], axis=1),
         )
 
-    def _held(self, lower: Array, upper: Array) -> Interval:
+    def _held(
+        self, lower: Array, upper: Array, forced: Sequence[tuple[int, Array]] = ()
+    ) -> Interval:
         """All nodes, in order."""
         low, high = np.empty((2, len(self._order), len(lower)))
         low[: self._leaves] = high[: self._leaves] = self._constants[:, None]
@@ -708,12 +729,16 @@ class Program:
             for function, arguments, parameters, start, end in self._groups:
                 found = function(*(Interval(low[a], high[a]) for a in arguments), *parameters)
                 low[start:end], high[start:end] = found.low, found.high
+                for row, values in forced:
+                    if start <= row < end:
+                        given = np.isfinite(values)
+                        low[row, given] = high[row, given] = values[given]
         return Interval(low, high)
 
     def obstacle(self, lower: Array, upper: Array) -> str:
         """What is not defined on all of a cell (N,), in words; blank if all is."""
         values = self._held(lower[None], upper[None])
-        place = {node: k for k, node in enumerate(self._order)}
+        place = self._place
         for k in self._roots:
             node = self._order[k]
             while not values.known[place[node], 0]:

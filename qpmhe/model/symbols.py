@@ -22,7 +22,7 @@ _MACHINERY = (
     *(str(_HERE / f"{name}.py") for name in (
         "symbols", "operations", "stand_ins", "tracing", "functions",
     )),
-    str(Path(np.__file__).parent),
+    str(_HERE.parent / "adapters"), str(Path(np.__file__).parent),
 )
 _PACKAGE = str(_HERE.parent)
 _LIBRARIES = (str(Path(np.__file__).parents[1]), str(Path(os.__file__).parent))

@@ -138,9 +138,13 @@ class ModelTrace:
         return self.confirm(None).model
 
     def watched(self, name: str) -> Traced:
-        """The trace of a function that is watched meanwhile: see `qpmhe.model.tracing`."""
-        source = self._functions[name] if self._sources is None else self._sources[name]
-        return expressed(source, (self._n, self._m), name, watched=True)
+        """The trace of a function that is watched meanwhile: see `qpmhe.model.tracing`.
+
+        A source is no code of the user's, but what is evaluated itself, as a program for JAX is.
+        """
+        if self._sources is not None:
+            return expressed(self._sources[name], (self._n, self._m), name)
+        return expressed(self._functions[name], (self._n, self._m), name, watched=True)
 
     def _pin(self, found: dict[str, Traced]) -> None:
         self._now = Pinned(found, self._n, self._p, self._m, self.dt, self.method)

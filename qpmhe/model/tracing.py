@@ -292,12 +292,12 @@ _TELLING_ATTRIBUTES = frozenset((
 
 def _is_trusted(name: str) -> bool:
     """Whether code works on symbols as on numbers: that of this module's like, and libraries."""
-    return name.startswith((*_MACHINERY, _ADAPTERS, "<frozen")) or "/casadi/" in name or (
+    return name.startswith((*_MACHINERY, "<frozen")) or "/casadi/" in name or (
         name.startswith(_STANDARD) and "site-packages" not in name
     )
 
 
-_ADAPTERS, _STANDARD = str(Path(__file__).parents[1] / "adapters"), str(Path(dis.__file__).parent)
+_STANDARD = str(Path(dis.__file__).parent)
 
 
 @contextlib.contextmanager
