@@ -41,7 +41,7 @@ class Cover:
     late: bool = False  # whether it ended because the time was over
 
 
-class _Cells:
+class Cells:
     """The cells of a region that remain, each with the bound of the cell that it is a part of."""
 
     def __init__(self, region: Region) -> None:
@@ -60,13 +60,9 @@ class _Cells:
         self.taken += len(chosen)
         return low, high
 
-    def halve(
-        self, low: Array, high: Array, enclosure: Enclosure, left: NDArray[Any], bounds: Array
-    ) -> None:
-        """Put the halves of cells back, along the coordinates that make most of the error."""
+    def halve(self, low: Array, high: Array, scores: Array, bounds: Array) -> None:
+        """Put the halves of cells back, along the coordinates with the largest scores."""
         region, rows = self._region, np.arange(low.shape[0])
-        corners = np.abs(enclosure.slopes[left]).sum(axis=(2, 3))
-        scores = enclosure.excess[left] + _CORNER_SHARE * corners
         known = np.isfinite(scores).all(axis=1) & (scores.max(axis=1) > 0.0)
         width = np.where(region.upper > region.lower, region.upper - region.lower, np.inf)
         which = np.where(known[:, None], scores, (high - low) / width).argmax(axis=1)
@@ -80,12 +76,19 @@ class _Cells:
         self.inherited = np.append(self.inherited, np.tile(bounds, 2)[stay])
 
 
+def _scores(enclosure: Enclosure, left: NDArray[Any]) -> Array:
+    """What the width of each coordinate adds to the error and the corners of some cells."""
+    corners = np.abs(enclosure.slopes[left]).sum(axis=(2, 3))
+    scores: Array = enclosure.excess[left] + _CORNER_SHARE * corners
+    return scores
+
+
 def cover(
     model: SmoothModel, region: Region, form: Form, most_cells: int = _MOST_CELLS,
     seconds: float | Deadline = PART_SECONDS,
 ) -> Cover:
     """Show an inequality on a region by dividing it until each cell is shown."""
-    deadline, cells, margin = Deadline.of(seconds), _Cells(region), np.inf
+    deadline, cells, margin = Deadline.of(seconds), Cells(region), np.inf
     corners = 2 ** min(region.lower.size, MOST_ACTIVE)
     chunk = int(np.clip(_WORK / (corners * (2 * model.n + model.p) ** 3), 1, _CHUNK))
     nowhere = np.empty((0, region.lower.size)), np.empty((0, model.n + model.p, model.n))
@@ -106,7 +109,7 @@ def cover(
             return Cover(False, cells.taken, margin, middle[broken], centres[broken])
         if cells.taken > most_cells:
             return Cover(False, cells.taken, margin, *nowhere)
-        cells.halve(low, high, enclosure, left, np.full(len(left), np.inf))
+        cells.halve(low, high, _scores(enclosure, left), np.full(len(left), np.inf))
     return Cover(True, cells.taken, margin, *nowhere)
 
 
@@ -170,7 +173,7 @@ def output_lipschitz(
 
     if model.output_reason:
         return seen(f"h cannot be run with intervals ({model.output_reason})")
-    cells, bound, end = _Cells(region), 0.0, ""
+    cells, bound, end = Cells(region), 0.0, ""
     while len(cells.lower):
         if cells.taken and (deadline.passed or cells.taken > _MOST_OUTPUT_CELLS):
             end = ", when its time was over" if deadline.passed else ", the most that are allowed"
@@ -190,7 +193,7 @@ def output_lipschitz(
         left = np.flatnonzero(~(bounds <= goal))
         bound = max(bound, float(np.delete(bounds, left).max(initial=0.0)))
         if left.size:
-            cells.halve(low[left], high[left], enclosure, left, bounds[left])
+            cells.halve(low[left], high[left], _scores(enclosure, left), bounds[left])
     how = "h is affine" if model.affine_output else f"bounded on {cells.taken} cells{end}"
     return LipschitzConstant(bound, Evidence.PROVED, attained, at, how)
 

@@ -78,7 +78,7 @@ class Region:
         """Which cells, given by corners (B, n + m), certainly have no state of the region."""
         if self.is_box:
             return np.zeros(len(lower), np.bool_)
-        least, most = _row_bounds(self.states.matrix, lower[:, : self.n], upper[:, : self.n])
+        least, most = row_bounds(self.states.matrix, lower[:, : self.n], upper[:, : self.n])
         away: NDArray[np.bool_] = np.any(
             (least > self.states.row_upper) | (most < self.states.row_lower), axis=1
         )
@@ -100,7 +100,7 @@ class Region:
         if self.is_box:
             return points
         n, directions = self.n, np.random.default_rng(0).standard_normal((_DIRECTIONS, self.n))
-        G, g = _inequalities(self.states)
+        G, g = inequalities(self.states)
         vertices = np.array([
             _support(G, g, e)[0] for e in (*np.eye(n), *-np.eye(n), *directions)
         ])
@@ -153,7 +153,7 @@ def bounded_region(
         )
     if not system.m and inputs is not None:
         raise SetError("inputs are bounded, but the system has none; leave inputs out.")
-    lower, upper = _bounds(chosen)
+    lower, upper = bounds(chosen)
     if inputs is not None:
         lower, upper = np.append(lower, inputs.lower), np.append(upper, inputs.upper)
     free = ~(np.isfinite(lower) & np.isfinite(upper))
@@ -174,15 +174,15 @@ def stated_region(region: Any) -> Region | None:
         return region
     if not isinstance(region, ConvexSet):
         raise SetError(f"region is {region!r}; expected a qpmhe.Box or a qpmhe.Polytope.")
-    return Region(region, *_bounds(region))
+    return Region(region, *bounds(region))
 
 
-def _bounds(states: ConvexSet) -> tuple[Array, Array]:
+def bounds(states: ConvexSet) -> tuple[Array, Array]:
     """Outward bounds on the components of a set's members; infinite where there are none."""
     if states.matrix.shape[0] == 0:
         return states.lower, states.upper
     n = states.dimension
-    G, g = _inequalities(states)
+    G, g = inequalities(states)
     found = [_support(G, g, e)[1:] for e in (*-np.eye(n), *np.eye(n))]
     sides, residuals = np.moveaxis(np.reshape(found, (2, n, 2)), -1, 0)
     if not np.isfinite(sides).all():
@@ -197,7 +197,7 @@ def _bounds(states: ConvexSet) -> tuple[Array, Array]:
     return np.maximum(-sides[0], states.lower), np.minimum(sides[1], states.upper)
 
 
-def _inequalities(states: ConvexSet) -> tuple[Array, Array]:
+def inequalities(states: ConvexSet) -> tuple[Array, Array]:
     """All inequalities of a set, as G x <= g."""
     eye = np.eye(states.dimension)
     G = np.vstack((eye, -eye, states.matrix, -states.matrix))
@@ -206,7 +206,7 @@ def _inequalities(states: ConvexSet) -> tuple[Array, Array]:
     return G[finite], g[finite]
 
 
-def _row_bounds(rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
+def row_bounds(rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
     """Outward bounds on linear forms over boxes; exact where a form is a coordinate."""
     positive, negative = np.maximum(rows, 0.0).T, np.minimum(rows, 0.0).T
     single = (np.count_nonzero(rows, axis=1) == 1) & (np.abs(rows).sum(axis=1) == 1.0)
@@ -243,8 +243,8 @@ def beyond(inner: Region, outer: Region) -> str:
     n, size = inner.n, inner.lower.size
     if outer.n != n:
         return f"it has {n} states instead of {outer.n}"
-    own, sides = _inequalities(inner.states)
-    G, g = _inequalities(outer.states)
+    own, sides = inequalities(inner.states)
+    G, g = inequalities(outer.states)
     eye, inputs = np.eye(size), slice(n, outer.lower.size)
     G = np.vstack((np.pad(G, ((0, 0), (0, size - n))), eye[inputs], -eye[inputs]))
     g = np.concatenate((g, outer.upper[inputs], -outer.lower[inputs]))
@@ -252,7 +252,7 @@ def beyond(inner: Region, outer: Region) -> str:
         same = (own == row[:n]).all(axis=1) & (not row[n:].any())
         if same.any() and sides[same].min() <= limit:
             continue
-        most = float(_row_bounds(row[None], inner.lower, inner.upper)[1][0])
+        most = float(row_bounds(row[None], inner.lower, inner.upper)[1][0])
         if not most <= limit:
             terms = " + ".join(
                 f"{row[j]:.6g} {'x' if j < n else 'u'}[{j if j < n else j - n}]"
