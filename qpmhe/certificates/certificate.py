@@ -332,8 +332,8 @@ class Certificate:
             radius = proved.radii(length, initial_error, proved.entering(w, v))
             return proved.farthest(radius, np.zeros((length + 1, self.system.n)))
         return self.bound(
-            None, np.full(length, w), np.full(length, v), initial_error=initial_error,
-            horizon=horizon, kind=kind,
+            None, np.full(length, w), np.full(length, v), horizon=horizon, kind=kind,
+            initial_error=checked_length("initial_error", initial_error),
         )
 
     def limit(

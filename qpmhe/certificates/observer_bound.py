@@ -28,7 +28,7 @@ from .._linalg import inverse
 from ..costs import Cost
 from ..errors import OptionError, SetError, ShapeError
 from ..estimation.estimate import Status
-from ..estimation.run import Run
+from ..estimation.run import Run, RunSource
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
@@ -485,6 +485,10 @@ class ObserverBound:
         ShapeError, OptionError, SetError
             If an argument does not fit.
         """
+        if run.source is not None and run.source.observer.metric is not self.projection:
+            other = self.of_observer(run.source.observer)
+            if other.projects != self.projects:
+                return other.along(run, disturbances, noises, initial_error=initial_error)
         radius = self.radii(len(run), initial_error, self.entering(disturbances, noises))
         z = run.observer_states
         lost, reason = self._lost(run, radius)
@@ -501,11 +505,37 @@ class ObserverBound:
         reasons = [(self.event(status), t) for t, status in _marked(run, self.projects)]
         if away.any():
             reasons.append((self.left(run.observer_states[t := int(away.argmax())]), t))
+        if run.source is not None:
+            reasons += self._of_source(run.source)
         empty = self.is_empty(radius[1:], run.observer_states[1:])
         if empty.any():
             reasons.append((CONTRADICTION, int(empty.argmax())))
         reason, first = min(reasons, key=lambda one: one[1], default=("", None))
         return first, reason
+
+    def _of_source(self, source: RunSource) -> list[tuple[str, int]]:
+        """What a run's inputs, steps and settings say against the bound."""
+        found, n = [], self.region.n
+        if source.settings.candidate != "observer":
+            found.append((REINITIALIZED, 0))
+        low, high = self.region.lower[n:], self.region.upper[n:]
+        if source.inputs is not None:
+            beyond = ((source.inputs < low) | (source.inputs > high)).any(axis=1)
+            if beyond.any():
+                found.append((self.input_beyond(source.inputs[t := int(beyond.argmax())]), t))
+        if source.steps is not None:
+            other = np.asarray(source.steps) != source.system.dt
+            if other.any():
+                t = int(other.argmax())
+                found.append((step_of(source.steps[t], source.system.dt), t))
+        return found
+
+    def input_beyond(self, u: Array) -> str:
+        """What to say of an input that is not certified; empty of one that is."""
+        low, high = self.region.lower[self.region.n :], self.region.upper[self.region.n :]
+        if bool(((low <= u) & (u <= high)).all()):
+            return ""
+        return f"the input {u.tolist()} is outside of what was certified"
 
     def is_empty(self, radius: Array, observer: Array) -> NDArray[np.bool_]:
         """Whether no state of the region is in the set around z."""
@@ -548,6 +578,16 @@ class ObserverBound:
         return content
 
 
+def step_of(length: float, usual: float | None) -> str:
+    """What to say of a step of another length than the one that was certified."""
+    return f"the step had the length {length:.6g}, and {usual or 0.0:.6g} is certified"
+
+
+#: Of an estimator whose observer does not run on.
+REINITIALIZED = (
+    "the candidate comes from an observer that starts again at each sample, whose states this "
+    "bound is not about"
+)
 #: Where the data contradict what is assumed.
 CONTRADICTION = (
     "no state of the region fits the bound: the disturbances, the noises or the initial error were "

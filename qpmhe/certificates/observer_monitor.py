@@ -13,15 +13,18 @@ from ..errors import InvalidInputError, ShapeError
 from ..estimation.estimate import Estimate
 from ..estimation.estimator import MovingHorizonEstimator
 from ..model.system import System
-from .observer_bound import CONTRADICTION, ObserverBound, SignalBounds, Size
+from .observer_bound import (
+    CONTRADICTION,
+    REINITIALIZED,
+    ObserverBound,
+    SignalBounds,
+    Size,
+    step_of,
+)
 
 # What rounding may make of one step of the observer, as a share of what it sums up.
 _ROUNDING = 1e-9
 
-_REINITIALIZED = (
-    "the candidate comes from an observer that starts again at each sample, whose states this "
-    "bound is not about"
-)
 _MOVED = (
     "the observer's state before was changed, by a late measurement (amend), by set or by a "
     "sample's own bounds"
@@ -117,7 +120,7 @@ class ObserverMonitor:
         self._radius = bound.initial(initial_error)
         self._lost: int | None = None
         self._reason = ""
-        self._barred = _REINITIALIZED if estimator.settings.candidate != "observer" else ""
+        self._barred = REINITIALIZED if estimator.settings.candidate != "observer" else ""
 
     @property
     def radius(self) -> float:
@@ -184,12 +187,11 @@ class ObserverMonitor:
         if np.isnan(estimate.noises[-1]).any():
             return "not all outputs were sampled"
         if dt is not None and dt != system.dt:
-            return f"the step had the length {dt:.6g}, and {system.dt or 0.0:.6g} is certified"
-        low, high = bound.region.lower[system.n :], bound.region.upper[system.n :]
-        if u.shape != low.shape:
-            raise ShapeError(f"u has shape {u.shape}; expected ({low.size},).")
-        if not ((low <= u) & (u <= high)).all():
-            return f"the input {u.tolist()} is outside of what was certified"
+            return step_of(dt, system.dt)
+        if u.shape != (system.m,):
+            raise ShapeError(f"u has shape {u.shape}; expected ({system.m},).")
+        if reason := bound.input_beyond(u):
+            return reason
         if not np.array_equal(estimate.candidate[-2], before):
             return _MOVED
         if bound.projected(estimate.status):
