@@ -19,6 +19,7 @@ from .observer_bound import (
     ObserverBound,
     SignalBounds,
     Size,
+    largest_ratio,
     step_of,
 )
 
@@ -212,19 +213,22 @@ class ObserverMonitor:
         """What `load_state_dict` restores, as plain numbers and arrays."""
         return {
             "time": self._time, "observer": self._z.copy(), "radius": self._radius,
-            "lost": self._lost, "reason": self._reason,
+            "lost": self._lost, "reason": self._reason, "metric": self.bound.metric.copy(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue where another monitor of the same bound stopped.
+        """Continue where another monitor of this observer stopped.
 
-        An `InvalidInputError` is raised if the state is of another kind.
+        It may have another P. An `InvalidInputError` is raised if it is not such a state.
         """
         try:
             z = np.array(state["observer"], np.float64).reshape(self._z.shape)
             time, radius = int(state["time"]), float(state["radius"])
             lost = None if state["lost"] is None else int(state["lost"])
             reason = str(state["reason"])
+            metric = np.array(state["metric"], np.float64).reshape(self.bound.metric.shape)
+            if not np.array_equal(metric, self.bound.metric):  # another search found another P
+                radius *= largest_ratio(self.bound.metric, metric)
         except (KeyError, TypeError, ValueError) as error:
             raise InvalidInputError(
                 f"the state is of no monitor of this observer: {error}."
