@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,7 +25,6 @@ from .audit import Audit, audit, checked_ingredients
 from .branch_and_bound import constant_output
 from .contraction import (
     certify_detectability,
-    certify_observer,
     constant_gain,
     gain_if_constant,
 )
@@ -39,7 +37,7 @@ from .evidence import (
     json_ready,
     weakest,
 )
-from .observer_bound import ObserverBound, SignalBounds, Size
+from .observer_bound import ObserverBound, SignalBounds, Size, bound_observer
 from .properties import Detectability, ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
@@ -51,8 +49,6 @@ Kind = TheoremKind | Literal["observer"]
 
 #: The constants are upper bounds, what is computed from them is not: this covers its rounding.
 OUTWARD = 1.0 + 1e-9
-# How close to its limit the observer's bound is when it is called settled.
-_SETTLED = 0.1
 
 #: What no check can see.
 ASSUMED = (
@@ -117,12 +113,6 @@ class Certificate:
     def diameter(self) -> float:
         """The largest distance of two states of the region, or a little more."""
         return self.region.diameter
-
-    @property
-    def widths(self) -> Array:
-        """How wide the region is in each component, (n,)."""
-        n = self.system.n
-        return self.region.upper[:n] - self.region.lower[:n]
 
     @property
     def kinds(self) -> tuple[TheoremKind, ...]:
@@ -332,8 +322,8 @@ class Certificate:
             radius = proved.radii(length, initial_error, proved.entering(w, v))
             return proved.farthest(radius, np.zeros((length + 1, self.system.n)))
         return self.bound(
-            None, np.full(length, w), np.full(length, v), initial_error=initial_error,
-            horizon=horizon, kind=kind,
+            None, np.full(length, w), np.full(length, v), horizon=horizon, kind=kind,
+            initial_error=checked_length("initial_error", initial_error),
         )
 
     def limit(
@@ -385,7 +375,7 @@ class Certificate:
         if kind == "observer":
             w, v = self._always(w_max, v_max, kind)
             proved = self._observer()
-            return not (proved.components(proved.limit(w, v)) < self.widths).all()
+            return not (proved.components(proved.limit(w, v)) < proved.widths).all()
         return not self.limit(w_max, v_max, horizon=horizon, kind=kind) < self.diameter
 
     def of(self, horizon: int | None = None) -> HorizonBounds:
@@ -431,34 +421,11 @@ class Certificate:
         return gain is not None and self.gain is not None and np.array_equal(gain, self.gain)
 
     @property
-    def settling_samples(self) -> int | None:
-        """Samples until the observer's bound is within 10 % of its limit, from any start.
-
-        From any two states of the region, that is; None where the limit is zero.
-        """
-        proved = self._observer()
-        widths, limit = self.widths, proved.limit()
-        start = proved.initial(Box(-widths, widths))
-        if not limit > 0.0:
-            return None
-        if start <= (1.0 + _SETTLED) * limit:
-            return 0
-        return math.ceil(math.log(_SETTLED * limit / (start - limit)) / math.log(proved.rate))
-
-    @property
     def headline(self) -> str:
         """The sharpest thing that is certified, in the states' units, in one line."""
-        proved = self.observer_bound
-        if proved is None:
+        if self.observer_bound is None:
             return "No bound of the observer's error is proved."
-        limit, widths = proved.components(proved.limit()), self.widths
-        each = ", ".join(f"|x{i + 1} - z{i + 1}| <= {size:.2g}" for i, size in enumerate(limit))
-        after = self.settling_samples
-        when = f" after {after} samples" if after else ""
-        wide = " x ".join(f"{width:.3g}" for width in widths)
-        vacuous = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limit >= widths))
-        nothing = f": it says nothing of {vacuous}" if vacuous else ""
-        return f"{each}{when} ({proved.evidence}), on a region {wide} wide{nothing}"
+        return self.observer_bound.headline
 
     def summary(self) -> str:
         """The headline, for what it holds, what it rests on, and what could not be certified."""
@@ -579,19 +546,19 @@ def examined(
     except CertificateError as error:
         errors["the theorem"] = error
     bounds_of_signals = SignalBounds.of(sizes, system, cost)
-    lengths = bounds_of_signals.lengths
     gain = gain_if_constant(observer, system)
     if detectability is not None:
         detectability = fitting(detectability, system, region, gain)
     if stability is not None:
         stability = fitting(stability, system, region, gain)
-    stability = stability or attempt("the observer", lambda: certify_observer(
-        system, observer, region,
-        sizes=bounds_of_signals.typical(system),
-        seconds=deadline.part(_OBSERVER),
-    ))
     proved = None
-    if stability is not None and stability.P is not None and stability.gain is not None:
+    if stability is None:
+        proved = attempt("the observer", lambda: bound_observer(
+            system, observer, cost, region, sizes=bounds_of_signals,
+            seconds=deadline.part(_OBSERVER),
+        ))
+        stability = None if proved is None else proved.stability
+    elif stability.P is not None and stability.gain is not None:
         proved = ObserverBound(stability, region, bounds_of_signals, observer.metric)
     findings: Audit | None = None
     constants: CostConstants | None = None

@@ -28,14 +28,16 @@ from .._linalg import inverse
 from ..costs import Cost
 from ..errors import OptionError, SetError, ShapeError
 from ..estimation.estimate import Status
-from ..estimation.run import Run
+from ..estimation.run import Run, RunSource
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
+from .contraction import certify_observer
+from .deadline import PART_SECONDS, Deadline
 from .evidence import Evidence, json_ready
 from .inequalities import Matrices, definite
 from .properties import ObserverStability
-from .regions import Region, stated_region
+from .regions import Region, bounded_region, stated_region
 from .theorem import Sizes, checked_length
 
 #: What bounds w or v: a length, a set, or lengths (T,) or vectors (T, n) at each sample.
@@ -45,6 +47,11 @@ _UNIT = float(np.finfo(np.float64).eps)
 # More than the rounding of a sum, a product and a root, each.
 _OUTWARD = 1.0 + 16.0 * _UNIT
 _SIGMAS = 3.0
+# How close to its limit the bound is when it is called settled.
+_SETTLED = 0.1
+_MOST_SAMPLES = 10**6  # that are counted until then
+# Of the larger size, what the other one counts at least where a matrix is sought.
+_LEAST = 1e-3
 # Boxes with more corners are bounded by sums over their sides.
 _MOST_CORNERS = 4096
 # Halvings of the bracket of a multiplier, each value of which gives a bound.
@@ -132,7 +139,7 @@ class SignalBounds:
         Where there is nothing of one kind, a thousandth of the other keeps the choice bounded.
         """
         found: list[float | Array] = []
-        least = 1e-3 * max(self.lengths.disturbance, self.lengths.noise)
+        least = _LEAST * max(self.lengths.disturbance, self.lengths.noise)
         for name, given, size in (
             ("disturbances", self.disturbances, system.r), ("noises", self.noises, system.p),
         ):
@@ -485,6 +492,10 @@ class ObserverBound:
         ShapeError, OptionError, SetError
             If an argument does not fit.
         """
+        if run.source is not None and run.source.observer.metric is not self.projection:
+            other = self.of_observer(run.source.observer)
+            if other.projects != self.projects:
+                return other.along(run, disturbances, noises, initial_error=initial_error)
         radius = self.radii(len(run), initial_error, self.entering(disturbances, noises))
         z = run.observer_states
         lost, reason = self._lost(run, radius)
@@ -501,11 +512,37 @@ class ObserverBound:
         reasons = [(self.event(status), t) for t, status in _marked(run, self.projects)]
         if away.any():
             reasons.append((self.left(run.observer_states[t := int(away.argmax())]), t))
+        if run.source is not None:
+            reasons += self._of_source(run.source)
         empty = self.is_empty(radius[1:], run.observer_states[1:])
         if empty.any():
             reasons.append((CONTRADICTION, int(empty.argmax())))
         reason, first = min(reasons, key=lambda one: one[1], default=("", None))
         return first, reason
+
+    def _of_source(self, source: RunSource) -> list[tuple[str, int]]:
+        """What a run's inputs, steps and settings say against the bound."""
+        found, n = [], self.region.n
+        if source.settings.candidate != "observer":
+            found.append((REINITIALIZED, 0))
+        low, high = self.region.lower[n:], self.region.upper[n:]
+        if source.inputs is not None:
+            beyond = ((source.inputs < low) | (source.inputs > high)).any(axis=1)
+            if beyond.any():
+                found.append((self.input_beyond(source.inputs[t := int(beyond.argmax())]), t))
+        if source.steps is not None:
+            other = np.asarray(source.steps) != source.system.dt
+            if other.any():
+                t = int(other.argmax())
+                found.append((step_of(source.steps[t], source.system.dt), t))
+        return found
+
+    def input_beyond(self, u: Array) -> str:
+        """What to say of an input that is not certified; empty of one that is."""
+        low, high = self.region.lower[self.region.n :], self.region.upper[self.region.n :]
+        if bool(((low <= u) & (u <= high)).all()):
+            return ""
+        return f"the input {u.tolist()} is outside of what was certified"
 
     def is_empty(self, radius: Array, observer: Array) -> NDArray[np.bool_]:
         """Whether no state of the region is in the set around z."""
@@ -536,6 +573,37 @@ class ObserverBound:
             )
         return ""
 
+    @property
+    def widths(self) -> Array:
+        """How wide the region is in each component, (n,)."""
+        n = self.region.n
+        return self.region.upper[:n] - self.region.lower[:n]
+
+    @property
+    def settling_samples(self) -> int | None:
+        """Samples until b(t) is within 10 % of its limit, from any two states of the region.
+
+        None where the limit is zero.
+        """
+        radius, limit = self.initial(Box(-self.widths, self.widths)), self.limit()
+        if not limit > 0.0:
+            return None
+        entering, samples = self.entering(), 0
+        while radius > (1.0 + _SETTLED) * limit and samples < _MOST_SAMPLES:
+            radius, samples = self.advanced(radius, entering), samples + 1
+        return samples
+
+    @property
+    def headline(self) -> str:
+        """The bound in the limit, in the states' units, and after how many samples, in one line."""
+        limit, after = self.components(self.limit()), self.settling_samples
+        each = ", ".join(f"|x{i + 1} - z{i + 1}| <= {size:.2g}" for i, size in enumerate(limit))
+        when = f" after {after} samples" if after else ""
+        wide = " x ".join(f"{width:.3g}" for width in self.widths)
+        vacuous = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limit >= self.widths))
+        nothing = f": it says nothing of {vacuous}" if vacuous else ""
+        return f"{each}{when} ({self.evidence}), on a region {wide} wide{nothing}"
+
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows."""
         limit = self.limit()
@@ -548,6 +616,52 @@ class ObserverBound:
         return content
 
 
+def bound_observer(
+    system: System, observer: Observer, cost: Cost, region: ConvexSet | Region | None = None, *,
+    inputs: Box | None = None, sizes: SignalBounds | Sizes | None = None,
+    seconds: float | Deadline = PART_SECONDS,
+) -> ObserverBound:
+    """Certify the observer alone: the first part of `certify`, with the same arguments.
+
+    Raises
+    ------
+    CertificateError, NotCertifiedError
+        If the observer has no constant gain, or is not shown to contract; the text says what may
+        help.
+    SetError, ShapeError, OptionError, ModelError
+        If an argument does not fit.
+    """
+    place, given = bounded_region(system, region, inputs), SignalBounds.of(sizes, system, cost)
+    stability = certify_observer(
+        system, observer, place, sizes=given.typical(system), seconds=seconds
+    )
+    return ObserverBound(stability, place, given, observer.metric)
+
+
+def largest_ratio(metric: Array, other: Array) -> float:
+    """A number c with |e|_P <= c |e|_M for all e, P the first and M the other metric."""
+    from scipy.linalg import eigh
+
+    top = float(eigh(metric, other, eigvals_only=True)[-1])
+    for slack in _SLACKS:
+        found = top * (1.0 + slack)
+        scaled = metric[None] / found
+        rest = Matrices.exact(other[None]) - Matrices(scaled, 2.0 * _UNIT * np.abs(scaled))
+        if found > 0.0 and definite(rest)[0].all():
+            return math.sqrt(found) * _OUTWARD
+    return math.inf
+
+
+def step_of(length: float, usual: float | None) -> str:
+    """What to say of a step of another length than the one that was certified."""
+    return f"the step had the length {length:.6g}, and {usual or 0.0:.6g} is certified"
+
+
+#: Of an estimator whose observer does not run on.
+REINITIALIZED = (
+    "the candidate comes from an observer that starts again at each sample, whose states this "
+    "bound is not about"
+)
 #: Where the data contradict what is assumed.
 CONTRADICTION = (
     "no state of the region fits the bound: the disturbances, the noises or the initial error were "

@@ -13,15 +13,19 @@ from ..errors import InvalidInputError, ShapeError
 from ..estimation.estimate import Estimate
 from ..estimation.estimator import MovingHorizonEstimator
 from ..model.system import System
-from .observer_bound import CONTRADICTION, ObserverBound, SignalBounds, Size
+from .observer_bound import (
+    CONTRADICTION,
+    REINITIALIZED,
+    ObserverBound,
+    SignalBounds,
+    Size,
+    largest_ratio,
+    step_of,
+)
 
 # What rounding may make of one step of the observer, as a share of what it sums up.
 _ROUNDING = 1e-9
 
-_REINITIALIZED = (
-    "the candidate comes from an observer that starts again at each sample, whose states this "
-    "bound is not about"
-)
 _MOVED = (
     "the observer's state before was changed, by a late measurement (amend), by set or by a "
     "sample's own bounds"
@@ -117,7 +121,7 @@ class ObserverMonitor:
         self._radius = bound.initial(initial_error)
         self._lost: int | None = None
         self._reason = ""
-        self._barred = _REINITIALIZED if estimator.settings.candidate != "observer" else ""
+        self._barred = REINITIALIZED if estimator.settings.candidate != "observer" else ""
 
     @property
     def radius(self) -> float:
@@ -184,12 +188,11 @@ class ObserverMonitor:
         if np.isnan(estimate.noises[-1]).any():
             return "not all outputs were sampled"
         if dt is not None and dt != system.dt:
-            return f"the step had the length {dt:.6g}, and {system.dt or 0.0:.6g} is certified"
-        low, high = bound.region.lower[system.n :], bound.region.upper[system.n :]
-        if u.shape != low.shape:
-            raise ShapeError(f"u has shape {u.shape}; expected ({low.size},).")
-        if not ((low <= u) & (u <= high)).all():
-            return f"the input {u.tolist()} is outside of what was certified"
+            return step_of(dt, system.dt)
+        if u.shape != (system.m,):
+            raise ShapeError(f"u has shape {u.shape}; expected ({system.m},).")
+        if reason := bound.input_beyond(u):
+            return reason
         if not np.array_equal(estimate.candidate[-2], before):
             return _MOVED
         if bound.projected(estimate.status):
@@ -210,19 +213,22 @@ class ObserverMonitor:
         """What `load_state_dict` restores, as plain numbers and arrays."""
         return {
             "time": self._time, "observer": self._z.copy(), "radius": self._radius,
-            "lost": self._lost, "reason": self._reason,
+            "lost": self._lost, "reason": self._reason, "metric": self.bound.metric.copy(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue where another monitor of the same bound stopped.
+        """Continue where another monitor of this observer stopped.
 
-        An `InvalidInputError` is raised if the state is of another kind.
+        It may have another P. An `InvalidInputError` is raised if it is not such a state.
         """
         try:
             z = np.array(state["observer"], np.float64).reshape(self._z.shape)
             time, radius = int(state["time"]), float(state["radius"])
             lost = None if state["lost"] is None else int(state["lost"])
             reason = str(state["reason"])
+            metric = np.array(state["metric"], np.float64).reshape(self.bound.metric.shape)
+            if not np.array_equal(metric, self.bound.metric):  # another search found another P
+                radius *= largest_ratio(self.bound.metric, metric)
         except (KeyError, TypeError, ValueError) as error:
             raise InvalidInputError(
                 f"the state is of no monitor of this observer: {error}."

@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InvalidInputError, SetError
+from ..costs import Cost
+from ..errors import InvalidInputError, OptionError, SetError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
+from ..model.system import System
 from ..models.example import Example
-from ..models.scenario import Record
+from ..models.scenario import Record, Scenario
 from ..plots.bounds import error_and_bounds
 from ..plots.style import save
 from .certificate import Certificate, Kind, examined, horizons_of
@@ -178,9 +180,11 @@ def certify_model(
     deadline = started(seconds)
     system, observer, cost, scenario = example
     record = scenario.simulate(seed)
-    place = _region(example, record, region, inputs)
+    place = region_of(system, scenario, region, inputs, record=record)
     horizons = horizons_of(scenario.horizon if horizon is None else horizon)
-    certificate = examined(system, observer, cost, place, horizons, _sizes(example), deadline)
+    certificate = examined(
+        system, observer, cost, place, horizons, sizes_of(system, cost, scenario), deadline
+    )
     report = Report(name or scenario.title, example, record, certificate)
     if certificate.holds:
         report.estimator = MovingHorizonEstimator(
@@ -189,20 +193,39 @@ def certify_model(
         )
         report.run, report.summary = monitored_run(
             certificate, report.estimator, record.measurements, record.inputs,
-            initial_error=initial_error(example),
+            initial_error=initial_error(scenario),
         )
         if certificate.observer_bound is not None:
             report.band = certificate.observer_bound.along(
-                report.run, initial_error=initial_error(example)
+                report.run, initial_error=initial_error(scenario)
             )
     return report
 
 
-def _region(
-    example: Example, record: Record, region: ConvexSet | Region | None, inputs: Box | None
+def region_of(
+    system: System, scenario: Scenario | None, region: ConvexSet | Region | None = None,
+    inputs: Box | None = None, *, record: Record | None = None, option: str = "region",
 ) -> Region:
-    system = example.system
-    if inputs is None and record.inputs is not None and not isinstance(region, Region):
+    """The set that a model is certified on, and bounds on its inputs.
+
+    Parameters
+    ----------
+    system, scenario
+        The model; the scenario is simulated where something is left out.
+    region, inputs : optional
+        What is given. Left out, the system's own X if that is bounded, or a box around the
+        simulated record, and that of the record's inputs.
+    record : Record, optional
+        The simulated record, where there is one already.
+    option : str
+        How an error names the region.
+    """
+    if record is None and scenario is not None:
+        record = scenario.simulate(0)
+    if (
+        inputs is None and record is not None and record.inputs is not None
+        and not isinstance(region, Region)
+    ):
         inputs = Box(record.inputs.min(axis=0), record.inputs.max(axis=0))
     if region is not None:
         return bounded_region(system, region, inputs)
@@ -211,8 +234,13 @@ def _region(
             return bounded_region(system, None, inputs)
         except SetError:
             pass  # not bounded: a box around the record bounds it
+    if record is None or scenario is None:
+        raise OptionError(
+            f"{option} is missing, and the model has neither a bounded set of states nor a "
+            "scenario to simulate; give the set in which the states stay."
+        )
     low, high = record.states.min(axis=0), record.states.max(axis=0)
-    start = example.scenario.initial_estimate
+    start = scenario.initial_estimate
     low, high = np.minimum(low, start), np.maximum(high, start)
     width = np.where(high > low, high - low, np.abs(high))
     room = _ROOM * np.where(width > 0.0, width, 1.0)
@@ -222,17 +250,16 @@ def _region(
     )
 
 
-def _sizes(example: Example) -> SignalBounds:
+def sizes_of(system: System, cost: Cost, scenario: Scenario | None) -> SignalBounds:
     """The system's W and V, or three standard deviations of the scenario's noises."""
-    scenario = example.scenario
+    if scenario is None:
+        return SignalBounds.of(None, system, cost)
     return SignalBounds.usual(
-        example.system, scenario.disturbance_covariance, scenario.noise_covariance,
-        "the model's scenario",
+        system, scenario.disturbance_covariance, scenario.noise_covariance, "the model's scenario"
     )
 
 
-def initial_error(example: Example) -> Box:
+def initial_error(scenario: Scenario) -> Box:
     """As far as the scenario's first state is from its first estimate, in each component."""
-    scenario = example.scenario
     away = np.abs(scenario.initial_state - scenario.initial_estimate)
     return Box(-away, away)

@@ -19,8 +19,8 @@ from ..certificates.properties import Detectability, ObserverStability
 from ..certificates.regions import Region
 from ..certificates.report import LABELS, Report, certify_model
 from ..errors import OptionError
-from ..model.sets import Box
 from ..models.loading import find, load
+from .boxes import read_box
 from .design import show_design
 
 
@@ -35,8 +35,8 @@ def certify(
         _check_report(report)  # before any work
     example = load(find(model))
     system, title = example.system, example.scenario.title or model
-    region = None if box is None else _box("--box", box, system.n, "states")
-    inputs = None if input_box is None else _box("--input-box", input_box, system.m, "inputs")
+    region = None if box is None else read_box("--box", box, system.n, "states")
+    inputs = None if input_box is None else read_box("--input-box", input_box, system.m, "inputs")
     with console.status("looking for matrices, and verifying them"):
         found = certify_model(
             example, horizon=horizons or None, region=region, inputs=inputs, seed=seed,
@@ -135,20 +135,6 @@ def _horizons(text: str | None) -> list[int]:
     if not found or min(found) < 1:
         raise OptionError(f"--horizon is {text!r}; expected integers >= 1 between commas.")
     return found
-
-
-def _box(option: str, text: str, width: int, kind: str) -> Box:
-    pairs = [item.split(":") for item in text.split(",")]
-    try:
-        if len(pairs) != width or any(len(pair) != 2 for pair in pairs):
-            raise ValueError("the number of components")
-        low, high = zip(*[(float(a), float(b)) for a, b in pairs], strict=True)
-    except ValueError as error:
-        raise OptionError(
-            f"{option} is {text!r}; expected low:high for each of {width} {kind}, between "
-            "commas, as in 0.1:9,-1:9."
-        ) from error
-    return Box(low, high)
 
 
 def _words(region: Region) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -14,6 +14,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ..errors import InvalidInputError, OptionError
+
+if TYPE_CHECKING:
+    from ..records.bounds import BoundOptions
 
 
 def estimate(
@@ -58,6 +61,32 @@ def estimate(
     step_time: Annotated[
         bool, typer.Option(help="Whether to write the seconds of each step.")
     ] = True,
+    bound: Annotated[
+        bool,
+        typer.Option("--bound", help="Columns of the proved set around the observer, which holds "
+                     "the true state, and of the bound of the estimate's error."),
+    ] = False,
+    bound_box: Annotated[
+        str | None,
+        typer.Option(help="For --bound: set of states, such as 0.1:9,-1:9; as for certify if "
+                     "left out."),
+    ] = None,
+    bound_input_box: Annotated[
+        str | None, typer.Option(help="For --bound: set of inputs, in the form of --bound-box.")
+    ] = None,
+    initial_error: Annotated[
+        str | None,
+        typer.Option(help="For --bound: most of |x - z| at the start, a length or one for each "
+                     "state; default is the scenario's."),
+    ] = None,
+    max_disturbance: Annotated[
+        str | None,
+        typer.Option(help="For --bound: most of |w|, a length or one for each state; default is "
+                     "W, or three standard deviations."),
+    ] = None,
+    max_noise: Annotated[
+        str | None, typer.Option(help="For --bound: most of |v|, likewise for outputs.")
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an estimation that was interrupted.")
     ] = False,
@@ -111,7 +140,31 @@ def estimate(
         )
     if initial_state is not None:
         options["initial_state"] = read_state(initial_state)
+    bounds = {name: options.pop(name, None) for name in _OF_BOUND}
+    if bound or any(value is not None for value in bounds.values()):
+        options["bound"] = bound_options(**bounds)
     run(Console(stderr=True), **options)
+
+
+_OF_BOUND = ("bound_box", "bound_input_box", "initial_error", "max_disturbance", "max_noise")
+
+
+def bound_options(
+    bound_box: str | None = None, bound_input_box: str | None = None, **sizes: str | None
+) -> BoundOptions:
+    """The options of --bound, read."""
+    from ..records.bounds import BoundOptions
+    from .boxes import read_box
+
+    numbers = {
+        name: None if text is None else read_numbers(f"--{name.replace('_', '-')}", text)
+        for name, text in sizes.items()
+    }
+    return BoundOptions(
+        None if bound_box is None else read_box("--bound-box", bound_box),
+        None if bound_input_box is None else read_box("--bound-input-box", bound_input_box),
+        **numbers,
+    )
 
 
 def run(
@@ -216,9 +269,12 @@ def _number(option: str, text: str, word: str) -> int | None:
 
 def read_state(text: str) -> NDArray[np.float64]:
     """The numbers of --initial-state."""
+    return read_numbers("--initial-state", text)
+
+
+def read_numbers(option: str, text: str) -> NDArray[np.float64]:
+    """Numbers between commas."""
     try:
         return np.array([float(item) for item in text.split(",")])
     except ValueError:
-        raise OptionError(
-            f"--initial-state is {text!r}; expected numbers between commas."
-        ) from None
+        raise OptionError(f"{option} is {text!r}; expected numbers between commas.") from None

@@ -24,6 +24,8 @@ STYLES: tuple[dict[str, Any], ...] = (
 )
 #: How the truth is drawn.
 REAL: dict[str, Any] = {"color": "0.25", "linewidth": 2.2, "alpha": 0.5, "label": "real"}
+#: How a band is filled that is proved to hold the truth.
+PROVED = "#E3ECF4"
 #: Parameters of matplotlib.
 LIGHT: Any = {
     "axes.axisbelow": True,

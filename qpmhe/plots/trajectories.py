@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._checks import Array, positive
+from ..errors import InvalidInputError
 from .checks import check_estimate, check_run, curve, label_list, named_curves, sample_times
-from .style import REAL, STYLES, panels
+from .style import PROVED, REAL, STYLES, panels
 
 if TYPE_CHECKING:
     from ..estimation.estimate import Estimate
@@ -70,9 +72,10 @@ def trajectories(
 def states(
     run: Run, *, dt: float = 1.0, labels: Sequence[str] | None = None,
     time_label: str = "time t (samples)", truth: Array | None = None, sigmas: float = 2.0,
-    axes: Any = None, residual: Residual | None = None,
+    band: tuple[ArrayLike, ArrayLike] | None = None, axes: Any = None,
+    residual: Residual | None = None,
 ) -> list[Any]:
-    """The estimates of a run, with bands of their covariances where it has them.
+    """The estimates of a run, with bands of their covariances and of what is proved.
 
     Parameters
     ----------
@@ -84,13 +87,16 @@ def states(
         As for `trajectories`.
     sigmas : float
         Half the width of a band, in standard deviations.
+    band : (lower, upper), optional
+        Sides (T + 1, n) of what holds the true state, as ``lower`` and ``upper`` of a
+        `qpmhe.certificates.Band`; nothing is drawn where they are NaN.
 
     Raises
     ------
     InvalidInputError
         If run is no `Run`, labels are no strings or axes no axes.
     ShapeError
-        If labels, truth or axes are not of the run's states and times.
+        If labels, truth, axes or band are not of the run's states and times.
     OptionError
         If a number is not above zero.
     """
@@ -111,8 +117,28 @@ def states(
                 color=STYLES[0]["color"], alpha=0.18, linewidth=0.0,
                 label=f"± {sigmas:g} standard deviations",
             )
+    if band is not None:
+        lower, upper = (
+            curve(f"band[{side}]", values, count, n) for side, values in enumerate(_pair(band))
+        )
+        for j, panel in enumerate(drawn):
+            panel.fill_between(
+                times, lower[:, j], upper[:, j], color=PROVED, linewidth=0.0, zorder=0.5,
+                label="holds the true state (proved)",
+            )
+    if band is not None or (run.covariances is not None and len(run)):
         _legend(drawn, axes)
     return drawn
+
+
+def _pair(band: Any) -> tuple[ArrayLike, ArrayLike]:
+    """The two sides of a band."""
+    if not isinstance(band, (tuple, list)) or len(band) != 2:
+        raise InvalidInputError(
+            f"band is of type {type(band).__name__}; expected (lower, upper), such as "
+            "(band.lower, band.upper) of certificate.observer_bound.along(run, ...)."
+        )
+    return band[0], band[1]
 
 
 def window(

@@ -51,6 +51,7 @@ class Checkpoint:
     samples_digest: str = ""
     results_digest: str = ""
     state: dict[str, Any] = field(default_factory=dict)
+    bound: dict[str, Any] = field(default_factory=dict)
     finished: bool = False
     versions: dict[str, str] = field(default_factory=versions)
 

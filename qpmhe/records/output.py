@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from ..estimation.estimate import Estimate
 from ..estimation.estimator import MovingHorizonEstimator
 from .checkpoints import CheckpointError, WriteError
 
+if TYPE_CHECKING:
+    from .bounds import RowBounds
+
 _COVARIANCES = ("none", "std", "full")
 _PIECE = 1 << 20
 _STANDARD_OUTPUT = 1  # the number of its file descriptor
@@ -28,12 +31,15 @@ _STANDARD_OUTPUT = 1  # the number of its file descriptor
 class RowFormat:
     """What is written for each sample."""
 
-    def __init__(self, states: tuple[str, ...], covariances: str, step_time: bool) -> None:
+    def __init__(
+        self, states: tuple[str, ...], covariances: str, step_time: bool,
+        bounds: RowBounds | None = None,
+    ) -> None:
         if covariances not in _COVARIANCES:
             raise OptionError(
                 f"--covariances is {covariances!r}; expected {', '.join(_COVARIANCES)}."
             )
-        self._covariances, self._step_time = covariances, step_time
+        self._covariances, self._step_time, self._bounds = covariances, step_time, bounds
         self._upper = np.triu_indices(len(states))
         kinds = ("filtered", "predicted")
         self.header = ["time", *(f"{kind}_{name}" for kind in kinds for name in states)]
@@ -44,6 +50,8 @@ class RowFormat:
                 f"cov_{kind}_{states[i]}_{states[j]}"
                 for kind in kinds for i, j in zip(*self._upper, strict=True)
             ]
+        if bounds is not None:
+            self.header += bounds.header(states)
         self.header += ["cost", "candidate_cost", "status", "qps", "inserted"]
         if step_time:
             self.header.append("step_time")
@@ -55,6 +63,8 @@ class RowFormat:
         numbers = [*estimate.filtered.tolist(), *estimate.state.tolist()]
         if self._covariances != "none":
             numbers += self._uncertainties(estimator)
+        if self._bounds is not None:
+            numbers += self._bounds.numbers
         numbers += [estimate.cost, estimate.candidate_cost]
         fields = [time, *("" if value != value else repr(value) for value in numbers)]
         status = str(estimate.status).removeprefix("Status.")

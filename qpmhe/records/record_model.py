@@ -29,6 +29,7 @@ class RecordModel:
     dt: float | None
     identity: dict[str, Any]
     time_unit: str = "s"
+    scenario: Scenario | None = None
 
 
 def load_record_model(text: str, engine_at_work: str | None = None, **options: Any) -> RecordModel:
@@ -39,6 +40,7 @@ def load_record_model(text: str, engine_at_work: str | None = None, **options: A
     source = find(text)
     name = source.name
     parts, given = _parts(name, build(source))
+    scenario = given.pop("scenario", None)
     signals = {kind: given.pop(kind, None) for kind in _SIZES}
     dt, unit = given.pop("dt", None), str(given.pop("time_unit", "s"))
     chosen = given | options
@@ -71,7 +73,9 @@ def load_record_model(text: str, engine_at_work: str | None = None, **options: A
     system = estimator.system
     sizes = {"states": system.n, "outputs": system.p, "inputs": estimator.inputs}
     names = {kind: _names(name, kind, signals[kind], size) for kind, size in sizes.items()}
-    return RecordModel(estimator, **names, dt=dt, identity=identity, time_unit=unit)
+    return RecordModel(
+        estimator, **names, dt=dt, identity=identity, time_unit=unit, scenario=scenario
+    )
 
 
 def _parts(name: str, made: Any) -> tuple[tuple[Any, ...], dict[str, Any]]:
@@ -89,6 +93,7 @@ def _parts(name: str, made: Any) -> tuple[tuple[Any, ...], dict[str, Any]]:
             options |= {
                 "horizon": extra.horizon, "initial_state": extra.initial_estimate,
                 "states": extra.labels, "dt": extra.dt, "time_unit": extra.time_unit,
+                "scenario": extra,
             }
         elif isinstance(extra, Mapping):
             options |= {str(key): value for key, value in extra.items()}

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from .output import Output, RowFormat, standard_output_for_rows
 from .record_model import RecordModel, load_record_model
 from .steps import Step, Steps
 from .tables import RecordError
+
+if TYPE_CHECKING:
+    from .bounds import BoundOptions, RowBounds
 
 _EVERY = 100
 # A mistake in the model's code, rather than a state at which it has no value.
@@ -103,6 +106,7 @@ def estimate_record(
     skip_repeated: bool = False,
     covariances: str = "none",
     step_time: bool = True,
+    bound: BoundOptions | bool = False,
     resume: bool = False,
     overwrite: bool = False,
     checkpoint_every: int | None = None,
@@ -142,6 +146,10 @@ def estimate_record(
         Most samples without measurement in a row, 500 by default.
     covariances, step_time : {"none", "std", "full"}, bool
         What to write of the covariances; whether to write the seconds of each step.
+    bound : BoundOptions or bool
+        Whether to write, for each predicted state, the sides of the proved set around the
+        observer and the bound of the estimate's error, blank from where they no longer hold. What
+        the options leave out comes from the model and its scenario.
     resume, overwrite : bool
         Whether to resume at the checkpoint beside ``out``, if there is one; whether to replace
         existing files.
@@ -188,7 +196,13 @@ def estimate_record(
             loaded.estimator.system, usual=loaded.dt if dt is None else dt, scale=time_scale,
             equal=equal_steps, max_gap=max_gap,
         )
-        rows = RowFormat(loaded.states, covariances, step_time)
+        bounds, asked = None, {}
+        if bound:
+            from .bounds import BoundOptions, RowBounds
+
+            given = BoundOptions() if bound is True else bound
+            bounds, asked = RowBounds(loaded, given, report), {"bound": given.identity()}
+        rows = RowFormat(loaded.states, covariances, step_time, bounds)
         reader = RecordReader(
             str(record), ColumnNames(loaded.outputs, loaded.inputs, time, outputs, inputs),
             separator=separator, decimal=decimal, encoding=encoding, skip_repeated=skip_repeated,
@@ -199,9 +213,9 @@ def estimate_record(
             "dt": dt, "time_scale": time_scale, "equal_steps": equal_steps,
             "states": list(loaded.states), "covariances": covariances, "step_time": step_time,
             "checkpoint_every": every,
-        })
+        } | asked)
         session = _Session(
-            loaded, rows, steps, reader, output, Checkpoint(identity, every),
+            loaded, rows, steps, reader, output, Checkpoint(identity, every), bounds,
             seconds=checkpoint_seconds, report=report, progress=progress, keep=keep_run,
         )
         return session.run(found)
@@ -256,14 +270,14 @@ class _Session:
 
     def __init__(
         self, model: RecordModel, rows: RowFormat, steps: Steps, reader: RecordReader,
-        output: Output, checkpoint: Checkpoint, *, seconds: float,
+        output: Output, checkpoint: Checkpoint, bounds: RowBounds | None, *, seconds: float,
         report: Callable[[str], None] | None, progress: Callable[[int, int | None], None] | None,
         keep: bool,
     ) -> None:
         self._model, self._keep = model, keep
         self._kept: KeptRun | None = None
         self._mhe, self._rows, self._steps = model.estimator, rows, steps
-        self._reader, self._output = reader, output
+        self._reader, self._output, self._bounds = reader, output, bounds
         self._report, self._progress = report, progress
         self._summary = Summary(model.estimator.engine)
         self._inserted = 0  # since the last row
@@ -343,6 +357,8 @@ class _Session:
             return None
         try:
             self._mhe.load_state_dict(found.state)
+            if self._bounds is not None:
+                self._bounds.load_state_dict(found.bound)
             time = FieldReader(".").time(found.time)
             inputs = np.array(found.inputs, np.float64).reshape(self._mhe.inputs)
         except (InvalidInputError, TypeError, ValueError) as error:
@@ -427,6 +443,8 @@ class _Session:
         estimate = self._mhe.update(y, sample.u if sample.u.size else None, dt=length)
         if self._kept is not None:
             self._kept.add(y, sample.u, length, estimate)
+        if self._bounds is not None:
+            self._bounds.check(estimate, sample.u, length, sample.time.text)
         if Status.MODEL_FAILED in estimate.status:
             self._count_failure(estimate, sample)
         else:
@@ -467,6 +485,7 @@ class _Session:
                 self._newest = replace(
                     self._newest, samples=self._taken, offset=self._output.offset,
                     time=sample.time.text, inputs=sample.u.tolist(), state=state,
+                    bound={} if self._bounds is None else self._bounds.state_dict(),
                     usual_step=self._steps.usual, samples_digest=self._digest,
                     results_digest=self._output.digest, finished=False, versions=versions(),
                 )
@@ -516,6 +535,8 @@ class _Session:
                 f"the last line of {reader.name}, {reader.cut}, has no end of line and may be cut "
                 "off: its numbers were used as they are. If more follows, --resume reads it again."
             )
+        if self._bounds is not None:
+            summary.notes.append(self._bounds.note)
         if reader.blank:
             summary.notes.append(
                 f"{reader.blank} rows without any value of {reader.name} were skipped."

@@ -1,0 +1,22 @@
+"""Boxes as options: low:high for each component, between commas."""
+
+from __future__ import annotations
+
+from ..errors import OptionError
+from ..model.sets import Box
+
+
+def read_box(option: str, text: str, width: int | None = None, kind: str = "components") -> Box:
+    """The box of an option, of so many components where that is known."""
+    pairs = [item.split(":") for item in text.split(",")]
+    try:
+        if len(pairs) != (width or len(pairs)) or any(len(pair) != 2 for pair in pairs):
+            raise ValueError("the number of components")
+        low, high = zip(*[(float(a), float(b)) for a, b in pairs], strict=True)
+    except ValueError as error:
+        many = "each component" if width is None else f"each of {width} {kind}"
+        raise OptionError(
+            f"{option} is {text!r}; expected low:high for {many}, between commas, as in "
+            "0.1:9,-1:9."
+        ) from error
+    return Box(low, high)
