@@ -66,7 +66,7 @@ SYSTEMS = (scalar, swap, reactor, fitzhugh_nagumo, van_der_pol, coupled, bent_ou
 def designed(make, seconds=60.0):
     """A design with an observer that was synthesised for the region."""
     system, region, sizes = make()
-    observer = synthesise_gain(system, region, weights=(sizes.disturbance, sizes.noise)).observer
+    observer = synthesise_gain(system, region, sizes=(sizes.disturbance, sizes.noise)).observer
     return design(system, region, observer=observer, sizes=sizes, seconds=seconds), observer
 
 
