@@ -11,12 +11,13 @@ import numpy as np
 from .._checks import Array
 from ..model.sets import ConvexSet
 from ..model.system import System
+from .branch_and_bound import Cover
 from .deadline import Deadline
-from .inequalities import Matrices, OutputInjection, OutputWeight, norms
+from .inequalities import Form, Matrices, OutputInjection, OutputWeight, norms
 from .observer_bound import SignalBounds, _alone, _read, _sides
 from .regions import Region
 from .sdp import Answer, Kind, Program, Scales, _columns
-from .search import Search
+from .search import Found, Search
 
 _MOST_CONDITION = 1e8
 _FLOOR = 1e-6  # of the noise's weight: a cost needs a positive one
@@ -190,6 +191,15 @@ class DesignSearch(Search):
                 self._horizon,
             )
         return self._program
+
+
+    def _verified(self, form: Form) -> Found | Cover:
+        """As `Search` does, after a look at the samples, which is cheap."""
+        blocks = form.matrices(Matrices.exact(self.jacobians)).middle
+        broken = np.linalg.eigvalsh(0.5 * (blocks + np.swapaxes(blocks, 1, 2)))[:, 0] <= 0.0
+        if broken.any():
+            return Cover(False, 0, 0.0, self.points[broken], self.jacobians[broken])
+        return super()._verified(form)
 
 
 def largest_sizes(sizes: SignalBounds) -> tuple[float | Array, float | Array]:

@@ -153,8 +153,8 @@ class Design:
         decay = self.discount ** (N - 1.0 - lags) @ self._observer().rate ** (2.0 * lags)
         return _OUTWARD * (own + self.slope * self._changes[0] * math.sqrt(float(decay)))
 
-    def least_horizon(self, kind: Kind = "decrease") -> int:
-        """The least N whose contraction is below 1."""
+    def least_horizon(self, kind: Kind = "decrease") -> int | None:
+        """The least N whose contraction is below 1; None if there is none up to 10,000."""
         return _first(lambda N: self.contraction(N, kind) < 1.0)
 
     def limit(
@@ -384,9 +384,9 @@ def _checked(kind: str) -> str:
     return kind
 
 
-def _first(wanted: Callable[[int], bool]) -> int:
-    """The least horizon for which something holds, or the longest one."""
-    return next((N for N in range(1, _MOST) if wanted(N)), _MOST)
+def _first(wanted: Callable[[int], bool]) -> int | None:
+    """The least horizon for which something holds."""
+    return next((N for N in range(1, _MOST + 1) if wanted(N)), None)
 
 
 def design(
@@ -460,7 +460,8 @@ def design(
         except (CertificateError, NotCertifiedError) as error:
             notes = (*notes, f"nothing holds in advance for any number of QPs: {error}")
     return Design(
-        system, place, form, gamma, known, horizon or proposed, bound, slope, evidence, notes
+        system, place, form, gamma, known, horizon or proposed or _MOST, bound, slope, evidence,
+        notes,
     )
 
 
