@@ -2,32 +2,28 @@ r"""The matrix inequality of the Lyapunov design, and the search for its unknown
 
 from __future__ import annotations
 
-import importlib
 import math
-import warnings
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from .._checks import Array
 from ..model.sets import ConvexSet
+from ..model.system import System
+from .branch_and_bound import Cover
 from .deadline import Deadline
-from .evidence import OutOfTimeError
-from .inequalities import Matrices, OutputInjection, OutputWeight, definite, norms
+from .inequalities import Form, Matrices, OutputInjection, OutputWeight, norms
 from .observer_bound import SignalBounds, _alone, _read, _sides
 from .regions import Region
-from .sdp import Answer, Scales, expected_seconds
-from .search import Search
+from .sdp import Answer, Kind, Program, Scales, _columns
+from .search import Found, Search
 
 _MOST_CONDITION = 1e8
-_LEAST = 1e-3  # seconds for a solver, for which zero may mean no limit
 _FLOOR = 1e-6  # of the noise's weight: a cost needs a positive one
-_DIGITS = 8  # of the weights: as they are verified, so they are printed
-_ROUNDING = _NOTHING = 1e-6
 _MARGIN = 1e-4  # of gamma: it saves the verification most of its cells, and costs as much
-_LEAST_SIZE = 1e-3  # of the other: what never occurs has a weight all the same
-_SHARES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.92)
+_DIGITS, _NOTHING = 8, 1e-6  # of the weights: as they are verified, so they are printed
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +35,7 @@ class Dissipation:
         + |w_1 - w_2|_Q^2 + |h(x_1) - h(x_2)|_R^2
 
     It follows from two inequalities, of which the first is that of `OutputWeight` or
-    `OutputInjection` with X for the first P, and the second has no state in it:
+    `OutputInjection` with X for its first P, and the second has no state in it:
 
     .. math::
         \begin{pmatrix} X & P A \\ \cdot & \gamma P + C^\top R C \end{pmatrix} \succ 0, \qquad
@@ -49,6 +45,7 @@ class Dissipation:
     inner: OutputWeight | OutputInjection
     X: Array  # (n, n)
     Q: Array  # (r, r)
+    G: Array  # (n, r)
 
     @property
     def P(self) -> Array:  # noqa: N802 - the paper's symbol
@@ -72,62 +69,56 @@ class Dissipation:
         middle[..., :n, :n] = self.X  # the first P was exact, and so is this
         return Matrices(middle, found.radius)
 
+    def constants(self) -> tuple[Matrices, ...]:
+        """The second matrix; see `Form.constants`."""
+        product = Matrices.exact(self.P) @ Matrices.exact(self.G)
+        rest = Matrices.exact(self.P) - Matrices.exact(self.X)
+        return (Matrices(*(
+            np.block([[a, b], [b.T, c]])[None] for a, b, c in (
+                (rest.middle, product.middle, self.Q),
+                (rest.radius, product.radius, np.zeros_like(self.Q)),
+            )
+        )),)
+
     def excess(self, dx: Array, df: Array, dh: Array) -> Array:
         """The conclusion of the first inequality alone; see `Form.excess`."""
         S = self.P @ np.linalg.solve(self.X, self.P)
         left = norms(df, 0.5 * (S + S.T)) * (1.0 - _ROUNDING)
         return left - np.hypot(self.rate * norms(dx, self.P), norms(dh, self.R))
 
-    def supplies(self, directions: Array) -> bool:
-        """Whether the second inequality holds, verified."""
-        product = Matrices.exact(self.P) @ Matrices.exact(directions)
-        rest = Matrices.exact(self.P) - Matrices.exact(self.X)
-        none = np.zeros_like(self.Q)
-        block = Matrices(*(
-            np.block([[a, b], [b.T, c]])[None] for a, b, c in (
-                (rest.middle, product.middle, self.Q), (rest.radius, product.radius, none)
-            )
-        ))
-        return bool(definite(block)[0][0])
 
+class DesignProgram(Program):
+    r"""Minimise the limit of the estimate's error over P, X, Q, R and the forms' other unknowns.
 
-class DesignProgram:
-    r"""Minimise the supply of the largest w and v over the inequality and :math:`P \succeq I`.
-
-    States are in units of the region, so that the root of the supply, divided by
-    :math:`1 - \gamma`, is what lasting disturbances make of the error there.
+    In states of the region's size :math:`P \succeq I`, and what the largest w and v supply is
+    minimised: a length is bounded by a multiple of the identity, a box by a diagonal matrix.
     """
 
     def __init__(
-        self, kind: Literal["output weight", "output injection"], jacobians: Array,
-        scales: Scales, directions: Array, sizes: SignalBounds,
+        self, kind: Kind, jacobians: Array, scales: Scales, G: Array, sizes: SignalBounds,
+        horizon: int | None,
     ) -> None:
-        cp: Any = importlib.import_module("cvxpy")
-
-        n = jacobians.shape[2]
-        p, r = jacobians.shape[1] - n, directions.shape[1]
-        self._kind, self._directions, self._sizes = kind, directions, sizes
-        self._d, self._s = d, s = scales.states, scales.outputs
-        self._g = g = 1.0 / np.abs(directions / d[:, None]).max(axis=0)
-        self.expected_seconds = jacobians.shape[0] * expected_seconds(n, p, kind)
-        self._gamma, self._margin = cp.Parameter(nonneg=True), cp.Parameter(nonneg=True)
-        self._P = P = cp.Variable((n, n), symmetric=True)
-        self._X = X = cp.Variable((n, n), symmetric=True)
-        self._Q = Q = cp.Variable((r, r), symmetric=True)
-        self._R = R = cp.Variable((p, p), symmetric=True)
-        self._Y = Y = cp.Variable((n, p))
-        self._M, self._N = M, N = cp.Variable((p, n)), cp.Variable((p, p))
-        w_sides, v_sides = cp.Variable(r), cp.Variable(p)
-        G = directions * g / d[:, None]
-        supply = cp.bmat([[P - X - self._margin * P, P @ G], [G.T @ P, Q - self._margin * Q]])
+        widths, groups, largest = _columns(G, scales, largest_sizes(sizes))
+        super().__init__(
+            kind, jacobians, Scales(largest * scales.states, largest * scales.outputs)
+        )
+        cp, P, d, s = self._cp, self._P, self._d, self._s
+        (n, r), p = G.shape, s.size
+        self._kind, self._G, self._sizes, self._horizon = kind, G, sizes, horizon
+        self._w, share = widths[:r], widths[r:] / s  # Q is in units of w's size, R in those of y
+        X, Q, R = (cp.Variable((size, size), symmetric=True) for size in (n, r, p))
+        Y, M, N = (cp.Variable(shape) for shape in ((n, p), (p, n), (p, p)))
+        self._X, self._Q, self._R, self._Y, self._M, self._N = X, Q, R, Y, M, N
+        shares = cp.Variable(groups.shape[1])
+        sides, PG = groups @ shares, P @ (G / d[:, None] * self._w)
         constraints: list[Any] = [
-            P - np.eye(n) >> 0, _MOST_CONDITION * np.eye(n) - P >> 0, R - _FLOOR * np.eye(p) >> 0,
-            cp.diag(w_sides) - Q >> 0, cp.diag(v_sides) - R >> 0, 0.5 * (supply + supply.T) >> 0,
+            P - np.eye(n) >> 0, _MOST_CONDITION * np.eye(n) - P >> 0,
+            cp.diag(sides[:r]) - Q >> 0, R - _FLOOR * np.eye(p) >> 0,
+            cp.diag(sides[r:]) - cp.multiply(np.outer(share, share), R) >> 0,
+            self._definite([[P - X - self._margin * P, PG], [PG.T, Q - self._margin * Q]]),
         ]
-        top, low = X - self._margin * P, self._gamma * P
-        for jacobian in jacobians:
-            A = jacobian[:n] * d / d[:, None]
-            C = jacobian[n:] * d / s[:, None]
+        top, low = X - self._margin * P, self._rest * P
+        for A, C in zip(self._A, self._C, strict=True):
             if kind == "output weight":
                 rows = [[top, P @ A], [A.T @ P, low + C.T @ R @ C]]
             else:
@@ -136,125 +127,88 @@ class DesignProgram:
                     [top, side, -Y], [side.T, low + C.T @ M + M.T @ C, mixed],
                     [-Y.T, mixed.T, R - N - N.T - self._margin * R],
                 ]
-            matrix = cp.bmat(rows)
-            constraints.append(0.5 * (matrix + matrix.T) >> 0)
-        # A length bounds all components as one, a set each of them.
-        given = [
-            np.abs(_sides(name, each)).max(axis=0) if isinstance(each, ConvexSet) else each
-            for name, each in (("disturbances", sizes.disturbances), ("noises", sizes.noises))
-        ]
-        relative = [np.broadcast_to(a, u.shape) / u for a, u in zip(given, (g, s), strict=True)]
-        most = max(float(each.max()) for each in relative) or 1.0
-        terms = []
-        for sides, each, side in zip((w_sides, v_sides), relative, given, strict=True):
-            cost = cp.multiply(np.square(np.maximum(each / most, _LEAST_SIZE)), sides)
-            terms.append(cp.sum(cost) if np.ndim(side) else cp.max(cost))
-        self._problem = cp.Problem(cp.Minimize(terms[0] + terms[1]), constraints)
+            constraints.append(self._definite(rows))
+        self._problem = cp.Problem(cp.Minimize(cp.sum(shares)), constraints)
 
     def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
-        """Solve for a rate, the root of gamma."""
+        """Solve for a rate, the root of gamma; the measure is the limit for a minimiser."""
         margin = max(margin, _MARGIN * rate * rate)
-        self._gamma.value, self._margin.value = max(rate * rate - margin, 0.0), margin
-        limit = {"time_limit": max(seconds, _LEAST)} if math.isfinite(seconds) else {}
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                self._problem.solve(solver="CLARABEL", **limit)
-        except Exception as error:  # a solver may raise anything
-            return Answer(f"the solver raised {type(error).__name__}")
-        status = str(self._problem.status)
-        if status in ("infeasible", "infeasible_inaccurate"):
-            return Answer("infeasible")
-        if self._P.value is None or not np.isfinite(self._P.value).all():
-            return Answer(status)
-        form = self._form(rate)
-        if form is None:
-            return Answer("inaccurate")
-        return Answer("solved" if status == "optimal" else status, float(self._problem.value), form)
+        answer = self._answer(self._problem, self._form, rate, margin, seconds)
+        if answer.form is None:
+            return answer
+        supply = max(float(self._problem.value), 0.0)
+        return replace(
+            answer, objective=math.sqrt(supply * growth(rate * rate, self._horizon))
+        )
 
-    def _form(self, rate: float) -> Dissipation | None:
+    def _form(self, rate: float) -> Dissipation:
         """The unknowns, scaled so that the largest w and v cost 1, and rounded."""
-        d, s, g = self._d, self._s, self._g
-
-        def value(variable: Any, rows: Array, columns: Array) -> Array:
-            return np.asarray(variable.value, np.float64) / np.outer(rows, columns)
-
+        d, s, w, sizes = self._d, self._s, self._w, self._sizes
         P, X, Q, R = (
-            value(*each) for each in (
-                (self._P, d, d), (self._X, d, d), (self._Q, g, g), (self._R, s, s)
+            self._value(each, side, side)
+            for each, side in ((self._P, d), (self._X, d), (self._Q, w), (self._R, s))
+        )
+        supply = sum(
+            float(_alone(name, _read(name, given), len(weight), weight)) ** 2
+            for name, given, weight in (
+                ("disturbances", sizes.disturbances, Q), ("noises", sizes.noises, R)
             )
         )
-        sizes = self._sizes
-        w = _alone("disturbances", _read("disturbances", sizes.disturbances), len(Q), Q)
-        v = _alone("noises", _read("noises", sizes.noises), len(R), R)
-        scale = 1.0 / (float(w**2 + v**2) or 1.0)
+        scale = 1.0 / (supply or 1.0)
         P, Q, R = (_rounded(scale * each) for each in (P, Q, R))
-        X = 0.5 * scale * (X + X.T)
         inner: OutputWeight | OutputInjection = OutputWeight(P, R, rate)
         if self._kind == "output injection":
             Y, M, N = (
-                scale * value(*each) for each in (
-                    (self._Y, d, s), (self._M, s, d), (self._N, s, s)
-                )
+                scale * self._value(*each)
+                for each in ((self._Y, d, s), (self._M, s, d), (self._N, s, s))
             )
             inner = OutputInjection(P, R, Y, M, N, rate)
-        for slack in (0.0, 1e-6, 1e-4, 1e-2):
-            form = Dissipation(inner, X, _rounded((1.0 + slack) * Q))
-            if form.supplies(self._directions):
-                return form
-        return None
+        return Dissipation(inner, 0.5 * scale * (X + X.T), Q, self._G)
 
 
 class DesignSearch(Search):
-    """`Search` with the design's program; the best rate is that of the smallest limit."""
+    """`Search` with the program of the design."""
 
     def __init__(
-        self, system: Any, region: Region, sizes: SignalBounds, horizon: int | None,
+        self, system: System, region: Region, sizes: SignalBounds, horizon: int | None,
         seconds: float | Deadline,
     ) -> None:
         super().__init__(system, region, None, (1.0, 1.0), seconds=seconds)
+        self._bounds, self._horizon = sizes, horizon
         half = 0.5 * (region.upper - region.lower)[: system.n]
         states = np.where(half > 0.0, half, 1.0) / (half.max() or 1.0)
-        self.scales = Scales(states, np.abs(self.jacobians[:, system.n :] * states).sum(2).max(0))
-        self.scales.outputs[self.scales.outputs == 0.0] = 1.0
-        matrix = system.disturbance_matrix
-        self._directions = np.eye(system.n) if matrix is None else np.asarray(matrix, np.float64)
-        self._sizes, self._horizon = sizes, horizon
+        outputs = np.abs(self.jacobians[:, system.n :] * states).sum(axis=2).max(axis=0)
+        self.scales = Scales(states, np.where(outputs > 0.0, outputs, 1.0))  # of any units
 
     @property
-    def program(self) -> Any:
+    def program(self) -> Program:
         """The program at the states chosen so far."""
         if self._program is None:
-            self._program = DesignProgram(  # type: ignore[assignment]
-                self.kind, self.jacobians[self._chosen], self.scales,  # type: ignore[arg-type]
-                self._directions, self._sizes,
+            matrix = self.system.disturbance_matrix
+            self._program = DesignProgram(
+                self.kind, self.jacobians[self._chosen], self.scales,
+                np.eye(self.system.n) if matrix is None else matrix, self._bounds,
+                self._horizon,
             )
         return self._program
 
-    def _best_rate(self, smallest: float) -> float:
-        """The rate with the smallest limit of the error, J(estimate) being at most J(truth)."""
-        deadline = self._deadline.part(0.5)
-        tried: dict[float, float] = {}
 
-        def attempt(gamma: float) -> None:
-            if gamma not in tried:
-                supply = self._feasible(math.sqrt(gamma), deadline).objective
-                tried[gamma] = supply * growth(gamma, self._horizon)
+    def _verified(self, form: Form) -> Found | Cover:
+        """As `Search` does, after a look at the samples, which is cheap."""
+        blocks = form.matrices(Matrices.exact(self.jacobians)).middle
+        broken = np.linalg.eigvalsh(0.5 * (blocks + np.swapaxes(blocks, 1, 2)))[:, 0] <= 0.0
+        if broken.any():
+            return Cover(False, 0, 0.0, self.points[broken], self.jacobians[broken])
+        return super()._verified(form)
 
-        least = smallest**2
-        try:
-            for share in _SHARES:
-                attempt(least + share * (1.0 - least))
-            for _ in range(2):
-                known = sorted(tried)
-                best = min(tried, key=lambda gamma: tried[gamma])
-                k = known.index(best)
-                for other in known[max(k - 1, 0) : k + 2]:
-                    attempt(0.5 * (best + other))
-        except OutOfTimeError:
-            pass
-        best = min(tried, key=lambda gamma: tried[gamma], default=least)
-        return math.sqrt(best) if tried and math.isfinite(tried[best]) else smallest
+
+def largest_sizes(sizes: SignalBounds) -> tuple[float | Array, float | Array]:
+    """The largest disturbances and noises: lengths, or half-widths by component."""
+    w, v = (
+        np.abs(_sides(name, given)).max(axis=0) if isinstance(given, ConvexSet) else given
+        for name, given in (("disturbances", sizes.disturbances), ("noises", sizes.noises))
+    )
+    return w, v
 
 
 def growth(gamma: float, horizon: int | None) -> float:

@@ -26,7 +26,7 @@ from ..observers import Observer
 from .branch_and_bound import constant_output, output_lipschitz
 from .contraction import _undetectable, certify_observer, constant_gain
 from .deadline import DEFAULT_SECONDS, Deadline
-from .dissipation import DesignSearch, Dissipation, growth
+from .dissipation import DesignSearch, Dissipation, growth, largest_sizes
 from .evidence import (
     CertificateError,
     Evidence,
@@ -36,7 +36,7 @@ from .evidence import (
     weakest,
 )
 from .inequalities import norms
-from .observer_bound import ObserverBound, SignalBounds, Size, _alone, _read
+from .observer_bound import Entering, ObserverBound, SignalBounds, Size, _alone, _read
 from .properties import ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
@@ -153,8 +153,8 @@ class Design:
         decay = self.discount ** (N - 1.0 - lags) @ self._observer().rate ** (2.0 * lags)
         return _OUTWARD * (own + self.slope * self._changes[0] * math.sqrt(float(decay)))
 
-    def least_horizon(self, kind: Kind = "decrease") -> int:
-        """The least N whose contraction is below 1."""
+    def least_horizon(self, kind: Kind = "decrease") -> int | None:
+        """The least N whose contraction is below 1; None if there is none up to 10,000."""
         return _first(lambda N: self.contraction(N, kind) < 1.0)
 
     def limit(
@@ -245,7 +245,7 @@ class Design:
         bound, errors = np.full(steps + 1, math.nan), np.zeros(steps + 1)
         bound[0] = float(norms(start[None], self.prior)[0]) * _OUTWARD
         if not restarts:
-            errors = self._observer().radii(steps, start, signals[2])
+            errors = self._observer().radii(steps, start, Entering(*signals[2:]))
         for t in (np.flatnonzero(~spoilt) + 1).tolist():
             first = max(t - N, 0)
             window, own, observed = [each[first:t] for each in signals], float(bound[first]), None
@@ -257,8 +257,8 @@ class Design:
         return bound
 
     def _step(
-        self, kind: Kind, error: float, truth: Array, fit: Array, driving: Array, *,
-        cost: float = math.nan, observed: float | None = None,
+        self, kind: Kind, error: float, truth: Array, fit: Array, length: Array, square: Array,
+        *, cost: float = math.nan, observed: float | None = None,
     ) -> float:
         """sqrt(J(estimate)) + sqrt(J(truth)) at a window's end, from the error of its prior.
 
@@ -270,28 +270,28 @@ class Design:
             return 2.0 * root * _OUTWARD
         if kind == "measured":
             return (root + math.sqrt(cost)) * _OUTWARD
-        errors, rate = np.empty(len(truth)), self._observer().rate
         following = self._changes[0] * error if observed is None else observed
-        for k, enters in enumerate(driving.tolist()):
-            errors[k], following = following, rate * following + enters
+        errors, observer = np.empty(len(truth)), self._observer()
+        for k, each in enumerate(zip(length, square, strict=True)):
+            errors[k], following = following, observer.advanced(following, Entering(*each))
         costs = np.square(self.slope * errors + fit)
         return (root + math.sqrt(float(ages @ costs))) * _OUTWARD
 
     def _signals(self, w: Size | None, v: Size | None, steps: int) -> list[Array]:
         """At each sample: the truth's cost, its noise in the candidate's, what drives the observer.
 
-        The last two are zero without an observer.
+        The last two, what `Entering` has, are zero without an observer.
         """
         w = _read("disturbances", self.sizes.disturbances if w is None else w)
         v = _read("noises", self.sizes.noises if v is None else v)
-        p, found = self.system.p, [np.zeros(())] * 3
+        p, found = self.system.p, [np.zeros(())] * 4
         found[0] = (
             _alone("disturbances", w, len(self.disturbance), self.disturbance) ** 2
             + _alone("noises", v, p, self.noise) ** 2
         )
         if self.observer is not None:
             fit = fit_weight(self.cost(), self.observer.gain)
-            found[1:] = _alone("noises", v, p, fit), self.observer.entering(w, v)
+            found[1:] = _alone("noises", v, p, fit), *self.observer.entering(w, v)
         if any(each.shape not in ((), (steps,)) for each in found):
             raise ShapeError(
                 f"disturbances or noises are not of {steps} samples, as the run is; expected "
@@ -384,9 +384,9 @@ def _checked(kind: str) -> str:
     return kind
 
 
-def _first(wanted: Callable[[int], bool]) -> int:
-    """The least horizon for which something holds, or the longest one."""
-    return next((N for N in range(1, _MOST) if wanted(N)), _MOST)
+def _first(wanted: Callable[[int], bool]) -> int | None:
+    """The least horizon for which something holds."""
+    return next((N for N in range(1, _MOST + 1) if wanted(N)), None)
 
 
 def design(
@@ -445,7 +445,8 @@ def design(
                 raise CertificateError("the system has a disturbance_matrix, not its corrections")
             K = constant_gain(observer, system)
             stability = stability or certify_observer(
-                system, observer, place, seconds=deadline.part(_OBSERVER)
+                system, observer, place, sizes=largest_sizes(known),
+                seconds=deadline.part(_OBSERVER),
             )
             stability = fitting(stability, system, place, K)
             if stability.P is None:
@@ -459,7 +460,8 @@ def design(
         except (CertificateError, NotCertifiedError) as error:
             notes = (*notes, f"nothing holds in advance for any number of QPs: {error}")
     return Design(
-        system, place, form, gamma, known, horizon or proposed, bound, slope, evidence, notes
+        system, place, form, gamma, known, horizon or proposed or _MOST, bound, slope, evidence,
+        notes,
     )
 
 

@@ -66,7 +66,7 @@ def _table(made: Design) -> Table:
             found = made.components(made.limit(kind=kind))
             limits = ", ".join(f"{value:.3g}" for value in found.tolist())
         table.add_row(
-            _MEANING[kind], f"{made.contraction(kind=kind):.3g}", str(made.least_horizon(kind)),
-            limits,
+            _MEANING[kind], f"{made.contraction(kind=kind):.3g}",
+            str(made.least_horizon(kind) or "-"), limits,
         )
     return table
