@@ -143,7 +143,7 @@ def prepared(case: Case) -> Row:
     """The certificate, with the time it took."""
     began, system, sizes = time.perf_counter(), case.system, case.sizes
     observer = case.observer or synthesise_gain(
-        system, case.region, inputs=case.inputs, weights=(sizes.disturbance, sizes.noise)
+        system, case.region, inputs=case.inputs, sizes=(sizes.disturbance, sizes.noise)
     ).observer
     cost = case.cost or qpmhe.QuadraticCost(
         prior=np.eye(system.n) / (10.0 * sizes.disturbance) ** 2,
