@@ -6,7 +6,7 @@ ARGS ?=
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: reproduce test test-all lint types examples benchmarks comparison choice docs release-check minimal-versions clean
+.PHONY: reproduce test test-all lint types examples benchmarks comparison choice certificates docs release-check minimal-versions clean
 
 # One stamp for each set of extras, renewed when the project's requirements change.
 $(VENV)/.%: pyproject.toml
@@ -63,6 +63,10 @@ comparison: $(VENV)/.test
 # The figures of docs/how-to-choose.md: about ten minutes on two cores; after a new comparison, too.
 choice: $(VENV)/.test
 	$(BIN)/python examples/studies/choice_page.py
+
+# The page docs/certified-systems.md and the picture of docs/how-to/certify.md: some minutes on two cores.
+certificates: $(VENV)/.test
+	$(BIN)/python examples/studies/certificates_page.py
 
 docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict

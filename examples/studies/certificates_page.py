@@ -1,5 +1,7 @@
 """Make docs/certified-systems.md: proved bounds beside the worst errors that an adversary reaches.
 
+It renews the pictures of docs/how-to/certify.md and docs/explanation/guarantees.md, too.
+
     python examples/studies/certificates_page.py
 
 ``make certificates`` does it. Every run is compared with its bounds as well; one that exceeds a
@@ -8,7 +10,11 @@ bound stops the script.
 
 from __future__ import annotations
 
+import contextlib
 import platform
+import re
+import shutil
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -25,6 +31,7 @@ from qpmhe.certificates import Certificate, Design, Sizes, certify, design, synt
 DOCS = Path(__file__).parents[2] / "docs"
 STEPS = (5, 10, 20, 40, 80)
 STARTS, CLIMBS, QPS = 8, 3, 2
+SECONDS = 300.0  # for each search; cores may be shared
 # More runs for differences would take minutes.
 MOST_STATES = 6
 
@@ -35,18 +42,18 @@ bounds for disturbances |w| and noises |v| up to the sizes given, and the larges
 adversary found who knows the model, chooses every disturbance and every noise anew, and starts the
 observer at the true state. `make certificates` makes it.
 
-| system | region | \\|w\\|, \\|v\\| | time | observer: bound | worst | factor | around it: x̂ within | worst | \
-factor |
+| system | region | \\|w\\|, \\|v\\| | time | observer: bound | worst | factor \
+| around it: x̂ within | worst | factor |
 |---|---|---|---|---|---|---|---|---|---|
 {first}
 
-*Observer*: |x − z| in the limit, from `certificate.observer_bound`. *Around it*: the farthest point
-from x̂ of the set around z that holds the true state, at the time of the worst |x − x̂|, from
+*Observer*: |x - z| in the limit, from `certificate.observer_bound`. *Around it*: the farthest point
+from x̂ of the set around z that holds the true state, at the time of the worst |x - x̂|, from
 `certificate.bound(run)`; the estimator has two QPs a sample. Lengths are Euclidean, in the units of
 the states; *time* is that of `certify`, and of finding the gain where it was synthesised (†).
 
-| system | Lyapunov: N | bound, any QPs | minimiser | worst | paper's theorem: N | bound | region's \
-diameter |
+| system | Lyapunov: N | bound, any QPs | minimiser | worst | paper's theorem: N | bound \
+| region's diameter |
 |---|---|---|---|---|---|---|---|
 {second}
 
@@ -61,7 +68,7 @@ says nothing.
   which the linearised error dynamics carry backwards; the run is repeated with the new ones, and
   the direction is that of the last error. {starts} starts, {directions} directions and windows of
   {steps} steps are tried.
-- **Against the estimates**: signals along P(x − x̂), step by step; and from the best of all runs on,
+- **Against the estimates**: signals along P(x - x̂), step by step; and from the best of all runs on,
   along the differences of the last error when one component of one sample is changed.
 - Runs count as long as truth, observer and estimates are in the region.
 
@@ -123,7 +130,7 @@ def cases() -> list[Case]:
     return [
         Case("batch reactor", reactor.system, qpmhe.Box([0.1, -1.0], [9.0, 9.0]),
              Sizes(0.3, 0.6), reactor.observer, cost=reactor.cost),
-        Case("FitzHugh–Nagumo",
+        Case("FitzHugh-Nagumo",
              qpmhe.System(fitzhugh_nagumo, lambda x: x[..., :1], n=2, p=1),
              qpmhe.Box([-2.5, -1.0], [2.5, 2.0]), Sizes(0.01, 0.02)),
         Case("van der Pol", models.van_der_pol().system,
@@ -143,7 +150,8 @@ def prepared(case: Case) -> Row:
     """The certificate, with the time it took."""
     began, system, sizes = time.perf_counter(), case.system, case.sizes
     observer = case.observer or synthesise_gain(
-        system, case.region, inputs=case.inputs, weights=(sizes.disturbance, sizes.noise)
+        system, case.region, inputs=case.inputs, sizes=(sizes.disturbance, sizes.noise),
+        seconds=SECONDS,
     ).observer
     cost = case.cost or qpmhe.QuadraticCost(
         prior=np.eye(system.n) / (10.0 * sizes.disturbance) ** 2,
@@ -152,7 +160,7 @@ def prepared(case: Case) -> Row:
     )
     certificate = certify(
         system, observer, cost, horizon=case.horizon, region=case.region, inputs=case.inputs,
-        sizes=sizes,
+        sizes=sizes, seconds=SECONDS,
     )
     seconds = time.perf_counter() - began
     proved = certificate.observer_bound
@@ -203,15 +211,15 @@ def attack(row: Row) -> None:
         worst = 0.0
         for signals in seeds:
             rounds = 2 if system.n <= MOST_STATES else 0
-            _, signals = against_estimates(setting, estimates, signals, rounds)  # noqa: PLW2901
+            _, signals = against_estimates(setting, estimates, signals, rounds)
             x, y = setting.truth(signals)
             mhe, run, until = played(y, x, **options)
             until = min(until, setting.inside(x))
             errors = np.linalg.norm(x - run.states, axis=1)[:until]
-            worst = max(worst, check(mhe, run, x, signals, errors))
+            worst = max(worst, check(mhe, run, signals, errors))
         return worst
 
-    def with_bound(mhe: Any, run: Any, x: Array, signals: Signals, errors: Array) -> float:
+    def with_bound(mhe: Any, run: Any, signals: Signals, errors: Array) -> float:
         for w, v in ((signals.w, signals.v), (case.sizes.disturbance, case.sizes.noise)):
             known = certificate.bound(run, w, v, initial_error=np.zeros(system.n), source=mhe)
             compare(errors, known[: len(errors)])
@@ -230,13 +238,13 @@ def attack(row: Row) -> None:
     try:
         row.plan = plan = design(
             system, case.region, observer=certificate.observer, sizes=case.sizes,
-            inputs=case.inputs, stability=certificate.stability,
+            inputs=case.inputs, stability=certificate.stability, seconds=SECONDS,
         )
     except qpmhe.errors.QpmheError as error:
         print(f"{case.name}: no design: {error}", flush=True)
         return
 
-    def with_plan(mhe: Any, run: Any, x: Array, signals: Signals, errors: Array) -> float:
+    def with_plan(mhe: Any, run: Any, signals: Signals, errors: Array) -> float:
         for kind in ("measured", "decrease") if plan.candidate is not None else ("measured",):
             known = plan.length(plan.along(
                 run, mhe, initial_error=np.zeros(system.n), disturbances=signals.w,
@@ -258,9 +266,23 @@ def compare(errors: Array, bound: Array) -> None:
         raise SystemExit(f"an error of {errors[above][0]} is above its bound {bound[above][0]}")
 
 
+def renew_picture(page: str, drawn: str, picture: str) -> None:
+    """Run a page's blocks, and take the picture that they draw."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        exec("\n".join(blocks), {"__name__": page})
+        shutil.copy(drawn, DOCS / "img" / picture)
+
+
+def short(value: float) -> str:
+    """Two digits."""
+    return f"{float(f'{value:.2g}'):,.0f}" if 100 <= value < np.inf else f"{value:.2g}"
+
+
 def first_line(row: Row) -> str:
     case, sizes = row.case, row.case.sizes
-    sides = " × ".join(
+    sides = " x ".join(
         f"[{low:g}, {high:g}]"
         for low, high in zip(case.region.lower, case.region.upper, strict=True)
     )
@@ -269,29 +291,28 @@ def first_line(row: Row) -> str:
     own = "" if case.observer is not None else " †"
     return (
         f"| {case.name}{own} | {sides} | {sizes.disturbance:g}, {sizes.noise:g} "
-        f"| {row.seconds:.1f} s | {row.bound:.2g} | {row.observed:.2g} "
-        f"| **{row.bound / row.observed:.1f}** | {row.around:.2g} | {row.estimated:.2g} "
+        f"| {row.seconds:.1f} s | {short(row.bound)} | {short(row.observed)} "
+        f"| **{row.bound / row.observed:.1f}** | {short(row.around)} | {short(row.estimated)} "
         f"| **{row.around / row.estimated:.1f}** |"
     )
 
 
 def second_line(row: Row) -> str:
-    plan, certificate, n = row.plan, row.certificate, row.case.system.n
-    cells = ["–"] * 4
+    plan, certificate = row.plan, row.certificate
+    cells = ["-"] * 4
     if plan is not None:
         limits = [
             float(plan.length(plan.limit(kind=kind)))
             if kind == "minimiser" or plan.candidate is not None else np.nan
             for kind in ("decrease", "minimiser")
         ]
-        cells = [str(plan.horizon), *(f"{each:.2g}" for each in limits), f"{row.designed:.2g}"]
-    paper = ["–", "–"]
+        cells = [str(plan.horizon), *map(short, limits), short(row.designed)]
+    paper = ["-", "-"]
     if certificate.bounds:
         limit = certificate.limit(
             row.case.sizes.disturbance, row.case.sizes.noise, kind="paper"
         )
-        paper = [str(row.case.horizon), f"{limit:.2g}"]
-    assert n
+        paper = [str(row.case.horizon), short(limit)]
     return f"| {row.case.name} | {' | '.join((*cells, *paper))} | {certificate.diameter:.3g} |"
 
 
@@ -313,7 +334,9 @@ def main() -> None:
         date=datetime.now(UTC).date(), python=platform.python_version(), numpy=np.__version__,
         minutes=max(1.0, (time.perf_counter() - began) / 60),
     ), encoding="utf-8")
-    print(f"wrote {DOCS / 'certified-systems.md'}")
+    renew_picture("how-to/certify.md", "certified.png", "certify-band.png")
+    renew_picture("explanation/guarantees.md", "certificate.png", "guarantees-reactor.png")
+    print(f"wrote {DOCS / 'certified-systems.md'} and two pictures")
 
 
 if __name__ == "__main__":
