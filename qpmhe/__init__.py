@@ -25,10 +25,12 @@ from .costs import (
     RobustCost,
 )
 from .errors import ObserverWarning, QpmheError
+from .estimation.active_rows import ActiveRow
 from .estimation.engines import Engine, register_engine
 from .estimation.estimate import DroppedRow, Estimate, Status
 from .estimation.estimator import MovingHorizonEstimator
 from .estimation.run import Run
+from .estimation.sensitivity import Gradient, Sensitivity
 from .estimation.settings import Settings
 from .model.constraints import Constraint
 from .model.noisy_inputs import noisy_inputs
@@ -71,6 +73,7 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
+    "ActiveRow",
     "BatchEstimator",
     "Box",
     "Compiled",
@@ -81,6 +84,7 @@ __all__ = [
     "DroppedRow",
     "Estimate",
     "ExtendedKalman",
+    "Gradient",
     "HighGain",
     "Huber",
     "Loss",
@@ -98,6 +102,7 @@ __all__ = [
     "RobustCost",
     "Run",
     "Sample",
+    "Sensitivity",
     "SoftSet",
     "Status",
     "SteadyStateKalman",

@@ -41,7 +41,8 @@ class Network(torch.nn.Module):
             torch.nn.Linear(1, hidden), torch.nn.Tanh(), torch.nn.Linear(hidden, 1)
         ).double()
         with torch.no_grad():
-            self.layers[0].weight *= 4.0
+            self.layers[0].weight.normal_(std=4.0)
+            self.layers[0].bias.normal_()
             self.layers[2].weight *= 0.0
             self.layers[2].bias[:] = np.log(0.1**2)
 
