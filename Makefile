@@ -42,6 +42,7 @@ examples: $(VENV)/.test
 	$(BIN)/python examples/benchmarks/batch.py --members 200 --steps 40 --out results
 	$(BIN)/python examples/benchmarks/backends.py --quick --out results
 	$(BIN)/python examples/closed_loop.py --steps 60 --seeds 1 --out results
+	$(BIN)/python examples/learnt_noise/with_jax.py --steps 4 --records 1 --tests 2
 	$(BIN)/qpmhe compare --seeds 2 --steps 40 --solver-iterations 2,none --store results/quick.sqlite --out results/compare
 	if [ -d "$(DATA)" ]; then $(BIN)/python examples/battery_soc/study.py --quick --data "$(DATA)" --out results; \
 	else echo "no battery data at '$(DATA)': battery example left out"; fi

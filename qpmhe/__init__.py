@@ -28,10 +28,12 @@ from .costs import (
     RobustCost,
 )
 from .errors import ObserverWarning, QpmheError
+from .estimation.active_rows import ActiveRow
 from .estimation.engines import Engine, register_engine
 from .estimation.estimate import DroppedRow, Estimate, Status
 from .estimation.estimator import MovingHorizonEstimator
 from .estimation.run import Run
+from .estimation.sensitivity import Gradient, Sensitivity
 from .estimation.settings import Settings
 from .model.constraints import Constraint
 from .model.noisy_inputs import noisy_inputs
@@ -74,6 +76,7 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
+    "ActiveRow",
     "Barron",
     "BatchEstimator",
     "Box",
@@ -87,6 +90,7 @@ __all__ = [
     "Estimate",
     "ExtendedKalman",
     "GemanMcClure",
+    "Gradient",
     "HighGain",
     "Huber",
     "Loss",
@@ -104,6 +108,7 @@ __all__ = [
     "RobustCost",
     "Run",
     "Sample",
+    "Sensitivity",
     "SoftSet",
     "Status",
     "SteadyStateKalman",

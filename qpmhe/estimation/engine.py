@@ -424,7 +424,7 @@ class PythonEngine:
         With the observer's covariance there if it has one, the samples since then, the last
         estimate's trajectory, the last states that were estimated, and the smoothed prior.
         """
-        tools = self._tools_for(usual)
+        tools = self._tools if usual is self._tools.usual else self._tools_for(usual)
         window = self._fresh_window(state, tools)
         window.time, window.smoothed_prior = time, smoothed
         if window._covariances is not None and covariance is not None:
