@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -49,6 +50,11 @@ def estimate(
     engine: Annotated[
         str | None,
         typer.Option(help="python, compiled, or auto: compiled where qpmhe compile made it."),
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(help="File of qpmhe tune: observer, cost, horizon and parameters of the "
+                     "model from there."),
     ] = None,
     covariances: Annotated[
         Literal["none", "std", "full"],
@@ -106,7 +112,22 @@ def estimate(
         )
     if initial_state is not None:
         options["initial_state"] = read_state(initial_state)
+    if weights is not None:
+        options = _weighted(options)
     run(Console(stderr=True), **options)
+
+
+def _weighted(options: dict[str, Any]) -> dict[str, Any]:
+    """The options, with what the file of weights says of observer, cost, model and horizon."""
+    from ..tuning import load
+    from .tune import with_arguments
+
+    found = load(options.pop("weights"))
+    return {
+        "horizon": found.horizon, **options,
+        "model": with_arguments(options["model"], found.parameters),
+        "observer": found.observer(), "cost": found.cost(),
+    }
 
 
 def run(

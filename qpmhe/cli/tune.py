@@ -94,7 +94,7 @@ def tune(
     wanted = _numbers("--horizons", horizons)
     started = _parameters(parameter or [])
     source = find(model)
-    named = _with_arguments(source.name, started)
+    named = with_arguments(source.name, started)
     chosen: dict[str, Any] = {} if engine is None else {"engine": engine}
     if horizon is not None:
         chosen["horizon"] = horizon
@@ -223,7 +223,7 @@ def _arguments(parameters: dict[str, float]) -> str:
     return ", ".join(f"{name}={float(value)!r}" for name, value in parameters.items())
 
 
-def _with_arguments(model: str, parameters: dict[str, float]) -> str:
+def with_arguments(model: str, parameters: dict[str, float]) -> str:
     """The name of a model with these arguments of its function."""
     if not parameters:
         return model
