@@ -27,7 +27,7 @@ STEPS = {
     "quadrotor": 400, "chain_of_masses": 400, "battery_cell": 1000,
 }
 # The reactor's states drift out of where its model holds: several short runs make up a record.
-RUNS = {"batch_reactor": 6}
+RUNS = {"batch_reactor": 40}
 # Groups of components with one standard deviation each, where there are many.
 GROUPS = {
     "vehicle": {
@@ -45,6 +45,8 @@ GROUPS = {
         "noise": {"position": range(6)},
     },
 }
+# The zoo's starts are far off, which biases any filter's likelihood; ours are ten times nearer.
+TEN = 10.0
 # A parameter that is named in more than half of the records counts as not identified.
 NAMED = 0.5
 
@@ -54,17 +56,23 @@ def recover(name: str, seed: int, steps: int) -> list[tuple[str, bool, float, bo
     system, _, cost, scenario = qpmhe.models.catalogue()[name]()
     scenario = replace(scenario, resolution=None)
     runs = [scenario.simulate(100 * seed + k, steps) for k in range(RUNS.get(name, 1))]
+    prior = np.linalg.inv(cost.prior) / TEN**2
+    starts = [near(system, run.states[0], prior, [seed, k]) for k, run in enumerate(runs)]
     structure = GROUPS.get(name, "diagonal")
     away = np.random.default_rng([20210829, seed])
     scales = {
         "disturbance": np.exp(away.uniform(-1.0, 1.0)), "noise": np.exp(away.uniform(-1.0, 1.0)),
     }
     tuning = qpmhe.tune(
-        system, [(run.measurements, run.inputs) for run in runs],
-        prior=np.linalg.inv(cost.prior),
+        system,
+        [
+            qpmhe.tuning.TuningRecord(run.measurements, run.inputs, initial_state=start)
+            for run, start in zip(runs, starts, strict=True)
+        ],
+        prior=prior,
         disturbance=scales["disturbance"] ** 2 * scenario.disturbance_covariance,
         noise=scales["noise"] ** 2 * scenario.noise_covariance,
-        initial_state=scenario.initial_estimate, structure=structure, objective="likelihood",
+        structure=structure, objective="likelihood",
         held_out=0.0, progress=False,
     )
     found = []
@@ -74,6 +82,16 @@ def recover(name: str, seed: int, steps: int) -> list[tuple[str, bool, float, bo
         width = np.sqrt(high / low) if low > 0.0 else np.inf
         found.append((each, bool(low <= true <= high), float(width), named))
     return found
+
+
+def near(
+    system: qpmhe.System, state: np.ndarray, covariance: np.ndarray, seed: list[int]
+) -> np.ndarray:
+    """A state drawn about the true one, within X."""
+    drawn = np.random.default_rng(seed).multivariate_normal(state, covariance)
+    if system.states is None:
+        return drawn
+    return np.clip(drawn, system.states.lower, system.states.upper)
 
 
 def table(name: str, steps: int, found: list[list[tuple[str, bool, float, bool]]]) -> Table:

@@ -22,6 +22,7 @@ from .estimate import estimate
 from .report import export, report
 from .reproduce import reproduce
 from .solve_qp import export_qps
+from .tune import tune
 
 # Heading, and the capability that it stands for; the table fits into 80 columns.
 _FLAGS = {
@@ -60,7 +61,7 @@ def _common(
     """Suboptimal moving horizon estimation by sequences of convex QPs."""
 
 
-for command in (estimate, reproduce, compare, study, report, export, compile, doctor):
+for command in (estimate, tune, reproduce, compare, study, report, export, compile, doctor):
     app.command()(command)
 app.command("export-qps")(export_qps)
 

@@ -54,6 +54,11 @@ def estimate(
         str | None,
         typer.Option(help="python, compiled, or auto: compiled where qpmhe compile made it."),
     ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(help="File of qpmhe tune: observer, cost, horizon and parameters of the "
+                     "model from there."),
+    ] = None,
     covariances: Annotated[
         Literal["none", "std", "full"],
         typer.Option(help="Standard deviations or covariances of the estimates."),
@@ -143,6 +148,8 @@ def estimate(
     bounds = {name: options.pop(name, None) for name in _OF_BOUND}
     if bound or any(value is not None for value in bounds.values()):
         options["bound"] = bound_options(**bounds)
+    if weights is not None:
+        options = _weighted(options)
     run(Console(stderr=True), **options)
 
 
@@ -165,6 +172,19 @@ def bound_options(
         None if bound_input_box is None else read_box("--bound-input-box", bound_input_box),
         **numbers,
     )
+
+
+def _weighted(options: dict[str, Any]) -> dict[str, Any]:
+    """The options, with what the file of weights says of observer, cost, model and horizon."""
+    from ..tuning import load
+    from .tune import with_arguments
+
+    found = load(options.pop("weights"))
+    return {
+        "horizon": found.horizon, **options,
+        "model": with_arguments(options["model"], found.parameters),
+        "observer": found.observer(), "cost": found.cost(),
+    }
 
 
 def run(

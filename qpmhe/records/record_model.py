@@ -35,6 +35,7 @@ class RecordModel:
 def load_record_model(text: str, engine_at_work: str | None = None, **options: Any) -> RecordModel:
     """Make the estimator of a model from its name; `options` replace the model's own.
 
+    Among them are ``observer`` and ``cost``.
     ``engine="auto"`` takes the engine `engine_at_work` of an earlier run, if there is one.
     """
     source = find(text)
@@ -44,6 +45,7 @@ def load_record_model(text: str, engine_at_work: str | None = None, **options: A
     signals = {kind: given.pop(kind, None) for kind in _SIZES}
     dt, unit = given.pop("dt", None), str(given.pop("time_unit", "s"))
     chosen = given | options
+    parts = (parts[0], chosen.pop("observer", parts[1]), chosen.pop("cost", parts[2]))
     for key in ("horizon", "initial_state"):
         if key not in chosen:
             raise OptionError(

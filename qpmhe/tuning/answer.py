@@ -19,15 +19,16 @@ from ..plots.style import STYLES, panels
 from .data import Data
 from .likelihood import Likelihood
 from .score import Score
-from .search import limit
+from .search import NORMAL, limit
 from .structures import Structure
 from .weights import Weights
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Of a normal variable, within 95 %; and half of the matching rise of twice the log likelihood.
-_NORMAL, _RISE = 1.959964, 1.920729
+# Intervals that are wider than this factor, or share, come from the likelihood itself: its
+# curvature is too crude for them.
+_CRUDE = 0.3
 # Wider 95 % intervals, either way: a factor for standard deviations, else a share or a number.
 _WIDEST_LOG, _WIDEST = float(np.log(10.0)), 1.0
 # Uncertainties that are as correlated as this are told in one sentence.
@@ -178,77 +179,72 @@ class Tuning:
 
     def _find_intervals(self, theta: Array, hessian: Array) -> None:
         structure, count = self._structure, self._structure.seen
-        eigenvalues, vectors = np.linalg.eigh(hessian) if count else (np.zeros(0), np.zeros((0, 0)))
-        inverse = (vectors / np.maximum(eigenvalues, _FLAT)) @ vectors.T
+        values, vectors = np.linalg.eigh(hessian)
+        inverse = (vectors / np.maximum(values, _FLAT)) @ vectors.T
         deviations = np.sqrt(inverse.diagonal())
-        values, self.intervals = structure.values(theta), {}
-        unknown, texts = [], []
+        self.intervals: dict[str, tuple[float, float]] = {}
+        ends, unknown = {}, []
         for k in range(count):
-            name, value, width = structure.names[k], values[structure.names[k]], (
-                _NORMAL * deviations[k]
-            )
-            is_log = structure.is_log(k)
-            at_end = min(theta[k] - structure.limits[k][0], structure.limits[k][1] - theta[k])
-            if width > (_WIDEST_LOG if is_log else _WIDEST) or at_end < 1e-3:
+            low, high = structure.limits[k]
+            width, ways = float(NORMAL * deviations[k]), (-1.0, 1.0)
+            ends[k] = [float(theta[k]) + way * width for way in ways]
+            if width > _CRUDE or ends[k][0] < low or ends[k][1] > high:
+                found = [
+                    limit(self._likelihood, theta, hessian, structure, self._data, k, way)
+                    for way in ways
+                ]
+                ends[k] = [
+                    way * np.inf if one is None else one
+                    for way, one in zip(ways, found, strict=True)
+                ]
+            widest = _WIDEST_LOG if structure.is_log(k) else _WIDEST
+            if max(theta[k] - ends[k][0], ends[k][1] - theta[k]) > widest:
                 unknown.append(k)
-            if is_log:
-                factor = float(np.exp(min(width, 700.0)))
-                self.intervals[name] = value / factor, value * factor
-            elif k < structure.covariances:
-                self.intervals[name] = value - width, value + width
-            else:
-                size = abs(structure.setting(structure.start).parameters[name])
-                self.intervals[name] = value - width * size, value + width * size
+            self.intervals[structure.names[k]] = self._stands_for(theta, k, ends[k])
         correlations = inverse / np.outer(deviations, deviations)
         told: set[int] = set()
+        texts = []
         for k in unknown:
-            if k in told:
-                continue
-            joined = [j for j in unknown if j == k or abs(correlations[k, j]) > _TOGETHER]
-            told.update(joined)
-            texts.append(
-                self._words(theta, joined, correlations) if len(joined) > 1
-                else self._alone(theta, k)
-            )
+            if k not in told:
+                members = [
+                    j for j in unknown if j == k or abs(correlations[k, j]) > _TOGETHER
+                ]
+                told.update(members)
+                texts.append(self._words(members, correlations))
         self.unidentified = tuple(texts)
 
-    def _alone(self, theta: Array, k: int) -> str:
-        """The range of a component that the records do not determine, by the likelihood itself."""
-        structure = self._structure
-        name = structure.names[k]
-        reach = [
-            limit(self._likelihood, theta, structure, self._data, k, sign, _RISE)
-            for sign in (-1.0, 1.0)
-        ]
-        ends = []
-        for one in reach:
+    def _stands_for(self, theta: Array, k: int, ends: list[float]) -> tuple[float, float]:
+        """The ends of an interval in the unit of what the component stands for."""
+        found = []
+        for end in ends:
+            if np.isinf(end):
+                found.append(0.0 if end < 0.0 and self._structure.is_log(k) else end)
+                continue
             at = theta.copy()
-            at[k] = theta[k] if one is None else one
-            ends.append(structure.values(at)[name])
-        low, high = ends
-        is_log = structure.is_log(k)
-        self.intervals[name] = (
-            low if reach[0] is not None else (0.0 if is_log else -np.inf),
-            high if reach[1] is not None else np.inf,
-        )
-        if reach[0] is None and reach[1] is None:
+            at[k] = end
+            found.append(self._structure.values(at)[self._structure.names[k]])
+        return min(found), max(found)
+
+    def _words(self, members: list[int], correlations: Array) -> str:
+        """What the records do not determine, as a sentence."""
+        names = [self._structure.names[k] for k in members]
+        if len(members) > 1:
+            same = all(correlations[members[0], k] > 0.0 for k in members)
+            return (
+                f"{', '.join(names[:-1])} and {names[-1]}: they can change "
+                f"{'together' if same else 'one against the other'}, and fit the records as well; "
+                "fix one of them, or tie them in a group."
+            )
+        (name,) = names
+        low, high = self.intervals[name]
+        no_low = low == 0.0 or np.isinf(low)
+        if no_low and np.isinf(high):
             return f"{name}: the records say nothing about it, any value fits."
-        if reach[0] is None:
+        if no_low:
             return f"{name}: any value below {high:.3g} fits the records."
-        if reach[1] is None:
+        if np.isinf(high):
             return f"{name}: any value above {low:.3g} fits the records."
         return f"{name}: the records fit anything from {low:.3g} to {high:.3g}."
-
-    def _words(self, theta: Array, members: list[int], correlations: Array) -> str:
-        names = [self._structure.names[k] for k in members]
-        for k in members:
-            self._alone(theta, k)
-        same = [correlations[members[0], k] > 0.0 for k in members]
-        how = "together" if all(same) else "one against the other"
-        return (
-            f"{', '.join(names[:-1])} and {names[-1]}: they can change {how}, and fit the records "
-            "as well; fix one of them, or tie them in a group."
-        )
 
     @cached_property
     def scores(self) -> dict[str, tuple[float, float]]:

@@ -30,6 +30,8 @@ _FAILED = 1e6
 # What a change of all standard deviations by e costs beside the score, which is about 1: where
 # the score says nothing, the likelihood's weights stay.
 _STAY = 1e-3
+#: Of a normal variable, within 95 %.
+NORMAL = 1.959964
 # Step of the score's differences; the estimator's iterations make it less smooth than a filter.
 _STEP = 1e-2
 _HESSIAN_STEP = 1e-3
@@ -123,7 +125,7 @@ def search_likelihood(
 
     minimize(
         cost, begin, jac=True, method="L-BFGS-B", bounds=structure.limits, callback=after,
-        options={"maxiter": _ITERATIONS, "ftol": 1e-13, "gtol": 1e-7},
+        options={"maxiter": _ITERATIONS, "ftol": 1e-9, "gtol": 1e-6},
     )
     note(best[0], best[1], True)
     return best[0], float(best[1])
@@ -215,60 +217,67 @@ def polish(
 
 
 def limit(
-    likelihood: Likelihood, theta: Array, structure: Structure, data: list[Data], k: int,
-    sign: float, rise: float,
+    likelihood: Likelihood, theta: Array, hessian: Array, structure: Structure, data: list[Data],
+    k: int, sign: float,
 ) -> float | None:
-    """How far component k can go one way before the likelihood's minimum rises by so much.
+    """Where component k is, one way, when the likelihood's minimum has risen to the 95 % limit.
 
-    None if it never does within its range.
+    The others follow. None if it never rises so far within the component's range.
     """
-    chosen = [~one.held for one in data]
-    least = likelihood.value(theta, chosen)
-    end = structure.limits[k][1 if sign > 0 else 0]
-    others = [j for j in range(structure.seen) if j != k]
+    chosen, count = [~one.held for one in data], structure.seen
+    least, end = likelihood.value(theta, chosen), structure.limits[k][1 if sign > 0 else 0]
+    others = [j for j in range(count) if j != k]
+    # Coordinates of the others in which the likelihood curves alike in all directions.
+    values, vectors = np.linalg.eigh(hessian[np.ix_(others, others)])
+    spread = vectors / np.sqrt(np.maximum(values, 1.0))
+    low, high = np.array(structure.limits).T
+    point = theta.copy()
 
-    def above(to: float, begin: Array) -> tuple[bool, Array]:
-        fixed = begin.copy()
-        fixed[k] = to
-        if likelihood.value(fixed, chosen) - least < rise:
-            return False, fixed
+    def rise(to: float) -> float:
+        """The rise in standard deviations, and the point where the others are best."""
+        begin = point.copy()
+        begin[k] = to
 
         def cost(part: Array) -> tuple[float, Array]:
-            whole = fixed.copy()
-            whole[others] = part
-            value, slope = likelihood.gradient(whole, chosen)
+            whole = begin.copy()
+            whole[others] += spread @ part
+            value, slope = likelihood.gradient(np.clip(whole, low, high), chosen)
             if not np.isfinite(value):
                 return _FAILED, np.zeros(len(others))
-            return value - least, slope[others]
+            return value - least, spread.T @ slope[others]
 
         if others:
-            bounds = [structure.limits[j] for j in others]
-            found = minimize(cost, fixed[others], jac=True, method="L-BFGS-B", bounds=bounds,
-                             options={"maxiter": 30})
-            fixed[others] = found.x
-        return likelihood.value(fixed, chosen) - least >= rise, fixed
-
-    inside, point, reach = float(theta[k]), theta, 0.5
-    while True:
-        to = inside + sign * reach
-        if sign * to >= sign * end:
-            is_above, _ = above(end, point)
-            if not is_above:
-                return None
-            to = end
-            break
-        is_above, reached = above(to, point)
-        if is_above:
-            break
-        inside, point, reach = to, reached, 2.0 * reach
-    for _ in range(5):
-        middle = 0.5 * (inside + to)
-        is_above, reached = above(middle, point)
-        if is_above:
-            to = middle
+            found = minimize(
+                cost, np.zeros(len(others)), jac=True, method="L-BFGS-B",
+                options={"maxiter": 15, "gtol": 0.05, "ftol": 1e-4},
+            )
+            begin[others] += spread @ found.x
+            difference = float(found.fun)
         else:
-            inside, point = middle, reached
-    return 0.5 * (inside + to)
+            difference = likelihood.value(begin, chosen) - least
+        point[:] = np.clip(begin, low, high)
+        return float(np.sqrt(2.0 * max(difference, 0.0)))
+
+    inside, outside, inner, outer = float(theta[k]), None, 0.0, np.inf
+    to = theta[k] + sign * NORMAL / np.sqrt(max(hessian[k, k], 1.0))
+    for _ in range(12):
+        to = min(to, end) if sign > 0 else max(to, end)
+        found = rise(to)
+        if found < NORMAL:
+            if to == end:
+                return None
+            inside, inner = to, found
+        else:
+            outside, outer = to, found
+        if abs(found - NORMAL) < 0.03:
+            return to
+        if outside is None:
+            growth = np.clip(NORMAL / max(found, 1e-3), 1.2, 3.0)
+            to = theta[k] + growth * (to - theta[k])
+        else:
+            share = np.clip((NORMAL - inner) / (outer - inner), 0.1, 0.9)
+            to = inside + share * (outside - inside)
+    return to
 
 
 def refine(
