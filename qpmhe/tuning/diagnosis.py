@@ -229,9 +229,10 @@ def _names(
             raise ShapeError(f"{name} is {given!r}; expected {size} strings.")
         sizes[name] = found
     step = system.dt if dt is None else positive("dt", dt)
-    times: Array = (step or 1.0) * np.arange(total)
+    times = (step or 1.0) * np.arange(total, dtype=np.float64)
     if source.steps is not None:
         scale = 1.0 if dt is None or system.dt is None else dt / system.dt
-        times[1:] = scale * np.cumsum(source.steps[:-1])
+        times[1:] = np.cumsum(source.steps[:-1])
+        times *= scale
     unit = "samples" if step is None else time_unit or "s"
     return Names(sizes["labels"], sizes["outputs"], sizes["inputs"], times, unit)

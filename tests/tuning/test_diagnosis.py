@@ -14,7 +14,7 @@ from qpmhe.tuning.observability import prior_shares
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "studies"))
 
-import planted_faults as planted  # noqa: E402 - a script of the examples
+import planted_faults as planted
 
 MODELS = list(qpmhe.models.catalogue())
 
@@ -168,9 +168,9 @@ def test_bad_input():
         qpmhe.diagnose(case)
     with pytest.raises(InvalidInputError, match="29 samples with measurements; expected at least"):
         qpmhe.diagnose(case._replace(measurements=case.measurements[:29]).run())
-    with pytest.raises(InvalidInputError, match="all measurements .* missing; check the columns"):
+    with pytest.raises(InvalidInputError, match=r"all measurements .* missing; check the columns"):
         qpmhe.diagnose(case._replace(measurements=np.full((50, 1), np.nan)).run())
-    with pytest.raises(ShapeError, match="labels is .* expected 2 strings"):
+    with pytest.raises(ShapeError, match=r"labels is .* expected 2 strings"):
         qpmhe.diagnose(run, labels=["a"])
     with pytest.raises(InvalidInputError, match="does not know its measurements"):
         qpmhe.diagnose(qpmhe.Run.of(run.states[0], []))
