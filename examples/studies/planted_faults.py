@@ -132,8 +132,7 @@ def timed(model: str, seed: int, step: float = 1.0, drift: float = 0.0) -> Case:
     spread_v = np.sqrt(scenario.noise_covariance.diagonal())
 
     def move(x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        reached = system.timed.f(x, np.append(u, dt)) if dt else x
-        return reached
+        return system.timed.f(x, np.append(u, dt)) if dt else x
 
     x, y, inputs = scenario.initial_state, [], []
     for t in range(int(total * (1.0 + drift)) + 1):
@@ -158,7 +157,7 @@ def unseen(_: str, seed: int) -> Case:
         moved = [x[..., 0] + 0.1 * x[..., 1], x[..., 1] - 0.2 * x[..., 0] - 0.02 * x[..., 1]]
         return np.stack((moved[0], moved[1] + 0.1 * x[..., 2] * u[..., 0], x[..., 2]), axis=-1)
 
-    system = qpmhe.System(f, lambda x, u: x[..., :1], n=3, p=1, m=1)
+    system = qpmhe.System(f, lambda x: x[..., :1], n=3, p=1, m=1)
     prior, disturbance = np.diag([1.0, 1.0, 0.25]), np.diag([1e-4, 1e-3, 1e-6])
     x, inputs, y = np.array([1.0, 0.0, 1.5]), np.zeros((total, 1)), np.zeros((total, 1))
     for t in range(total):
@@ -194,7 +193,7 @@ FAULTS: dict[str, tuple[str, Callable[[str, int], Case], tuple[str, ...]]] = {
     "wrong sign of an input": ("sign", wrong_sign, ("battery_cell", "cstr", "vehicle")),
     "one sample late": (
         "shift", lambda model, seed: measured(model, seed, late),
-        ("vehicle", "battery_cell", "cstr")),
+        ("battery_cell", "cstr", "vehicle")),
     "parameter that is not excited": ("unseen", unseen, ("oscillator",)),
     "outliers, 3 %": (
         "outliers", lambda model, seed: measured(model, seed, outlying),

@@ -19,10 +19,10 @@ _SHIFTS = (-2, -1, 1, 2)
 _DRIFTS = tuple(late for late in range(-16, 17) if abs(late) > 1)
 # More components than this have no factors or pairs of their own.
 _MOST = 8
-# What a fault must gain in log likelihood, in all and for each measurement that it concerns; and the
-# least effect worth a word: factors of covariances, deviations of a bias, shares of a step and of an
-# input, samples.
-_GAIN, _GAIN_EACH, _LOCAL = 12.0, 0.04, ("bias", "outliers")
+# What a fault must gain in log likelihood, in all and for each measurement that it concerns; and
+# the least effect worth a word: factors of covariances, deviations of a bias, shares of a step
+# and of an input, samples.
+_GAIN, _GAIN_EACH, _LOCAL = 12.0, 0.035, ("bias", "outliers")
 _LEAST = {
     "noise": np.log(2.0), "disturbance": np.log(2.0), "bias": 0.5, "step": 0.02, "sign": 0.1,
     "input": 0.1, "shift": 0.3, "clock": 0.5, "outliers": 0.0, "swapped": 0.0,
@@ -80,7 +80,10 @@ def search(
 
 
 def _best(bank: FilterBank, base: Hypothesis, null: Filtered) -> Fault | None:
-    tried = [*_scaled(base), *_exchanged(base), *_shifted(base), *_drifted(bank, base, null), *_linear(bank, base, null)]
+    tried = [
+        *_scaled(base), *_exchanged(base), *_shifted(base), *_drifted(bank, base, null),
+        *_linear(bank, base, null),
+    ]
     likelihoods = bank.run([base, *(one.hypothesis for one in tried)]).likelihoods
     reference, values = likelihoods[0], likelihoods[1:]
     refined = list(_refined(base, tried, values, reference))
@@ -168,7 +171,8 @@ def _exchanged(base: Hypothesis) -> Iterator[Fault]:
         for pair in combinations(range(p), 2):
             order = np.arange(p)
             order[list(pair)] = pair[::-1]
-            yield Fault("swapped", 0.0, replace(base, measurements=base.measurements[:, order]), pair)
+            exchanged = replace(base, measurements=base.measurements[:, order])
+            yield Fault("swapped", 0.0, exchanged, pair)
     for j in range(m):
         inputs = base.inputs.copy()
         inputs[:, j] *= -1.0

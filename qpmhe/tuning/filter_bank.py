@@ -149,7 +149,7 @@ class FilterBank:
         unit = np.sqrt(hypotheses[0].noise.diagonal())
         noise = noise / np.multiply.outer(unit, unit)
         extreme = np.log(_SHARE / _WIDTH)
-        usual, all_scales_one, any_outliers = np.log1p(-_SHARE), (scale == 1.0).all(), outliers.any()
+        usual, any_outliers = np.log1p(-_SHARE), outliers.any()
         for t in range(total):
             now, seen = u[:, t], there[:, t]
             c = _values(model.h_jacobian.batch, x, now, (p, n)) / unit[:, None]
@@ -199,7 +199,7 @@ class FilterBank:
             first.corrected[t], first.covariances[t] = x[0], covariance[0]
             a = _values(model.f_jacobian.batch, x, now, (n, n))
             following = _values(model.f.batch, x, now, (n,))
-            if not all_scales_one:
+            if (scale != 1.0).any():
                 following = x + scale * (following - x)
                 a = eye_n + scale[:, :, None] * (a - eye_n)
             first.transitions[t] = a[0]
@@ -219,12 +219,12 @@ class FilterBank:
 def _inverses(matrices: Array, alive: NDArray[np.bool_]) -> Array:
     """The inverses; the filter of a singular one is dead, and has the identity."""
     try:
-        return np.linalg.inv(matrices)
+        return np.asarray(np.linalg.inv(matrices), np.float64)
     except np.linalg.LinAlgError:
         singular = np.linalg.slogdet(matrices)[0] <= 0.0
         alive[singular] = False
         matrices[singular] = np.eye(matrices.shape[-1])
-        return np.linalg.inv(matrices)
+        return np.asarray(np.linalg.inv(matrices), np.float64)
 
 
 def _values(function: Function, x: Array, u: Array, shape: tuple[int, ...]) -> Array:

@@ -197,7 +197,9 @@ def describe(fault: Fault, names: Names, deviations: Array, outliers: Array) -> 
             remedy = "Synchronise the clocks, or resample the measurements at the inputs' times."
         case "outliers":
             worst = np.argsort(-outliers)[:3]
-            shares = [f"{outliers[j]:.1%} of {names.outputs[j]}" for j in worst if outliers[j] > 0.0]
+            shares = [
+                f"{outliers[j]:.1%} of {names.outputs[j]}" for j in worst if outliers[j] > 0.0
+            ]
             text = f"There are outliers: {listed(shares)} beyond 4 sigma."
             remedy = "Take a qpmhe.RobustCost, with qpmhe.Huber for the noise."
     return Finding(fault.kind, text[:1].upper() + text[1:], remedy, "fault", where)

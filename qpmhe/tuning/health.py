@@ -323,6 +323,5 @@ def _svg(diagnosis: Diagnosis, paint: Callable[[Diagnosis, Any], None], number: 
         written = io.StringIO()
         figure.savefig(written, format="svg", metadata={"Date": None})
     text = written.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>f{number}-", text)
-    return text
+    text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
+    return re.sub(r'(id="|url\(#|href="#)', rf"\g<1>f{number}-", text)

@@ -13,6 +13,9 @@ _LEAST = 10
 # Samples at an end of the range, and how many times those at the number next to it.
 _AT_END, _MORE = 7, 3.0
 
+# Of a step, how far its multiples may be off; of the noise, what a step that matters has at least.
+_ROUNDING, _STEP = 1e-3, 0.5
+
 
 def longest_repetition(y: Array) -> tuple[int, int]:
     """First and last sample of the longest row of equal numbers; NaN interrupts none."""
@@ -36,10 +39,19 @@ def is_dead(y: Array, first: int, last: int) -> bool:
     return bool(inside >= max(_LEAST, rare))
 
 
-def is_rounded(y: Array) -> bool:
-    """Whether a sensor takes few enough values to repeat some of them by chance."""
-    there = y[np.isfinite(y)]
-    return bool(there.size > 1 and np.unique(there).size < 0.5 * there.size)
+def is_rounded(y: Array, repeated: Mask, deviation: float) -> bool:
+    """Whether a sensor's steps are not small beside the noise, so that it may repeat a number."""
+    others = y[np.isfinite(y) & ~repeated]
+    if others.size and np.unique(others).size < 0.5 * others.size:
+        return True
+    values = np.unique(y[np.isfinite(y)])
+    if values.size < 2:
+        return False
+    multiples = (values - values[0]) / np.diff(values).min()
+    return bool(
+        (np.abs(multiples - np.rint(multiples)) < _ROUNDING).all()
+        and np.diff(values).min() > _STEP * deviation
+    )
 
 
 def at_end_of_range(y: Array) -> tuple[Mask, bool]:
