@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..model.stand_ins import without_symbols
-from ..model.symbols import NotTraceableError
+from ..model.symbols import NotTraceableError, Symbol, SymbolArray
 
 # A loop with more turns, all together, is not unrolled.
 _MOST_TURNS = 1000
@@ -133,8 +133,8 @@ def _step(core: Any, step: Any, values: list[Any]) -> list[Any]:
 
 
 def _is_symbolic(value: Any) -> bool:
-    return getattr(value, "dtype", None) == np.object_ or not isinstance(
-        value, (np.ndarray, np.generic, int, float)
+    return isinstance(value, (Symbol, SymbolArray)) or (
+        getattr(value, "dtype", None) == np.object_
     )
 
 

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from .._checks import Array
 from ..errors import ModelError
-from ..model.expressions import CasadiModel, import_casadi
 from ..model.system import System
-from ..model.tracing import Traced
-from .graph import Graph, Program, read
+from .graph import Graph
 from .intervals import Interval
+from .programs import Program
+from .reading import expression_of, read
 from .regions import Region
+from .slopes import Slopes
 
 _REMEDY = "Take a smaller region, or make the model defined on all of it."
 _SAMPLES, _SEED = 400, 20210829
@@ -145,14 +146,17 @@ class Enclosure:
             errors.append(error + rounding)
         return np.concatenate(moved, axis=1), np.max(errors, axis=0)
 
-    def with_rows(self, at: NDArray[np.intp], other: Enclosure, rows: NDArray[np.bool_]) -> Enclosure:
+    def with_rows(
+        self, at: NDArray[np.intp], other: Enclosure, rows: NDArray[np.bool_]
+    ) -> Enclosure:
         """The same, and some rows of another enclosure in place of its own at these cells."""
         parts = [self.centre.copy(), self.slopes.copy(), self.error.copy(), self.excess.copy()]
         for mine, theirs in zip(
             parts, (other.centre, other.slopes, other.error, other.excess), strict=True
         ):
             mine[at] = theirs[rows]
-        return Enclosure(*parts, self.jacobian)
+        centre, slopes, error, excess = parts
+        return Enclosure(centre, slopes, error, excess, self.jacobian)
 
 
 class SmoothModel:
@@ -169,7 +173,8 @@ class SmoothModel:
     def __init__(self, system: System, region: Region) -> None:
         self._system, self._region = system, region
         self.n, self.p = system.n, system.p
-        self._graph = Graph(system.n + system.m, system.n)
+        self._graph = Graph(system.n + system.m)
+        self._slopes = Slopes(self._graph, system.n)
         self._programs: dict[str, Program] = {}
         self._plans: dict[bool, _Plan] = {}
         self.output_reason, self._output = self._read("h")
@@ -179,7 +184,7 @@ class SmoothModel:
         self._rows = following + self._output
         self.affine_output = not (
             self.output_reason
-            or any(self._graph.second(root) for root in self._output)
+            or any(self._slopes.second(root) for root in self._output)
             or self._obstacle("h", region.lower, region.upper)
         )
 
@@ -249,7 +254,7 @@ class SmoothModel:
     def _enclosed(self, lower: Array, upper: Array, output_only: bool) -> Enclosure:
         if output_only not in self._plans:
             roots = self._output if output_only else self._rows
-            self._plans[output_only] = _Plan(self._graph, roots, self.n)
+            self._plans[output_only] = _Plan(self._graph, self._slopes, roots, self.n)
         plan = self._plans[output_only]
         found, open_ends = plan.enclosed(lower, upper)
         count = open_ends.sum(axis=1)
@@ -276,16 +281,16 @@ class SmoothModel:
 class _Plan:
     """The programs for the Jacobian of some nodes by the first n variables, over cells."""
 
-    def __init__(self, graph: Graph, roots: list[int], n: int) -> None:
+    def __init__(self, graph: Graph, derivatives: Slopes, roots: list[int], n: int) -> None:
         self._q, self._n = len(roots), n
         first = [
             (row, i, node) for row, root in enumerate(roots)
-            for i, node in graph.first(root).items() if i < n
+            for i, node in derivatives.first(root).items() if i < n
         ]
         # Each second derivative in all places that it has.
         second = [
             (row, this, other, node) for row, root in enumerate(roots)
-            for (i, j), node in graph.second(root).items()
+            for (i, j), node in derivatives.second(root).items()
             for this, other in sorted({(i, j), (j, i)}) if this < n
         ]
         self._first = _columns(first, 2)
@@ -367,31 +372,6 @@ class _Plan:
 def _columns(places: list[Any], count: int) -> tuple[NDArray[np.intp], ...]:
     """The first columns of a table, as indices."""
     return tuple(np.array([one[k] for one in places], np.intp) for k in range(count))
-
-
-def expression_of(system: System, name: str) -> Traced:
-    """f or h of a system as a CasADi function of one column of states and inputs."""
-    tracing, model = system.tracing, system.symbolic if system.tracing is None else None
-    if tracing is not None:
-        found = tracing.watched(name)
-        if found.function is None:
-            return found
-        model = CasadiModel(
-            found.function, found.function, system.n, system.p, system.m, tracing.dt,
-            tracing.method,
-        )
-    if model is None:
-        return Traced(None, "it was not made of functions that are known")
-    ca = import_casadi()
-    x, u = ca.SX.sym("x", system.n), ca.SX.sym("u", system.m)
-    try:
-        value = (
-            model.step().expand()(x, u, model.dt or 0.0) if name == "f"
-            else model.h.expand()(x, u)
-        )
-    except RuntimeError as error:
-        return Traced(None, f"CasADi has no scalar form of it ({str(error).splitlines()[-1]})")
-    return Traced(ca.Function(name, [ca.vertcat(x, u)], [ca.densify(value)]), "")
 
 
 def _at_each(function: Any, x: Array, u: Array) -> Array:

@@ -100,11 +100,13 @@ class Interval:
         return _outward(self.low - other.high, self.high - other.low)
 
     def __rsub__(self, other: Any) -> Interval:
-        return Interval.of(other) - self
+        turned: Interval = self - other
+        return -turned
 
     def __mul__(self, other: Any) -> Interval:
         if other is self:
-            return self.power(2)
+            square: Interval = self.power(2)
+            return square
         other = Interval.of(other)
         first, second = self.low * other.low, self.low * other.high
         third, fourth = self.high * other.low, self.high * other.high
@@ -116,10 +118,12 @@ class Interval:
     __rmul__ = __mul__
 
     def __truediv__(self, other: Any) -> Interval:
-        return self * Interval.of(other).power(-1)
+        quotient: Interval = self * Interval.of(other).power(-1)
+        return quotient
 
     def __rtruediv__(self, other: Any) -> Interval:
-        return self.power(-1) * other
+        quotient: Interval = self.power(-1) * other
+        return quotient
 
     def power(self, exponent: int) -> Interval:
         """s^k for an integer k, of which k < 0 excludes zero."""
@@ -146,7 +150,7 @@ class Interval:
     def raised(self, exponent: float) -> Interval:
         """s^c for any number c, of members that are not negative; not of zero if c < 0."""
         value = self.increasing(lambda s: np.power(s, exponent)) if exponent > 0 else -(
-            (self.increasing(lambda s: -np.power(s, exponent)))
+            self.increasing(lambda s: -np.power(s, exponent))
         )
         return Interval(np.maximum(value.low, 0.0), value.high).where(self.low >= 0.0)
 
@@ -168,7 +172,7 @@ class Interval:
         """
         found = function(Interval.of(self.low)).hull(function(Interval.of(self.high)))
         for turn in turns:
-            about = _outward(np.float64(turn), np.float64(turn))
+            about = _outward(np.array(turn), np.array(turn))
             reached = (self.low <= about.high) & (self.high >= about.low)
             found = found.hull(function(about), reached)
         return found
@@ -213,11 +217,12 @@ def angle(y: Interval, x: Interval) -> Interval:
 def length(*legs: Interval) -> Interval:
     """The length of vectors."""
     squares = [leg.power(2) for leg in legs]
-    return sum(squares[1:], squares[0]).increasing(np.sqrt, 0.0)
+    total = sum(squares[1:], squares[0])
+    return Interval(np.maximum(total.low, 0.0), total.high).increasing(np.sqrt, 0.0)
 
 
 def share(x: Interval, y: Interval) -> Interval:
-    """x / length(x, y), which grows with x, and towards zero with the size of y.
+    """X / length(x, y), which grows with x, and towards zero with the size of y.
 
     At the origin anything between -1 and 1: the generalised derivatives of the length there.
     """

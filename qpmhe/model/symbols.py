@@ -203,7 +203,7 @@ class Symbol:
         """Return the symbol itself: a state is real."""
         return self
 
-    @property
+    @property  # type: ignore[misc]
     def __class__(self) -> Any:
         """The type of an array's entry, for who asks by ``isinstance``."""
         return np.bool_ if self.logical else np.float64

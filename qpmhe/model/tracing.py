@@ -302,14 +302,14 @@ _STANDARD = str(Path(dis.__file__).parent)
 
 @contextlib.contextmanager
 def _watch(record: Record) -> Iterator[None]:
-    """Refuse, meanwhile, exceptions in the user's code, and code that tells symbols from numbers."""
+    """Refuse, meanwhile, exceptions in the user's code, and looks at types and identities."""
 
-    def within(frame: Any, event: str, argument: Any) -> Any:
+    def within(_: Any, event: str, argument: Any) -> Any:
         if event == "exception" and not issubclass(argument[0], (StopIteration, GeneratorExit)):
             record.refuse(f"an exception on symbols, {argument[0].__name__}")
         return within
 
-    def called(frame: Any, event: str, argument: Any) -> Any:
+    def called(frame: Any, *_: Any) -> Any:
         if _is_trusted(frame.f_code.co_filename):
             return None
         frame.f_trace_lines = False

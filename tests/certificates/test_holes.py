@@ -7,10 +7,10 @@ import math
 import operator
 import threading
 from math import tanh as kept_tanh
-from numpy import array as kept_array
 
 import numpy as np
 import pytest
+from numpy import array as kept_array
 
 import qpmhe
 from qpmhe.certificates.contraction import certify_detectability

@@ -218,7 +218,9 @@ def test_random_expressions_lie_in_their_enclosures(block, monkeypatch):
                 assert exact <= values.high[0, 0] + room * abs(exact)
             if np.isnan(found.error).any():
                 continue
-            shares = [(s - float(c)) / float(w) for s, c, w in zip(point, centre, half, strict=True)]
+            shares = [
+                (s - float(c)) / float(w) for s, c, w in zip(point, centre, half, strict=True)
+            ]
             for k in range(2):
                 exact = mpmath.diff(
                     lambda s, k=k, point=point, expression=expression: value(

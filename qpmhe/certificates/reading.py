@@ -1,0 +1,161 @@
+"""A system's functions as nodes of a graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from ..model.expressions import CasadiModel, import_casadi
+from ..model.system import System
+from ..model.tracing import Traced
+from .graph import CONDITIONS, Graph
+
+
+def expression_of(system: System, name: str) -> Traced:
+    """F or h of a system as a CasADi function of one column of states and inputs."""
+    tracing, model = system.tracing, system.symbolic if system.tracing is None else None
+    if tracing is not None:
+        found = tracing.watched(name)
+        if found.function is None:
+            return found
+        model = CasadiModel(
+            found.function, found.function, system.n, system.p, system.m, tracing.dt,
+            tracing.method,
+        )
+    if model is None:
+        return Traced(None, "it was not made of functions that are known")
+    ca = import_casadi()
+    x, u = ca.SX.sym("x", system.n), ca.SX.sym("u", system.m)
+    try:
+        value = (
+            model.step().expand()(x, u, model.dt or 0.0) if name == "f"
+            else model.h.expand()(x, u)
+        )
+    except RuntimeError as error:
+        return Traced(None, f"CasADi has no scalar form of it ({str(error).splitlines()[-1]})")
+    return Traced(ca.Function(name, [ca.vertcat(x, u)], [ca.densify(value)]), "")
+
+
+def read(graph: Graph, function: Any) -> list[int]:
+    """The nodes of the entries that a casadi.Function returns, of one column of the variables."""
+    ca = import_casadi()
+    names = {getattr(ca, name): name[3:] for name in dir(ca) if name.startswith("OP_")}
+    work: dict[int, int] = {}
+    results = [graph.constant(0.0)] * function.numel_out(0)
+    for k in range(function.n_instructions()):
+        code = function.instruction_id(k)
+        inputs, outputs = function.instruction_input(k), function.instruction_output(k)
+        if code == ca.OP_INPUT:
+            work[outputs[0]] = graph.variables[inputs[1]]
+        elif code == ca.OP_CONST:
+            work[outputs[0]] = graph.constant(function.instruction_constant(k))
+        elif code == ca.OP_OUTPUT:
+            results[outputs[1]] = _settled(graph, work[inputs[0]])
+        else:
+            operation = _READ.get(names[code])
+            work[outputs[0]] = (
+                graph.node("unknown", parameter=names[code].lower()) if operation is None
+                else operation(graph, *(work[one] for one in inputs))
+            )
+    return results
+
+
+def _settled(graph: Graph, node: int) -> int:
+    """A number in place of a condition, or of half of a choice."""
+    operation, arguments, _ = graph.nodes[node]
+    if operation == "pick":
+        return graph.choice(arguments[0], arguments[1], graph.constant(0.0))
+    return graph.of("truth", node) if operation in CONDITIONS else node
+
+
+def _condition(graph: Graph, node: int) -> int:
+    """What is not zero, as a condition."""
+    if graph.nodes[node][0] in CONDITIONS:
+        return node
+    return graph.negated(graph.of("equal", *sorted((_settled(graph, node), graph.constant(0.0)))))
+
+
+def _pick(graph: Graph, c: int, a: int) -> int:
+    c, a = _condition(graph, c), _settled(graph, a)
+    return a if graph.value(a) == 0.0 else graph.of("pick", c, a)
+
+
+def _add(graph: Graph, a: int, b: int) -> int:
+    if graph.nodes[a][0] == graph.nodes[b][0] == "pick":
+        (c, first), (other, second) = graph.nodes[a][1], graph.nodes[b][1]
+        if c == graph.negated(other):
+            return graph.choice(c, first, second)
+    return graph.add(_settled(graph, a), _settled(graph, b))
+
+
+def _divided(graph: Graph, a: int, b: int) -> int:
+    if graph.value(a) == 1.0 and graph.nodes[b][0] == "add":
+        # 1 / (1 + exp(s)), whose derivatives are enclosed as those of one function.
+        for one, other in (graph.nodes[b][1], graph.nodes[b][1][::-1]):
+            if graph.value(one) == 1.0 and graph.nodes[other][0] == "exp":
+                return graph.of("sigmoid", graph.neg(graph.nodes[other][1][0]))
+    return graph.mul(a, graph.power(b, -1))
+
+
+def _raised(graph: Graph, a: int, b: int) -> int:
+    exponent = graph.value(b)
+    if exponent is not None:
+        return graph.raised(a, exponent)
+    return graph.of("exp", graph.mul(b, graph.of("log", a)))
+
+
+def _same(_: Graph, a: int, *__: int) -> int:
+    return a
+
+
+def _elementary(operation: str, graph: Graph, a: int) -> int:
+    return graph.of(operation, a)
+
+
+def _of_numbers(function: Callable[..., int]) -> Callable[..., int]:
+    return lambda graph, *nodes: function(graph, *(_settled(graph, one) for one in nodes))
+
+
+def _functions(table: Mapping[str, Callable[..., int]]) -> Mapping[str, Callable[..., int]]:
+    """The table itself, all of one type."""
+    return table
+
+
+def _of_conditions(operation: str) -> Callable[..., int]:
+    return lambda graph, *nodes: graph.of(
+        operation, *(_condition(graph, one) for one in nodes)
+    )
+
+
+def _ordered(operation: str) -> Callable[..., int]:
+    return _of_numbers(lambda graph, a, b: graph.of(operation, *sorted((a, b))))
+
+
+_READ: dict[str, Callable[..., int]] = {
+    "ADD": _add, "IF_ELSE_ZERO": _pick, "AND": _of_conditions("and"), "OR": _of_conditions("or"),
+    "NOT": lambda graph, c: graph.negated(_condition(graph, c)),
+    "EQ": _ordered("equal"), "FMAX": _ordered("max"), "FMIN": _ordered("min"),
+    "NE": _of_numbers(lambda graph, a, b: graph.negated(graph.of("equal", *sorted((a, b))))),
+    **{name: _of_numbers(function) for name, function in _functions({
+        "SUB": Graph.sub, "MUL": Graph.mul, "NEG": Graph.neg, "DIV": _divided, "SQRT": Graph.root,
+        "POW": _raised, "CONSTPOW": _raised, "SQ": lambda graph, a: graph.power(a, 2),
+        "TWICE": lambda graph, a: graph.mul(graph.constant(2.0), a),
+        "INV": lambda graph, a: _divided(graph, graph.constant(1.0), a),
+        "ASSIGN": _same, "LIFT": _same,
+        "LT": lambda graph, a, b: graph.of("less", a, b),
+        "LE": lambda graph, a, b: graph.of("atmost", a, b),
+        "FABS": lambda graph, a: graph.of("abs", a),
+        "ATAN2": lambda graph, a, b: graph.of("angle", a, b),
+        "HYPOT": lambda graph, a, b: graph.of("length", a, b),
+        "FMOD": lambda graph, a, b: graph.sub(
+            a, graph.mul(b, graph.of("trunc", _divided(graph, a, b)))),
+        "COPYSIGN": lambda graph, a, b: graph.choice(
+            graph.of("atmost", graph.constant(0.0), b), graph.of("abs", a),
+            graph.neg(graph.of("abs", a))),
+    }).items()},
+    **{name: _of_numbers(partial(_elementary, name.lower())) for name in (
+        "EXP", "LOG", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "SINH", "COSH", "TANH", "ASINH",
+        "ACOSH", "ATANH", "EXPM1", "LOG1P", "ERF", "FLOOR", "CEIL", "SIGN",
+    )},
+}
