@@ -13,7 +13,7 @@ from .._checks import Array, positive, vector
 from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
-from .enclosures import SmoothModel, evaluated, joint_jacobians
+from .enclosures import Enclosure, SmoothModel, evaluated, joint_jacobians
 from .evidence import Evidence, NotCertifiedError, OutOfTimeError
 from .inequalities import Form, Matrices, definite
 from .regions import Region
@@ -42,6 +42,7 @@ _ABOVE, _ATTEMPTS = 0.01, 4
 _SHARES = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
 _REFINEMENTS = 3  # of the best of them, each by two more programs
 _SEED = 20210829
+_ROUNDING = 1e-12  # of a state that f keeps
 _PAIRS = 2000
 # How much of the time the choice of a rate may take, and one verification; how many programs
 # the former solves; how far off the time that a program is expected to take may be.
@@ -65,11 +66,40 @@ class _BrokenPairError(NotCertifiedError):
     """No matrix helps where f or h jumps."""
 
 
+class FreeModel:
+    """A model's Jacobians by some of its states, where f keeps the others at their values."""
+
+    def __init__(self, model: SmoothModel, free: NDArray[np.intp]) -> None:
+        self._model, self._free = model, free
+        self.n, self.p = model.n, model.p
+        self.reason, self.affine_output = model.reason, model.affine_output
+        self._rows = np.append(free, model.n + np.arange(model.p))
+
+    def enclose(self, lower: Array, upper: Array) -> Enclosure:
+        """As `SmoothModel.enclose`; nothing is known where f is not shown to keep the others."""
+        found, kept = self._model.enclose(lower, upper), np.ones(self.n, np.bool_)
+        kept[self._free] = False
+        moves = (
+            np.abs(found.centre) + np.abs(found.slopes).sum(axis=1) + found.error
+        )[:, : self.n][:, kept][:, :, self._free].any(axis=(1, 2))
+        rows, columns = self._rows[:, None], self._free
+        return Enclosure(
+            found.centre[:, rows, columns], found.slopes[:, :, rows, columns],
+            np.where(moves[:, None, None], np.nan, found.error[:, rows, columns]), found.excess,
+            found.jacobian[:, rows, columns],
+        )
+
+
 class Search:
     """Programs at some states, verification at all of them, and more states where it fails.
 
     ``kind=None`` takes the form of detectability that the output allows. The sizes are those of
     disturbance and noise; for detectability, two numbers that say how much they matter.
+
+    A state that the region fixes, such as a known parameter, has no error. It is left out where
+    f keeps it at its value, whatever the others do, and the gain does not move it. Jacobians,
+    scales, gain and forms are of the states in ``free`` only, and of the disturbances in ``acting``
+    that move none of the fixed states.
     """
 
     def __init__(
@@ -81,17 +111,25 @@ class Search:
         if kind is None:
             first, second = vector("weights", np.asarray(sizes), 2).tolist()
             self._weights = positive("weights[0]", first), positive("weights[1]", second)
-        self.model = SmoothModel(system, region)
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
-        self.jacobians = joint_jacobians(system, self.points)
+        jacobians, n = joint_jacobians(system, self.points), system.n
+        fixed = (region.lower == region.upper)[:n]
+        self.free = np.flatnonzero(~fixed)
+        self.model: SmoothModel | FreeModel = SmoothModel(system, region)
+        self._matrix, self.acting = system.disturbance_matrix, np.arange(system.r)
+        if fixed.any():
+            self._leave_out(fixed, jacobians)
+        rows = np.append(self.free, n + np.arange(system.p))
+        self.jacobians = jacobians[:, rows[:, None], self.free]
+        self.n = self.free.size
         if kind is None:
-            outputs = self.jacobians[:, system.n :]
+            outputs = self.jacobians[:, self.n :]
             same = self.model.affine_output or (
                 bool(self.model.reason) and np.ptp(outputs, axis=0).max() == 0.0
             )
             kind = "output weight" if same else "output injection"
         self.kind: Kind = kind
-        each = expected_seconds(system.n, system.p, kind)
+        each = expected_seconds(self.n, system.p, kind)
         affordable = _CHOICE * self._deadline.left / (_PROGRAMS * each)
         self._chosen = _far_apart(self.jacobians, int(np.clip(affordable, 1, _MOST_POINTS)))
         if not self.model.reason and "given" in (
@@ -103,14 +141,53 @@ class Search:
             self.jacobians[self._chosen] = np.where(
                 np.isfinite(true), true, self.jacobians[self._chosen]
             )
-        self.scales = _typical_scales(region, self.jacobians, system.n)
+        self.scales = _typical_scales(region, self.jacobians, self.free)
         self._program: Program | None = None
+
+    def _leave_out(self, fixed: NDArray[np.bool_], jacobians: Array) -> None:
+        """Leave the states out that the region fixes; an error if it cannot be done."""
+        states, n = self.points[:, : self.system.n], self.system.n
+        ahead = evaluated("f", self.system.f, states, self.points[:, n:])
+        kept = np.abs(ahead - states) <= _ROUNDING * np.abs(states)
+        moved = fixed & ~(kept.all(axis=0) & ~jacobians[:, :n][:, :, ~fixed].any(axis=(0, 2)))
+        corrected = fixed & (False if self.gain is None else self.gain.any(axis=1))
+        for who, which in (("f", moved), ("the observer's gain", corrected)):
+            if which.any():
+                names = ", ".join(f"x[{j}]" for j in np.flatnonzero(which))
+                raise NotCertifiedError(
+                    f"the region has no width in {names}, but {who} moves it",
+                    ("a region with some width there", "a gain with a row of zeros there")
+                    if who != "f" else ("a region with some width there",),
+                )
+        if not self.free.size:
+            raise NotCertifiedError("the region is a single state, which has nothing to estimate")
+        G = np.eye(n) if self._matrix is None else self._matrix
+        self.acting = np.flatnonzero(~G[fixed].any(axis=0) & G[~fixed].any(axis=0))
+        self._matrix = G[np.ix_(self.free, self.acting)]
+        if self.gain is not None:
+            self.gain = self.gain[self.free]
+        w, v = self._sizes
+        if np.shape(w) == (self.system.r,):
+            self._sizes = np.asarray(w)[self.acting], v
+        if not self.acting.size:
+            self._matrix, self._sizes = None, (0.0, v)
+        if isinstance(self.model, SmoothModel):
+            self.model = FreeModel(self.model, self.free)
+
+    def embedded(self, matrix: Array, places: NDArray[np.intp], size: int) -> Array:
+        """A weight of what is not left out, as one of everything; what is left out weighs most."""
+        if places.size == size:
+            return matrix
+        full = np.eye(size) * float(np.linalg.eigvalsh(matrix)[-1])
+        if places.size:
+            full[np.ix_(places, places)] = matrix
+        return full
 
     @property
     def program(self) -> Program:
         """The program at the states chosen so far."""
         if self._program is None:
-            at, matrix = (self.jacobians[self._chosen], self.scales), self.system.disturbance_matrix
+            at, matrix = (self.jacobians[self._chosen], self.scales), self._matrix
             if self.gain is not None:
                 self._program = ObserverProgram(*at, self._sizes, self.gain, matrix)
             elif self.kind == "synthesis":
@@ -303,13 +380,14 @@ class Search:
         """Raise where the inequality does not hold between two of the samples."""
         n, rng = self.system.n, np.random.default_rng(_SEED)
         start, end = self.points[rng.integers(len(self.points), size=(2, _PAIRS))]
-        end[:, n:] = start[:, n:]
+        fixed = np.setdiff1d(np.arange(start.shape[1]), self.free)
+        end[:, fixed] = start[:, fixed]
         df, dh = (
             evaluated(name, function, end[:, :n], end[:, n:])
             - evaluated(name, function, start[:, :n], start[:, n:])
             for name, function in (("f", self.system.f), ("h", self.system.h))
         )
-        broken = form.excess((end - start)[:, :n], df, dh) > 0.0
+        broken = form.excess((end - start)[:, self.free], df[:, self.free], dh) > 0.0
         if broken.any():
             k = int(np.argmax(broken))
             raise _BrokenPairError(
@@ -345,11 +423,10 @@ def _far_apart(jacobians: Array, count: int = _MOST_POINTS) -> NDArray[np.intp]:
     return np.array(chosen, dtype=np.intp)
 
 
-def _typical_scales(region: Region, jacobians: Array, n: int) -> Scales:
-    """Sizes of states and outputs on a region."""
-    half = 0.5 * (region.upper - region.lower)[:n]
-    states = np.where(half > 0.0, half, 1.0)
+def _typical_scales(region: Region, jacobians: Array, free: NDArray[np.intp]) -> Scales:
+    """Sizes of outputs on a region, and of the states that are not fixed."""
+    states = 0.5 * (region.upper - region.lower)[free]
     states = np.maximum(states / states.max(), 1e-6)
-    outputs = np.abs(jacobians[:, n:] * states).sum(axis=2).max(axis=0)
+    outputs = np.abs(jacobians[:, free.size :] * states).sum(axis=2).max(axis=0)
     return Scales(states, np.where(outputs > 0.0, outputs, 1.0))
 
