@@ -33,6 +33,8 @@ from .theorem import checked_rate
 _SAMPLES = 400
 _ROUNDS = 8
 _MARGINS = (1e-6, 1e-4, 1e-3, 1e-2)
+# Of what a rate that is not given leaves to 1: few cells suffice where there is room.
+_ROOM = (0.03, 0.06, 0.12, 0.25)
 _TOLERANCE = 1e-3  # of the smallest rate
 _LARGEST_RATE = 0.9999
 # Above the smallest feasible rate, at which constants may grow without bound, and how often
@@ -303,7 +305,7 @@ class Search:
                 )
             rate = max(smallest + share * (1.0 - smallest), self._best_rate(smallest))
             try:
-                return self._find(rate)
+                return self._find(rate, given=False)
             except (OutOfTimeError, _BrokenPairError):
                 raise
             except NotCertifiedError as error:
@@ -311,17 +313,19 @@ class Search:
                 refused, share = error, 3.0 * share
         raise refused
 
-    def _find(self, rate: float) -> Found:
+    def _find(self, rate: float, *, given: bool = True) -> Found:
         """An inequality with this rate, verified as far as can be."""
-        level, size = 0, min(1.0, rate * rate)
+        level, margins = 0, [each * min(1.0, rate * rate) for each in _MARGINS]
+        if not given and self.kind in ("observer", "synthesis"):
+            margins = [each * (1.0 - rate * rate) for each in _ROOM]
         best: Found | None = None
         status = "no round was left"
         for turn in range(1, _ROUNDS + 1):
             try:
-                answer = self._solved(rate, _MARGINS[level] * size, self._deadline)
+                answer = self._solved(rate, margins[level], self._deadline)
                 if isinstance(self.program, GainProgram):
                     answer = self.program.improved(
-                        answer, _MARGINS[level] * size, self._deadline.left
+                        answer, margins[level], self._deadline.left
                     )
             except OutOfTimeError:
                 if best is None:
@@ -337,7 +341,7 @@ class Search:
                 best = outcome
             elif self._added(outcome) and turn % 2:
                 continue
-            if level + 1 == len(_MARGINS):
+            if level + 1 == len(margins):
                 break
             level += 1
         if best is not None:
