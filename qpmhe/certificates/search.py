@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import Array, positive, vector
+from ..model.residuals import Angles
 from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import Enclosure, SmoothModel, evaluated, joint_jacobians
-from .evidence import Evidence, NotCertifiedError, OutOfTimeError
+from .evidence import CertificateError, Evidence, NotCertifiedError, OutOfTimeError
 from .inequalities import Form, Matrices, definite
 from .regions import Region
 from .sdp import (
@@ -111,6 +112,12 @@ class Search:
         self._deadline = Deadline.of(seconds)
         self.system, self.region, self.gain, self._sizes = system, region, gain, sizes
         if kind is None:
+            if system.output_residual is not None or system.state_residual is not None:
+                raise CertificateError(
+                    "the system has angles, whose differences may wrap: only an observer is "
+                    "certified, within a region where they do not. Leave the residuals out for "
+                    "detectability, with outputs and states that do not wrap within the region."
+                )
             first, second = vector("weights", np.asarray(sizes), 2).tolist()
             self._weights = positive("weights[0]", first), positive("weights[1]", second)
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
@@ -145,6 +152,33 @@ class Search:
             )
         self.scales = _typical_scales(region, self.jacobians, self.free)
         self._program: Program | None = None
+        self.notes = self._angles()
+
+    def _angles(self) -> tuple[str, ...]:
+        """How large noises of angles may be, so that innovations in the region do not wrap."""
+        angles, m = self.system.output_residual, self.region.lower[None]
+        if not isinstance(angles, Angles):
+            return ()
+        if not isinstance(self.model, SmoothModel) or self.model.reason:
+            raise CertificateError(
+                "the outputs' angles have no enclosure, so that it is not known where they wrap"
+            )
+        outputs = self.model.values(m, self.region.upper[None])
+        first = self.model.n + angles.components
+        width = (outputs.high - outputs.low)[0, first]
+        room = 0.5 * angles.periods - width
+        largest = np.broadcast_to(np.asarray(self._sizes[1]), (self.system.p,))[angles.components]
+        if not (room > largest).all():
+            k = int(np.argmin(room - largest))
+            raise NotCertifiedError(
+                f"the angle y[{angles.components[k]}] may wrap: it moves by up to {width[k]:.3g} in "
+                f"the region, and by the noise, {largest[k]:.3g}, and half a period is "
+                f"{0.5 * angles.periods[k]:.3g}", ("a smaller region",),
+            )
+        return tuple(
+            f"the noise of the angle y[{j}] is less than {each:.4g}: then no innovation wraps"
+            for j, each in zip(angles.components, np.floor(room * 1e4) / 1e4, strict=True)
+        )
 
     def _leave_out(self, fixed: NDArray[np.bool_], jacobians: Array) -> None:
         """Leave the states out that the region fixes; an error if it cannot be done."""
