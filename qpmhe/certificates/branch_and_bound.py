@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,15 +83,26 @@ def _scores(enclosure: Enclosure, left: NDArray[Any]) -> Array:
     return scores
 
 
+class Enclosing(Protocol):
+    """Whatever encloses Jacobians over cells."""
+
+    n: int
+    p: int
+
+    def enclose(self, lower: Array, upper: Array) -> Enclosure:
+        """As `SmoothModel.enclose`."""
+
+
 def cover(
-    model: SmoothModel, region: Region, form: Form, most_cells: int = _MOST_CELLS,
+    model: Enclosing, region: Region, form: Form, most_cells: int = _MOST_CELLS,
     seconds: float | Deadline = PART_SECONDS,
 ) -> Cover:
     """Show an inequality on a region by dividing it until each cell is shown."""
     deadline, cells, margin = Deadline.of(seconds), Cells(region), np.inf
     corners = 2 ** min(region.lower.size, MOST_ACTIVE)
     chunk = int(np.clip(_WORK / (corners * (2 * model.n + model.p) ** 3), 1, _CHUNK))
-    nowhere = np.empty((0, region.lower.size)), np.empty((0, model.n + model.p, model.n))
+    order = form.P.shape[0]
+    nowhere = np.empty((0, region.lower.size)), np.empty((0, order + model.p, order))
     while len(cells.lower):
         if cells.taken and deadline.passed:
             return Cover(False, cells.taken, margin, *nowhere, late=True)

@@ -80,7 +80,7 @@ def certify_detectability(
     found = search.answer("eta", eta, (), _undetectable)
     form = found.form
     assert isinstance(form, (OutputWeight, OutputInjection))
-    notes = (*found.notes, _PAIR_STAYS)
+    notes = (*found.notes, *_left_out(search), _PAIR_STAYS)
     if isinstance(form, OutputInjection):
         notes = (
             *notes,
@@ -90,7 +90,8 @@ def certify_detectability(
     return sealed(
         Detectability(
             form.rate, *euclidean_constants(form.P, form.R, form.rate), form=search.kind,
-            region=search.region, notes=notes, P=form.P, V=form.R, margin=found.margin,
+            region=search.region, notes=notes,
+            P=search.embedded(form.P, search.free, system.n), V=form.R, margin=found.margin,
             cells=found.cells,
         ),
         system, found.evidence,
@@ -117,7 +118,7 @@ def _undetectable(search: Search, text: str) -> NotCertifiedError:
 
 def _steepest(search: Search) -> str:
     """Where f grows so fast that rounding alone may spoil a program; empty if nowhere."""
-    n = search.system.n
+    n = search.n
     radii = np.abs(np.linalg.eigvals(search.jacobians[:, :n])).max(axis=1)
     worst = int(radii.argmax())
     if radii[worst] < _STEEP:
@@ -130,7 +131,7 @@ def _steepest(search: Search) -> str:
 
 def _undetected(search: Search) -> str | None:
     """A mode that does not decay and is not seen, at one of the states."""
-    n = search.system.n
+    n = search.n
     states, outputs = search.scales.states, search.scales.outputs
     for point, jacobian in zip(search.points, search.jacobians, strict=True):
         A = jacobian[:n] * states / states[:, None]
@@ -243,19 +244,36 @@ def _stability(search: Search, rho: float | None) -> ObserverStability:
     V = 0.5 * (product.middle + product.middle.T)
     V += 2.0 * float(product.radius.sum()) * np.eye(V.shape[0])
     kappa = float(norm_bound(Matrices.exact(form.gain[None]))[0])
+    system, free = search.system, search.free
+    full = np.zeros((system.n, system.p))
+    full[free] = form.gain
     return sealed(
         ObserverStability(
-            form.rate, *euclidean_constants(form.P, V, form.rate), kappa, gain=form.gain,
-            region=search.region, notes=(*found.notes, _RUN_STAYS), P=form.P, V=V, Q=form.Q,
+            form.rate, *euclidean_constants(form.P, V, form.rate), kappa, gain=full,
+            region=search.region, notes=(*found.notes, *search.notes, *_left_out(search), _RUN_STAYS),
+            P=search.embedded(form.P, free, system.n), V=V,
+            Q=None if form.Q is None else search.embedded(form.Q, search.acting, system.r),
             R=form.R, margin=found.margin, cells=found.cells,
         ),
-        search.system, found.evidence,
+        system, found.evidence,
+    )
+
+
+def _left_out(search: Search) -> tuple[str, ...]:
+    """What to say of states that the region fixes."""
+    fixed = np.setdiff1d(np.arange(search.system.n), search.free)
+    if not fixed.size:
+        return ()
+    names = ", ".join(f"x[{j}]" for j in fixed)
+    return (
+        f"{names} is known: the region has no width there, f keeps it, and no gain or disturbance "
+        "may move it",
     )
 
 
 def _radii(search: Search) -> Array:
     """The spectral radii of A - L C at the samples."""
-    n = search.system.n
+    n = search.n
     assert search.gain is not None
     closed = search.jacobians[:, :n] - search.gain @ search.jacobians[:, n:]
     radii: Array = np.abs(np.linalg.eigvals(closed)).max(axis=1)

@@ -185,7 +185,8 @@ def inner_region(region: Region, metric: Array, radius: float) -> Region | None:
 
 def _inward(sides: Array, reach: Array) -> Array:
     """Lower sides moved up by some lengths, rounded up; infinite ones stay."""
-    return np.where(np.isinf(sides), sides, np.nextafter(sides + reach, np.inf))
+    moved: Array = np.where(np.isinf(sides), sides, np.nextafter(sides + reach, np.inf))
+    return moved
 
 
 def _supports(metric: Array, rows: Array) -> Array:

@@ -13,6 +13,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import Array, numbers
 from ..errors import SetError
+from ..model.residuals import Angles
 from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
 from .evidence import CertificateError
@@ -121,12 +122,32 @@ def bounded_region(
     """Check a set of states, and put a box around it."""
     checked_system(system)
     for name in ("output_residual", "state_residual"):
-        if getattr(system, name) is not None:
+        residual = getattr(system, name)
+        if residual is not None and not isinstance(residual, Angles):
             raise CertificateError(
-                f"the system has {name} = {shown(getattr(system, name))}: certificates take plain "
-                f"differences only. Leave {name} out, with outputs and states that do not wrap "
+                f"the system has {name} = {shown(residual)}: certificates take plain differences "
+                f"only, or angles. Leave {name} out, with outputs and states that do not wrap "
                 "within the region."
             )
+    where = _bounded(system, region, inputs)
+    if isinstance(system.state_residual, Angles):
+        angles = system.state_residual
+        width = (where.upper - where.lower)[angles.components]
+        wide = width >= 0.5 * angles.periods
+        if wide.any():
+            names = ", ".join(f"x[{j}]" for j in angles.components[wide])
+            raise CertificateError(
+                f"the region is {width[wide].tolist()} wide in the angle {names}, where differences "
+                f"may wrap; expected less than half a period, {0.5 * angles.periods[wide].tolist()}"
+                ". Take a region that is narrower there."
+            )
+    return where
+
+
+def _bounded(
+    system: System, region: ConvexSet | Region | None, inputs: Box | None
+) -> Region:
+    """A set of states with a box around it."""
     if isinstance(region, Region):
         if region.n != system.n or region.lower.size != system.n + system.m:
             raise SetError(

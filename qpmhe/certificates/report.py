@@ -17,13 +17,17 @@ from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..models.example import Example
 from ..models.scenario import Record, Scenario
+from ..observers import Observer
 from ..plots.bounds import error_and_bounds
 from ..plots.style import save
 from .certificate import Certificate, Kind, examined, horizons_of
+from .contraction import certify_observer, synthesise_gain
 from .deadline import DEFAULT_SECONDS, Deadline
+from .evidence import CertificateError, NotCertifiedError
 from .lyapunov import Design
 from .monitor import MonitorSummary, monitored_run
-from .observer_bound import Band, SignalBounds
+from .observer_bound import Band, ObserverBound, SignalBounds
+from .properties import ObserverStability
 from .regions import Region, bounded_region
 from .sdp import started
 
@@ -38,6 +42,8 @@ LABELS = {
 
 # Without a region: the simulated states, with this share of their extent on each side.
 _ROOM = 0.5
+# How much of the time the choice of an observer may take.
+_OBSERVER = 0.6
 _QPS = 2  # a sample, in the run on the simulated record
 
 
@@ -57,6 +63,8 @@ class Report:
         Where something bounds the error: the estimator's run on the record, with the largest
         horizon and two QPs a sample, the observer's bound along it, what the monitor saw, and the
         estimator after it.
+    replaced : str
+        Which observer took the place of the model's own, and why; empty if none did.
     design : Design or None
         Weights that fit each other, where they were asked for.
     """
@@ -70,6 +78,7 @@ class Report:
     summary: MonitorSummary | None = None
     estimator: MovingHorizonEstimator | None = None
     design: Design | None = None
+    replaced: str = ""
 
     @property
     def region(self) -> Region:
@@ -182,10 +191,16 @@ def certify_model(
     record = scenario.simulate(seed)
     place = region_of(system, scenario, region, inputs, record=record)
     horizons = horizons_of(scenario.horizon if horizon is None else horizon)
+    sizes = sizes_of(system, cost, scenario)
+    found = _proved_observer(system, observer, place, sizes, deadline.part(_OBSERVER))
+    observer, stability, replaced = found
     certificate = examined(
-        system, observer, cost, place, horizons, sizes_of(system, cost, scenario), deadline
+        system, observer, cost, place, horizons, sizes, deadline, stability=stability
     )
-    report = Report(name or scenario.title, example, record, certificate)
+    report = Report(
+        name or scenario.title, example._replace(observer=observer), record, certificate,
+        replaced=replaced,
+    )
     if certificate.holds:
         report.estimator = MovingHorizonEstimator(
             system, observer, cost, horizon=horizons[-1],
@@ -202,6 +217,37 @@ def certify_model(
     return report
 
 
+def _proved_observer(
+    system: System, observer: Observer, region: Region, sizes: SignalBounds, deadline: Deadline
+) -> tuple[Observer, ObserverStability | None, str]:
+    """The observer or, where its bound says nothing, one with a gain made for the region; why."""
+    widths, own = (region.upper - region.lower)[: system.n], None
+    try:
+        own = certify_observer(
+            system, observer, region, sizes=sizes.typical(system), seconds=deadline.part(0.5)
+        )
+        proved = ObserverBound(own, region, sizes)
+        limit = proved.components(proved.limit())
+        if (limit < widths)[widths > 0.0].all():
+            return observer, own, ""
+        why = f"its bound, {np.round(limit, 3).tolist()}, says nothing of every state"
+    except (NotCertifiedError, CertificateError) as error:
+        why = str(error.args[0])
+    try:
+        made = synthesise_gain(
+            system, region, sizes=sizes.typical(system), seconds=deadline
+        )
+    except (NotCertifiedError, CertificateError):
+        return observer, own, ""
+    proved = ObserverBound(made.stability, region, sizes)
+    if not (proved.components(proved.limit()) < widths)[widths > 0.0].all() and own is not None:
+        return observer, own, ""
+    return made.observer, made.stability, (
+        f"Luenberger({made.observer.gain.tolist()}), made for the region in place of the model's "
+        f"own: {why}"
+    )
+
+
 def region_of(
     system: System, scenario: Scenario | None, region: ConvexSet | Region | None = None,
     inputs: Box | None = None, *, record: Record | None = None, option: str = "region",
@@ -213,13 +259,14 @@ def region_of(
     system, scenario
         The model; the scenario is simulated where something is left out.
     region, inputs : optional
-        What is given. Left out, the system's own X if that is bounded, or a box around the
-        simulated record, and that of the record's inputs.
+        What is given. Left out, the scenario's; else the system's own X if that is bounded, or a
+        box around the simulated record, and that of the record's inputs.
     record : Record, optional
         The simulated record, where there is one already.
     option : str
         How an error names the region.
     """
+    given = inputs
     if record is None and scenario is not None:
         record = scenario.simulate(0)
     if (
@@ -227,6 +274,8 @@ def region_of(
         and not isinstance(region, Region)
     ):
         inputs = Box(record.inputs.min(axis=0), record.inputs.max(axis=0))
+    if region is None and scenario is not None and scenario.region is not None:
+        region, inputs = scenario.region, given or scenario.input_region or inputs
     if region is not None:
         return bounded_region(system, region, inputs)
     if system.states is not None:

@@ -28,6 +28,7 @@ _MOST_CONDITION = 1e8
 _SECONDS = 5e-9
 # Bounds on the limit, as multiples of the largest noise.
 _SMALLEST_LIMIT, _LARGEST_LIMIT = 1e-2, 1e3
+_DIGITS = 4  # of a gain, after the first
 _LEAST = 1e-3  # seconds for a solver, for which zero may mean no limit
 # What a noise counts as at least, of the largest one, in the sizes of states and outputs.
 _SMALLEST_NOISE = 1e-4
@@ -329,7 +330,17 @@ class GainProgram(Program):
 
     def _form(self, rate: float) -> Form:
         P, Y = self._symmetric(self._P), self._value(self._Y, self._d, self._s)
-        return ErrorContraction(P, np.asarray(np.linalg.solve(P, Y), np.float64), rate)
+        return ErrorContraction(P, _printable(np.linalg.solve(P, Y)), rate)
+
+
+def _printable(gain: Array) -> Array:
+    """A gain with as many digits in each row as are worth printing."""
+    sizes = np.abs(gain).max(axis=1)
+    powers = np.floor(np.log10(np.where(sizes > 0.0, sizes, 1.0)))
+    return np.array([
+        [float(f"{round(float(each), _DIGITS - int(power)):.{_DIGITS + 3}g}") for each in row]
+        for row, power in zip(gain, powers, strict=True)
+    ])
 
 
 def _columns(matrix: Array, scales: Scales, sizes: NoiseSizes) -> tuple[Array, Array, float]:

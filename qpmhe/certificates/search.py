@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import Array, positive, vector
+from ..model.residuals import Angles
 from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import PART_SECONDS, Deadline
-from .enclosures import SmoothModel, evaluated, joint_jacobians
-from .evidence import Evidence, NotCertifiedError, OutOfTimeError
+from .enclosures import Enclosure, SmoothModel, evaluated, joint_jacobians
+from .evidence import CertificateError, Evidence, NotCertifiedError, OutOfTimeError
 from .inequalities import Form, Matrices, definite
 from .regions import Region
 from .sdp import (
@@ -33,6 +34,8 @@ from .theorem import checked_rate
 _SAMPLES = 400
 _ROUNDS = 8
 _MARGINS = (1e-6, 1e-4, 1e-3, 1e-2)
+# Of what a rate that is not given leaves to 1: few cells suffice where there is room.
+_ROOM = (0.03, 0.06, 0.12, 0.25)
 _TOLERANCE = 1e-3  # of the smallest rate
 _LARGEST_RATE = 0.9999
 # Above the smallest feasible rate, at which constants may grow without bound, and how often
@@ -42,6 +45,7 @@ _ABOVE, _ATTEMPTS = 0.01, 4
 _SHARES = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
 _REFINEMENTS = 3  # of the best of them, each by two more programs
 _SEED = 20210829
+_ROUNDING = 1e-12  # of a state that f keeps
 _PAIRS = 2000
 # How much of the time the choice of a rate may take, and one verification; how many programs
 # the former solves; how far off the time that a program is expected to take may be.
@@ -65,11 +69,40 @@ class _BrokenPairError(NotCertifiedError):
     """No matrix helps where f or h jumps."""
 
 
+class FreeModel:
+    """A model's Jacobians by some of its states, where f keeps the others at their values."""
+
+    def __init__(self, model: SmoothModel, free: NDArray[np.intp]) -> None:
+        self._model, self._free = model, free
+        self.n, self.p = model.n, model.p
+        self.reason, self.affine_output = model.reason, model.affine_output
+        self._rows = np.append(free, model.n + np.arange(model.p))
+
+    def enclose(self, lower: Array, upper: Array) -> Enclosure:
+        """As `SmoothModel.enclose`; nothing is known where f is not shown to keep the others."""
+        found, kept = self._model.enclose(lower, upper), np.ones(self.n, np.bool_)
+        kept[self._free] = False
+        moves = (
+            np.abs(found.centre) + np.abs(found.slopes).sum(axis=1) + found.error
+        )[:, : self.n][:, kept][:, :, self._free].any(axis=(1, 2))
+        rows, columns = self._rows[:, None], self._free
+        return Enclosure(
+            found.centre[:, rows, columns], found.slopes[:, :, rows, columns],
+            np.where(moves[:, None, None], np.nan, found.error[:, rows, columns]), found.excess,
+            found.jacobian[:, rows, columns],
+        )
+
+
 class Search:
     """Programs at some states, verification at all of them, and more states where it fails.
 
     ``kind=None`` takes the form of detectability that the output allows. The sizes are those of
     disturbance and noise; for detectability, two numbers that say how much they matter.
+
+    A state that the region fixes, such as a known parameter, has no error. It is left out where
+    f keeps it at its value, whatever the others do, and the gain does not move it. Jacobians,
+    scales, gain and forms are of the states in ``free`` only, and of the disturbances in ``acting``
+    that move none of the fixed states.
     """
 
     def __init__(
@@ -79,19 +112,33 @@ class Search:
         self._deadline = Deadline.of(seconds)
         self.system, self.region, self.gain, self._sizes = system, region, gain, sizes
         if kind is None:
+            if system.output_residual is not None or system.state_residual is not None:
+                raise CertificateError(
+                    "the system has angles, whose differences may wrap: only an observer is "
+                    "certified, within a region where they do not. Leave the residuals out for "
+                    "detectability, with outputs and states that do not wrap within the region."
+                )
             first, second = vector("weights", np.asarray(sizes), 2).tolist()
             self._weights = positive("weights[0]", first), positive("weights[1]", second)
-        self.model = SmoothModel(system, region)
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
-        self.jacobians = joint_jacobians(system, self.points)
+        jacobians, n = joint_jacobians(system, self.points), system.n
+        fixed = (region.lower == region.upper)[:n]
+        self.free = np.flatnonzero(~fixed)
+        self.model: SmoothModel | FreeModel = SmoothModel(system, region)
+        self._matrix, self.acting = system.disturbance_matrix, np.arange(system.r)
+        if fixed.any():
+            self._leave_out(fixed, jacobians)
+        rows = np.append(self.free, n + np.arange(system.p))
+        self.jacobians = jacobians[:, rows[:, None], self.free]
+        self.n = self.free.size
         if kind is None:
-            outputs = self.jacobians[:, system.n :]
+            outputs = self.jacobians[:, self.n :]
             same = self.model.affine_output or (
                 bool(self.model.reason) and np.ptp(outputs, axis=0).max() == 0.0
             )
             kind = "output weight" if same else "output injection"
         self.kind: Kind = kind
-        each = expected_seconds(system.n, system.p, kind)
+        each = expected_seconds(self.n, system.p, kind)
         affordable = _CHOICE * self._deadline.left / (_PROGRAMS * each)
         self._chosen = _far_apart(self.jacobians, int(np.clip(affordable, 1, _MOST_POINTS)))
         if not self.model.reason and "given" in (
@@ -103,14 +150,80 @@ class Search:
             self.jacobians[self._chosen] = np.where(
                 np.isfinite(true), true, self.jacobians[self._chosen]
             )
-        self.scales = _typical_scales(region, self.jacobians, system.n)
+        self.scales = _typical_scales(region, self.jacobians, self.free)
         self._program: Program | None = None
+        self.notes = self._angles()
+
+    def _angles(self) -> tuple[str, ...]:
+        """How large noises of angles may be, so that innovations in the region do not wrap."""
+        angles, m = self.system.output_residual, self.region.lower[None]
+        if not isinstance(angles, Angles):
+            return ()
+        if not isinstance(self.model, SmoothModel) or self.model.reason:
+            raise CertificateError(
+                "the outputs' angles have no enclosure, so that it is not known where they wrap"
+            )
+        outputs = self.model.values(m, self.region.upper[None])
+        first = self.model.n + angles.components
+        width = (outputs.high - outputs.low)[0, first]
+        room = 0.5 * angles.periods - width
+        largest = np.broadcast_to(np.asarray(self._sizes[1]), (self.system.p,))[angles.components]
+        if not (room > largest).all():
+            k = int(np.argmin(room - largest))
+            raise NotCertifiedError(
+                f"the angle y[{angles.components[k]}] may wrap: it moves by up to {width[k]:.3g} in "
+                f"the region, and by the noise, {largest[k]:.3g}, and half a period is "
+                f"{0.5 * angles.periods[k]:.3g}", ("a smaller region",),
+            )
+        return tuple(
+            f"the noise of the angle y[{j}] is less than {each:.4g}: then no innovation wraps"
+            for j, each in zip(angles.components, np.floor(room * 1e4) / 1e4, strict=True)
+        )
+
+    def _leave_out(self, fixed: NDArray[np.bool_], jacobians: Array) -> None:
+        """Leave the states out that the region fixes; an error if it cannot be done."""
+        states, n = self.points[:, : self.system.n], self.system.n
+        ahead = evaluated("f", self.system.f, states, self.points[:, n:])
+        kept = np.abs(ahead - states) <= _ROUNDING * np.abs(states)
+        moved = fixed & ~(kept.all(axis=0) & ~jacobians[:, :n][:, :, ~fixed].any(axis=(0, 2)))
+        corrected = fixed & (False if self.gain is None else self.gain.any(axis=1))
+        for who, which in (("f", moved), ("the observer's gain", corrected)):
+            if which.any():
+                names = ", ".join(f"x[{j}]" for j in np.flatnonzero(which))
+                raise NotCertifiedError(
+                    f"the region has no width in {names}, but {who} moves it",
+                    ("a region with some width there", "a gain with a row of zeros there")
+                    if who != "f" else ("a region with some width there",),
+                )
+        if not self.free.size:
+            raise NotCertifiedError("the region is a single state, which has nothing to estimate")
+        G = np.eye(n) if self._matrix is None else self._matrix
+        self.acting = np.flatnonzero(~G[fixed].any(axis=0) & G[~fixed].any(axis=0))
+        self._matrix = G[np.ix_(self.free, self.acting)]
+        if self.gain is not None:
+            self.gain = self.gain[self.free]
+        w, v = self._sizes
+        if np.shape(w) == (self.system.r,):
+            self._sizes = np.asarray(w)[self.acting], v
+        if not self.acting.size:
+            self._matrix, self._sizes = None, (0.0, v)
+        if isinstance(self.model, SmoothModel):
+            self.model = FreeModel(self.model, self.free)
+
+    def embedded(self, matrix: Array, places: NDArray[np.intp], size: int) -> Array:
+        """A weight of what is not left out, as one of everything; what is left out weighs most."""
+        if places.size == size:
+            return matrix
+        full = np.eye(size) * float(np.linalg.eigvalsh(matrix)[-1])
+        if places.size:
+            full[np.ix_(places, places)] = matrix
+        return full
 
     @property
     def program(self) -> Program:
         """The program at the states chosen so far."""
         if self._program is None:
-            at, matrix = (self.jacobians[self._chosen], self.scales), self.system.disturbance_matrix
+            at, matrix = (self.jacobians[self._chosen], self.scales), self._matrix
             if self.gain is not None:
                 self._program = ObserverProgram(*at, self._sizes, self.gain, matrix)
             elif self.kind == "synthesis":
@@ -226,7 +339,7 @@ class Search:
                 )
             rate = max(smallest + share * (1.0 - smallest), self._best_rate(smallest))
             try:
-                return self._find(rate)
+                return self._find(rate, given=False)
             except (OutOfTimeError, _BrokenPairError):
                 raise
             except NotCertifiedError as error:
@@ -234,17 +347,19 @@ class Search:
                 refused, share = error, 3.0 * share
         raise refused
 
-    def _find(self, rate: float) -> Found:
+    def _find(self, rate: float, *, given: bool = True) -> Found:
         """An inequality with this rate, verified as far as can be."""
-        level, size = 0, min(1.0, rate * rate)
+        level, margins = 0, [each * min(1.0, rate * rate) for each in _MARGINS]
+        if not given and self.kind in ("observer", "synthesis"):
+            margins = [each * (1.0 - rate * rate) for each in _ROOM]
         best: Found | None = None
         status = "no round was left"
         for turn in range(1, _ROUNDS + 1):
             try:
-                answer = self._solved(rate, _MARGINS[level] * size, self._deadline)
+                answer = self._solved(rate, margins[level], self._deadline)
                 if isinstance(self.program, GainProgram):
                     answer = self.program.improved(
-                        answer, _MARGINS[level] * size, self._deadline.left
+                        answer, margins[level], self._deadline.left
                     )
             except OutOfTimeError:
                 if best is None:
@@ -260,7 +375,7 @@ class Search:
                 best = outcome
             elif self._added(outcome) and turn % 2:
                 continue
-            if level + 1 == len(_MARGINS):
+            if level + 1 == len(margins):
                 break
             level += 1
         if best is not None:
@@ -303,13 +418,14 @@ class Search:
         """Raise where the inequality does not hold between two of the samples."""
         n, rng = self.system.n, np.random.default_rng(_SEED)
         start, end = self.points[rng.integers(len(self.points), size=(2, _PAIRS))]
-        end[:, n:] = start[:, n:]
+        fixed = np.setdiff1d(np.arange(start.shape[1]), self.free)
+        end[:, fixed] = start[:, fixed]
         df, dh = (
             evaluated(name, function, end[:, :n], end[:, n:])
             - evaluated(name, function, start[:, :n], start[:, n:])
             for name, function in (("f", self.system.f), ("h", self.system.h))
         )
-        broken = form.excess((end - start)[:, :n], df, dh) > 0.0
+        broken = form.excess((end - start)[:, self.free], df[:, self.free], dh) > 0.0
         if broken.any():
             k = int(np.argmax(broken))
             raise _BrokenPairError(
@@ -345,11 +461,10 @@ def _far_apart(jacobians: Array, count: int = _MOST_POINTS) -> NDArray[np.intp]:
     return np.array(chosen, dtype=np.intp)
 
 
-def _typical_scales(region: Region, jacobians: Array, n: int) -> Scales:
-    """Sizes of states and outputs on a region."""
-    half = 0.5 * (region.upper - region.lower)[:n]
-    states = np.where(half > 0.0, half, 1.0)
+def _typical_scales(region: Region, jacobians: Array, free: NDArray[np.intp]) -> Scales:
+    """Sizes of outputs on a region, and of the states that are not fixed."""
+    states = 0.5 * (region.upper - region.lower)[free]
     states = np.maximum(states / states.max(), 1e-6)
-    outputs = np.abs(jacobians[:, n:] * states).sum(axis=2).max(axis=0)
+    outputs = np.abs(jacobians[:, free.size :] * states).sum(axis=2).max(axis=0)
     return Scales(states, np.where(outputs > 0.0, outputs, 1.0))
 

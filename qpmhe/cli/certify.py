@@ -46,7 +46,8 @@ def certify(
     _print(console, f"[bold]{escape(certificate.headline)}[/]")
     rows = Table.grid(padding=(0, 2))
     for name, text in (
-        ("model", title), ("states", _words(found.region)), *_findings(found, seed),
+        ("model", title), ("states", _words(found.region)),
+        *([("observer", found.replaced)] if found.replaced else []), *_findings(found, seed),
     ):
         rows.add_row(f"[dim]  {name}[/]", escape(text))
     console.print(rows, highlight=False)

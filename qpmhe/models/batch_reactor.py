@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ..model.sets import Box
 from ..model.system import System
 from ..observers import Luenberger
 from .example import Array, Example, make_example
@@ -90,4 +91,5 @@ def batch_reactor(method: str = "euler") -> Example:
         disturbance=[0.1, 0.1], noise=[0.2], initial_state=[5.0, 2.0],
         initial_estimate=[3.0, 0.0], dt=_DT, horizon=10, steps=150,
         labels=("x1 (A)", "x2 (B)"), settling_time=2.0, title="Batch reactor, 2A <-> B",
+        region=Box([0.1, -1.0], [9.0, 9.0]),
     )

@@ -105,5 +105,6 @@ def battery_cell(method: str = "rk4") -> Example:
         disturbance=[0.0002, 0.001, 0.0005], noise=[0.005], initial_state=[1.0, 0.0, 0.0],
         initial_estimate=[0.5, 0.0, 0.0], dt=_DT, horizon=60, steps=400,
         labels=("state of charge", "v1 (V)", "v2 (V)"), inputs=_current, settling_time=300.0,
-        title="Battery cell, two RC elements",
+        title="Battery cell, two RC elements", region=Box([0.1, -0.2, -0.2], [1.0, 0.2, 0.2]),
+        input_region=Box([-2.0 * _CAPACITY], [0.8 * _CAPACITY]),
     )

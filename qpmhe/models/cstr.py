@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..model.sets import Box
+from ..model.sets import Box, ConvexSet, Polytope
 from ..model.system import System
 from ..observers import design_luenberger
 from .example import Array, Example, Selection, make_example
@@ -59,6 +59,14 @@ def _coolant(t: int, x: Array) -> Array:
     return coolant
 
 
+def _about_the_steady_states() -> ConvexSet:
+    """Within 12 K of the mean setpoint, and 0.15 mol/L of a line along its steady states."""
+    slope, room = 0.021, 0.15  # mol/(L K), mol/L
+    middle = 0.5 + slope * _MEAN
+    strip = Polytope([[1.0, slope], [-1.0, -slope]], [middle + room, room - middle])
+    return Box([0.0, _MEAN - 12.0], [_FEED, _MEAN + 12.0]) & strip
+
+
 def cstr(method: str = "rk4") -> Example:
     r"""An exothermic reaction A -> B in a stirred tank with a cooling jacket.
 
@@ -107,4 +115,5 @@ def cstr(method: str = "rk4") -> Example:
         initial_state=[0.5, 350.0], initial_estimate=[0.65, 347.0], dt=_DT, horizon=20, steps=200,
         labels=("c (mol/L)", "T (K)"), time_unit="min", inputs=_coolant, settling_time=1.0,
         title="Continuous stirred tank reactor, exothermic A -> B",
+        region=_about_the_steady_states(), input_region=Box([_COOLANT[0]], [_COOLANT[1]]),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..model.sets import Box
 from ..model.system import System
 from ..observers import HighGain
 from .example import Array, Example, Selection, make_example
@@ -66,4 +67,5 @@ def pendulum(method: str = "rk4") -> Example:
         noise=[_COUNT / 12.0**0.5], initial_state=[2.5, 0.0], initial_estimate=[0.0, 0.0], dt=_DT,
         horizon=30, steps=300, labels=("angle (rad)", "speed (rad/s)"), settling_time=1.0,
         title="Damped pendulum with encoder", resolution=[_COUNT],
+        region=Box([-3.2, -12.0], [3.2, 12.0]),
     )

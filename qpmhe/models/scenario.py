@@ -22,7 +22,7 @@ from .._checks import (
 from .._linalg import cholesky
 from ..errors import InvalidInputError, ModelError, OptionError
 from ..model.residuals import difference
-from ..model.sets import ConvexSet
+from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
 
 # Draws for one sample until it lies in the sets: more would mean that hardly any does.
@@ -91,6 +91,8 @@ class Scenario:
         Step of outputs that are digital, 0 where they are not. Such an output is h(x)
         rounded to the nearest multiple of its step, in place of normal noise; the matching
         variance is the step squared over 12.
+    region, input_region : ConvexSet and Box, optional
+        The states and inputs for which the model is meant, on which `qpmhe certify` certifies it.
 
     Raises
     ------
@@ -112,6 +114,8 @@ class Scenario:
     settling_time: float = 0.0
     title: str = ""
     resolution: Array | None = None
+    region: ConvexSet | None = None
+    input_region: Box | None = None
 
     def __post_init__(self) -> None:
         checked_system(self.system)
@@ -146,6 +150,16 @@ class Scenario:
             if (step < 0.0).any():
                 raise OptionError(f"resolution is {step.tolist()}; expected steps >= 0.")
             object.__setattr__(self, "resolution", step)
+        for name, region, size in (
+            ("region", self.region, n), ("input_region", self.input_region, self.system.m)
+        ):
+            if region is not None and (
+                not isinstance(region, ConvexSet) or region.dimension != size
+            ):
+                raise OptionError(
+                    f"{name} is {shown(region)}; expected a set of dimension {size}, such as "
+                    "qpmhe.Box(lower, upper)."
+                )
 
     def simulate(self, seed: int, steps: int | None = None) -> Record:
         """Simulate x(t+1) = f(x(t), u(t)) + G w(t), y(t) = h(x(t), u(t)) + v(t).

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..model.sets import Box, Polytope
 from ..model.system import System
 from ..observers import HighGain
 from .example import Array, Example, Selection, make_example
@@ -60,4 +61,5 @@ def van_der_pol(method: str = "rk4") -> Example:
         system, HighGain(2, epsilon=0.4, dt=_DT), prior=[1.0, 1.0], disturbance=[0.02, 0.05],
         noise=[0.1], initial_state=[2.0, 0.0], initial_estimate=[0.0, 0.0], dt=_DT, horizon=20,
         steps=200, labels=("x1", "x2"), settling_time=3.0, title="Van der Pol oscillator",
+        region=Box([-2.5, -3.5], [2.5, 3.5]) & Polytope([[0.8, 0.6], [-0.8, -0.6]], [2.4, 2.4]),
     )

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from ..model.residuals import angles
+from ..model.sets import Box
 from ..model.system import System
 from ..observers import OutputInjection
 from .example import Array, Example, make_example
@@ -116,4 +117,5 @@ def vehicle(method: str = "rk4") -> Example:
         initial_estimate=[-1.0, 1.1, 0.3], dt=_DT, horizon=20, steps=250,
         labels=("x (m)", "y (m)", "heading (rad)"), inputs=_drive, settling_time=5.0,
         title="Vehicle with ranges and bearings of two beacons",
+        region=Box([-5.0, -3.0, -0.9], [5.0, 3.0, 0.9]), input_region=Box([0.0, -1.5], [2.0, 1.5]),
     )
