@@ -37,7 +37,7 @@ LABELS = {
 }
 
 # Without a region: the simulated states, with this share of their extent on each side.
-_ROOM = 0.5
+_ROOM = 0.75
 _QPS = 2  # a sample, in the run on the simulated record
 
 

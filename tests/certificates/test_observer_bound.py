@@ -356,3 +356,44 @@ def test_without_a_run_it_is_the_bound_of_the_observers_error():
     wide = proved.settling_samples
     whole = proved.radii(wide, qpmhe.Box([-180.0], [180.0]), proved.entering())
     assert whole[wide] <= 1.1 * proved.limit() < whole[wide - 1]
+
+
+# What the headline rests on
+
+
+def scalar_certificate(slope, region=1.0, w=0.01):
+    system = qpmhe.System(lambda x: slope * x, lambda x: x, n=1, p=1)
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
+    return certify(
+        system, qpmhe.Luenberger([[max(slope - 0.5, 0.1)]]), cost, horizon=3,
+        region=qpmhe.Box([-region], [region]), sizes=SignalBounds(qpmhe.Box([-w], [w]), 0.01),
+    )
+
+
+def test_a_region_that_the_state_leaves_is_said_first():
+    certificate = scalar_certificate(1.5)
+    assert "(proved while x stays in the region)" in certificate.headline
+    text = certificate.summary()
+    assert "not proved: f and the disturbances reach x1 = " in text
+    assert "1.51 through the face" in text
+    assert certificate.observer_bound.inner is None
+    told = certificate.to_dict()["observer_bound"]
+    assert told["invariance"]["holds"] is False
+    assert told["invariance"]["reach"] == pytest.approx(1.51)
+
+
+def test_a_region_that_is_kept_is_said_and_the_observer_with_it():
+    certificate = scalar_certificate(0.8)
+    assert "(proved), on a region 2 wide" in certificate.headline
+    bound = certificate.observer_bound
+    assert bound.invariance.holds
+    low, high = bound.inner.region.lower[0], bound.inner.region.upper[0]
+    limit = bound.components(bound.limit())[0]
+    assert (low, high) == pytest.approx((limit - 1.0, 1.0 - limit))
+    assert bound.condition.startswith("x and z stay in the region: proved from x1 in [-0.9")
+    # Where the disturbance just fits, there is no room for the observer's error.
+    tight = scalar_certificate(0.8, w=0.199).observer_bound
+    assert tight.invariance.holds
+    assert tight.inner is None
+    assert "that z does is checked at each sample" in tight.condition
+
