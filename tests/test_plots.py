@@ -44,6 +44,21 @@ def test_states_with_bands(case):
     assert len(axes[0].figure.legends) == 1
 
 
+def test_a_band_that_holds_the_truth_is_drawn_behind(case):
+    states, run, _ = case
+    lower, upper = run.states - [1.0, 2.0], run.states + 3.0
+    lower[20:], upper[20:] = np.nan, np.nan
+    axes = plots.states(run, dt=0.1, truth=states, band=(lower, upper))
+    for j, panel in enumerate(axes):
+        band = panel.collections[-1]
+        low, high = band.get_paths()[0].get_extents().get_points()
+        assert low == pytest.approx((0.0, np.nanmin(lower[:, j])))
+        assert high == pytest.approx((1.9, np.nanmax(upper[:, j])))
+        assert band.get_zorder() < min(line.get_zorder() for line in panel.lines)
+    (legend,) = axes[0].figure.legends
+    assert "holds the true state (proved)" in [each.get_text() for each in legend.get_texts()]
+
+
 def test_estimates_of_angles_are_drawn_on_the_turn_of_the_truth():
     system, observer, cost, scenario = qpmhe.models.vehicle()
     record = scenario.simulate(0, 60)
@@ -151,6 +166,9 @@ def empty():
         ({"sigmas": -2.0}, OptionError, "sigmas is -2.0"),
         ({"axes": 3}, InvalidInputError, "axes contain 3; expected matplotlib Axes, 2"),
         ({"axes": Figure()}, InvalidInputError, "axes contain .*Figure"),
+        ({"band": np.zeros((31, 2))}, InvalidInputError, r"band is of type ndarray.*\(lower,"),
+        ({"band": (np.zeros((31, 2)), 0.0)}, ShapeError, r"band\[1\] has shape \(\)"),
+        ({"band": (np.zeros((30, 2)), np.zeros((31, 2)))}, ShapeError, r"band\[0\] has shape"),
     ],
 )
 def test_states_refuse_what_does_not_fit(case, options, error, words):

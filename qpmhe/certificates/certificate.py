@@ -37,7 +37,7 @@ from .evidence import (
     json_ready,
     weakest,
 )
-from .observer_bound import ObserverBound, SignalBounds, Size, bound_observer
+from .observer_bound import ObserverBound, SignalBounds, Size, bound_observer, with_invariance
 from .properties import Detectability, ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
@@ -432,7 +432,7 @@ class Certificate:
         lines = [self.headline]
         if self.observer_bound is not None:
             lines.append(f"for {self.observer_bound.sizes}")
-            lines.append(f"while {ASSUMED[0]}")
+            lines.append(self.observer_bound.condition)
         lines += [f"Not certified: {each}" for each in self.failures]
         return "\n".join(lines)
 
@@ -465,8 +465,8 @@ class Certificate:
 
 Result = TypeVar("Result")
 
-# How much of the time left the observer, the audit and detectability take.
-_OBSERVER, _AUDIT, _DETECTABILITY = 0.6, 0.4, 0.9
+# How much of the time left each part takes.
+_OBSERVER, _AUDIT, _DETECTABILITY, _INVARIANCE = 0.6, 0.4, 0.9, 0.2
 
 
 def certify(
@@ -559,7 +559,10 @@ def examined(
         ))
         stability = None if proved is None else proved.stability
     elif stability.P is not None and stability.gain is not None:
-        proved = ObserverBound(stability, region, bounds_of_signals, observer.metric)
+        proved = with_invariance(
+            ObserverBound(stability, region, bounds_of_signals, observer.metric), system,
+            deadline.part(_INVARIANCE),
+        )
     findings: Audit | None = None
     constants: CostConstants | None = None
     if "the theorem" not in errors:

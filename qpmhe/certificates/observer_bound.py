@@ -36,6 +36,7 @@ from .contraction import certify_observer
 from .deadline import PART_SECONDS, Deadline
 from .evidence import Evidence, json_ready
 from .inequalities import Matrices, definite
+from .invariance import Invariance, certify_invariance, inner_region
 from .properties import ObserverStability
 from .regions import Region, bounded_region, stated_region
 from .theorem import Sizes, checked_length
@@ -49,6 +50,8 @@ _OUTWARD = 1.0 + 16.0 * _UNIT
 _SIGMAS = 3.0
 # How close to its limit the bound is when it is called settled.
 _SETTLED = 0.1
+# How much of the time is for the contraction, and of the rest for the region itself.
+_CONTRACTION, _INVARIANCE = 0.8, 0.6
 _MOST_SAMPLES = 10**6  # that are counted until then
 # Of the larger size, what the other one counts at least where a matrix is sought.
 _LEAST = 1e-3
@@ -227,12 +230,19 @@ class ObserverBound:
         What bounds w and v unless something else is passed.
     projection : ndarray or None
         The metric in which the observer is projected onto X, if it has one of its own.
+    invariance : Invariance or None
+        Whether the true state stays in the region, for disturbances of these sizes.
+    inner : Invariance or None
+        The same of a smaller region, around which the observer stays in the region: within
+        the bound's limit. None where there is no such region, or its invariance is not proved.
     """
 
     stability: ObserverStability
     region: Region
     sizes: SignalBounds
     projection: Array | None = None
+    invariance: Invariance | None = None
+    inner: Invariance | None = None
 
     @property
     def evidence(self) -> Evidence:
@@ -602,7 +612,26 @@ class ObserverBound:
         wide = " x ".join(f"{width:.3g}" for width in self.widths)
         vacuous = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limit >= self.widths))
         nothing = f": it says nothing of {vacuous}" if vacuous else ""
-        return f"{each}{when} ({self.evidence}), on a region {wide} wide{nothing}"
+        stays = self.invariance is not None and self.invariance.holds
+        condition = "" if stays else " while x stays in the region"
+        return f"{each}{when} ({self.evidence}{condition}), on a region {wide} wide{nothing}"
+
+    @property
+    def condition(self) -> str:
+        """Whether state and observer stay in the region, in words."""
+        if self.inner is not None:
+            low, high = self.inner.region.lower, self.inner.region.upper
+            start = ", ".join(
+                f"x{i + 1} in [{low[i]:.4g}, {high[i]:.4g}]" for i in range(self.region.n)
+            )
+            return (
+                f"x and z stay in the region: proved from {start} on, for an initial error of at "
+                "most the limit"
+            )
+        if self.invariance is not None and self.invariance.holds:
+            return "x stays in the region: proved; that z does is checked at each sample"
+        why = "" if self.invariance is None else f": {self.invariance}"
+        return f"x stays in the region: not proved{why}; that z does is checked at each sample"
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows."""
@@ -611,6 +640,8 @@ class ObserverBound:
         content: dict[str, Any] = json_ready({
             "evidence": self.evidence.value, "rate": self.rate, "metric": self.metric,
             "gain": self.gain, "sizes": self.sizes.to_dict(), "limit": limit,
+            "condition": self.condition,
+            "invariance": self.invariance and self.invariance.to_dict(),
             "components": self.components(limit), "length": length,
         })
         return content
@@ -632,10 +663,31 @@ def bound_observer(
         If an argument does not fit.
     """
     place, given = bounded_region(system, region, inputs), SignalBounds.of(sizes, system, cost)
+    deadline = Deadline.of(seconds)
     stability = certify_observer(
-        system, observer, place, sizes=given.typical(system), seconds=seconds
+        system, observer, place, sizes=given.typical(system), seconds=deadline.part(_CONTRACTION)
     )
-    return ObserverBound(stability, place, given, observer.metric)
+    return with_invariance(
+        ObserverBound(stability, place, given, observer.metric), system, deadline
+    )
+
+
+def with_invariance(
+    bound: ObserverBound, system: System, seconds: float | Deadline
+) -> ObserverBound:
+    """The bound with what is found of whether state and observer stay in the region."""
+    if system.disturbance_matrix is not None:
+        return bound
+    deadline, w = Deadline.of(seconds), bound.sizes.disturbances
+    sizes: Any = np.abs(_sides("disturbances", w)).max(axis=0) if isinstance(w, ConvexSet) else w
+    found = certify_invariance(
+        system, bound.region, disturbance=sizes, seconds=deadline.part(_INVARIANCE)
+    )
+    kept: Invariance | None = None
+    region = inner_region(bound.region, bound.metric, bound.limit())
+    if region is not None:
+        kept = certify_invariance(system, region, disturbance=sizes, seconds=deadline)
+    return replace(bound, invariance=found, inner=kept if kept is not None and kept.holds else None)
 
 
 def largest_ratio(metric: Array, other: Array) -> float:

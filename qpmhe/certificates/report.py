@@ -41,7 +41,7 @@ LABELS = {
 }
 
 # Without a region: the simulated states, with this share of their extent on each side.
-_ROOM = 0.5
+_ROOM = 0.75
 # How much of the time the choice of an observer may take.
 _OBSERVER = 0.6
 _QPS = 2  # a sample, in the run on the simulated record

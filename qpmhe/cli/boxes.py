@@ -10,13 +10,14 @@ def read_box(option: str, text: str, width: int | None = None, kind: str = "comp
     """The box of an option, of so many components where that is known."""
     pairs = [item.split(":") for item in text.split(",")]
     try:
-        if len(pairs) != (width or len(pairs)) or any(len(pair) != 2 for pair in pairs):
+        many = len(pairs) if width is None else width
+        if len(pairs) != many or any(len(pair) != 2 for pair in pairs):
             raise ValueError("the number of components")
         low, high = zip(*[(float(a), float(b)) for a, b in pairs], strict=True)
     except ValueError as error:
-        many = "each component" if width is None else f"each of {width} {kind}"
+        whom = "each component" if width is None else f"each of {width} {kind}"
         raise OptionError(
-            f"{option} is {text!r}; expected low:high for {many}, between commas, as in "
+            f"{option} is {text!r}; expected low:high for {whom}, between commas, as in "
             "0.1:9,-1:9."
         ) from error
     return Box(low, high)

@@ -79,7 +79,7 @@ def _findings(found: Report, seed: int) -> list[tuple[str, str]]:
     certificate, proved, rows = found.certificate, found.certificate.observer_bound, []
     if proved is not None:
         rows.append(("for", str(proved.sizes)))
-        rows.append(("while", ASSUMED[0]))
+        rows.append(("stays", proved.condition))
         if found.example.system.states is not None and not proved.projects:
             rows.append((
                 "projection", "the observer is projected onto X in another metric than the "

@@ -84,7 +84,7 @@ def test_the_truth_is_in_the_columns(made):
                               report=warned.append, **OPTIONS)
     wide = inside(columns("out.csv"), states)
     note = next(each for each in summary.notes if "z1" in each)
-    assert "(proved)" in note
+    assert "(proved while x stays in the region)" in note
     assert "three standard deviations of the model's scenario" in note
     assert warned == []
     given = BoundOptions(
