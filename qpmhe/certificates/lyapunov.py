@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .._checks import Array, count, numbers
 from ..costs import QuadraticCost
@@ -199,13 +199,15 @@ class Design:
         return _ratio(np.eye(len(self.prior)), self.prior) * numbers("bound", bound, finite=False)
 
     def along(
-        self, run: Run, source: MovingHorizonEstimator, *, initial_error: ArrayLike,
+        self, run: Run, source: MovingHorizonEstimator, *, initial_error: Size,
         disturbances: Size | None = None, noises: Size | None = None, kind: Kind = "measured",
     ) -> Array:
         r"""The bound of :math:`|\hat x(t) - x(t)|_P` along a run at t = 0, ..., T, (T + 1,).
 
-        NaN from where something broke it: a missing measurement, a failed model, or a projected
-        observer where kind or candidate need it as it is.
+        NaN where something in the window broke it: a missing measurement, a failed model, an input
+        or step that is not certified, or a projected observer where kind or candidate need it as
+        it is. A window after that starts from the region's size; the running observer's bounds do
+        not come back.
 
         Parameters
         ----------
@@ -214,8 +216,8 @@ class Design:
         source : MovingHorizonEstimator
             The estimator that made it, with the design's `cost`. Its horizon and candidate
             are those of the bound.
-        initial_error : (n,) array_like or float
-            x(0) minus the first guess, or a bound on its length.
+        initial_error : (n,) array_like, float or set
+            x(0) minus the first guess, a bound on its length, or a set that holds it.
         disturbances, noises : optional
             w(t) and v(t) as vectors (T, r) and (T, p), lengths (T,), or bounds for all times: a
             number for the length or a set, such as ``qpmhe.Box``. Left out, `sizes`.
@@ -231,30 +233,50 @@ class Design:
         """
         self._check(kind, source)
         steps, N, restarts = len(run), source.horizon, _restarts(source.settings.candidate)
-        start = numbers("initial_error", initial_error)
-        if start.shape not in ((), (self.system.n,)):
-            raise ShapeError(
-                f"initial_error has shape {start.shape}; expected ({self.system.n},) or a number."
-            )
         signals = self._signals(disturbances, noises, steps)
         flags, spoilt = _BROKEN, np.zeros(steps, np.bool_)
         if kind == "decrease" or not restarts:
             flags |= Status.OBSERVER_PROJECTED
-        for t in np.flatnonzero(run.flags & flags.value).tolist():
+        unusual = (run.flags & flags.value).astype(np.bool_) | self._unusual(run)
+        for t in np.flatnonzero(unusual).tolist():
             spoilt[t : t + N if restarts else steps] = True
         bound, errors = np.full(steps + 1, math.nan), np.zeros(steps + 1)
-        bound[0] = float(norms(start[None], self.prior)[0]) * _OUTWARD
+        width = (self.region.upper - self.region.lower)[: self.system.n]
+        widest = float(_alone("the region", Box(-width, width), len(width), self.prior))
+        bound[0] = self._initial(initial_error)
         if not restarts:
-            errors = self._observer().radii(steps, start, Entering(*signals[2:]))
+            errors = self._observer().radii(steps, initial_error, Entering(*signals[2:]))
         for t in (np.flatnonzero(~spoilt) + 1).tolist():
             first = max(t - N, 0)
-            window, own, observed = [each[first:t] for each in signals], float(bound[first]), None
+            window, observed = [each[first:t] for each in signals], None
+            own = float(np.fmin(bound[first], widest)) if first else float(bound[0])
             if not restarts:
                 observed = float(errors[first])
                 own = self._changes[1] * observed if first else own
             cost = float(run.costs[t - 1])
             bound[t] = self._step(kind, own, *window, cost=cost, observed=observed)
         return bound
+
+    def _initial(self, error: Size) -> float:
+        """The first bound."""
+        given, n = _read("initial_error", error), self.system.n
+        if isinstance(given, ConvexSet):
+            return float(_alone("initial_error", given, n, self.prior))
+        if given.shape not in ((), (n,)):
+            raise ShapeError(
+                f"initial_error has shape {given.shape}; expected ({n},), a length, or a set."
+            )
+        return float(norms(given[None], self.prior)[0]) * _OUTWARD
+
+    def _unusual(self, run: Run) -> NDArray[np.bool_]:
+        """The samples with an input outside of the region, or a step of unusual length."""
+        found, source, n = np.zeros(len(run), np.bool_), run.source, self.system.n
+        if source is not None and source.inputs is not None:
+            low, high = self.region.lower[n:], self.region.upper[n:]
+            found |= ((source.inputs < low) | (source.inputs > high)).any(axis=1)
+        if source is not None and source.steps is not None:
+            found |= np.asarray(source.steps) != source.system.dt
+        return found
 
     def _step(
         self, kind: Kind, error: float, truth: Array, fit: Array, length: Array, square: Array,

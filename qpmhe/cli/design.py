@@ -38,7 +38,7 @@ def show_design(
         f"\n[bold]Lyapunov design ({made.evidence})[/], for {escape(str(made.sizes))}",
         highlight=False,
     )
-    console.print(_table(made), highlight=False)
+    console.print(_table(made, horizon is not None), highlight=False)
     for note in made.notes:
         console.print(f"Note: {escape(note)}", highlight=False)
     console.print()
@@ -46,27 +46,33 @@ def show_design(
     return made
 
 
-def _table(made: Design) -> Table:
+def _table(made: Design, fixed: bool) -> Table:
+    """What holds for the horizon proposed; in advance for any QPs, also for a longer one."""
     table = Table(
         box=boxes.SIMPLE, padding=(0, 1, 0, 0), caption_justify="left",
         caption="Contraction: by which factor the error shrinks over a window that starts at an "
         "estimate. Least N: from which it is below 1. Limit: of each state's error, for noises "
-        "that always act in the worst direction; -, none in advance for this N.",
+        "that always act in the worst direction; -, none in advance; in brackets, no less than "
+        "the region's width, so that it says nothing.",
     )
+    names = [f"x{j + 1}" for j in range(made.region.n)]
+    if len(names) > 3:
+        names[1:-1] = ["..."]
     table.add_column("what bounds J(estimate)", overflow="fold", vertical="bottom")
-    numbers = f"contraction\nN = {made.horizon}", "least\nN"
-    for name in numbers:
-        table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
-    table.add_column(
-        f"limit\nx1{f', ..., x{n}' if (n := made.region.n) > 1 else ''}", overflow="fold"
-    )
+    for name in ("\nN", "contrac-\ntion", "least\nN"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column(f"limit\n{', '.join(names)}", overflow="fold")
     for kind in made.kinds:
-        limits = "-"
-        if kind != "measured" and made.contraction(kind=kind) < 1.0:
-            found = made.components(made.limit(kind=kind))
-            limits = ", ".join(f"{value:.3g}" for value in found.tolist())
-        table.add_row(
-            _MEANING[kind], f"{made.contraction(kind=kind):.3g}",
-            str(made.least_horizon(kind) or "-"), limits,
-        )
+        least, N, limits = made.least_horizon(kind), made.horizon, "-"
+        if kind == "decrease" and least is not None and not fixed:
+            N = max(N, 2 * least)
+        factor = made.contraction(N, kind)
+        if kind != "measured" and factor < 1.0:
+            found = made.components(made.limit(N, kind))
+            widths = (made.region.upper - made.region.lower)[: found.size]
+            limits = ", ".join(
+                f"{value:.3g}" if value < width else f"({value:.3g})"
+                for value, width in zip(found.tolist(), widths.tolist(), strict=True)
+            )
+        table.add_row(_MEANING[kind], str(N), f"{factor:.3g}", str(least or "-"), limits)
     return table

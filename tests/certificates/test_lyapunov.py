@@ -184,8 +184,9 @@ def test_no_measurement_no_bound(double):
     for candidate, spoilt in (("reinitialized", range(7, 11)), ("observer", range(7, 21))):
         mhe = estimator(plan, observer, horizon=4, candidate=candidate)
         bound = plan.along(mhe.run(measurements), mhe, initial_error=1.0)
-        assert np.isfinite(bound[:7]).all()
-        assert np.isnan(bound[list(spoilt)]).all()
+        assert np.flatnonzero(np.isnan(bound)).tolist() == list(spoilt)
+        if candidate == "reinitialized":  # from anywhere in the region, as 0 was from 1 off
+            assert 1.0 < bound[11] / bound[4] < 30.0
 
 
 def test_projection_ends_what_needs_the_observer():
@@ -262,6 +263,25 @@ def test_disturbances_in_fewer_directions():
     run = mhe.run(np.array(states)[:-1, :1] + v)
     error = np.linalg.norm(run.states - states, axis=1)
     assert (error <= plan.length(plan.along(run, mhe, initial_error=[1.0, 0.5]))).all()
+
+
+def test_inputs_outside_of_what_was_certified():
+    system = qpmhe.System(
+        lambda x, u: 0.8 * x + 0.1 * np.sin(x) * u, lambda x, u: x, n=1, p=1, m=1
+    )
+    region, sizes = qpmhe.Box([-2.0], [2.0]), Sizes(0.1, 0.1)
+    plan = design(
+        system, region, inputs=qpmhe.Box([-1.0], [1.0]), sizes=sizes, horizon=4,
+        observer=qpmhe.Luenberger([[0.5]]),
+    )
+    assert plan.horizon == 4
+    mhe = estimator(plan, qpmhe.Luenberger([[0.5]]), horizon=3)
+    inputs = np.where(np.arange(20) == 5, 1.5, 0.5)[:, None]
+    run = mhe.run(np.zeros((20, 1)), inputs)
+    for kind in plan.kinds:
+        bound = plan.along(run, mhe, initial_error=qpmhe.Box([-0.5], [0.25]), kind=kind)
+        assert np.flatnonzero(np.isnan(bound)).tolist() == [6, 7, 8]
+        assert bound[0] == pytest.approx(0.5 * math.sqrt(plan.prior[0, 0]))
 
 
 def test_the_code_is_python(double):
