@@ -245,7 +245,7 @@ def attack(row: Row) -> None:
         return
 
     def with_plan(mhe: Any, run: Any, signals: Signals, errors: Array) -> float:
-        for kind in ("measured", "decrease") if plan.candidate is not None else ("measured",):
+        for kind in set(plan.kinds) - {"minimiser"}:
             known = plan.length(plan.along(
                 run, mhe, initial_error=np.zeros(system.n), disturbances=signals.w,
                 noises=signals.v, kind=kind,
@@ -302,8 +302,7 @@ def second_line(row: Row) -> str:
     cells = ["-"] * 4
     if plan is not None:
         limits = [
-            float(plan.length(plan.limit(kind=kind)))
-            if kind == "minimiser" or plan.candidate is not None else np.nan
+            float(plan.length(plan.limit(kind=kind))) if kind in plan.kinds else np.nan
             for kind in ("decrease", "minimiser")
         ]
         cells = [str(plan.horizon), *map(short, limits), short(row.designed)]
