@@ -57,10 +57,11 @@ the states; *time* is that of `certify`, and of finding the gain where it was sy
 |---|---|---|---|---|---|---|---|---|
 {second}
 
-*Lyapunov*: the discounted cost and the horizon of `qpmhe.certificates.design` with the re-initialised
-candidate; the bound is a minimiser's, the worst error that with two QPs. *Any QPs*: the same for any
-number of QPs, with twice the least N for which that contracts. *Paper's theorem*: the constants of
-the proof, which show stability for each N; beyond the region's diameter, a bound says nothing.
+*Lyapunov*: the discounted cost and the horizon of `qpmhe.certificates.design` with the
+re-initialised candidate; the bound is a minimiser's, the worst error that with two QPs. *Any QPs*:
+the same for any number of QPs, with twice the least N for which that contracts. *Paper's theorem*:
+the constants of the proof, which show stability for each N; beyond the region's diameter, a bound
+says nothing.
 
 ## The adversary
 
