@@ -116,7 +116,7 @@ Estimates = Callable[[Array, Array], tuple[Array, int]]
 
 
 def against_estimates(
-    setting: Setting, estimates: Estimates, signals: Signals, rounds: int = 2, last: int = 20
+    setting: Setting, estimates: Estimates, signals: Signals, rounds: int = 2, last: int = 12
 ) -> tuple[float, Signals]:
     """The largest |x - x_hat|: signs by differences of whole runs, from given signals on.
 
