@@ -151,7 +151,7 @@ class _Point:
         self.prior_bent = self.factors[0] * self.cost.prior_hessian(self.offset, self.prior_weight)
         self.majorised = np.broadcast_to(2.0 * trial.weights, (count, *trial.weights.shape[-2:]))
         self.cost_forces = np.einsum("kij,kj->ki", self.majorised, self.residuals)
-        self.rows = HeldRows(problem, solved.formulation.penalties, trial, self.jacobian)
+        self.rows = HeldRows(problem, solved.formulation, trial, self.jacobian)
         self.rows.settle(self.regular, self.gradient)
 
     def differentiate(self, second: SecondDerivatives) -> tuple[Array, Array]:
@@ -162,6 +162,7 @@ class _Point:
         self.bent = bent + self.rows.penalty_bent
         own, below = self._blocks(self.prior_bent, self.bent)
         own[:-1] -= self.curvature.own
+        own += self.rows.curvature(second.scales)
         if not all(np.isfinite(one).all() for one in (own, below, *self.curvature)):
             raise InvalidInputError(
                 "the model or the cost has no finite second derivatives along the estimate."

@@ -292,6 +292,18 @@ def test_sets(kind):
     assert not found.weakly_active
 
 
+@pytest.mark.parametrize(
+    ("penalty", "least"),
+    [({}, 1), ({"linear": 100.0}, 1), ({"linear": 2.0, "quadratic": 30.0}, 0)],
+    ids=["hard", "soft and exact", "soft"],
+)
+def test_nonlinear_constraints_of_the_state(penalty, least):
+    curved = qpmhe.Constraint(lambda x: x[..., 0] ** 2 + 0.5 * x[..., 1] ** 2 - 1.0, **penalty)
+    found = Case(discount=0.95, constraints=[curved]).check()
+    assert len(found.active) >= least
+    assert all(row.set == "constraints" for row in found.active)
+
+
 @pytest.mark.parametrize("loss", ["huber", "own"])
 def test_losses_with_active_rows(loss):
     case = robust(LOSSES[loss])
@@ -741,7 +753,7 @@ def test_refusals():
 
     with pytest.raises(qpmhe.errors.InvalidInputError, match="Own has no second derivatives"):
         made(cost=own).sensitivity()
-    curved = qpmhe.Constraint(lambda x: x[..., 0] ** 2 + x[..., 1] ** 2 - 1.4)
+    curved = qpmhe.Constraint(lambda x, w: x[..., 0] ** 2 + w[..., 1] ** 2 - 0.9)
     with pytest.raises(qpmhe.errors.InvalidInputError, match="row 0 of the nonlinear constraints"):
         made(constraints=[curved]).sensitivity()
     inactive = qpmhe.Constraint(lambda x: x[..., 0] ** 2 + x[..., 1] ** 2 - 40.0)
