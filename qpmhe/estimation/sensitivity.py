@@ -133,7 +133,8 @@ class _Point:
             problem = problem.without_violated()
             trial = problem.evaluate(solved.trajectory.copy())
         self.problem, self.trial, self.trajectory = problem, trial, trial.trajectory
-        self.residuals, self.weights = trial.residuals, problem.stage_weights
+        # Copies: the window's arrays go on to the next sample.
+        self.residuals, self.weights = trial.residuals, problem.stage_weights.copy()
         count, self.n = self.trajectory.shape[0] - 1, self.trajectory.shape[1]
         self.p = self.residuals.shape[1] - self.n
         self.known = solved.formulation.system.m - parameter_count
@@ -447,20 +448,11 @@ def _jacobian(problem: Problem, states: Array) -> Array:
 
 
 def _reductions(solved: Solved) -> Array | None:
-    """The matrices T (K, p, p) with R -> T R T' what a noise weight R is without missing outputs.
-
-    To first order, around the weight of each sample; None where nothing is missing.
-    """
-    problem = solved.problem
-    if problem.observed is None:
+    """`Cost.reduction` of each sample (K, p, p); None where nothing is missing."""
+    observed, cost = solved.problem.observed, solved.formulation.cost
+    if observed is None:
         return None
-    p = problem.observed.shape[1]
-    found = np.tile(np.eye(p), (len(problem.observed), 1, 1))
-    for k in np.flatnonzero(~problem.observed.all(axis=1)):
-        own = solved.conditions[k].noise_weight
-        weight, there = solved.formulation.cost.noise if own is None else own, problem.observed[k]
-        found[k] = 0.0
-        found[k][np.ix_(there, there)] = np.eye(int(there.sum()))
-        gone = np.linalg.solve(weight[np.ix_(~there, ~there)], weight[np.ix_(~there, there)])
-        found[k][np.ix_(there, ~there)] = -gone.T
-    return found
+    return np.array([
+        cost.reduction(there, own.noise_weight)
+        for there, own in zip(observed, solved.conditions, strict=True)
+    ])

@@ -69,7 +69,7 @@ class SecondDerivatives:
         return self._function is not None
 
     def at(self, states: Array, inputs: Array, forces: Array) -> Curvature:
-        """The derivatives along states (K, n); good until the next call.
+        """The derivatives along states (K, n).
 
         Parameters
         ----------
@@ -91,9 +91,8 @@ class SecondDerivatives:
         if inputs.shape[1] == m:
             u[:, m] = self.system.dt or 0.0
         if not call():
-            for array in found:
-                array.fill(np.nan)
-        return found
+            return Curvature(*(np.full_like(array, np.nan) for array in found))
+        return Curvature(*(array.copy() for array in found))
 
     def _call(self, count: int) -> tuple[tuple[Array, ...], Curvature, Any]:
         n, p, m = self.system.n, self.system.p, self.system.m

@@ -774,6 +774,34 @@ def test_refusals():
         mhe.sensitivity()
 
 
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+def test_what_was_handed_out_stays(engine):
+    case = robust(qpmhe.Huber)
+    case.data, case.horizon = Case(samples=12).data, 5
+    case.options = {"engine": engine}
+    case.data.measurements[10, 0] = np.nan  # the window then has weights of its samples
+    mhe = case.estimator(case.data)
+    first, cotangent = mhe.sensitivity(), np.ones((6, 2))
+    expected = {name: getattr(first.adjoint(cotangent), name) for name in NAMES}
+    for _ in range(40):  # until the window's arrays are full, and move
+        mhe.update([0.3, 0.1], [0.2])
+        mhe.sensitivity()
+    gradient = first.adjoint(cotangent)
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(gradient, name), expected[name])
+
+
+def test_rows_that_were_dropped_do_not_hold():
+    case = Case(states=qpmhe.Box([-1.0, -1.2], [2.0, 2.0]), noises=symmetric(1.5, 1.5))
+    mhe = case.estimator(case.data)
+    estimate = mhe.update([6.0, 6.0], [0.0])
+    assert qpmhe.Status.ROWS_DROPPED in estimate.status
+    found = mhe.sensitivity()
+    np.testing.assert_allclose(found.trajectory, estimate.trajectory, atol=1e-12)
+    dropped = {row[:4] for row in estimate.dropped}
+    assert dropped.isdisjoint(row[:4] for row in found.active)
+
+
 def test_newest_state():
     found = made().sensitivity()
     whole = np.zeros(found.trajectory.shape)
