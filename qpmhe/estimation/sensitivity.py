@@ -219,7 +219,7 @@ class _Point:
 
 
 class Sensitivity:
-    r"""Derivatives of the last estimate: how it moves with weights, data and parameters.
+    r"""Derivatives of an estimate, as `MovingHorizonEstimator.sensitivity` returns them.
 
     With the states x of the window, its data and weights :math:`\theta`, the true cost J and the
     active rows :math:`c(x, \theta) = 0`, the estimate satisfies the optimality conditions
@@ -290,6 +290,10 @@ class Sensitivity:
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *NAMES]
+
+    def __repr__(self) -> str:
+        text = f"Sensitivity of {len(self.trajectory)} states, {len(self.active)} rows active"
+        return f"{text}. {self.warning}".strip()
 
     @cached_property
     def _whole(self) -> Gradient:
