@@ -307,7 +307,7 @@ class Sensitivity:
             said.append(
                 f"The estimate has not converged: a Newton step would lower J = {cost:.6g} by "
                 f"{decrease:.3g}. The derivatives are those of a minimiser only up to first order "
-                "in `step`; take max_qps=None."
+                "in `step`; take max_qps=None, or a smaller tolerance."
             )
         if not self._matrix.definite:
             said.append(
