@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from qpmhe_solvers.values import finite, shown
 
 from .._checks import SINGULAR, Array
-from .._linalg import inverse
+from .._linalg import inverse, solve
 from ..errors import InvalidInputError, OptionError
 from .subspace import Subspace
 
@@ -405,6 +405,18 @@ class Cost(ABC):
             block = inverse(weight)[np.ix_(there, there)]
             reduced[np.ix_(there, there)] = inverse(block)
         return self.joint_weight(reduced, disturbance)
+
+    def reduction(self, observed: Mask, noise: Array | None = None) -> Array:
+        """A matrix T (p, p) with T R T' the weight of the observed components of y alone.
+
+        R is ``noise``, or the usual weight. To first order in changes of R, T is a constant.
+        """
+        weight, gone = self.noise if noise is None else noise, ~observed
+        matrix = np.diag(observed.astype(np.float64))
+        if gone.any() and observed.any():
+            rest = solve(weight[np.ix_(gone, gone)], weight[np.ix_(gone, observed)])
+            matrix[np.ix_(observed, gone)] = -rest.T
+        return matrix
 
 
 def quadratic_form(residuals: Array, weights: Array) -> Array:

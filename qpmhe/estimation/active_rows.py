@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidInputError
+from ..model.constraints import ConstraintFunctions
 from .constraints import Rows
 from .optimality import OptimalityMatrix
-from .problem import Problem, Trial
+from .problem import Formulation, Problem, Trial
 from .softened import Penalties
 
 Array = NDArray[np.float64]
@@ -22,6 +23,8 @@ Blocks = tuple[Array, Array]
 _AT_SIDE = 1e-5
 # A row that would move by less than this share of its scale, were it released, is weakly active.
 _WEAK = 1e-4
+# Of differences of the derivatives of nonlinear constraints, which may be differences already.
+_STEP = 1e-4
 # Each round may release rows with a multiplier of the wrong sign.
 _ROUNDS = 10
 
@@ -74,11 +77,17 @@ class HeldRows:
     """
 
     def __init__(
-        self, problem: Problem, penalties: Penalties | None, trial: Trial, jacobian: Array
+        self, problem: Problem, formulation: Formulation, trial: Trial, jacobian: Array
     ) -> None:
         count, q, n = jacobian.shape
         self._count, self._q, self._n, self._jacobian = count, q, n, jacobian
-        parts = [_candidates(one, n, q) for one in _sides(problem, penalties, trial)]
+        self._along = trial.trajectory, problem.inputs, trial.residuals, -jacobian
+        self._functions = functions = formulation.functions
+        slopes = None
+        if functions is not None:
+            slopes = np.where(functions.on_state[:, None], functions.linearised(*self._along)[0], 0)
+        sides = _sides(problem, formulation.penalties, trial)
+        parts = [_candidates(one, n, q, functions, slopes) for one in sides]
         found = [one for one in parts if len(one["stage"])]
         none = _nothing(n, q)
         joined = {name: np.concatenate([none[name], *(one[name] for one in found)])
@@ -152,6 +161,33 @@ class HeldRows:
             if not (released.any() or forced.any()):
                 return
 
+    def curvature(self, scales: Array) -> Array | float:
+        """What nonlinear constraints add to the Hessian's diagonal blocks, (K + 1, n, n).
+
+        By differences of their derivatives, with steps in these magnitudes of the states (n,).
+        """
+        functions, every = self._functions, self._all
+        bent = (every["set"] == "constraints") & (self._held | self._forced)
+        if functions is None or not bent.any():
+            return 0.0
+        gaps = 2.0 * every["quadratic"] * every["gap"]
+        values = np.where(self._forced, every["most"] + gaps, self._values)[bent]
+        forces = np.zeros((self._count + 1, functions.size))
+        np.add.at(forces, (every["stage"][bent], every["function"][bent]), values)
+        trajectory, *others = self._along
+        found = np.empty((self._count + 1, self._n, self._n))
+        for j in range(self._n):
+            move = _STEP * np.maximum(np.abs(trajectory[:, j]), scales[j])
+            ends = []
+            for direction in (1.0, -1.0):
+                moved = trajectory.copy()
+                moved[:, j] += direction * move
+                slopes = functions.linearised(moved, *others)[0]
+                ends.append(np.where(forces[:, :, None] != 0.0, slopes, 0.0))
+            change = np.einsum("kt,kti->ki", forces, ends[0] - ends[1])
+            found[:, :, j] = change / (2.0 * move[:, None])
+        return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
+
     def on_residuals(self, multipliers: Array) -> Array:
         """What multipliers (..., R) add to the derivative by the residuals, (..., K, n + p)."""
         found = np.zeros((*multipliers.shape[:-1], self._count, self._q))
@@ -219,7 +255,9 @@ def _sides(problem: Problem, penalties: Penalties | None, trial: Trial) -> Itera
         yield _Side(rows, -1.0, below, linear, quadratic)
 
 
-def _candidates(side: _Side, n: int, q: int) -> dict[str, Array]:
+def _candidates(
+    side: _Side, n: int, q: int, functions: ConstraintFunctions | None, slopes: Array | None
+) -> dict[str, Array]:
     """The rows that are at a side or beyond it."""
     rows, direction = side.rows, side.direction
     scale = np.broadcast_to(rows.scale, side.gaps.shape)
@@ -229,15 +267,20 @@ def _candidates(side: _Side, n: int, q: int) -> dict[str, Array]:
     chosen = np.where(fixed, direction > 0.0, side.gaps >= -_AT_SIDE * scale)
     chosen &= np.isfinite(side.gaps)
     k, r = np.nonzero(chosen)
-    if k.size and rows.name == "constraints":
-        raise InvalidInputError(
-            f"row {int(rows.numbers[r[0]])} of the nonlinear constraints is active, whose second "
-            "derivatives are not known; write it as a set (qpmhe.Box, qpmhe.Polytope) of states, "
-            "disturbances or noises, with a further state if need be."
-        )
     matrix = direction * rows.matrix[r]
     on_state, on_residual = np.zeros((k.size, n)), np.zeros((k.size, q))
-    if rows.name == "states":
+    function = np.zeros(k.size, np.intp)
+    if functions is not None and slopes is not None and rows.name == "constraints":
+        function = rows.components[r]
+        other = ~functions.on_state[function]
+        if other.any():
+            raise InvalidInputError(
+                f"row {int(function[other][0])} of the nonlinear constraints is active, a function "
+                "of more than the state, whose second derivatives are not known; write it as a "
+                "function of x alone (qpmhe.Constraint), or as a set of disturbances or noises."
+            )
+        on_state[...] = np.einsum("rt,rtn->rn", matrix, slopes[k])
+    elif rows.name == "states":
         on_state[...] = matrix
     elif rows.name == "disturbances":
         on_residual[:, :n] = matrix
@@ -248,7 +291,7 @@ def _candidates(side: _Side, n: int, q: int) -> dict[str, Array]:
         "scale": scale[k, r], "most": side.most[k, r],
         "quadratic": side.quadratic[k, r], "fixed": fixed[k, r],
         "set": np.full(k.size, rows.name, dtype="U12"), "number": rows.numbers[r],
-        "direction": np.full(k.size, direction),
+        "direction": np.full(k.size, direction), "function": function,
     }
 
 
@@ -259,5 +302,5 @@ def _nothing(n: int, q: int) -> dict[str, Array]:
         "stage": np.zeros(0, np.intp), "on_state": np.zeros((0, n)),
         "on_residual": np.zeros((0, q)), "gap": empty, "scale": empty, "most": empty,
         "quadratic": empty, "fixed": np.zeros(0, np.bool_), "set": np.zeros(0, "U12"),
-        "number": np.zeros(0, np.intp), "direction": empty,
+        "number": np.zeros(0, np.intp), "direction": empty, "function": np.zeros(0, np.intp),
     }

@@ -617,7 +617,7 @@ class MovingHorizonEstimator:
         InvalidInputError
             Before the first measurement, or if second derivatives do not exist along the
             estimate or are not known: of a cost of the user's own, or of an active nonlinear
-            constraint.
+            constraint of more than the state.
         """
         return self._sensitivity_of(self._engine.solved())
 

@@ -133,7 +133,8 @@ class _Point:
             problem = problem.without_violated()
             trial = problem.evaluate(solved.trajectory.copy())
         self.problem, self.trial, self.trajectory = problem, trial, trial.trajectory
-        self.residuals, self.weights = trial.residuals, problem.stage_weights
+        # Copies: the window's arrays go on to the next sample.
+        self.residuals, self.weights = trial.residuals, problem.stage_weights.copy()
         count, self.n = self.trajectory.shape[0] - 1, self.trajectory.shape[1]
         self.p = self.residuals.shape[1] - self.n
         self.known = solved.formulation.system.m - parameter_count
@@ -151,7 +152,7 @@ class _Point:
         self.prior_bent = self.factors[0] * self.cost.prior_hessian(self.offset, self.prior_weight)
         self.majorised = np.broadcast_to(2.0 * trial.weights, (count, *trial.weights.shape[-2:]))
         self.cost_forces = np.einsum("kij,kj->ki", self.majorised, self.residuals)
-        self.rows = HeldRows(problem, solved.formulation.penalties, trial, self.jacobian)
+        self.rows = HeldRows(problem, solved.formulation, trial, self.jacobian)
         self.rows.settle(self.regular, self.gradient)
 
     def differentiate(self, second: SecondDerivatives) -> tuple[Array, Array]:
@@ -162,6 +163,7 @@ class _Point:
         self.bent = bent + self.rows.penalty_bent
         own, below = self._blocks(self.prior_bent, self.bent)
         own[:-1] -= self.curvature.own
+        own += self.rows.curvature(second.scales)
         if not all(np.isfinite(one).all() for one in (own, below, *self.curvature)):
             raise InvalidInputError(
                 "the model or the cost has no finite second derivatives along the estimate."
@@ -217,7 +219,7 @@ class _Point:
 
 
 class Sensitivity:
-    r"""Derivatives of the last estimate: how it moves with weights, data and parameters.
+    r"""Derivatives of an estimate, as `MovingHorizonEstimator.sensitivity` returns them.
 
     With the states x of the window, its data and weights :math:`\theta`, the true cost J and the
     active rows :math:`c(x, \theta) = 0`, the estimate satisfies the optimality conditions
@@ -289,6 +291,10 @@ class Sensitivity:
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *NAMES]
 
+    def __repr__(self) -> str:
+        text = f"Sensitivity of {len(self.trajectory)} states, {len(self.active)} rows active"
+        return f"{text}. {self.warning}".strip()
+
     @cached_property
     def _whole(self) -> Gradient:
         """The derivatives of each number of the trajectory."""
@@ -301,7 +307,7 @@ class Sensitivity:
             said.append(
                 f"The estimate has not converged: a Newton step would lower J = {cost:.6g} by "
                 f"{decrease:.3g}. The derivatives are those of a minimiser only up to first order "
-                "in `step`; take max_qps=None."
+                "in `step`; take max_qps=None, or a smaller tolerance."
             )
         if not self._matrix.definite:
             said.append(
@@ -446,20 +452,11 @@ def _jacobian(problem: Problem, states: Array) -> Array:
 
 
 def _reductions(solved: Solved) -> Array | None:
-    """The matrices T (K, p, p) with R -> T R T' what a noise weight R is without missing outputs.
-
-    To first order, around the weight of each sample; None where nothing is missing.
-    """
-    problem = solved.problem
-    if problem.observed is None:
+    """`Cost.reduction` of each sample (K, p, p); None where nothing is missing."""
+    observed, cost = solved.problem.observed, solved.formulation.cost
+    if observed is None:
         return None
-    p = problem.observed.shape[1]
-    found = np.tile(np.eye(p), (len(problem.observed), 1, 1))
-    for k in np.flatnonzero(~problem.observed.all(axis=1)):
-        own = solved.conditions[k].noise_weight
-        weight, there = solved.formulation.cost.noise if own is None else own, problem.observed[k]
-        found[k] = 0.0
-        found[k][np.ix_(there, there)] = np.eye(int(there.sum()))
-        gone = np.linalg.solve(weight[np.ix_(~there, ~there)], weight[np.ix_(~there, there)])
-        found[k][np.ix_(there, ~there)] = -gone.T
-    return found
+    return np.array([
+        cost.reduction(there, own.noise_weight)
+        for there, own in zip(observed, solved.conditions, strict=True)
+    ])

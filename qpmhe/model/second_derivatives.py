@@ -54,6 +54,8 @@ class SecondDerivatives:
 
     def __init__(self, system: System) -> None:
         self.system, self.traced = system, system.is_traced
+        #: Typical magnitudes of the states, (n,).
+        self.scales: Array = np.ones(system.n) if system.scales is None else system.scales
         self._calls: dict[int, tuple[tuple[Array, ...], Curvature, Any]] = {}
         self._function: Any = None
         model = system.symbolic
@@ -67,7 +69,7 @@ class SecondDerivatives:
         return self._function is not None
 
     def at(self, states: Array, inputs: Array, forces: Array) -> Curvature:
-        """The derivatives along states (K, n); good until the next call.
+        """The derivatives along states (K, n).
 
         Parameters
         ----------
@@ -89,9 +91,8 @@ class SecondDerivatives:
         if inputs.shape[1] == m:
             u[:, m] = self.system.dt or 0.0
         if not call():
-            for array in found:
-                array.fill(np.nan)
-        return found
+            return Curvature(*(np.full_like(array, np.nan) for array in found))
+        return Curvature(*(array.copy() for array in found))
 
     def _call(self, count: int) -> tuple[tuple[Array, ...], Curvature, Any]:
         n, p, m = self.system.n, self.system.p, self.system.m
@@ -117,7 +118,7 @@ class SecondDerivatives:
 
         methods = {model.f_jacobian.method, model.h_jacobian.method}
         share = _OF_DIFFERENCES if "finite differences" in methods else _OF_EXACT
-        sizes = np.maximum(np.abs(states), 1.0 if system.scales is None else system.scales)
+        sizes = np.maximum(np.abs(states), self.scales)
         largest = np.abs(inputs[:, :m]).max(axis=0, initial=0.0)
         magnitudes = np.broadcast_to(np.where(largest > 0.0, largest, 1.0), (len(states), m))
         at = slopes(states, inputs)

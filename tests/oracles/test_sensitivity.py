@@ -292,6 +292,18 @@ def test_sets(kind):
     assert not found.weakly_active
 
 
+@pytest.mark.parametrize(
+    ("penalty", "least"),
+    [({}, 1), ({"linear": 100.0}, 1), ({"linear": 2.0, "quadratic": 30.0}, 0)],
+    ids=["hard", "soft and exact", "soft"],
+)
+def test_nonlinear_constraints_of_the_state(penalty, least):
+    curved = qpmhe.Constraint(lambda x: x[..., 0] ** 2 + 0.5 * x[..., 1] ** 2 - 1.0, **penalty)
+    found = Case(discount=0.95, constraints=[curved]).check()
+    assert len(found.active) >= least
+    assert all(row.set == "constraints" for row in found.active)
+
+
 @pytest.mark.parametrize("loss", ["huber", "own"])
 def test_losses_with_active_rows(loss):
     case = robust(LOSSES[loss])
@@ -741,7 +753,7 @@ def test_refusals():
 
     with pytest.raises(qpmhe.errors.InvalidInputError, match="Own has no second derivatives"):
         made(cost=own).sensitivity()
-    curved = qpmhe.Constraint(lambda x: x[..., 0] ** 2 + x[..., 1] ** 2 - 1.4)
+    curved = qpmhe.Constraint(lambda x, w: x[..., 0] ** 2 + w[..., 1] ** 2 - 0.9)
     with pytest.raises(qpmhe.errors.InvalidInputError, match="row 0 of the nonlinear constraints"):
         made(constraints=[curved]).sensitivity()
     inactive = qpmhe.Constraint(lambda x: x[..., 0] ** 2 + x[..., 1] ** 2 - 40.0)
@@ -760,6 +772,34 @@ def test_refusals():
     mhe.reset()
     with pytest.raises(qpmhe.errors.InvalidInputError, match="no estimate yet"):
         mhe.sensitivity()
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+def test_what_was_handed_out_stays(engine):
+    case = robust(qpmhe.Huber)
+    case.data, case.horizon = Case(samples=12).data, 5
+    case.options = {"engine": engine}
+    case.data.measurements[10, 0] = np.nan  # the window then has weights of its samples
+    mhe = case.estimator(case.data)
+    first, cotangent = mhe.sensitivity(), np.ones((6, 2))
+    expected = {name: getattr(first.adjoint(cotangent), name) for name in NAMES}
+    for _ in range(40):  # until the window's arrays are full, and move
+        mhe.update([0.3, 0.1], [0.2])
+        mhe.sensitivity()
+    gradient = first.adjoint(cotangent)
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(gradient, name), expected[name])
+
+
+def test_rows_that_were_dropped_do_not_hold():
+    case = Case(states=qpmhe.Box([-1.0, -1.2], [2.0, 2.0]), noises=symmetric(1.5, 1.5))
+    mhe = case.estimator(case.data)
+    estimate = mhe.update([6.0, 6.0], [0.0])
+    assert qpmhe.Status.ROWS_DROPPED in estimate.status
+    found = mhe.sensitivity()
+    np.testing.assert_allclose(found.trajectory, estimate.trajectory, atol=1e-12)
+    dropped = {row[:4] for row in estimate.dropped}
+    assert dropped.isdisjoint(row[:4] for row in found.active)
 
 
 def test_newest_state():
