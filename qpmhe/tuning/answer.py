@@ -131,6 +131,16 @@ class Tuning:
         """Parameters of the model."""
         return self.weights.parameters
 
+    @property
+    def cost_per_sample(self) -> float:
+        """The negative log likelihood per sample at ``likeliest``, of the blocks that tune.
+
+        Among several starts or models for the same records, the least one is the likeliest.
+        """
+        chosen = [~one.held for one in self._data]
+        samples = sum(int(mask.sum()) for mask in chosen)
+        return self._likelihood.value(self._likeliest, chosen) / samples
+
     def cost(self) -> Cost:
         """The cost of these weights, ready for `qpmhe.MovingHorizonEstimator`."""
         return self.weights.cost()
@@ -151,6 +161,10 @@ class Tuning:
             self._score.begin(first)
         return {"before": self._score.samples(first), "after": self._score.samples(self.weights)}
 
+    @property
+    def _judges(self) -> str:
+        return "held-out blocks" if any(one.held.any() for one in self._data) else "all blocks"
+
     def _judge(self, theta: Array, refined: Array) -> tuple[Array, str]:
         """The weights to take: those of the second search where they are better beyond chance."""
         likeliest, found = (self._score.samples(self._weights_at(at)) for at in (theta, refined))
@@ -162,19 +176,24 @@ class Tuning:
                 if np.isfinite((old - new)[mask & (one.block == b)]).any()
             ]
         what = "error" if self._objective == "truth" else "prediction error"
-        mean = float(np.mean(gains)) if gains else 0.0
-        spread = float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else 0.0
-        base = float(np.mean([np.nanmean(each) for each in likeliest]))
-        share = f"{100.0 * mean / base:.2g} % (standard error {100.0 * spread / base:.2g} %)"
+        blocks = self._judges
+        if len(gains) < 2:
+            return theta, (
+                f"by the likelihood: {len(gains)} {blocks} cannot judge the estimator's "
+                f"{what}; record for longer."
+            )
+        mean, base = float(np.mean(gains)), self._mean(likeliest)
+        spread = float(np.std(gains, ddof=1) / np.sqrt(len(gains)))
+        share, doubt = 100.0 * mean / base, 100.0 * spread / base
         if mean > spread:
             return refined, (
-                f"by the likelihood, then the estimator's {what}: the mean square on held-out "
-                f"blocks falls by {share}."
+                f"by the likelihood, then by the estimator's {what}: its mean square on {blocks} "
+                f"falls by {share:.2g} % more (standard error {doubt:.2g} %)."
             )
         return theta, (
             f"by the likelihood: tuning the estimator's {what} as well would change its mean "
-            f"square on held-out blocks by {-100.0 * mean / base:.2g} % (standard error "
-            f"{100.0 * spread / base:.2g} %), no gain beyond chance."
+            f"square on {blocks} by {-share:+.2g} % (standard error {doubt:.2g} %), no gain "
+            "beyond chance."
         )
 
     def _find_intervals(self, theta: Array, hessian: Array) -> None:
@@ -324,8 +343,7 @@ class Tuning:
             interval = self.intervals.get(name)
             text = "" if interval is None else f"{interval[0]:.3g} to {interval[1]:.3g}"
             weights.add_row(name, f"{self.start[name]:.4g}", f"{value:.4g}", text)
-        held = "held-out blocks" if any(one.held.any() for one in self._data) else "all samples"
-        scores = Table(box=None, pad_edge=False, title=f"Scores on {held}, less is better",
+        scores = Table(box=None, pad_edge=False, title=f"Scores on {self._judges}, less is better",
                        title_justify="left")
         for title in ("", "before", "after"):
             scores.add_column(title, justify="left" if not title else "right", no_wrap=True)
@@ -335,6 +353,7 @@ class Tuning:
         console.print(weights)
         console.print()
         console.print(scores)
+        console.print()
         texts = [f"Chosen {self.judgement}"]
         texts += [f"Not identified: {one}" for one in self.unidentified]
         texts += [f"Note: {one}" for one in self.notes]

@@ -170,7 +170,7 @@ def hold_out(data: list[Data], share: float, least: int) -> None:
         samples = sum(map(len, data))
         raise InvalidInputError(
             f"the records have {samples} samples, too few for held-out blocks of {least}; record "
-            "for longer, take a shorter horizon, or give held_out=0: then nothing judges the "
+            "for longer, predict fewer steps ahead, or give held_out=0: then nothing judges the "
             "weights."
         )
     for one in data:

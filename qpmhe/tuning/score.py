@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from .._checks import Array
+from ..codegen import compile as compile_ahead
 from ..errors import EngineWarning, ObserverWarning, QpmheError
+from ..estimation.engines import python_only
 from ..estimation.estimator import MovingHorizonEstimator
 from ..model.system import System
 from ..observers import Observer
@@ -63,11 +66,13 @@ class Score:
     def begin(self, weights: Weights) -> None:
         """Take the errors at these weights as the unit of all others."""
         errors = np.concatenate(self.errors(weights))
-        if self._robust:
-            self._scale = 1.4826 * np.nanmedian(np.abs(errors), axis=0)
-        else:
-            self._scale = np.sqrt(np.nanmean(errors * errors, axis=0))
-        self._scale = np.where(self._scale > 0.0, self._scale, 1.0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of components without any
+            if self._robust:
+                scale = 1.4826 * np.nanmedian(np.abs(errors), axis=0)
+            else:
+                scale = np.sqrt(np.nanmean(errors * errors, axis=0))
+        self._scale = np.where(scale > 0.0, scale, 1.0)
 
     @property
     def has_begun(self) -> bool:
@@ -92,6 +97,14 @@ class Score:
                 warnings.simplefilter("ignore", RuntimeWarning)  # of samples without any
                 found.append(np.nanmean(terms, axis=1))
         return found
+
+    def compile(self, weights: Weights) -> None:
+        """Compile the step, for `qpmhe.MovingHorizonEstimator` to find, where it has a C form."""
+        if self._options.get("engine", "auto") != "auto" or python_only():
+            return
+        system = self._make(weights.parameters)
+        with suppress(QpmheError):
+            compile_ahead(self._estimator(system, weights, self._data[0]))
 
     def errors(self, weights: Weights) -> list[Array]:
         """Errors of each record (T, n) or (T, p), NaN where there is nothing to compare."""
@@ -141,19 +154,22 @@ class Score:
         behind = list(weights.parameters.values())[:missing]
         return np.hstack((one.u, np.tile(behind, (len(one), 1)))) if missing else one.u
 
-    def _estimates(self, system: System, weights: Weights, one: Data) -> Array:
-        """The estimates of x(1), ..., x(T), each made with the y before."""
+    def _estimator(self, system: System, weights: Weights, one: Data) -> MovingHorizonEstimator:
         options = dict(self._options)
         missing = system.m - one.u.shape[1]
         if missing:
             options["parameters"] = list(weights.parameters.values())[:missing]
+        return MovingHorizonEstimator(
+            system, weights.observer(self.kind), weights.cost(), horizon=weights.horizon,
+            initial_state=one.start, **options,
+        )
+
+    def _estimates(self, system: System, weights: Weights, one: Data) -> Array:
+        """The estimates of x(1), ..., x(T), each made with the y before."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ObserverWarning)
             warnings.simplefilter("ignore", EngineWarning)
-            mhe = MovingHorizonEstimator(
-                system, weights.observer(self.kind), weights.cost(), horizon=weights.horizon,
-                initial_state=one.start, **options,
-            )
+            mhe = self._estimator(system, weights, one)
             self.engine = mhe.engine
             u = one.u if one.u.shape[1] else None
             if one.dt is None:

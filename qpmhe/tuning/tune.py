@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _OBJECTIVES = ("auto", "likelihood", "prediction", "truth")
+# Samples times parameters beyond which compiling the step takes less time than it saves.
+_WORTH_COMPILING = 2000
 # Spread of the logarithms of further starts.
 _SPREAD = 1.0
 
@@ -163,7 +165,7 @@ def tune(
     sizes = {"prior": first.n, "disturbance": first.r, "noise": first.p}
     start = checked_start(sizes, prior, disturbance, noise, discount, threshold, started)
     data = checked_data(records, first, inputs, initial_state)
-    hold_out(data, held_out, horizon + ahead)
+    hold_out(data, held_out, 2 * ahead)
     labels = _labels(first, names)
     plan = Structure(start, structure, labels)
     check_enough(data, plan.names, _noise_outputs(plan, labels["noise"]))
@@ -197,6 +199,8 @@ def tune(
         robust=threshold is not None, options=options,
     )
     if objective != "likelihood":
+        if sum(map(len, data)) * len(plan.names) > _WORTH_COMPILING:
+            score.compile(weights_at(plan.start))
         score.begin(weights_at(plan.start))
     kept = Checkpoint(
         None if checkpoint is None else Path(checkpoint),
