@@ -313,7 +313,7 @@ def _candidates(
         top = sums[None, :] - sums[:, None]  # from stretch i up to k, without k
         bottom = diagonal[None, :] + diagonal[:, None] - squares - squares.T
         gains = np.where(np.triu(bottom, 1) > 0.0, 0.5 * top**2 / bottom, 0.0)
-        i, k = np.unravel_index(int(np.argmax(gains)), gains.shape)
+        i, k = divmod(int(np.argmax(gains)), len(gains))
         if gains[i, k] > 0.0:
             first, last = (listed[at[i]].span or (0, 0))[0], (listed[at[k - 1]].span or (0, 0))[1]
             one = _bias(bank, len(listed[0].outputs), j, first, last)

@@ -78,8 +78,8 @@ class Names:
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
 
     def span(self, first: int, last: int) -> tuple[float, float]:
-        """Times of two samples."""
-        return float(self.times[first]), float(self.times[last])
+        """Times of two samples, without the rounding of a sum of steps."""
+        return float(f"{self.times[first]:.9g}"), float(f"{self.times[last]:.9g}")
 
     def between(self, first: int, last: int) -> str:
         """A stretch of samples in words; blank for all of them."""
