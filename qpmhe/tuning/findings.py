@@ -146,7 +146,8 @@ def describe(fault: Fault, names: Names, deviations: Array, outliers: Array) -> 
     match fault.kind:
         case "noise":
             whose = f" of {sensors}" if subject else ""
-            text = f"R{whose} is too {size} by about {factor}: the innovations are that far off."
+            text = f"R{whose} is too {size} by about {factor}: the measurements scatter "
+            text += "more than it says." if value > 1.0 else "less than it says."
             remedy = (
                 f"{'Multiply' if value > 1 else 'Divide'} the covariance of the noise by {factor}, "
                 "or let qpmhe.tune choose the weights."

@@ -298,7 +298,7 @@ estimator's model and weights, from sample {diagnosis.first} on.</footer>
 def _item(one: Finding) -> str:
     word = "" if one.severity == "note" else f"<span class='{one.severity}'>{one.severity}:</span> "
     remedy = f" <span class='remedy'>{escape(one.remedy)}</span>" if one.remedy else ""
-    return f"<li>{word}{escape(one.text)}{remedy}</li>"
+    return f"<li>{word}{escape(one.text)}{remedy}</li>".replace(" %", "&nbsp;%")
 
 
 def percent_of(share: float) -> str:
