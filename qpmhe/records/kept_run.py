@@ -20,6 +20,7 @@ class _Kept(NamedTuple):
 
     state: Array
     filtered: Array
+    observer_state: Array
     delayed: Array | None
     cost: float
     candidate_cost: float
@@ -36,7 +37,7 @@ class KeptRun:
 
     def __init__(self, estimator: MovingHorizonEstimator, steps: Steps) -> None:
         self._estimator, self._steps = estimator, steps
-        self._start = estimator.state.copy()
+        self._start, self._observer_start = estimator.state.copy(), estimator.observer_state.copy()
         self._estimates: list[Any] = []
         self._y: list[Array] = []
         self._u: list[Array] = []
@@ -50,14 +51,14 @@ class KeptRun:
         self._u.append(np.append(u, parameters))
         self._lengths.append(length)
         self._estimates.append(_Kept(
-            estimate.state.copy(), estimate.filtered.copy(),
+            estimate.state.copy(), estimate.filtered.copy(), estimate.observer_state.copy(),
             None if estimate.delayed is None else estimate.delayed.copy(),
-            *(getattr(estimate, name) for name in _Kept._fields[3:]),
+            *(getattr(estimate, name) for name in _Kept._fields[4:]),
         ))
 
     def run(self) -> Run:
         """All samples so far."""
-        run = Run.of(self._start, self._estimates)
+        run = Run.of(self._start, self._estimates, observer_start=self._observer_start)
         system = self._estimator.system
         usual = self._steps.usual
         steps = None

@@ -13,6 +13,7 @@ from .._linalg import inverse
 from ..costs import RobustCost
 from ..estimation.estimate import Status
 from ..estimation.run import Run, RunSource
+from ..model.residuals import difference
 from .faults import Fault, search
 from .filter_bank import FilterBank, Filtered, Hypothesis
 from .findings import Finding, Names, describe, listed, number, percent
@@ -35,6 +36,8 @@ _WORSE = 1.4
 # A repeated number contradicts the filter if innovations are so many deviations off.
 _OTHERWISE = 1.7
 _FAILING, _KEPT, _WEAK_PRIOR = 0.02, 0.5, 0.1
+# How far from one the observer's error may be, in deviations of the prior.
+_SUITS = 0.3, 1.5
 # Correlations of innovations that matter, and how sure they must be.
 _CORRELATED, _SURE = 0.2, 1e-6
 
@@ -224,7 +227,8 @@ class Examination:
     def _conclude(self) -> None:
         """Put everything into words, what is certain first."""
         found, first = self.found, self.first
-        findings, notes = list(self.certain), []
+        findings, notes = self.findings, self.notes
+        findings += self.certain
         for one in found:
             span = None
             if one.span is not None:  # before the filter began there is no evidence, nor an end
@@ -241,7 +245,6 @@ class Examination:
         notes += self._notes()
         if not findings:
             notes += self._input_notes()
-        self.findings, self.notes = findings, notes
 
     def _nis(self, seen: Mask) -> Array:
         errors = np.where(seen, self.null.innovations, 0.0)
@@ -387,6 +390,8 @@ class Examination:
         if some:
             yield note("record", f"Missing: {listed(some)}.")
         yield self._prior_note()
+        if not self.findings and self.source.cost.observer_prior is None:
+            yield from self._prior_weight_note()
         kept = run.share(Status.CANDIDATE)
         if kept > 0.0:
             why = [
@@ -436,6 +441,36 @@ class Examination:
             "qpmhe.ObserverPrior."
         )
         return Finding("prior", text, remedy, "note")
+
+    def _prior_weight_note(self) -> Iterator[Finding]:
+        """Whether the prior's weight suits the observer whose states it weighs.
+
+        A filter's error is orthogonal to all that the data say, the observer's state included: so
+        the mean square of the observer's error is that of its distance from the filter, and the
+        filter's variance.
+        """
+        z, names = self.run.observer_states[self.first : len(self.run)], self.names
+        apart = difference(self.source.system.state_residual, z, self.along.corrected)
+        late = len(apart) // 3  # the first error of the observer has decayed
+        own = np.mean(apart[late:] ** 2, axis=0) + np.diagonal(
+            self.along.covariances[late:], axis1=1, axis2=2
+        ).mean(axis=0)
+        ratios = np.sqrt(own / self.prior.diagonal())
+        i = int(np.nanargmax(ratios))
+        said, seen = np.sqrt(self.prior[i, i]), np.sqrt(own[i])
+        if not np.isfinite(ratios[i]) or _SUITS[0] < ratios[i] < _SUITS[1]:
+            return
+        large = ratios[i] > 1.0
+        if not large and self.prior_shares[self.horizon].max() < _WEAK_PRIOR:
+            return  # it does not matter
+        yield Finding(
+            "prior",
+            f"The prior says that the observer is off by {number(said)} in {names.states[i]}; by "
+            f"the data it is off by {number(seen)}"
+            + ("." if large else ", and by a smaller share in the other states."),
+            f"The prior's weight may be {number(max(ratios[i], 1.0 / ratios[i]) ** 2)} times "
+            + ("smaller." if large else "as large, once the start is forgotten."), "note",
+        )
 
     def _constants(self) -> list[int]:
         """The states that the model keeps: parameters."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -230,7 +230,7 @@ class _Signature:
 def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[_Signature]:
     total, p = base.measurements.shape
     n = bank.system.n
-    none_x, none_y = np.zeros((total, n)), np.zeros((total, p))
+    none_x = np.zeros((total, n))
     inputs = bank.full_inputs(base.inputs, base.step)
     # At each sample from those before it alone: else noise would look like a fault.
     expected, moves = bank.moves(null.states, inputs)
@@ -248,19 +248,23 @@ def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[
             reached - bank.model.f.batch(null.corrected, without),
         )
     for j in range(p):
-        for first, last in _spans(total):
-            bias = none_y.copy()
-            bias[first : last + 1, j] = 1.0
-            yield _Signature("bias", (j,), bias, none_x, (first, last))
+        for first, last in _blocks(total, p):
+            yield _bias(bank, total, j, first, last)
 
 
-def _spans(total: int) -> Iterator[tuple[int, int]]:
-    """The whole record, and halves, quarters, ... of it that overlap by half."""
-    length = total
-    while length >= max(8, total // 32):
-        for first in range(0, total - length // 2, max(1, length // 2)):
-            yield first, min(first + length, total) - 1
-        length //= 2
+def _bias(bank: FilterBank, total: int, sensor: int, first: int, last: int) -> _Signature:
+    outputs = np.zeros((total, bank.system.p))
+    outputs[first : last + 1, sensor] = 1.0
+    return _Signature(
+        "bias", (sensor,), outputs, np.zeros((total, bank.system.n)), (first, last)
+    )
+
+
+def _blocks(total: int, sensors: int) -> list[tuple[int, int]]:
+    """First and last samples of stretches that make up the record."""
+    count = max(1, min(32 if sensors <= _MOST else 8, total // 4))
+    edges = np.linspace(0, total, count + 1).astype(int)
+    return [(int(first), int(end) - 1) for first, end in pairwise(edges)]
 
 
 def _linear(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Fault]:
@@ -280,55 +284,79 @@ def _linear(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Faul
     ]
     if not listed or not np.isfinite(null.likelihoods[0]):
         return
-    sizes, gains = _sizes(listed, null)
-    best: dict[tuple[str, tuple[int, ...]], int] = {}
-    for k in np.argsort(-gains):
-        best.setdefault((listed[k].kind, listed[k].subject), int(k))
-    for k in best.values():
-        if gains[k] > 0.5 * _GAIN:
-            yield _removed(base, listed[k], float(sizes[k]))
+    against, own = _moments(listed, null)
+    best: dict[tuple[str, tuple[int, ...]], tuple[float, float, _Signature]] = {}
+    for one, size, gain in _candidates(bank, listed, against, own):
+        key = one.kind, one.subject
+        if gain > 0.5 * _GAIN and gain > best.get(key, (0.0,))[0]:
+            best[key] = gain, size, one
+    for _, size, one in best.values():
+        yield _removed(base, one, size)
 
 
-def _sizes(listed: list[_Signature], null: Filtered) -> tuple[Array, Array]:
-    """Size and gain in log likelihood of each fault."""
+def _candidates(
+    bank: FilterBank, listed: list[_Signature], against: Array, own: Array
+) -> Iterator[tuple[_Signature, float, float]]:
+    """Signatures with size and gain: those listed, and of biases the best row of stretches."""
+    for k, one in enumerate(listed):
+        if one.kind != "bias" and own[k, k] > 0.0:
+            yield one, against[k] / own[k, k], 0.5 * against[k] ** 2 / own[k, k]
+    for j in range(bank.system.p):
+        at = [k for k, one in enumerate(listed) if one.kind == "bias" and one.subject == (j,)]
+        if not at:
+            continue
+        # Signatures add up: sums over rows of stretches by prefix sums.
+        sums = np.append(0.0, np.cumsum(against[at]))
+        squares = np.zeros((len(at) + 1, len(at) + 1))
+        squares[1:, 1:] = np.cumsum(np.cumsum(own[np.ix_(at, at)], axis=0), axis=1)
+        diagonal = squares.diagonal()
+        top = sums[None, :] - sums[:, None]  # from stretch i up to k, without k
+        bottom = diagonal[None, :] + diagonal[:, None] - squares - squares.T
+        gains = np.where(np.triu(bottom, 1) > 0.0, 0.5 * top**2 / bottom, 0.0)
+        i, k = divmod(int(np.argmax(gains)), len(gains))
+        if gains[i, k] > 0.0:
+            first, last = (listed[at[i]].span or (0, 0))[0], (listed[at[k - 1]].span or (0, 0))[1]
+            one = _bias(bank, len(listed[0].outputs), j, first, last)
+            yield one, float(top[i, k] / bottom[i, k]), float(gains[i, k])
+
+
+def _moments(listed: list[_Signature], null: Filtered) -> tuple[Array, Array]:
+    """Products of the signatures in the innovations with these (K,), and with each other (K, K)."""
     outputs = np.stack([one.outputs for one in listed], axis=2)
     states = np.stack([one.states for one in listed], axis=2)
     there = np.isfinite(null.innovations)
     errors = np.where(there, null.innovations, 0.0)
     weights = np.linalg.inv(null.innovation_covariances)
     moved = np.zeros(states.shape[1:])
-    against, own = np.zeros(len(listed)), np.zeros(len(listed))
+    against, own = np.zeros(len(listed)), np.zeros((len(listed), len(listed)))
     for t in range(len(outputs)):
         shown = null.outputs[t] @ moved + outputs[t] * there[t][:, None]
         weighted = weights[t] @ shown
         against += errors[t] @ weighted
-        own += np.einsum("ik,ik->k", shown, weighted)
+        own += shown.T @ weighted
         moved = null.transitions[t] @ (moved - null.gains[t] @ shown) + states[t]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        sizes = np.where(own > 0.0, against / own, 0.0)
-    return sizes, 0.5 * sizes * against
+    return against, own
 
 
 def _with_ends(bank: FilterBank, base: Hypothesis, null: Filtered, bias: Fault) -> Fault:
     """A bias with the first and last sample under which the record is most likely."""
-    total, p = base.measurements.shape
+    total = len(base.measurements)
     first, last = bias.span or (0, total - 1)
-    none_x = np.zeros((total, bank.system.n))
-    step = max(1, (last - first) // 2)
+    step = max(1, total // 64)
     while True:
-        listed = []
-        for begin in sorted({max(first + d, 0) for d in (-step, 0, step)}):
-            for end in sorted({min(last + d, total - 1) for d in (-step, 0, step)}):
-                if end - begin >= 2:
-                    outputs = np.zeros((total, p))
-                    outputs[begin : end + 1, bias.subject[0]] = 1.0
-                    listed.append(_Signature("bias", bias.subject, outputs, none_x, (begin, end)))
-        sizes, gains = _sizes(listed, null)
-        k = int(np.argmax(gains))
+        listed = [
+            _bias(bank, total, bias.subject[0], begin, end)
+            for begin in sorted({max(first + d, 0) for d in (-step, 0, step)})
+            for end in sorted({min(last + d, total - 1) for d in (-step, 0, step)})
+            if end - begin >= 2
+        ]
+        against, own = _moments(listed, null)
+        sizes = against / own.diagonal()
+        k = int(np.argmax(sizes * against))
         same, (first, last) = listed[k].span == (first, last), listed[k].span or (first, last)
         if same and step == 1:
             break
-        step = max(1, step // 2)
+        step = max(1, step // 2) if same else step
     refined = _removed(base, listed[k], float(sizes[k]))
     values = bank.run([base, refined.hypothesis]).likelihoods
     gain = float(values[1] - values[0])

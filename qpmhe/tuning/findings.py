@@ -78,8 +78,8 @@ class Names:
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
 
     def span(self, first: int, last: int) -> tuple[float, float]:
-        """Times of two samples."""
-        return float(self.times[first]), float(self.times[last])
+        """Times of two samples, without the rounding of a sum of steps."""
+        return float(f"{self.times[first]:.9g}"), float(f"{self.times[last]:.9g}")
 
     def between(self, first: int, last: int) -> str:
         """A stretch of samples in words; blank for all of them."""
@@ -146,7 +146,8 @@ def describe(fault: Fault, names: Names, deviations: Array, outliers: Array) -> 
     match fault.kind:
         case "noise":
             whose = f" of {sensors}" if subject else ""
-            text = f"R{whose} is too {size} by about {factor}: the innovations are that far off."
+            text = f"R{whose} is too {size} by about {factor}: the measurements scatter "
+            text += "more than it says." if value > 1.0 else "less than it says."
             remedy = (
                 f"{'Multiply' if value > 1 else 'Divide'} the covariance of the noise by {factor}, "
                 "or let qpmhe.tune choose the weights."

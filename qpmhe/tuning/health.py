@@ -188,6 +188,7 @@ def _limits(diagnosis: Diagnosis, axes: Any) -> None:
     low, high = axes.get_ylim()
     reach = max(3.0 * diagnosis.correlations.limit, abs(low), abs(high))
     axes.set_ylim(-reach, reach)
+    axes.xaxis.get_major_locator().set_params(integer=True)
 
 
 def _observability(diagnosis: Diagnosis, axes: Any) -> None:
@@ -229,7 +230,7 @@ def _outcomes(diagnosis: Diagnosis, axes: Any) -> None:
 def _legend(axes: Any) -> None:
     labels = axes.get_legend_handles_labels()[1]
     if labels:
-        columns = max(1, min(4, 56 // (8 + max(map(len, labels)))))
+        columns = max(1, min(4, 64 // (6 + max(map(len, labels)))))
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2)
 
 
@@ -297,7 +298,7 @@ estimator's model and weights, from sample {diagnosis.first} on.</footer>
 def _item(one: Finding) -> str:
     word = "" if one.severity == "note" else f"<span class='{one.severity}'>{one.severity}:</span> "
     remedy = f" <span class='remedy'>{escape(one.remedy)}</span>" if one.remedy else ""
-    return f"<li>{word}{escape(one.text)}{remedy}</li>"
+    return f"<li>{word}{escape(one.text)}{remedy}</li>".replace(" %", "&nbsp;%")
 
 
 def percent_of(share: float) -> str:

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import qpmhe
+from qpmhe.cli.app import app
 from qpmhe.errors import InvalidInputError, ShapeError
 from qpmhe.tuning import observability
 from qpmhe.tuning.filter_bank import FilterBank, Hypothesis
@@ -259,3 +261,39 @@ def test_filters_are_kalman_filters():
     # In units of the noise of the first hypothesis.
     told = alone.likelihoods[0] - 25.0 * np.log(9.0)
     assert told == pytest.approx(found.likelihoods[1])
+
+
+def test_command_writes_the_page(tmp_path):
+    case = planted.wrong_sign("cstr", 0)
+    generator = np.random.default_rng(0)
+    times = np.append(0.0, np.cumsum(generator.uniform(0.99, 1.01, len(case.inputs) - 1) * 0.05))
+    record = tmp_path / "record.csv"
+    np.savetxt(
+        record, np.column_stack((times, case.measurements, case.inputs)), delimiter=",",
+        header="time,y1,u1", comments="")
+
+    def estimate(page, rows="rows.csv"):
+        return CliRunner().invoke(
+            app, ["estimate", "cstr", str(record), "--out", str(tmp_path / rows), "--overwrite",
+                  "--diagnose", str(tmp_path / page)])
+
+    answer = estimate("health.html")
+    assert answer.exit_code == 0, answer.output
+    assert "1. Input u1 has the wrong sign." in answer.output
+    assert "time (min)" in (tmp_path / "health.html").read_text(encoding="utf-8")
+    wrong = estimate("health.pdf", "none.csv")
+    assert wrong.exit_code != 0
+    assert "expected the name of an .html file" in str(wrong.exception)
+    assert not (tmp_path / "none.csv").exists()
+    record.write_text("\n".join(record.read_text().splitlines()[:21]))
+    short = estimate("short.html")
+    assert short.exit_code == 0
+    assert "no diagnosis: the run has 20 samples" in short.output.replace("\n", " ")
+
+
+def test_prior_that_claims_too_much():
+    case = planted.healthy("batch_reactor", 0)
+    cost = qpmhe.QuadraticCost(
+        prior=400.0 * case.cost.prior, disturbance=case.cost.disturbance, noise=case.cost.noise)
+    found = qpmhe.diagnose(case._replace(cost=cost).run())
+    assert any("The prior says that the observer is off by" in one.text for one in found.notes)
