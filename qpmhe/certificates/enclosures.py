@@ -117,11 +117,11 @@ class Enclosure:
     error: Array  # (B, q, n): E, rounded up; NaN where it could not be enclosed
     excess: Array  # (B, N): what the width of each coordinate contributes to E
     jacobian: Array  # (B, q, n): J at the cell's middle; NaN where it has none
-    others: tuple[Enclosure, ...] = ()  # where J is in this one, or else in one of these
+    sides: tuple[Enclosure, ...] = ()  # where J is in one of these, which say more
 
     def corners(self) -> tuple[Array, Array]:
         """Matrices whose convex hull, widened by an error, holds J on each cell."""
-        parts = (self, *self.others)
+        parts = self.sides or (self,)
         # Cells of which nothing is known must not hide how the others vary.
         known = np.isfinite(self.error).all(axis=(1, 2))
         weight = np.max([
@@ -273,9 +273,9 @@ class SmoothModel:
         ]
         known = np.all([np.isfinite(side.error).all(axis=(1, 2)) for side in sides], axis=0)
         at = np.flatnonzero(kinked)[known]
-        return replace(found.with_rows(at, sides[0], known), others=tuple(
-            found.with_rows(at, side, known) for side in sides[1:]
-        ))
+        every = tuple(found.with_rows(at, side, known) for side in sides)
+        # Cells are divided by what the sides of a kink leave open, not by the kink.
+        return replace(found, sides=every, excess=np.max([side.excess for side in every], axis=0))
 
 
 class _Plan:

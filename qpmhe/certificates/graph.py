@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from .polynomials import Polynomial, Polynomials, UnclearError, holds, total
+from .polynomials import BRANCHES, Polynomial, Polynomials, UnclearError, holds, total
 
 CONDITIONS = ("less", "atmost", "equal", "and", "or", "not")
 
@@ -145,7 +145,7 @@ class Graph:
         legs = self._legs(a)
         if not legs or self.value(a) is not None:
             return self.of("sqrt", a)
-        return self.of("length", *legs) if len(legs) > 1 else self.of("abs", *legs)
+        return self.of("length", *legs) if len(legs) > 1 else self.absolute(legs[0])
 
     def _legs(self, a: int) -> list[int]:
         """Nodes whose squares sum up to a node; none if it is no such sum."""
@@ -175,12 +175,26 @@ class Graph:
             return a
         operation, sides, _ = self.nodes[c]
         if operation in ("less", "atmost") and set(sides) == {a, b}:
-            return self.of("min" if sides == (a, b) else "max", min(a, b), max(a, b))
+            return self.least(a, b) if sides == (a, b) else self.largest(a, b)
         gap = self._gap(c, a, b)
         if gap is None:
             return self.of("jump", c, a, b)
         found = self.of("either", c, a, b)
         return self.node("near", found, parameter=gap) if gap else found
+
+    def absolute(self, a: int) -> int:
+        """|a|."""
+        return self.of("abs", self.of("less", self.constant(0.0), a), a, self.neg(a))
+
+    def largest(self, a: int, b: int) -> int:
+        """The larger one of two."""
+        a, b = sorted((a, b))
+        return a if a == b else self.of("max", self.of("atmost", b, a), a, b)
+
+    def least(self, a: int, b: int) -> int:
+        """The smaller one of two."""
+        a, b = sorted((a, b))
+        return a if a == b else self.of("min", self.of("atmost", a, b), a, b)
 
     def _assumed(self, node: int, c: int) -> int:
         """The node where a condition holds."""
@@ -188,7 +202,7 @@ class Graph:
         if operation == "near":
             moved = self._assumed(arguments[0], c)
             return node if moved == arguments[0] else self.node("near", moved, parameter=parameter)
-        if operation not in ("either", "jump"):
+        if operation not in BRANCHES:
             return node
         other, first, second = arguments
         if other in (c, self.negated(c)):

@@ -253,13 +253,27 @@ def _decided(truth: Interval) -> NDArray[np.bool_]:
     return np.asarray(truth.low == truth.high)
 
 
-def either(truth: Interval, first: Interval, second: Interval) -> Interval:
-    """One of two, or what holds both where the truth is not known."""
-    low = np.where(truth.low == 1.0, first.low, np.where(
-        truth.high == 0.0, second.low, np.minimum(first.low, second.low) + 0.0 * truth.low))
-    high = np.where(truth.low == 1.0, first.high, np.where(
-        truth.high == 0.0, second.high, np.maximum(first.high, second.high) + 0.0 * truth.low))
-    return Interval(low, high)
+def either(
+    truth: Interval, first: Interval, second: Interval, between: Interval | None = None
+) -> Interval:
+    """One of two; where the truth is not known, what lies between: what holds both."""
+    between = first.hull(second) if between is None else between
+    return Interval(*(
+        np.where(truth.low == 1.0, one, np.where(truth.high == 0.0, other, rest + 0.0 * truth.low))
+        for one, other, rest in (
+            (first.low, second.low, between.low), (first.high, second.high, between.high)
+        )
+    ))
+
+
+def maximum(s: Interval, t: Interval) -> Interval:
+    """The larger of two."""
+    return Interval(np.maximum(s.low, t.low), np.maximum(s.high, t.high))
+
+
+def minimum(s: Interval, t: Interval) -> Interval:
+    """The smaller of two."""
+    return Interval(np.minimum(s.low, t.low), np.minimum(s.high, t.high))
 
 
 def _step(function: Callable[[Array], Any]) -> Callable[[Interval], Interval]:
@@ -281,7 +295,7 @@ def _erf(s: Interval) -> Interval:
 #: What is defined where, as `Graph` names it: elementwise functions of intervals.
 OPERATIONS: dict[str, Callable[..., Interval]] = {
     "add": lambda s, t: s + t, "sub": lambda s, t: s - t, "mul": lambda s, t: s * t,
-    "neg": lambda s: -s, "abs": abs, "pow": lambda s, k: s.power(k),
+    "neg": lambda s: -s, "pow": lambda s, k: s.power(k),
     "raised": lambda s, c: s.raised(c),
     "sqrt": lambda s: s.increasing(np.sqrt, 0.0, ulps=1),
     "exp": lambda s: s.increasing(np.exp, 0.0), "expm1": lambda s: s.increasing(np.expm1, -1.0),
@@ -304,15 +318,16 @@ OPERATIONS: dict[str, Callable[..., Interval]] = {
     "t-3t^2+2t^3": lambda s: s.pieces(
         lambda t: t * ((1.0 - t) * (1.0 - 2.0 * t)), 0.5 - 12.0**-0.5, 0.5 + 12.0**-0.5),
     "angle": angle, "length": length, "share": share,
-    "max": lambda s, t: Interval(np.maximum(s.low, t.low), np.maximum(s.high, t.high)),
-    "min": lambda s, t: Interval(np.minimum(s.low, t.low), np.minimum(s.high, t.high)),
+    # What is decided is one of the two, also beyond where it is.
+    "max": lambda c, s, t: either(c, s, t, maximum(s, t)),
+    "min": lambda c, s, t: either(c, s, t, minimum(s, t)),
+    "abs": lambda c, s, t: either(c, s, t, abs(s)),
     "less": lambda s, t: _truth(s.high < t.low, s.low < t.high, s, t),
     "atmost": lambda s, t: _truth(s.high <= t.low, s.low <= t.high, s, t),
     "equal": lambda s, t: _truth(
         (s.low == t.high) & (s.high == t.low), (s.low <= t.high) & (t.low <= s.high), s, t),
     "not": lambda s: Interval(1.0 - s.high, 1.0 - s.low),
-    "and": lambda s, t: Interval(np.minimum(s.low, t.low), np.minimum(s.high, t.high)),
-    "or": lambda s, t: Interval(np.maximum(s.low, t.low), np.maximum(s.high, t.high)),
+    "and": minimum, "or": maximum,
     "either": either, "jump": lambda c, s, t: either(c.where(_decided(c)), s, t),
     "truth": lambda c: c.where(_decided(c)),
     "smooth": lambda c, s: s.where(_decided(c)),

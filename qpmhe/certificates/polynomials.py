@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
 
@@ -13,11 +12,12 @@ from .intervals import OPERATIONS, Interval
 
 Polynomial = dict[Any, Fraction]
 
+#: Choices between two nodes, behind a condition.
+BRANCHES = ("either", "jump", "max", "min", "abs")
 _MOST_TERMS, _MOST_LEVELS = 40, 25
 # Constants that differ by less, beside what they are computed from, are equal but for rounding.
 _ROUNDING = 1e-13
 _NUMBER = "number"
-_EXACT: dict[str, Callable[..., Fraction]] = {"abs": abs, "max": max, "min": min}
 _AT_ZERO = {
     **dict.fromkeys(("exp", "cos", "cosh"), 1.0),
     **dict.fromkeys(("sqrt", "sin", "tan", "asin", "atan", "sinh", "tanh", "asinh", "atanh", "erf",
@@ -65,7 +65,7 @@ class Polynomials:
             return _number(Fraction(parameter))
         if operation == "variable" or level > _MOST_LEVELS:
             return self._atom((node,))
-        if operation in ("either", "jump"):
+        if operation in BRANCHES:
             holds = self._decided(arguments[0], level)
             return self._atom((node,)) if holds is None else self.of(
                 arguments[1 if holds else 2], level
@@ -87,8 +87,6 @@ class Polynomials:
         if not all(set(part) <= {()} for part in parts):
             return self._atom((operation, parameter, *(frozenset(part.items()) for part in parts)))
         values = [part.get((), Fraction(0)) for part in parts]
-        if operation in _EXACT:
-            return _number(_EXACT[operation](*values))
         if operation == "pow" and values[0]:
             return _number(values[0] ** parameter)
         if not any(values) and operation in _AT_ZERO:

@@ -11,6 +11,7 @@ import numpy as np
 from .._checks import Array
 from .graph import Graph
 from .intervals import OPERATIONS, Interval
+from .polynomials import BRANCHES
 
 # Numbers that are held at once, of both ends of intervals.
 _HELD = 1_000_000
@@ -128,7 +129,7 @@ class Program:
             node = self._order[k]
             while not values.known[place[node], 0]:
                 operation, arguments, parameter = self._graph.nodes[node]
-                if operation in ("either", "jump"):
+                if operation in BRANCHES:
                     truth = values.low[place[arguments[0]], 0], values.high[place[arguments[0]], 0]
                     if truth in ((0.0, 0.0), (1.0, 1.0)):
                         arguments = (arguments[1 if truth[0] else 2],)

@@ -135,7 +135,8 @@ def _ordered(operation: str) -> Callable[..., int]:
 _READ: dict[str, Callable[..., int]] = {
     "ADD": _add, "IF_ELSE_ZERO": _pick, "AND": _of_conditions("and"), "OR": _of_conditions("or"),
     "NOT": lambda graph, c: graph.negated(_condition(graph, c)),
-    "EQ": _ordered("equal"), "FMAX": _ordered("max"), "FMIN": _ordered("min"),
+    "EQ": _ordered("equal"), "FMAX": _of_numbers(Graph.largest),
+    "FMIN": _of_numbers(Graph.least),
     "NE": _of_numbers(lambda graph, a, b: graph.negated(graph.of("equal", *sorted((a, b))))),
     **{name: _of_numbers(function) for name, function in _functions({
         "SUB": Graph.sub, "MUL": Graph.mul, "NEG": Graph.neg, "DIV": _divided, "SQRT": Graph.root,
@@ -145,14 +146,14 @@ _READ: dict[str, Callable[..., int]] = {
         "ASSIGN": _same, "LIFT": _same,
         "LT": lambda graph, a, b: graph.of("less", a, b),
         "LE": lambda graph, a, b: graph.of("atmost", a, b),
-        "FABS": lambda graph, a: graph.of("abs", a),
+        "FABS": Graph.absolute,
         "ATAN2": lambda graph, a, b: graph.of("angle", a, b),
         "HYPOT": lambda graph, a, b: graph.of("length", a, b),
         "FMOD": lambda graph, a, b: graph.sub(
             a, graph.mul(b, graph.of("trunc", _divided(graph, a, b)))),
         "COPYSIGN": lambda graph, a, b: graph.choice(
-            graph.of("atmost", graph.constant(0.0), b), graph.of("abs", a),
-            graph.neg(graph.of("abs", a))),
+            graph.of("atmost", graph.constant(0.0), b), graph.absolute(a),
+            graph.neg(graph.absolute(a))),
     }).items()},
     **{name: _of_numbers(partial(_elementary, name.lower())) for name in (
         "EXP", "LOG", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "SINH", "COSH", "TANH", "ASINH",

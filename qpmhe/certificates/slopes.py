@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from .graph import CONDITIONS, Graph
+from .polynomials import BRANCHES
 
 Pairs = dict[tuple[int, int], int]
 
@@ -56,9 +57,8 @@ class Slopes:
         operation, arguments, parameter = self._graph.nodes[node]
         if operation == "variable":
             return {parameter: self._one}
-        branches = self._branches(node)
-        if branches is not None:
-            c, a, b = branches
+        if operation in BRANCHES:
+            c, a, b = arguments
             return {
                 i: self._either(c, self._entry(a, i), self._entry(b, i))
                 for i in sorted({*self.first(a), *self.first(b)})
@@ -71,11 +71,10 @@ class Slopes:
         return {i: one for i, one in found.items() if one != self._zero}
 
     def _second_of(self, node: int) -> Pairs:
-        graph, arguments = self._graph, self._graph.nodes[node][1]
+        graph, (operation, arguments, _) = self._graph, self._graph.nodes[node]
         found: Pairs = {}
-        branches = self._branches(node)
-        if branches is not None:
-            c, *sides = branches
+        if operation in BRANCHES:
+            c, *sides = arguments
             first, second = (self.second(side) for side in sides)
             for pair in {**first, **second}:
                 found[pair] = self._either(
@@ -112,20 +111,6 @@ class Slopes:
 
     def _either(self, c: int, a: int, b: int) -> int:
         return a if a == b else self._graph.of("either", c, a, b)
-
-    def _branches(self, node: int) -> tuple[int, int, int] | None:
-        """Condition and choices of a function with kinks or jumps."""
-        graph = self._graph
-        operation, arguments, _ = graph.nodes[node]
-        if operation in ("either", "jump"):
-            return arguments[0], arguments[1], arguments[2]
-        if operation in ("max", "min"):
-            a, b = arguments
-            return graph.of("atmost", *((b, a) if operation == "max" else (a, b))), a, b
-        if operation == "abs":
-            a = arguments[0]
-            return graph.of("less", self._zero, a), a, graph.neg(a)
-        return None
 
     def _partial(self, node: int) -> tuple[list[int], Pairs]:
         """Partial derivatives of an operation by its arguments, and the second ones by pairs."""
