@@ -191,7 +191,7 @@ def output_lipschitz(
             bound = max(bound, float(cells.inherited.max()))
             if np.isfinite(bound):
                 break
-            return seen(f"no bound was found with {cells.taken} cells{end}")
+            return seen(f"no bound was found with {cells.taken} cells{end}{model.unknown}")
         low, high = cells.take(_CHUNK)
         enclosure = model.enclose(low, high, output_only=True)
         bounds, middles = _norm_bounds(enclosure), 0.5 * low + 0.5 * high

@@ -177,6 +177,7 @@ class SmoothModel:
         self._slopes = Slopes(self._graph, system.n)
         self._programs: dict[str, Program] = {}
         self._plans: dict[bool, _Plan] = {}
+        self._unknown: tuple[Array, Array] | None = None
         self.output_reason, self._output = self._read("h")
         self.reason, following = (
             (self.output_reason, []) if self.output_reason else self._read("f")
@@ -204,12 +205,26 @@ class SmoothModel:
     def _obstacle(self, name: str, lower: Array, upper: Array) -> str:
         return self._programs[name].obstacle(lower, upper)
 
+    @property
+    def unknown(self) -> str:
+        """The last cell that could not be enclosed, and why, as the rest of a sentence."""
+        if self._unknown is None:
+            return ""
+        obstacle = self.obstacle(*self._unknown)
+        return obstacle and f"; between {self._unknown[0].tolist()} and " + (
+            f"{self._unknown[1].tolist()} {obstacle}"
+        )
+
     def obstacle(self, lower: Array, upper: Array) -> str:
         """What has no enclosure on a cell (N,), in words; blank if all has."""
         for name in ("f", "h"):
             found = self._obstacle(name, lower, upper) if name in self._programs else ""
             if found:
                 return f"{name} has {found}"
+        for plan in self._plans.values():
+            found = plan.obstacle(lower, upper)
+            if found:
+                return f"a derivative has {found}"
         return ""
 
     def _differs(self, name: str) -> str:
@@ -246,6 +261,7 @@ class SmoothModel:
             found = self._enclosed(lower, upper, output_only)
         unknown = np.isnan(found.error).any(axis=(1, 2))
         if unknown.any():
+            self._unknown = lower[unknown][-1], upper[unknown][-1]
             middles = 0.5 * lower[unknown] + 0.5 * upper[unknown]
             middles = middles[self._region.contains(middles[:, : self.n])]
             check_values(self._system, middles, output_only=output_only)
@@ -300,6 +316,10 @@ class _Plan:
         decisions = [pair[0] for pair in self._conditions]
         self._point = Program(graph, roots + slopes + decisions)
         self._cell = Program(graph, roots + slopes + [one[-1] for one in second] + decisions)
+
+    def obstacle(self, lower: Array, upper: Array) -> str:
+        """What is not defined on all of a cell (N,), in words; blank if all is."""
+        return self._point.obstacle(lower, upper)
 
     def enclosed(
         self, lower: Array, upper: Array, truths: Array | None = None

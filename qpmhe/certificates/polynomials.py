@@ -16,7 +16,7 @@ Polynomial = dict[Any, Fraction]
 BRANCHES = ("either", "jump", "max", "min", "abs")
 _MOST_TERMS, _MOST_LEVELS = 40, 25
 # Constants that differ by less, beside what they are computed from, are equal but for rounding.
-_ROUNDING = 1e-13
+_ROUNDING = 1e-14
 _NUMBER = "number"
 _AT_ZERO = {
     **dict.fromkeys(("exp", "cos", "cosh"), 1.0),

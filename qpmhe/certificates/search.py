@@ -78,6 +78,11 @@ class FreeModel:
         self.reason, self.affine_output = model.reason, model.affine_output
         self._rows = np.append(free, model.n + np.arange(model.p))
 
+    @property
+    def unknown(self) -> str:
+        """As `SmoothModel.unknown`."""
+        return self._model.unknown
+
     def enclose(self, lower: Array, upper: Array) -> Enclosure:
         """As `SmoothModel.enclose`; nothing is known where f is not shown to keep the others."""
         found, kept = self._model.enclose(lower, upper), np.ones(self.n, np.bool_)
@@ -403,6 +408,7 @@ class Search:
         end = ", when its time was over" if found.late else ""
         return self._sampled(
             form, f"the proof was given up after dividing the region into {found.cells} cells{end}"
+            f"{self.model.unknown}",
         )
 
     def _sampled(self, form: Form, why: str) -> Found | Cover:

@@ -113,6 +113,17 @@ def test_what_jumps_is_not_certified_from_its_derivatives(f):
             ask(scalar(f, lambda x: 0.0 * x), box(-0.973, 0.931))  # no sample is at a jump
 
 
+@pytest.mark.parametrize(("h", "word"), [
+    (lambda x: np.where(x > 0.3, 1e-9 + x, x), "h has a choice (numpy.where, if_else) that may"),
+    (lambda x: x + 1e-9 * np.floor(x), "h has a jump of floor"),
+    (lambda x: np.sqrt(np.maximum(x, 0.0)), "a derivative has a division by a value that may be"),
+])
+def test_what_could_not_be_enclosed_is_named(h, word):
+    found = output_lipschitz(scalar(h=h), bounded_region(scalar(h=h), box(-0.973, 0.931)), None, 1)
+    assert found.evidence is Evidence.SAMPLED
+    assert word in found.note
+
+
 def test_what_is_steep_or_kinked_is_not_said_to_jump():
     found = certify_detectability(
         scalar(lambda x: 0.5 * np.abs(x), lambda x: 0.0 * x), box(-1.0, 1.0), eta=0.8
