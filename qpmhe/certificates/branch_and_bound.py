@@ -13,7 +13,7 @@ from ..model.system import System
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel, check_values, evaluated
 from .evidence import Evidence
-from .inequalities import Form, Matrices, definite, norm_bound
+from .inequalities import Form, Matrices, definite, norm_bound, quickly_definite
 from .regions import Region
 
 _CHUNK = 256
@@ -24,6 +24,8 @@ _WORK = 4e7
 # Cells are split by what their width adds to the error; what it adds to the corners counts
 # a little, for cells that reach out of a polytope.
 _CORNER_SHARE = 1e-3
+# Rows of matrices from which on their smallest eigenvalues cost too much; the margin is NaN then.
+_LARGE = 20
 _MOST_OUTPUT_CELLS = 20_000
 _TOLERANCE = 1e-3
 _SAMPLES = 2000
@@ -78,8 +80,12 @@ class Cells:
 
 def _scores(enclosure: Enclosure, left: NDArray[Any]) -> Array:
     """What the width of each coordinate adds to the error and the corners of some cells."""
-    corners = np.abs(enclosure.slopes[left]).sum(axis=(2, 3))
-    scores: Array = enclosure.excess[left] + _CORNER_SHARE * corners
+    sizes = np.abs(enclosure.slopes)
+    weight = np.nan_to_num(sizes).max(axis=(0, 2, 3), initial=0.0)
+    # Of coordinates beyond the most active ones, all that they do is in the error.
+    share = np.ones(weight.size)
+    share[np.argsort(weight)[::-1][:MOST_ACTIVE]] = _CORNER_SHARE
+    scores: Array = enclosure.excess[left] + share * sizes[left].sum(axis=(2, 3))
     return scores
 
 
@@ -127,7 +133,11 @@ def cover(
 def _shown(form: Form, enclosure: Enclosure) -> tuple[NDArray[np.bool_], Array]:
     matrices, cells = _at_corners(enclosure)
     with np.errstate(all="ignore"):
-        proved, least = definite(form.matrices(matrices))
+        found = form.matrices(matrices)
+        if found.middle.shape[-1] < _LARGE:
+            proved, least = definite(found)
+        else:
+            proved, least = quickly_definite(found), np.full(len(found.middle), np.nan)
     every: NDArray[np.bool_] = np.all(proved.reshape(cells, -1), axis=1)
     smallest: Array = least.reshape(cells, -1).min(axis=1)
     return every, smallest

@@ -311,6 +311,40 @@ def definite(matrices: Matrices) -> tuple[NDArray[np.bool_], Array]:
     return proved, least
 
 
+def quickly_definite(matrices: Matrices) -> NDArray[np.bool_]:
+    r"""As `definite`, for many large matrices: quicker, and of no use for single small numbers.
+
+    With unit diagonals, the members lie within the largest row sum of the radii of the middle,
+    in the spectral norm. Cholesky's factorisation of the middle A less c I, where it ends, is of
+    a matrix that differs by at most :math:`\gamma_{n+1} \operatorname{tr} A` up to a factor near
+    one; c is more than both.
+
+    References
+    ----------
+    Rump, Verification of positive definiteness, BIT 46 (2006). Higham, Accuracy and Stability
+    of Numerical Algorithms, 2nd edition, theorem 10.3.
+    """
+    middle = 0.5 * (matrices.middle + np.swapaxes(matrices.middle, -1, -2))
+    radius = np.broadcast_to(matrices.radius, middle.shape)
+    n, diagonal = middle.shape[-1], np.diagonal(middle, axis1=-2, axis2=-1)
+    with np.errstate(all="ignore"):
+        # Powers of two scale without rounding.
+        scale = np.exp2(-np.round(0.5 * np.log2(diagonal)))
+        factor = scale[:, :, None] * scale[:, None, :]
+        A, spread = factor * middle, factor * radius
+        widest = np.maximum(spread, np.swapaxes(spread, -1, -2)).sum(axis=-1).max(axis=-1)
+        trace = np.diagonal(A, axis1=-2, axis2=-1).sum(axis=-1)
+        shift = (widest + 4.0 * (n + 4) * _UNIT * trace) * (1.0 + 1e-12)
+        A[:, range(n), range(n)] -= shift[:, None]
+        proved = np.isfinite(A).all(axis=(-2, -1))
+        for k in range(n):
+            pivot = A[:, k, k]
+            proved &= pivot > 0.0
+            column = A[:, k + 1 :, k] / np.sqrt(np.where(proved, pivot, np.nan))[:, None]
+            A[:, k + 1 :, k + 1 :] -= column[:, :, None] * column[:, None, :]
+    return proved
+
+
 def eigenvalue_bounds(P: Array) -> tuple[float, float]:
     r"""Numbers :math:`0 < a \le b` with :math:`a I \prec P \prec b I`, verified."""
     values = np.linalg.eigvalsh(P)

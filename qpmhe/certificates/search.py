@@ -36,6 +36,10 @@ _ROUNDS = 8
 _MARGINS = (1e-6, 1e-4, 1e-3, 1e-2)
 # Of what a rate that is not given leaves to 1: few cells suffice where there is room.
 _ROOM = (0.03, 0.06, 0.12, 0.25)
+# Where one program takes longer than so many seconds, these rates are tried in turn, with more
+# room and fewer Jacobians.
+_LONG, _RATES, _WIDE_ROOM = 0.3, (0.9, 0.95, 0.98), (0.2, 0.4, 0.6)
+_FEW_POINTS = 4
 _TOLERANCE = 1e-3  # of the smallest rate
 _LARGEST_RATE = 0.9999
 # Above the smallest feasible rate, at which constants may grow without bound, and how often
@@ -145,7 +149,9 @@ class Search:
         self.kind: Kind = kind
         each = expected_seconds(self.n, system.p, kind)
         affordable = _CHOICE * self._deadline.left / (_PROGRAMS * each)
-        self._chosen = _far_apart(self.jacobians, int(np.clip(affordable, 1, _MOST_POINTS)))
+        self._long = each * _MOST_POINTS > _LONG
+        most = _FEW_POINTS if self._long else _MOST_POINTS
+        self._chosen = _far_apart(self.jacobians, int(np.clip(affordable, 1, most)))
         if not self.model.reason and "given" in (
             system.f_jacobian.method, system.h_jacobian.method
         ):
@@ -336,6 +342,15 @@ class Search:
     def _find_best(self) -> Found:
         """An inequality with the best rate found."""
         share, refused = _ABOVE, NotCertifiedError("no rate was tried")
+        if self._long:
+            for rate in _RATES:
+                try:
+                    return self._find(rate, given=False)
+                except (OutOfTimeError, _BrokenPairError):
+                    raise
+                except NotCertifiedError as error:
+                    refused = error
+            raise refused
         for _ in range(_ATTEMPTS):
             smallest = self._smallest_rate()
             if not np.isfinite(smallest):
@@ -355,7 +370,9 @@ class Search:
     def _find(self, rate: float, *, given: bool = True) -> Found:
         """An inequality with this rate, verified as far as can be."""
         level, margins = 0, [each * min(1.0, rate * rate) for each in _MARGINS]
-        if not given and self.kind in ("observer", "synthesis"):
+        if self._long:
+            margins = [each * (1.0 - rate * rate) for each in _WIDE_ROOM]
+        elif not given and self.kind in ("observer", "synthesis"):
             margins = [each * (1.0 - rate * rate) for each in _ROOM]
         best: Found | None = None
         status = "no round was left"
@@ -378,7 +395,7 @@ class Search:
                 if outcome.evidence is Evidence.PROVED or self.model.reason:
                     return outcome
                 best = outcome
-            elif self._added(outcome) and turn % 2:
+            elif self._added(outcome) and turn % 2 and not self._long:
                 continue
             if level + 1 == len(margins):
                 break

@@ -17,6 +17,7 @@ from qpmhe.certificates.inequalities import (
     eigenvalue_bounds,
     euclidean_constants,
     norm_bound,
+    quickly_definite,
 )
 
 
@@ -50,6 +51,7 @@ def test_never_more_than_exact_arithmetic_and_hardly_less(n):
         shown = bool(definite(Matrices.exact(matrix[None]))[0][0])
         truth = exactly_definite(matrix)
         assert truth or not shown
+        assert truth or not quickly_definite(Matrices.exact(matrix[None]))[0]
         proved += shown
     assert proved > 10
 
@@ -71,6 +73,27 @@ def test_radius_is_covered():
     for _ in range(50):
         noise = generator.uniform(-0.1, 0.1, (3, 3))
         assert exactly_definite(matrix[0] + 0.5 * (noise + noise.T))
+
+
+def test_quick_proof_covers_radii_and_refuses_what_is_singular():
+    generator = np.random.default_rng(8)
+    shown = 0
+    for _ in range(200):
+        n = int(generator.integers(1, 8))
+        basis = generator.standard_normal((n, n)) * 10.0 ** generator.uniform(-3, 3, (n, 1))
+        matrix = basis @ basis.T
+        matrix = 0.5 * (matrix + matrix.T)
+        sizes = np.sqrt(np.diag(matrix))
+        radius = 10.0 ** generator.uniform(-6, 0) * np.outer(sizes, sizes)
+        if not quickly_definite(Matrices(matrix[None], radius[None]))[0]:
+            continue
+        shown += 1
+        noise = generator.choice([-1.0, 1.0], (n, n)) * radius
+        assert exactly_definite(matrix + 0.5 * (noise + noise.T))
+    assert shown > 50
+    ones, nan = np.ones((3, 3)), np.full((3, 3), np.nan)
+    stack = np.stack((ones, nan, -np.eye(3), np.eye(3), 1e-30 * np.eye(3)))
+    assert quickly_definite(Matrices.exact(stack)).tolist() == [False, False, False, True, True]
 
 
 def test_products_hold_exact_products():
