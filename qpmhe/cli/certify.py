@@ -43,7 +43,8 @@ def certify(
             seconds=seconds, name=model,
         )
     certificate = found.certificate
-    _print(console, f"[bold]{escape(certificate.headline)}[/]")
+    other = "With a gain made for the region: " if found.replaced else ""
+    _print(console, f"[bold]{other}{escape(certificate.headline)}[/]")
     rows = Table.grid(padding=(0, 2))
     for name, text in (
         ("model", title), ("states", _words(found.region)),
