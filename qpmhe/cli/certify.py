@@ -20,8 +20,8 @@ from ..certificates.regions import Region
 from ..certificates.report import LABELS, Report, certify_model
 from ..errors import OptionError
 from ..models.loading import find, load
-from .boxes import read_box
 from .design import show_design
+from .values import read_box
 
 
 def certify(
