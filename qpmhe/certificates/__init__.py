@@ -12,11 +12,12 @@ from .evidence import (
 )
 from .lyapunov import Design, design
 from .monitor import Hypotheses, Monitor, MonitorSummary, monitor, monitored_run
-from .observer_bound import Band, ObserverBound, SignalBounds
+from .observer_bound import Band, ObserverBound
 from .observer_monitor import ObserverMonitor, Reading
 from .properties import Detectability, ObserverStability
 from .regions import Region
 from .report import Report, certify_model
+from .signal_bounds import SignalBounds
 from .theorem import DecayingSums, Sizes, TheoremConstants
 
 __all__ = [

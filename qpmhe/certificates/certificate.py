@@ -37,10 +37,11 @@ from .evidence import (
     json_ready,
     weakest,
 )
-from .observer_bound import ObserverBound, SignalBounds, Size, bound_observer, with_invariance
+from .observer_bound import ObserverBound, bound_observer, with_invariance
 from .properties import Detectability, ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
+from .signal_bounds import SignalBounds, Size
 from .theorem import Sizes, checked_length
 from .window_bounds import HorizonBounds, bounds_for
 from .window_bounds import Kind as TheoremKind

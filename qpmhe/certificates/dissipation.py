@@ -14,10 +14,10 @@ from ..model.system import System
 from .branch_and_bound import Cover
 from .deadline import Deadline
 from .inequalities import Form, Matrices, OutputInjection, OutputWeight, norms
-from .observer_bound import SignalBounds, _alone, _read, _sides
 from .regions import Region
 from .sdp import Answer, Kind, Program, Scales, _columns
 from .search import Found, Search
+from .signal_bounds import SignalBounds, lengths_of, read_size, sides_of
 
 _MOST_CONDITION = 1e8
 _FLOOR = 1e-6  # of the noise's weight: a cost needs a positive one
@@ -149,7 +149,7 @@ class DesignProgram(Program):
             for each, side in ((self._P, d), (self._X, d), (self._Q, w), (self._R, s))
         )
         supply = sum(
-            float(_alone(name, _read(name, given), len(weight), weight)) ** 2
+            float(lengths_of(name, read_size(name, given), len(weight), weight)) ** 2
             for name, given, weight in (
                 ("disturbances", sizes.disturbances, Q), ("noises", sizes.noises, R)
             )
@@ -205,7 +205,7 @@ class DesignSearch(Search):
 def largest_sizes(sizes: SignalBounds) -> tuple[float | Array, float | Array]:
     """The largest disturbances and noises: lengths, or half-widths by component."""
     w, v = (
-        np.abs(_sides(name, given)).max(axis=0) if isinstance(given, ConvexSet) else given
+        np.abs(sides_of(name, given)).max(axis=0) if isinstance(given, ConvexSet) else given
         for name, given in (("disturbances", sizes.disturbances), ("noises", sizes.noises))
     )
     return w, v

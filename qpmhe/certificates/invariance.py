@@ -169,7 +169,7 @@ def inner_region(region: Region, metric: Array, radius: float) -> Region | None:
         None if it is empty, or has no interior.
     """
     states, n = region.states, region.n
-    sides, slants = (radius * _supports(metric, rows) for rows in (np.eye(n), states.matrix))
+    sides, slants = (radius * supports(metric, rows) for rows in (np.eye(n), states.matrix))
     inner = ConvexSet(
         _inward(states.lower, sides), -_inward(-states.upper, sides), states.matrix,
         _inward(states.row_lower, slants), -_inward(-states.row_upper, slants),
@@ -189,7 +189,7 @@ def _inward(sides: Array, reach: Array) -> Array:
     return moved
 
 
-def _supports(metric: Array, rows: Array) -> Array:
+def supports(metric: Array, rows: Array) -> Array:
     """The largest g^T e over |e|_P <= 1, for each row g, rounded up."""
     guess = np.einsum("ij,ji->i", rows, np.linalg.solve(metric, rows.T))
     for slack in _SLACKS:

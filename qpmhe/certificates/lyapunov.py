@@ -36,10 +36,11 @@ from .evidence import (
     weakest,
 )
 from .inequalities import norms
-from .observer_bound import Entering, ObserverBound, SignalBounds, Size, _alone, _read
+from .observer_bound import Entering, ObserverBound
 from .properties import ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
+from .signal_bounds import SignalBounds, Size, lengths_of, read_size
 from .theorem import Sizes
 from .window_bounds import _slope, fit_weight, largest
 
@@ -242,7 +243,7 @@ class Design:
             spoilt[t : t + N if restarts else steps] = True
         bound, errors = np.full(steps + 1, math.nan), np.zeros(steps + 1)
         width = (self.region.upper - self.region.lower)[: self.system.n]
-        widest = float(_alone("the region", Box(-width, width), len(width), self.prior))
+        widest = float(lengths_of("the region", Box(-width, width), len(width), self.prior))
         bound[0] = self._initial(initial_error)
         if not restarts:
             errors = self._observer().radii(steps, initial_error, Entering(*signals[2:]))
@@ -259,9 +260,9 @@ class Design:
 
     def _initial(self, error: Size) -> float:
         """The first bound."""
-        given, n = _read("initial_error", error), self.system.n
+        given, n = read_size("initial_error", error), self.system.n
         if isinstance(given, ConvexSet):
-            return float(_alone("initial_error", given, n, self.prior))
+            return float(lengths_of("initial_error", given, n, self.prior))
         if given.shape not in ((), (n,)):
             raise ShapeError(
                 f"initial_error has shape {given.shape}; expected ({n},), a length, or a set."
@@ -304,16 +305,16 @@ class Design:
 
         The last two, what `Entering` has, are zero without an observer.
         """
-        w = _read("disturbances", self.sizes.disturbances if w is None else w)
-        v = _read("noises", self.sizes.noises if v is None else v)
+        w = read_size("disturbances", self.sizes.disturbances if w is None else w)
+        v = read_size("noises", self.sizes.noises if v is None else v)
         p, found = self.system.p, [np.zeros(())] * 4
         found[0] = (
-            _alone("disturbances", w, len(self.disturbance), self.disturbance) ** 2
-            + _alone("noises", v, p, self.noise) ** 2
+            lengths_of("disturbances", w, len(self.disturbance), self.disturbance) ** 2
+            + lengths_of("noises", v, p, self.noise) ** 2
         )
         if self.observer is not None:
             fit = fit_weight(self.cost(), self.observer.gain)
-            found[1:] = _alone("noises", v, p, fit), *self.observer.entering(w, v)
+            found[1:] = lengths_of("noises", v, p, fit), *self.observer.entering(w, v)
         if any(each.shape not in ((), (steps,)) for each in found):
             raise ShapeError(
                 f"disturbances or noises are not of {steps} samples, as the run is; expected "

@@ -21,8 +21,8 @@ from ..estimation.run import Run
 from ..model.system import System
 from .certificate import BROKEN, OUTWARD, Certificate
 from .evidence import MismatchError
-from .observer_bound import SignalBounds, Size
 from .observer_monitor import ObserverMonitor, Reading, sharper
+from .signal_bounds import SignalBounds, Size
 
 _RELATIVE = 1e-6
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)

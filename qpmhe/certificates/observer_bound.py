@@ -16,154 +16,51 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qpmhe_solvers.values import shown
-
 from .._checks import Array, numbers
-from .._linalg import inverse
 from ..costs import Cost
-from ..errors import OptionError, SetError, ShapeError
-from ..estimation.estimate import Status
-from ..estimation.run import Run, RunSource
+from ..errors import OptionError, ShapeError
+from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
+from .bound_events import CONTRADICTION, events_of
 from .contraction import certify_observer
 from .deadline import PART_SECONDS, Deadline
 from .evidence import Evidence, json_ready
 from .inequalities import Matrices, definite
-from .invariance import Invariance, certify_invariance, inner_region
+from .invariance import Invariance, certify_invariance, inner_region, supports
 from .properties import ObserverStability
-from .regions import Region, bounded_region, stated_region
+from .regions import Region, bounded_region
+from .signal_bounds import (
+    MOST_CORNERS,
+    OUTWARD,
+    SignalBounds,
+    Size,
+    corners_of,
+    largest_length,
+    lengths_of,
+    read_size,
+    root_of,
+    sides_of,
+    weighted_lengths,
+)
 from .theorem import Sizes, checked_length
 
-#: What bounds w or v: a length, a set, or lengths (T,) or vectors (T, n) at each sample.
-Size = ArrayLike | ConvexSet
-
 _UNIT = float(np.finfo(np.float64).eps)
-# More than the rounding of a sum, a product and a root, each.
-_OUTWARD = 1.0 + 16.0 * _UNIT
-_SIGMAS = 3.0
 # How close to its limit the bound is when it is called settled.
 _SETTLED = 0.1
 # How much of the time is for the contraction, and of the rest for the region itself.
 _CONTRACTION, _INVARIANCE = 0.8, 0.6
 _MOST_SAMPLES = 10**6  # that are counted until then
-# Of the larger size, what the other one counts at least where a matrix is sought.
-_LEAST = 1e-3
-# Boxes with more corners are bounded by sums over their sides.
-_MOST_CORNERS = 4096
 # Halvings of the bracket of a multiplier, each value of which gives a bound.
 _HALVINGS = 20
 _SLACKS = (1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
-
-#: Samples after which the inequality says nothing of the observer's next state, and why.
-_BREAKS = (
-    (Status.MISSING, "a measurement was missing"),
-    (Status.MODEL_FAILED, "the model failed, and the observer started again"),
-)
-
-
-@dataclass(frozen=True)
-class SignalBounds:
-    """What bounds disturbances and noises at all times, and where that comes from.
-
-    Parameters
-    ----------
-    disturbances, noises : float or ConvexSet
-        The largest |w| and |v|, or sets that hold w and v; of a set, the box around it is used.
-    source : str
-        In words, for reports.
-    """
-
-    disturbances: float | ConvexSet
-    noises: float | ConvexSet
-    source: str = "as stated"
-
-    def __post_init__(self) -> None:
-        for name in ("disturbances", "noises"):
-            _read(name, getattr(self, name))
-
-    @classmethod
-    def usual(
-        cls, system: System, w_covariance: Array, v_covariance: Array, origin: str
-    ) -> SignalBounds:
-        """The system's W and V, and three standard deviations where these are not bounded."""
-        found: list[ConvexSet] = []
-        sources: list[str] = []
-        spread = system.state_covariance(w_covariance)
-        for letter, stated, covariance in (
-            ("W", system.disturbances, spread), ("V", system.noises, v_covariance),
-        ):
-            of_states = letter == "V" or system.disturbance_matrix is None
-            if stated is not None and of_states and np.isfinite(_bounds(stated)).all():
-                found.append(stated)
-                sources.append(f"the system's {letter}")
-            else:
-                half = _SIGMAS * np.sqrt(np.diag(covariance))
-                found.append(Box(-half, half))
-                sources.append(f"three standard deviations of {origin}")
-        return cls(found[0], found[1], " and ".join(dict.fromkeys(sources)))
-
-    @classmethod
-    def of(cls, sizes: SignalBounds | Sizes | None, system: System, cost: Cost) -> SignalBounds:
-        """Those that are stated, or the usual ones with the weights as inverse covariances."""
-        if isinstance(sizes, Sizes):
-            return cls(sizes.disturbance, sizes.noise)
-        if sizes is not None:
-            return sizes
-        covariance, factor = inverse(cost.disturbance), cost.disturbance_factor
-        if factor is not None:
-            covariance = factor @ covariance @ factor.T
-        return cls.usual(system, covariance, inverse(cost.noise), "the cost's inverse weights")
-
-    @property
-    def largest(self) -> tuple[float, float]:
-        """The largest |w| and |v|."""
-        w, v = (
-            float(given) if not isinstance(given, ConvexSet)
-            else float(np.linalg.norm(np.abs(_sides(name, given)).max(axis=0))) * _OUTWARD
-            for name, given in (("disturbances", self.disturbances), ("noises", self.noises))
-        )
-        return w, v
-
-    @property
-    def lengths(self) -> Sizes:
-        """The largest |w| and |v|; 1 each where there are neither disturbances nor noises."""
-        return Sizes(*self.largest) if max(self.largest) > 0.0 else Sizes()
-
-    def typical(self, system: System) -> tuple[float | Array, float | Array]:
-        """Sizes of w and v to choose a certificate for: of each component, or lengths.
-
-        Where there is nothing of one kind, a thousandth of the other keeps the choice bounded.
-        """
-        found: list[float | Array] = []
-        least = _LEAST * max(self.lengths.disturbance, self.lengths.noise)
-        for name, given, size in (
-            ("disturbances", self.disturbances, system.r), ("noises", self.noises, system.p),
-        ):
-            if isinstance(given, ConvexSet):
-                largest = np.abs(_sides(name, given)).max(axis=0)
-                if largest.size == size:
-                    found.append(np.maximum(largest, least))
-                    continue
-            length = self.lengths.disturbance if name == "disturbances" else self.lengths.noise
-            found.append(max(length, least))
-        return found[0], found[1]
-
-    def __str__(self) -> str:
-        return f"{_words('w', self.disturbances)}, {_words('v', self.noises)} ({self.source})"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything in types that JSON knows."""
-        return {"source": self.source} | {
-            name: _sides(name, given).tolist() if isinstance(given, ConvexSet) else float(given)
-            for name, given in (("disturbances", self.disturbances), ("noises", self.noises))
-        }
 
 
 class Entering(NamedTuple):
@@ -278,25 +175,13 @@ class ObserverBound:
     @cached_property
     def slopes(self) -> Array:
         """The roots of P^-1's diagonal, (n,): |e_i| <= slopes[i] |e|_P, rounded outward."""
-        n = len(self.metric)
-        guess = np.diag(np.linalg.inv(self.metric))
-        for slack in _SLACKS:
-            found = guess * (1.0 + slack)
-            # e_i e_i^T / c < P exactly where (P^-1)_ii < c, by Schur's complement.
-            less = np.zeros((n, n, n))
-            less[range(n), range(n), range(n)] = 1.0 / found
-            rest = Matrices.exact(np.broadcast_to(self.metric, (n, n, n))) - Matrices(
-                less, 2.0 * _UNIT * less
-            )
-            if (found > 0.0).all() and definite(rest)[0].all():
-                return np.sqrt(found) * _OUTWARD
-        return np.full(n, math.inf)
+        return supports(self.metric, np.eye(len(self.metric)))
 
     @cached_property
     def _axes(self) -> tuple[Array, Array]:
         """Half axes of an ellipsoid around {|e|_P <= 1}, the longest first, and directions."""
         n = len(self.metric)
-        ball = np.full(n, float(np.linalg.norm(self.slopes)) * _OUTWARD), np.eye(n)
+        ball = np.full(n, float(np.linalg.norm(self.slopes)) * OUTWARD), np.eye(n)
         try:
             factor = np.linalg.cholesky(self.metric)
             left, sizes, _ = np.linalg.svd(np.linalg.inv(factor).T)
@@ -315,20 +200,20 @@ class ObserverBound:
 
     def length(self, errors: ArrayLike) -> Array:
         """|e|_P of errors (..., n), rounded up."""
-        return _lengths(numbers("errors", errors), self.metric)
+        return weighted_lengths(numbers("errors", errors), self.metric)
 
     def initial(self, error: Size) -> float:
         """b(0) from x(0) - z(0): a vector (n,), a bound on its length, or a set that holds it."""
-        given, n = _read("initial_error", error), len(self.metric)
+        given, n = read_size("initial_error", error), len(self.metric)
         if isinstance(given, ConvexSet):
-            return _largest("initial_error", given, n, self.metric)
+            return largest_length("initial_error", given, n, self.metric)
         if given.shape not in ((), (n,)):
             raise ShapeError(
                 f"initial_error has shape {given.shape}; expected ({n},), a length, or a qpmhe.Box."
             )
         if given.shape == (n,):
             return float(self.length(given))
-        return checked_length("initial_error", given) * _root(self.metric)
+        return checked_length("initial_error", given) * root_of(self.metric)
 
     def entering(
         self, disturbances: Size | None = None, noises: Size | None = None
@@ -340,17 +225,18 @@ class ObserverBound:
         disturbances, noises : optional
             Vectors (T, n) and (T, p), lengths (T,), a length or a set; `sizes` if left out.
         """
-        w = _read("disturbances", self.sizes.disturbances if disturbances is None else disturbances)
-        v = _read("noises", self.sizes.noises if noises is None else noises)
+        usual = self.sizes
+        w = read_size("disturbances", usual.disturbances if disturbances is None else disturbances)
+        v = read_size("noises", usual.noises if noises is None else noises)
         n, p = self.gain.shape
         if isinstance(w, ConvexSet) and isinstance(v, ConvexSet):
-            ws, vs = _corners("disturbances", w, n), _corners("noises", v, p)
-            if len(ws) * len(vs) in range(1, _MOST_CORNERS + 1):
+            ws, vs = corners_of("disturbances", w, n), corners_of("noises", v, p)
+            if len(ws) * len(vs) in range(1, MOST_CORNERS + 1):
                 joint = self._joint(np.repeat(ws, len(vs), 0), np.tile(vs, (len(ws), 1))).max()
                 return Entering(np.array(joint), self._square(w, v))
-        first = _alone("disturbances", w, n, self.metric)
+        first = lengths_of("disturbances", w, n, self.metric)
         assert self.stability.V is not None
-        second = _alone("noises", v, p, self.stability.V)  # no less than L^T P L
+        second = lengths_of("noises", v, p, self.stability.V)  # no less than L^T P L
         if first.ndim and second.ndim and len(first) != len(second):
             raise ShapeError(
                 f"disturbances has {len(first)} samples, and noises {len(second)}; expected the "
@@ -358,22 +244,21 @@ class ObserverBound:
             )
         if not isinstance(w, ConvexSet) and not isinstance(v, ConvexSet) and w.ndim == v.ndim == 2:
             return Entering(self._joint(w, v), self._square(w, v))
-        return Entering((first + second) * _OUTWARD, self._square(w, v))
+        return Entering((first + second) * OUTWARD, self._square(w, v))
 
     def _square(self, w: Array | ConvexSet, v: Array | ConvexSet) -> Array:
         """|w|_Q^2 + |v|_R^2 at most; infinite where the sum of squares is not certified."""
         Q, R = self.stability.Q, self.stability.R
         if Q is None or R is None or len(Q) != len(self.metric):
             return np.array(math.inf)
-        first, second = _alone("disturbances", w, len(Q), Q), _alone("noises", v, len(R), R)
-        return (first * first + second * second) * _OUTWARD
+        first, second = lengths_of("disturbances", w, len(Q), Q), lengths_of("noises", v, len(R), R)
+        return (first * first + second * second) * OUTWARD
 
     def _joint(self, w: Array, v: Array) -> Array:
         sizes = np.abs(w) + np.abs(v) @ np.abs(self.gain.T)
         error = (self.gain.shape[1] + 2) * _UNIT * sizes
-        return (
-            _lengths(w - v @ self.gain.T, self.metric) + _lengths(error, np.abs(self.metric))
-        ) * _OUTWARD
+        rounding = weighted_lengths(error, np.abs(self.metric))
+        return (weighted_lengths(w - v @ self.gain.T, self.metric) + rounding) * OUTWARD
 
     def radii(self, steps: int, initial_error: Size, entering: Entering) -> Array:
         """b(0), ..., b(T), from what enters at each sample or always."""
@@ -393,7 +278,7 @@ class ObserverBound:
         """b(t+1) from b(t), rounded up: the smaller of the two that are certified."""
         reached = self.rate * radius
         linear = reached + float(entering.length)
-        return min(linear, math.hypot(reached, math.sqrt(entering.square))) * _OUTWARD
+        return min(linear, math.hypot(reached, math.sqrt(entering.square))) * OUTWARD
 
     def at(
         self, time: int, initial_error: Size, disturbances: Size | None = None,
@@ -409,13 +294,13 @@ class ObserverBound:
             raise OptionError(
                 "disturbances and noises are of single samples; expected bounds for all times."
             )
-        rate = self.rate * _OUTWARD
+        rate = self.rate * OUTWARD
         linear = float(entering.length) / (1.0 - rate)
-        return min(linear, math.sqrt(float(entering.square) / (1.0 - rate * rate))) * _OUTWARD
+        return min(linear, math.sqrt(float(entering.square) / (1.0 - rate * rate))) * OUTWARD
 
     def components(self, radius: ArrayLike) -> Array:
         """What each |x_i - z_i| is at most where |x - z|_P <= radius: (..., n) for (...)."""
-        return np.multiply.outer(np.asarray(radius, np.float64), self.slopes) * _OUTWARD
+        return np.multiply.outer(np.asarray(radius, np.float64), self.slopes) * OUTWARD
 
     def around(self, radius: ArrayLike, observer: Array) -> tuple[Array, Array]:
         """Sides (..., n) of a box that holds the true state: around z, and within the region."""
@@ -477,7 +362,7 @@ class ObserverBound:
             z = np.asarray(observer, np.float64)
             lower, upper = self.around(b, z)
             away = np.maximum(np.abs(z + o - lower), np.abs(upper - z - o))
-            found = np.minimum(found, np.linalg.norm(away, axis=-1) * _OUTWARD)
+            found = np.minimum(found, np.linalg.norm(away, axis=-1) * OUTWARD)
         result: Array = found
         return result
 
@@ -508,7 +393,11 @@ class ObserverBound:
                 return other.along(run, disturbances, noises, initial_error=initial_error)
         radius = self.radii(len(run), initial_error, self.entering(disturbances, noises))
         z = run.observer_states
-        lost, reason = self._lost(run, radius)
+        events = events_of(run, self.region, self.projects)
+        empty = self.is_empty(radius[1:], z[1:])
+        if empty.any():
+            events.append((int(empty.argmax()), CONTRADICTION))
+        lost, reason = min(events, key=itemgetter(0), default=(None, ""))
         if lost is not None:
             radius[lost + 1 :] = np.nan
         lower, upper = self.around(radius, z)
@@ -516,72 +405,10 @@ class ObserverBound:
             radius, lower, upper, self.farthest(radius, run.states - z, z), lost, reason
         )
 
-    def _lost(self, run: Run, radius: Array) -> tuple[int | None, str]:
-        """The first sample after which the bound does not follow, and why."""
-        away = ~self.region.contains(run.observer_states[:-1])
-        reasons = [(self.event(status), t) for t, status in _marked(run, self.projects)]
-        if away.any():
-            reasons.append((self.left(run.observer_states[t := int(away.argmax())]), t))
-        if run.source is not None:
-            reasons += self._of_source(run.source)
-        empty = self.is_empty(radius[1:], run.observer_states[1:])
-        if empty.any():
-            reasons.append((CONTRADICTION, int(empty.argmax())))
-        reason, first = min(reasons, key=lambda one: one[1], default=("", None))
-        return first, reason
-
-    def _of_source(self, source: RunSource) -> list[tuple[str, int]]:
-        """What a run's inputs, steps and settings say against the bound."""
-        found, n = [], self.region.n
-        if source.settings.candidate != "observer":
-            found.append((REINITIALIZED, 0))
-        low, high = self.region.lower[n:], self.region.upper[n:]
-        if source.inputs is not None:
-            beyond = ((source.inputs < low) | (source.inputs > high)).any(axis=1)
-            if beyond.any():
-                found.append((self.input_beyond(source.inputs[t := int(beyond.argmax())]), t))
-        if source.steps is not None:
-            other = np.asarray(source.steps) != source.system.dt
-            if other.any():
-                t = int(other.argmax())
-                found.append((step_of(source.steps[t], source.system.dt), t))
-        return found
-
-    def input_beyond(self, u: Array) -> str:
-        """What to say of an input that is not certified; empty of one that is."""
-        low, high = self.region.lower[self.region.n :], self.region.upper[self.region.n :]
-        if bool(((low <= u) & (u <= high)).all()):
-            return ""
-        return f"the input {u.tolist()} is outside of what was certified"
-
     def is_empty(self, radius: Array, observer: Array) -> NDArray[np.bool_]:
         """Whether no state of the region is in the set around z."""
         lower, upper = self.around(radius, observer)
         return np.asarray(np.any(lower > upper, axis=-1))
-
-    def left(self, observer: Array) -> str:
-        """What to say of an observer outside of the region; empty within it."""
-        if self.region.contains(observer):
-            return ""
-        return f"the observer was outside of the region, at {np.round(observer, 6).tolist()}"
-
-    def projected(self, status: Status) -> bool:
-        """Whether the observer was projected onto X in this step."""
-        return Status.OBSERVER_PROJECTED in status
-
-    def event(self, status: Status) -> str:
-        """Which event of a step ends the bound, in words; empty if none does."""
-        for flag, text in _BREAKS:
-            if flag in status:
-                return text
-        if Status.METRIC_SINGULAR in status:
-            return "the observer was projected in a metric of the projection's own"
-        if self.projected(status) and not self.projects:
-            return (
-                "the observer was projected onto X in another metric than the certified one, "
-                "metric=observer_bound.metric"
-            )
-        return ""
 
     @property
     def widths(self) -> Array:
@@ -679,7 +506,7 @@ def with_invariance(
     if system.disturbance_matrix is not None:
         return bound
     deadline, w = Deadline.of(seconds), bound.sizes.disturbances
-    sizes: Any = np.abs(_sides("disturbances", w)).max(axis=0) if isinstance(w, ConvexSet) else w
+    sizes: Any = np.abs(sides_of("disturbances", w)).max(axis=0) if isinstance(w, ConvexSet) else w
     found = certify_invariance(
         system, bound.region, disturbance=sizes, seconds=deadline.part(_INVARIANCE)
     )
@@ -700,134 +527,5 @@ def largest_ratio(metric: Array, other: Array) -> float:
         scaled = metric[None] / found
         rest = Matrices.exact(other[None]) - Matrices(scaled, 2.0 * _UNIT * np.abs(scaled))
         if found > 0.0 and definite(rest)[0].all():
-            return math.sqrt(found) * _OUTWARD
+            return math.sqrt(found) * OUTWARD
     return math.inf
-
-
-def step_of(length: float, usual: float | None) -> str:
-    """What to say of a step of another length than the one that was certified."""
-    return f"the step had the length {length:.6g}, and {usual or 0.0:.6g} is certified"
-
-
-#: Of an estimator whose observer does not run on.
-REINITIALIZED = (
-    "the candidate comes from an observer that starts again at each sample, whose states this "
-    "bound is not about"
-)
-#: Where the data contradict what is assumed.
-CONTRADICTION = (
-    "no state of the region fits the bound: the disturbances, the noises or the initial error were "
-    "larger than stated, or the model is another one"
-)
-
-
-def _marked(run: Run, projects: bool) -> list[tuple[int, Status]]:
-    """Samples of a run with an event that ends the bound, the first of each kind."""
-    flags = [flag for flag, _ in _BREAKS] + [Status.METRIC_SINGULAR]
-    if not projects:
-        flags.append(Status.OBSERVER_PROJECTED)
-    found = []
-    for flag in flags:
-        there = (run.flags & flag.value) != 0
-        if there.any():
-            t = int(there.argmax())
-            found.append((t, run.statuses[t]))
-    return found
-
-
-def _read(name: str, value: Any) -> Array | ConvexSet:
-    """A set, or numbers."""
-    if isinstance(value, ConvexSet):
-        _sides(name, value)
-        return value
-    found = numbers(name, value)
-    if found.ndim == 0:
-        checked_length(name, found)
-    return found
-
-
-def _bounds(given: ConvexSet) -> Array:
-    """Sides (2, n) of a box around a set, which may be infinite."""
-    around = stated_region(given)
-    assert around is not None
-    return np.stack((around.lower, around.upper))
-
-
-def _sides(name: str, given: ConvexSet) -> Array:
-    sides = _bounds(given)
-    if not np.isfinite(sides).all():
-        raise SetError(
-            f"{name} is an unbounded set; expected bounds on each component, such as "
-            "qpmhe.Box(lower, upper) has."
-        )
-    return sides
-
-
-def _corners(name: str, given: ConvexSet, size: int) -> Array:
-    """The corners (K, n) of the box around a set; none of them where there are too many."""
-    lower, upper = _sides(name, given)
-    if lower.size != size:
-        raise ShapeError(f"{name} is a set of dimension {lower.size}; expected {size}.")
-    wide = np.flatnonzero(upper > lower)
-    if 2**wide.size > _MOST_CORNERS:
-        return np.empty((0, size))
-    found = np.tile(lower, (2**wide.size, 1))
-    for k, j in enumerate(wide):
-        found[(np.arange(len(found)) >> k) % 2 == 1, j] = upper[j]
-    return found
-
-
-def _largest(name: str, given: ConvexSet, size: int, weight: Array) -> float:
-    """The largest |s|_W in the box around a set, or a little more."""
-    corners = _corners(name, given, size)
-    if len(corners):
-        return float(_lengths(corners, weight).max())
-    largest = np.abs(_sides(name, given)).max(axis=0)
-    return float(_lengths(largest, np.abs(weight)))
-
-
-def _alone(name: str, given: Array | ConvexSet, size: int, weight: Array) -> Array:
-    """|s|_W at most, always () or at each sample (T,)."""
-    if isinstance(given, ConvexSet):
-        return np.array(_largest(name, given, size, weight))
-    if given.ndim > 2 or (given.ndim == 2 and given.shape[1] != size):
-        raise ShapeError(
-            f"{name} has shape {given.shape}; expected vectors (T, {size}), lengths (T,), a "
-            "length, or a set such as qpmhe.Box."
-        )
-    if given.ndim == 2:
-        return _lengths(given, weight)
-    if (given < 0.0).any():
-        raise OptionError(f"{name} is {shown(given)}; expected Euclidean lengths, all >= 0.")
-    return given * _root(weight)
-
-
-def _lengths(vectors: Array, weight: Array) -> Array:
-    """|s|_W of vectors (..., n), rounded up."""
-    sizes = np.abs(vectors)
-    squares = np.einsum("...i,ij,...j->...", vectors, weight, vectors)
-    slack = np.einsum("...i,ij,...j->...", sizes, np.abs(weight), sizes)
-    squares = np.maximum(squares, 0.0) + (2 * len(weight) + 4) * _UNIT * slack
-    found: Array = np.sqrt(squares) * _OUTWARD
-    return found
-
-
-def _root(weight: Array) -> float:
-    """The largest |s|_W of |s| = 1, rounded up."""
-    n = len(weight)
-    top = float(np.linalg.eigvalsh(weight)[-1])
-    slack = 16.0 * n * n * _UNIT * float(np.linalg.norm(weight))
-    return math.sqrt(max(top, 0.0) + slack) * _OUTWARD
-
-
-def _words(letter: str, given: float | ConvexSet) -> str:
-    """Bounds of one signal in words."""
-    if not isinstance(given, ConvexSet):
-        return f"|{letter}| <= {given:.4g}"
-    lower, upper = _sides(letter, given)
-    several = lower.size > 1
-    return ", ".join(
-        f"|{letter}{j + 1 if several else ''}| <= {high:.4g}" if low == -high
-        else f"{letter}{j + 1 if several else ''} in [{low:.4g}, {high:.4g}]"
-        for j, (low, high) in enumerate(zip(lower, upper, strict=True))
-    )

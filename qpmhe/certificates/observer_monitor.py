@@ -10,18 +10,19 @@ from numpy.typing import ArrayLike
 
 from .._checks import Array
 from ..errors import InvalidInputError, ShapeError
-from ..estimation.estimate import Estimate
+from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..model.system import System
-from .observer_bound import (
+from .bound_events import (
     CONTRADICTION,
     REINITIALIZED,
-    ObserverBound,
-    SignalBounds,
-    Size,
-    largest_ratio,
+    event_of,
+    input_beyond,
+    outside,
     step_of,
 )
+from .observer_bound import ObserverBound, largest_ratio
+from .signal_bounds import SignalBounds, Size
 
 # What rounding may make of one step of the observer, as a share of what it sums up.
 _ROUNDING = 1e-9
@@ -182,7 +183,7 @@ class ObserverMonitor:
     def _fault(self, estimate: Estimate, u: Array, dt: float | None) -> str:
         """Why the inequality says nothing of this step, or empty."""
         bound, system, before = self.bound, self._system, self._z
-        reason = bound.event(estimate.status) or bound.left(before)
+        reason = event_of(estimate.status, bound.projects) or outside(bound.region, before)
         if reason:
             return reason
         if np.isnan(estimate.noises[-1]).any():
@@ -191,11 +192,11 @@ class ObserverMonitor:
             return step_of(dt, system.dt)
         if u.shape != (system.m,):
             raise ShapeError(f"u has shape {u.shape}; expected ({system.m},).")
-        if reason := bound.input_beyond(u):
+        if reason := input_beyond(bound.region, u):
             return reason
         if not np.array_equal(estimate.candidate[-2], before):
             return _MOVED
-        if bound.projected(estimate.status):
+        if Status.OBSERVER_PROJECTED in estimate.status:
             return ""
         try:
             output = system.h(before, u)

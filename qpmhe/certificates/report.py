@@ -26,10 +26,11 @@ from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import CertificateError, NotCertifiedError
 from .lyapunov import Design
 from .monitor import MonitorSummary, monitored_run
-from .observer_bound import Band, ObserverBound, SignalBounds
+from .observer_bound import Band, ObserverBound
 from .properties import ObserverStability
 from .regions import Region, bounded_region
 from .sdp import started
+from .signal_bounds import SignalBounds
 
 #: Names of the kinds of bounds in figures and tables.
 LABELS = {
@@ -93,7 +94,7 @@ class Report:
             for text in getattr(each, "suggestions", ())
         ]
         return certificate.to_dict() | {
-            "model": self.name, "certified": certificate.holds,
+            "model": self.name, "certified": certificate.holds, "replaced": self.replaced,
             "monitor": self.summary and str(self.summary),
             "monitored": self.summary and self.summary.to_dict(),
             "design": self.design and self.design.to_dict(),

@@ -20,8 +20,8 @@ from ..certificates.regions import Region
 from ..certificates.report import LABELS, Report, certify_model
 from ..errors import OptionError
 from ..models.loading import find, load
-from .boxes import read_box
 from .design import show_design
+from .values import read_box
 
 
 def certify(
@@ -43,7 +43,8 @@ def certify(
             seconds=seconds, name=model,
         )
     certificate = found.certificate
-    _print(console, f"[bold]{escape(certificate.headline)}[/]")
+    other = "With a gain made for the region: " if found.replaced else ""
+    _print(console, f"[bold]{other}{escape(certificate.headline)}[/]")
     rows = Table.grid(padding=(0, 2))
     for name, text in (
         ("model", title), ("states", _words(found.region)),

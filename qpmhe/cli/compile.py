@@ -11,7 +11,7 @@ from rich.markup import escape
 from .. import codegen
 from ..errors import QpmheError
 from ..records.record_model import load_record_model
-from .estimate import read_state
+from .values import read_state
 
 
 def compile(  # noqa: A001 - the name of the command

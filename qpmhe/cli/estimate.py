@@ -6,14 +6,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ..errors import InvalidInputError, OptionError
+from .values import read_box, read_numbers, read_state
 
 if TYPE_CHECKING:
     from ..records.bounds import BoundOptions
@@ -161,7 +160,6 @@ def bound_options(
 ) -> BoundOptions:
     """The options of --bound, read."""
     from ..records.bounds import BoundOptions
-    from .boxes import read_box
 
     numbers = {
         name: None if text is None else read_numbers(f"--{name.replace('_', '-')}", text)
@@ -285,16 +283,3 @@ def _number(option: str, text: str, word: str) -> int | None:
         return int(text)
     except ValueError:
         raise OptionError(f"{option} is {text!r}; expected an integer, or {word!r}.") from None
-
-
-def read_state(text: str) -> NDArray[np.float64]:
-    """The numbers of --initial-state."""
-    return read_numbers("--initial-state", text)
-
-
-def read_numbers(option: str, text: str) -> NDArray[np.float64]:
-    """Numbers between commas."""
-    try:
-        return np.array([float(item) for item in text.split(",")])
-    except ValueError:
-        raise OptionError(f"{option} is {text!r}; expected numbers between commas.") from None

@@ -13,7 +13,7 @@ from rich.markup import escape
 from .._checks import Array
 from ..errors import ModelError, OptionError
 from ..models.loading import build, find
-from .estimate import read_state
+from .values import read_state
 
 
 def tune(

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array
-from ..certificates.observer_bound import ObserverBound, SignalBounds, Size, bound_observer
+from ..certificates.observer_bound import ObserverBound, bound_observer
 from ..certificates.observer_monitor import ObserverMonitor
 from ..certificates.report import initial_error, region_of, sizes_of
+from ..certificates.signal_bounds import SignalBounds, Size
 from ..errors import OptionError
 from ..estimation.estimate import Estimate
 from ..model.sets import Box

@@ -114,37 +114,43 @@ def test_without_a_box_the_record_gives_one(shown):
     assert low < 0.0 < 1.0 < high
 
 
-def test_an_unstable_observer_is_named_and_the_rest_is_shown(shown, tmp_path):
-    report = tmp_path / "failed.json"
+def test_an_unstable_observer_is_named_and_another_one_is_made(shown, tmp_path):
+    report = tmp_path / "other.json"
     done, text = shown("(gain=-2.0)", report=report, box="-2:2,-2:2")
+    assert done
+    assert text.startswith("With a gain made for the region: |x1 - z1| <= ")
+    words = " ".join(text.split())
+    assert "in place of the model's own: the observer's error does not contract" in words
+    content = json.loads(report.read_text())
+    assert content["certified"] is True
+    assert content["replaced"].startswith("Luenberger([[")
+    assert content["observer"]["gain"] != [[-2.0], [0.1]]
+
+
+def test_an_undetectable_mode_is_named_and_nothing_is_drawn(shown, tmp_path):
+    report = tmp_path / "failed.json"
+    done, text = shown("(growth=1.1)", report=report, box="-2:2,-2:2")
     assert not done
-    for words in ("Not certified", "the observer", "another gain", "e-IOSS"):
+    assert text.startswith("No bound of the observer's error is proved.")
+    for words in ("Not certified", "eigenvalue 1.1", "What may help", "another gain"):
         assert words in text, words
     assert "candidate, at each step and with any solver" in " ".join(text.split())
     content = json.loads(report.read_text())
     assert content["certified"] is False
-    assert len(content["failures"]) == 1
+    assert len(content["failures"]) == 2
     assert not report.with_suffix(".png").exists()
     assert content["region"]["lower"] == [-2.0, -2.0]
     assert content["region"]["diameter"] == pytest.approx(32.0**0.5)
-    assert content["detectability"]["evidence"] == "proved"
-    assert 0.0 < content["detectability"]["eta"] < 1.0
+    assert content["detectability"] is None
     assert content["observer"] is None
     assert any("another gain" in each for each in content["suggestions"])
     assert content["smallest_rates"] == {"eta": None, "rho": None}
-    report = certify_model(load(find(f"{tmp_path}/two.py:model(gain=-2.0)")))
+    report = certify_model(load(find(f"{tmp_path}/two.py:model(growth=1.1)")))
     assert not report.certificate.holds
     assert report.certificate.stability is None
-    assert list(report.certificate.errors) == ["the observer"]
+    assert list(report.certificate.errors) == ["the observer", "detectability"]
     with pytest.raises(InvalidInputError, match="no certificate"):
         report.draw()
-
-
-def test_an_undetectable_mode_is_named(shown):
-    done, text = shown("(growth=1.1)")
-    assert not done
-    assert "eigenvalue 1.1" in text
-    assert "What may help" in text
 
 
 @pytest.mark.parametrize(

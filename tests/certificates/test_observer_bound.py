@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates import ObserverBound, SignalBounds, certify, certify_observer
-from qpmhe.certificates.evidence import Evidence, NotCertifiedError
+from qpmhe.certificates import (
+    ObserverBound,
+    SignalBounds,
+    certify,
+    certify_observer,
+    observer_bound,
+)
+from qpmhe.certificates import certificate as certification
+from qpmhe.certificates.evidence import Evidence, NotCertifiedError, OutOfTimeError
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.errors import OptionError, SetError, ShapeError
 
@@ -317,7 +324,7 @@ def test_a_cost_without_constants_leaves_the_observers_bound():
     assert list(certificate.errors) == ["the theorem"]
     assert not certificate.vacuous()
     assert 7.8 <= certificate.limit() <= 1.05 * 7.8
-    assert certificate.headline.startswith("|x1 - z1| <= 7.8 after ")
+    assert certificate.headline.startswith(f"|x1 - z1| <= {certificate.limit():.2g} after ")
     assert "Not certified: the theorem: the cost has no constants" in certificate.summary()
     with pytest.raises(OptionError, match=r"could not be certified.*discount"):
         certificate.limit(kind="paper")
@@ -397,3 +404,18 @@ def test_a_region_that_is_kept_is_said_and_the_observer_with_it():
     assert tight.inner is None
     assert "that z does is checked at each sample" in tight.condition
 
+
+
+def test_time_up_leaves_what_was_reached(monkeypatch):
+    def late(*_, **__):
+        raise OutOfTimeError("the time for this search (1 s) was too short", ("more seconds",))
+
+    monkeypatch.setattr(certification, "certify_detectability", late)
+    certificate = scalar_certificate(0.8)
+    assert certificate.observer_bound.evidence is Evidence.PROVED
+    assert isinstance(certificate.errors["detectability"], OutOfTimeError)
+    assert certificate.horizons == ()
+    assert "Not certified: detectability: the time for this search" in certificate.summary()
+    monkeypatch.setattr(observer_bound, "certify_observer", late)
+    with pytest.raises(OutOfTimeError, match="more seconds"):
+        scalar_certificate(0.8)

@@ -1,6 +1,9 @@
-"""Boxes as options: low:high for each component, between commas."""
+"""Values of options: numbers and boxes, between commas."""
 
 from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import OptionError
 from ..model.sets import Box
@@ -21,3 +24,16 @@ def read_box(option: str, text: str, width: int | None = None, kind: str = "comp
             "0.1:9,-1:9."
         ) from error
     return Box(low, high)
+
+
+def read_state(text: str) -> NDArray[np.float64]:
+    """The numbers of --initial-state."""
+    return read_numbers("--initial-state", text)
+
+
+def read_numbers(option: str, text: str) -> NDArray[np.float64]:
+    """Numbers between commas."""
+    try:
+        return np.array([float(item) for item in text.split(",")])
+    except ValueError:
+        raise OptionError(f"{option} is {text!r}; expected numbers between commas.") from None
