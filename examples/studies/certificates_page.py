@@ -75,8 +75,8 @@ says nothing.
 
 {compared} errors were compared with their bounds along the run; none was above.
 
-Measured on {date} with Python {python}, NumPy {numpy}, in {minutes:.0f} minutes, while cores were shared with other
-work.
+Measured on {date} with Python {python}, NumPy {numpy}, in {minutes:.0f} minutes, while cores were
+shared with other work.
 """
 
 
