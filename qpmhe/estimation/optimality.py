@@ -7,6 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from qpmhe_solvers.qp import band_of
+
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
@@ -39,10 +41,9 @@ class OptimalityMatrix:
         self, own: Array, below: Array, stage: Index, on_own: Array, on_next: Array,
         typical: Array,
     ) -> None:
-        from scipy.linalg.lapack import dgbtrf, dgbtrs, dpbtrf, dpbtrs  # late: as the solvers do
+        from scipy.linalg.lapack import dgbtrf, dgbtrs, dpbtrs  # late: as the solvers do
 
         stages, n = typical.shape
-        self._shape = stages, n
         self._solve: Callable[[Array], Array]
         self._own, self._below = own, below
         self._units = units = np.ldexp(1.0, -(np.frexp(typical)[1] // 2))
@@ -64,8 +65,7 @@ class OptimalityMatrix:
         ]
         self.definite: bool
         if not rows:
-            factor, info = dpbtrf(_lower_band(entries, size, 2 * n - 1), lower=1)
-            self.definite = info == 0
+            factor, self.definite = _cholesky(own, below)
             if self.definite:
                 self._solve = lambda side: dpbtrs(factor, side, lower=1)[0]
                 return
@@ -94,12 +94,9 @@ class OptimalityMatrix:
         on_next: Array,
     ) -> bool:
         """Whether H is positive definite where all rows are zero: the second-order condition."""
-        from scipy.linalg.lapack import dpbtrf
-
-        stages, n = self._shape
         own, below = own.copy(), below.copy()
         np.add.at(own, stage, _STIFF * on_own[:, :, None] * on_own[:, None, :])
-        inner = stage < stages - 1
+        inner = stage < len(below)
         np.add.at(
             own, following[inner],
             _STIFF * on_next[inner, :, None] * on_next[inner, None, :],
@@ -107,12 +104,7 @@ class OptimalityMatrix:
         np.add.at(
             below, stage[inner], _STIFF * on_next[inner, :, None] * on_own[inner, None, :]
         )
-        at = n * np.arange(stages)[:, None] + np.arange(n)
-        entries = [
-            (at[1:, :, None], at[:-1, None, :], below), (at[:, :, None], at[:, None, :], own),
-        ]
-        _, info = dpbtrf(_lower_band(entries, stages * n, 2 * n - 1), lower=1)
-        return bool(info == 0)
+        return _cholesky(own, below)[1]
 
     def solve(self, states: Array, rows: Array | float = 0.0) -> tuple[Array, Array]:
         """Solutions for several right-hand sides: (B, K + 1, n) and (B, R), or 0."""
@@ -129,11 +121,12 @@ class OptimalityMatrix:
         return float(value + 2.0 * np.einsum("ki,kij,kj->", step[1:], self._below, step[:-1]))
 
 
-def _lower_band(entries: list[tuple[Index, Index, Array]], size: int, width: int) -> Array:
-    """The lower band of a symmetric matrix, in LAPACK's layout."""
-    band = np.zeros((width + 1, size), order="F")
-    for i, j, values in entries:
-        i, j = np.broadcast_arrays(i, j)
-        below = i >= j
-        band[(i - j)[below], j[below]] = values[below]
-    return band
+def _cholesky(own: Array, below: Array) -> tuple[Array, bool]:
+    """The Cholesky factor of a block-tridiagonal matrix, in LAPACK's band, if it has one."""
+    from scipy.linalg.lapack import dpbtrf
+
+    columns = np.concatenate((own, np.zeros_like(own)), axis=1)
+    columns[:-1, own.shape[1] :] = below
+    band = band_of(columns).reshape(-1, 2 * own.shape[1]).T
+    factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
+    return factor, bool(info == 0)
