@@ -157,8 +157,6 @@ class Tuning:
     def _samples(self) -> dict[str, list[Array]]:
         """The estimator's score of each sample, before and after."""
         first = self._weights_at(self._structure.start)
-        if not self._score.has_begun:
-            self._score.begin(first)
         return {"before": self._score.samples(first), "after": self._score.samples(self.weights)}
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -29,8 +30,11 @@ class Likelihood:
         \sum_t \tfrac12 |L_t^{-1} e_t|^2 + \log \det L_t,
 
     over the samples of chosen blocks; outputs that are missing do not enter. With a threshold k,
-    components of :math:`L^{-1} e` beyond k cost k times their size, less k^2 / 2, and correct the
-    filter as if they were k. States are clipped to the bounds of X.
+    components s of :math:`L^{-1} e` beyond k correct the filter as if they were k, and cost
+    :math:`k^2 (\tfrac12 + \log |s| / k)`, and all costs are divided by the mean of min(s^2, k^2)
+    of a normal s: the least cost is then where Huber's second proposal for a scale has it, right
+    for normal noise, and no outlier counts for more than k^2. States are clipped to the bounds
+    of X.
 
     A system that is traced has the exact gradient, by one sweep back through the filter; of others
     it is made of central differences, for all of which the filter runs at once.
@@ -312,12 +316,20 @@ def _cholesky(S: Array) -> Array:
 
 
 def _loss(white: Array, threshold: float | None) -> Array:
-    """Half the square of each row, or Huber's loss of its components."""
+    """Half the square of each row, or the robust cost of its components."""
     if threshold is None:
         return np.asarray(0.5 * (white * white).sum(axis=-1))
-    size = np.abs(white)
-    beyond = threshold * (size - 0.5 * threshold)
-    return np.asarray(np.where(size <= threshold, 0.5 * size * size, beyond).sum(axis=-1))
+    size, k = np.abs(white), threshold
+    beyond = k * k * (0.5 + np.log(np.maximum(size, k) / k))
+    costs = np.where(size <= k, 0.5 * size * size, beyond).sum(axis=-1)
+    return np.asarray(costs / _clipped_variance(k))
+
+
+def _clipped_variance(k: float) -> float:
+    """The mean of min(s^2, k^2) of a standard normal s."""
+    beyond = math.erfc(k / math.sqrt(2.0))
+    density = math.exp(-0.5 * k * k) / math.sqrt(2.0 * math.pi)
+    return 1.0 - beyond - 2.0 * k * density + k * k * beyond
 
 
 def _bounds(system: System) -> tuple[Array, Array]:
@@ -364,9 +376,8 @@ def _symbolic_step(
     losses = 0.5 * white * white
     if threshold is not None:
         used = ca.fmax(ca.fmin(white, threshold), -threshold)
-        losses = ca.if_else(
-            size <= threshold, losses, threshold * (size - 0.5 * threshold)
-        )
+        beyond = threshold**2 * (0.5 + ca.log(ca.fmax(size, threshold) / threshold))
+        losses = ca.if_else(size <= threshold, losses, beyond) / _clipped_variance(threshold)
     gain = ca.SX(p, n)  # transposed
     for i in reversed(range(p)):
         rest = W[i, :] - sum((L[k, i] * gain[k, :] for k in range(i + 1, p)), ca.SX(1, n))
