@@ -284,16 +284,20 @@ def refine(
     score: Score, weights_at: Callable[[Array], Weights], theta: Array, structure: Structure,
     checkpoint: Checkpoint, advance: Callable[[str], None],
 ) -> Array:
-    """The minimum of the estimator's score near the likelihood's, by differences of runs."""
+    """The minimum of the estimator's score, by differences of runs.
+
+    It begins at the likelihood's weights or, where these are worse, at those of the start.
+    """
     known, value, done = checkpoint.known("estimator")
     if done and known is not None:
         return known
-    best: list[Any] = [theta if known is None else known, value]
     low, high = np.array(structure.limits).T
+    anchor = min((theta, structure.start), key=lambda point: score.total(weights_at(point)))
+    best: list[Any] = [anchor if known is None else known, value]
 
     def total(point: Array) -> float:
         found = score.total(weights_at(point))
-        return found + _STAY * float(np.sum((point - theta) ** 2))
+        return found + _STAY * float(np.sum((point - anchor) ** 2))
 
     def cost(point: Array) -> tuple[float, Array]:
         value = total(point)
