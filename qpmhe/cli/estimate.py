@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from ..errors import InvalidInputError, OptionError
+from ..errors import InvalidInputError, ModelError, OptionError
 
 if TYPE_CHECKING:
     from ..records.bounds import BoundOptions
@@ -177,7 +177,6 @@ def bound_options(
 def _weighted(options: dict[str, Any]) -> dict[str, Any]:
     """The options, with what the file of weights says of observer, cost, model and horizon."""
     from ..tuning import load
-    from .tune import with_arguments
 
     found = load(options.pop("weights"))
     return {
@@ -298,3 +297,20 @@ def read_numbers(option: str, text: str) -> NDArray[np.float64]:
         return np.array([float(item) for item in text.split(",")])
     except ValueError:
         raise OptionError(f"{option} is {text!r}; expected numbers between commas.") from None
+
+
+def arguments_of(parameters: dict[str, float]) -> str:
+    """Parameters as arguments of a model's function."""
+    return ", ".join(f"{name}={float(value)!r}" for name, value in parameters.items())
+
+
+def with_arguments(model: str, parameters: dict[str, float]) -> str:
+    """The name of a model with these arguments of its function."""
+    if not parameters:
+        return model
+    if model.endswith(")"):
+        raise ModelError(
+            f"model {model!r} has arguments already; give the tuned ones by --parameter only, and "
+            "the others as defaults of the function."
+        )
+    return f"{model}({arguments_of(parameters)})"

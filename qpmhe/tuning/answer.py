@@ -68,7 +68,8 @@ class Tuning:
         What was found, as a whole.
     start, values : dict
         What each name stands for: standard deviations of disturbance, noise and prior in the
-        units of state and output, of a group that of its first component; parameters; at the start, and as tuned.
+        units of state and output, of a group that of its first component; parameters. At the
+        start, and as tuned.
     intervals : dict
         Its 95 % interval (low, high) by the likelihood's curvature. That is honest where the
         model is right; errors of the model make intervals too narrow.
@@ -428,7 +429,7 @@ class Tuning:
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set_yticks(range(len(shown)), list(reversed(shown)))
         axes.set_xlabel("standard deviation, as a factor of the start")
-        axes.legend(fontsize="small", loc="best")
+        axes.legend(fontsize="small", loc="best", frameon=False)
 
     def _draw_blocks(self, axes: Axes) -> None:
         where, rows = [], {"before": [], "after": []}  # type: ignore[var-annotated]
@@ -444,11 +445,11 @@ class Tuning:
         for k, (name, found) in enumerate(rows.items()):
             style = STYLES[1 - k]
             axes.plot(at, found, marker="o", markersize=3.5, label=name, **style)
-        for k in np.flatnonzero(where):
+        for k in np.flatnonzero(where).tolist():
             axes.axvspan(k - 0.5, k + 0.5, color="0.93", zorder=0,
                          label="held out" if k == int(np.argmax(where)) else None)
         axes.set_xlabel("block")
         what = "error" if self._objective == "truth" else f"error {self._ahead} ahead"
         axes.set_ylabel(f"mean square {what}, scaled")
         axes.set_ylim(bottom=0.0)
-        axes.legend(fontsize="small", loc="best")
+        axes.legend(fontsize="small", loc="best", frameon=False)

@@ -166,7 +166,7 @@ class _Filter:
         )
 
     def _inputs(self, setting: Setting, one: Data) -> Array:
-        """u (T, m) with the model's parameters behind, where they are inputs."""
+        """U (T, m) with the model's parameters behind, where they are inputs."""
         missing = self._system.m - one.u.shape[1]
         if not missing:
             return one.u
@@ -216,7 +216,7 @@ class _Filter:
         ]
 
     def _forward(self, setting: Setting, one: Data) -> tuple[Array, Array, Array, Array]:
-        """z (n, T) and P (n, n T) after each sample, costs (T,), whitened innovations (T, p)."""
+        """Z (n, T) and P (n, n T) after each sample, costs (T,), whitened innovations (T, p)."""
         forward, _ = self._sweep(len(one))
         z, covariance, cost, white = (
             np.asarray(each) for each in forward(
@@ -306,7 +306,7 @@ class _Filter:
 
 def _cholesky(S: Array) -> Array:
     try:
-        return np.linalg.cholesky(S)
+        return np.asarray(np.linalg.cholesky(S))
     except np.linalg.LinAlgError:  # of one setting: the others go on
         found = np.full_like(S, np.nan)
         for k, one in enumerate(S):
@@ -355,9 +355,10 @@ def _symbolic_step(
     following, output = model.step()(z, u, dt), model.h(z, u)
     A, C = ca.jacobian(following, z), ca.mtimes(ca.diag(there), ca.jacobian(output, z))
     e = y - output
-    if system.output_residual is not None and system.output_residual.periods is not None:
-        residual = system.output_residual
-        for i, period in zip(residual.components, residual.periods, strict=True):
+    residual = system.output_residual
+    periods = None if residual is None else residual.periods
+    if residual is not None and periods is not None:
+        for i, period in zip(residual.components, periods, strict=True):
             e[int(i)] -= period * ca.floor(e[int(i)] / period + 0.5)
     # An output that is missing has the innovation 0 and the variance 1.
     e = ca.if_else(there > 0.0, e, 0.0)

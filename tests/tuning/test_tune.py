@@ -221,6 +221,7 @@ def test_the_estimators_own_error():
 def test_a_state_without_truth_does_not_count():
     y, u, x = simulated(steps=300, truth=True)
     x[:, 1] = np.nan
+    y[50:55] = x[50:55, 0] = np.nan  # a gap of the record
     tuning = tuned([(y, u, x)], objective="auto", horizon=3, structure="scalar")
     assert "error of x1" in tuning.scores
     assert "error of x2" not in tuning.scores
