@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ..errors import InvalidInputError, OptionError
-from .values import read_box, read_numbers, read_state
+from .values import read_box, read_numbers, read_state, with_arguments
 
 if TYPE_CHECKING:
     from ..records.bounds import BoundOptions
@@ -175,7 +175,6 @@ def bound_options(
 def _weighted(options: dict[str, Any]) -> dict[str, Any]:
     """The options, with what the file of weights says of observer, cost, model and horizon."""
     from ..tuning import load
-    from .tune import with_arguments
 
     found = load(options.pop("weights"))
     return {

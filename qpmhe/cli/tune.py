@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.markup import escape
 
 from .._checks import Array
-from ..errors import ModelError, OptionError
+from ..errors import OptionError
 from ..models.loading import build, find
-from .values import read_state
+from .values import arguments_of, read_state, with_arguments
 
 
 def tune(
@@ -90,7 +90,9 @@ def tune(
 
     console = Console()
     if out.exists() and not overwrite:
-        raise OptionError(f"{out} exists already; give another --out, or replace it by --overwrite.")
+        raise OptionError(
+            f"{out} exists already; give another --out, or replace it by --overwrite."
+        )
     wanted = _numbers("--horizons", horizons)
     started = _parameters(parameter or [])
     source = find(model)
@@ -120,13 +122,15 @@ def tune(
     system: Any = mhe.system
     if started:
         def make(**parameters: float) -> Any:
-            made = build(replace(source, arguments=_arguments(parameters)))
+            made = build(replace(source, arguments=arguments_of(parameters)))
             return made[0] if isinstance(made, (tuple, list)) else made.system
 
         system = make
+    found = covariances_of(mhe.observer, mhe.cost)
     tuning = run(
         system, records, horizon=mhe.horizon, initial_state=mhe.initial_state, structure=plan,
-        **covariances_of(mhe.observer, mhe.cost), parameters=started, threshold=threshold,
+        prior=found["prior"], disturbance=found["disturbance"], noise=found["noise"],
+        parameters=started, threshold=threshold,
         objective=objective, held_out=held_out, starts=starts, seed=seed, jobs=jobs,
         names={"states": loaded.states, "outputs": loaded.outputs},
         checkpoint=out.with_name(f"{out.name}.search"), progress=Console(stderr=True),
@@ -181,7 +185,7 @@ def _read(
     dt = np.array([*lengths, np.nan])
     own = None
     if np.isfinite(dt).any():
-        own = np.where(np.isfinite(dt), dt, steps.usual)
+        own = np.where(np.isfinite(dt), dt, steps.usual or np.nan)
     return np.array(ys), np.array(us) if us[0].size else None, own
 
 
@@ -217,19 +221,3 @@ def _numbers(option: str, text: str | None) -> list[int]:
         return [int(item) for item in text.split(",")] if text else []
     except ValueError:
         raise OptionError(f"{option} is {text!r}; expected integers between commas.") from None
-
-
-def _arguments(parameters: dict[str, float]) -> str:
-    return ", ".join(f"{name}={float(value)!r}" for name, value in parameters.items())
-
-
-def with_arguments(model: str, parameters: dict[str, float]) -> str:
-    """The name of a model with these arguments of its function."""
-    if not parameters:
-        return model
-    if model.endswith(")"):
-        raise ModelError(
-            f"model {model!r} has arguments already; give the tuned ones by --parameter only, and "
-            "the others as defaults of the function."
-        )
-    return f"{model}({_arguments(parameters)})"

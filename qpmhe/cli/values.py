@@ -1,11 +1,11 @@
-"""Values of options: numbers and boxes, between commas."""
+"""Values of options: numbers, boxes, and models with arguments."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionError
+from ..errors import ModelError, OptionError
 from ..model.sets import Box
 
 
@@ -37,3 +37,20 @@ def read_numbers(option: str, text: str) -> NDArray[np.float64]:
         return np.array([float(item) for item in text.split(",")])
     except ValueError:
         raise OptionError(f"{option} is {text!r}; expected numbers between commas.") from None
+
+
+def arguments_of(parameters: dict[str, float]) -> str:
+    """Parameters as arguments of a model's function."""
+    return ", ".join(f"{name}={float(value)!r}" for name, value in parameters.items())
+
+
+def with_arguments(model: str, parameters: dict[str, float]) -> str:
+    """The name of a model with these arguments of its function."""
+    if not parameters:
+        return model
+    if model.endswith(")"):
+        raise ModelError(
+            f"model {model!r} has arguments already; give the tuned ones by --parameter only, and "
+            "the others as defaults of the function."
+        )
+    return f"{model}({arguments_of(parameters)})"

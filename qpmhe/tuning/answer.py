@@ -68,7 +68,8 @@ class Tuning:
         What was found, as a whole.
     start, values : dict
         What each name stands for: standard deviations of disturbance, noise and prior in the
-        units of state and output, of a group that of its first component; parameters; at the start, and as tuned.
+        units of state and output, of a group that of its first component; parameters. At the
+        start, and as tuned.
     intervals : dict
         Its 95 % interval (low, high) by the likelihood's curvature. That is honest where the
         model is right; errors of the model make intervals too narrow.
@@ -157,8 +158,6 @@ class Tuning:
     def _samples(self) -> dict[str, list[Array]]:
         """The estimator's score of each sample, before and after."""
         first = self._weights_at(self._structure.start)
-        if not self._score.has_begun:
-            self._score.begin(first)
         return {"before": self._score.samples(first), "after": self._score.samples(self.weights)}
 
     @property
@@ -166,35 +165,53 @@ class Tuning:
         return "held-out blocks" if any(one.held.any() for one in self._data) else "all blocks"
 
     def _judge(self, theta: Array, refined: Array) -> tuple[Array, str]:
-        """The weights to take: those of the second search where they are better beyond chance."""
-        likeliest, found = (self._score.samples(self._weights_at(at)) for at in (theta, refined))
-        gains = []
-        for one, mask, new, old in zip(self._data, self._judged, found, likeliest, strict=True):
-            gains += [
-                float(np.nanmean((old - new)[mask & (one.block == b)]))
-                for b in np.unique(one.block[mask])
-                if np.isfinite((old - new)[mask & (one.block == b)]).any()
-            ]
+        """The weights to take: those of a search where they are better beyond chance."""
+        start = self._structure.start
+        found = [self._score.samples(self._weights_at(at)) for at in (start, theta, refined)]
         what = "error" if self._objective == "truth" else "prediction error"
         blocks = self._judges
-        if len(gains) < 2:
+        count = len(self._block_gains(found[0], found[1]))
+        if count < 2:
             return theta, (
-                f"by the likelihood: {len(gains)} {blocks} cannot judge the estimator's "
-                f"{what}; record for longer."
+                f"by the likelihood: {count} {blocks} cannot judge the estimator's {what}; record "
+                "for longer."
             )
-        mean, base = float(np.mean(gains)), self._mean(likeliest)
-        spread = float(np.std(gains, ddof=1) / np.sqrt(len(gains)))
-        share, doubt = 100.0 * mean / base, 100.0 * spread / base
-        if mean > spread:
-            return refined, (
+
+        def gain(old: list[Array], new: list[Array]) -> tuple[float, float]:
+            gains = self._block_gains(old, new)
+            each = 100.0 / self._mean(old)
+            spread = each * np.std(gains, ddof=1) / np.sqrt(count)
+            return each * float(np.mean(gains)), float(spread)
+
+        share, doubt = gain(found[1], found[2])
+        best, chosen = (2, refined) if share > doubt else (1, theta)
+        loss, spread = gain(found[best], found[0])
+        if loss > spread:
+            return start, (
+                f"as at the start: the estimator's mean square {what} on {blocks} is larger with "
+                "what was found. The model's error is no white noise, or the records are too "
+                "short; tune with the truth, fewer parameters, or a better model."
+            )
+        if best == 2:
+            return chosen, (
                 f"by the likelihood, then by the estimator's {what}: its mean square on {blocks} "
                 f"falls by {share:.2g} % more (standard error {doubt:.2g} %)."
             )
-        return theta, (
+        return chosen, (
             f"by the likelihood: tuning the estimator's {what} as well would change its mean "
             f"square on {blocks} by {-share:+.2g} % (standard error {doubt:.2g} %), no gain "
             "beyond chance."
         )
+
+    def _block_gains(self, old: list[Array], new: list[Array]) -> list[float]:
+        """By how much each block that judges is better."""
+        gains = []
+        for one, mask, before, after in zip(self._data, self._judged, old, new, strict=True):
+            for block in np.unique(one.block[mask]):
+                inside = (before - after)[mask & (one.block == block)]
+                if np.isfinite(inside).any():
+                    gains.append(float(np.nanmean(inside)))
+        return gains
 
     def _find_intervals(self, theta: Array, hessian: Array) -> None:
         structure, count = self._structure, self._structure.seen
@@ -412,7 +429,7 @@ class Tuning:
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set_yticks(range(len(shown)), list(reversed(shown)))
         axes.set_xlabel("standard deviation, as a factor of the start")
-        axes.legend(fontsize="small", loc="best")
+        axes.legend(fontsize="small", loc="best", frameon=False)
 
     def _draw_blocks(self, axes: Axes) -> None:
         where, rows = [], {"before": [], "after": []}  # type: ignore[var-annotated]
@@ -428,11 +445,11 @@ class Tuning:
         for k, (name, found) in enumerate(rows.items()):
             style = STYLES[1 - k]
             axes.plot(at, found, marker="o", markersize=3.5, label=name, **style)
-        for k in np.flatnonzero(where):
+        for k in np.flatnonzero(where).tolist():
             axes.axvspan(k - 0.5, k + 0.5, color="0.93", zorder=0,
                          label="held out" if k == int(np.argmax(where)) else None)
         axes.set_xlabel("block")
         what = "error" if self._objective == "truth" else f"error {self._ahead} ahead"
         axes.set_ylabel(f"mean square {what}, scaled")
         axes.set_ylim(bottom=0.0)
-        axes.legend(fontsize="small", loc="best")
+        axes.legend(fontsize="small", loc="best", frameon=False)

@@ -84,7 +84,9 @@ class Data:
                     f"{name} has steps of its own (dt), and the system is discrete; make it by "
                     "System.from_ode, or resample the record."
                 )
-        self.truth = None if given.states is None else _truth(name, given.states, system, samples)
+        self.truth = None if given.states is None else _truth(
+            name, given.states, system, self.observed.any(axis=1)
+        )
         start = initial_state
         if given.initial_state is not None:
             start = vector(f"initial_state of {name}", given.initial_state, system.n)
@@ -101,7 +103,8 @@ class Data:
         return len(self.y)
 
 
-def _truth(name: str, given: ArrayLike, system: System, samples: int) -> Array:
+def _truth(name: str, given: ArrayLike, system: System, observed: Mask) -> Array:
+    samples = len(observed)
     truth = numbers(f"states of {name}", given, finite=False)
     if truth.ndim != 2 or truth.shape[1] != system.n or len(truth) not in (samples, samples + 1):
         raise ShapeError(
@@ -109,10 +112,12 @@ def _truth(name: str, given: ArrayLike, system: System, samples: int) -> Array:
             "row more."
         )
     missing = ~np.isfinite(truth)
-    partly = missing.any(axis=0) & ~missing.all(axis=0)
+    # Where nothing was measured either, as in a gap of the record, it may be missing.
+    needed = missing[:samples][observed]
+    partly = needed.any(axis=0) & ~missing.all(axis=0)
     if partly.any() or missing.all():
         j = int(np.argmax(partly)) if partly.any() else 0
-        rows = np.flatnonzero(missing[:, j])
+        rows = np.flatnonzero(missing[:samples, j] & observed)
         raise InvalidInputError(
             f"the truth of state {j + 1} of {name} is missing in {rows.size} rows, first in row "
             f"{rows[0]}; interpolate it, or make its whole column NaN: then the state counts as "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -29,8 +30,11 @@ class Likelihood:
         \sum_t \tfrac12 |L_t^{-1} e_t|^2 + \log \det L_t,
 
     over the samples of chosen blocks; outputs that are missing do not enter. With a threshold k,
-    components of :math:`L^{-1} e` beyond k cost k times their size, less k^2 / 2, and correct the
-    filter as if they were k. States are clipped to the bounds of X.
+    components s of :math:`L^{-1} e` beyond k correct the filter as if they were k, and cost
+    :math:`k^2 (\tfrac12 + \log |s| / k)`, and all costs are divided by the mean of min(s^2, k^2)
+    of a normal s: the least cost is then where Huber's second proposal for a scale has it, right
+    for normal noise, and no outlier counts for more than k^2. States are clipped to the bounds
+    of X.
 
     A system that is traced has the exact gradient, by one sweep back through the filter; of others
     it is made of central differences, for all of which the filter runs at once.
@@ -162,7 +166,7 @@ class _Filter:
         )
 
     def _inputs(self, setting: Setting, one: Data) -> Array:
-        """u (T, m) with the model's parameters behind, where they are inputs."""
+        """U (T, m) with the model's parameters behind, where they are inputs."""
         missing = self._system.m - one.u.shape[1]
         if not missing:
             return one.u
@@ -212,7 +216,7 @@ class _Filter:
         ]
 
     def _forward(self, setting: Setting, one: Data) -> tuple[Array, Array, Array, Array]:
-        """z (n, T) and P (n, n T) after each sample, costs (T,), whitened innovations (T, p)."""
+        """Z (n, T) and P (n, n T) after each sample, costs (T,), whitened innovations (T, p)."""
         forward, _ = self._sweep(len(one))
         z, covariance, cost, white = (
             np.asarray(each) for each in forward(
@@ -302,7 +306,7 @@ class _Filter:
 
 def _cholesky(S: Array) -> Array:
     try:
-        return np.linalg.cholesky(S)
+        return np.asarray(np.linalg.cholesky(S))
     except np.linalg.LinAlgError:  # of one setting: the others go on
         found = np.full_like(S, np.nan)
         for k, one in enumerate(S):
@@ -312,12 +316,20 @@ def _cholesky(S: Array) -> Array:
 
 
 def _loss(white: Array, threshold: float | None) -> Array:
-    """Half the square of each row, or Huber's loss of its components."""
+    """Half the square of each row, or the robust cost of its components."""
     if threshold is None:
         return np.asarray(0.5 * (white * white).sum(axis=-1))
-    size = np.abs(white)
-    beyond = threshold * (size - 0.5 * threshold)
-    return np.asarray(np.where(size <= threshold, 0.5 * size * size, beyond).sum(axis=-1))
+    size, k = np.abs(white), threshold
+    beyond = k * k * (0.5 + np.log(np.maximum(size, k) / k))
+    costs = np.where(size <= k, 0.5 * size * size, beyond).sum(axis=-1)
+    return np.asarray(costs / _clipped_variance(k))
+
+
+def _clipped_variance(k: float) -> float:
+    """The mean of min(s^2, k^2) of a standard normal s."""
+    beyond = math.erfc(k / math.sqrt(2.0))
+    density = math.exp(-0.5 * k * k) / math.sqrt(2.0 * math.pi)
+    return 1.0 - beyond - 2.0 * k * density + k * k * beyond
 
 
 def _bounds(system: System) -> tuple[Array, Array]:
@@ -343,9 +355,10 @@ def _symbolic_step(
     following, output = model.step()(z, u, dt), model.h(z, u)
     A, C = ca.jacobian(following, z), ca.mtimes(ca.diag(there), ca.jacobian(output, z))
     e = y - output
-    if system.output_residual is not None and system.output_residual.periods is not None:
-        residual = system.output_residual
-        for i, period in zip(residual.components, residual.periods, strict=True):
+    residual = system.output_residual
+    periods = None if residual is None else residual.periods
+    if residual is not None and periods is not None:
+        for i, period in zip(residual.components, periods, strict=True):
             e[int(i)] -= period * ca.floor(e[int(i)] / period + 0.5)
     # An output that is missing has the innovation 0 and the variance 1.
     e = ca.if_else(there > 0.0, e, 0.0)
@@ -364,9 +377,8 @@ def _symbolic_step(
     losses = 0.5 * white * white
     if threshold is not None:
         used = ca.fmax(ca.fmin(white, threshold), -threshold)
-        losses = ca.if_else(
-            size <= threshold, losses, threshold * (size - 0.5 * threshold)
-        )
+        beyond = threshold**2 * (0.5 + ca.log(ca.fmax(size, threshold) / threshold))
+        losses = ca.if_else(size <= threshold, losses, beyond) / _clipped_variance(threshold)
     gain = ca.SX(p, n)  # transposed
     for i in reversed(range(p)):
         rest = W[i, :] - sum((L[k, i] * gain[k, :] for k in range(i + 1, p)), ca.SX(1, n))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,8 @@ class Score:
         From the model's parameters to the system.
     kind : callable
         From covariances to the observer.
+    start : Weights
+        Those before tuning.
     ahead : int
         k.
     truth : bool
@@ -52,38 +55,27 @@ class Score:
 
     def __init__(
         self, data: list[Data], make: Callable[[dict[str, float]], System],
-        kind: Callable[..., Observer], *, ahead: int, truth: bool, robust: bool,
+        kind: Callable[..., Observer], start: Weights, *, ahead: int, truth: bool, robust: bool,
         options: dict[str, Any],
     ) -> None:
         self._data, self._make, self.kind = data, make, kind
         self._ahead, self._truth, self._robust = ahead, truth, robust
-        self._options = options
-        self._scale: Array | None = None
+        self._options, self._start = options, start
         #: What ran the steps last, and the first failure of a run.
         self.engine = "python"
         self.failure = ""
 
-    def begin(self, weights: Weights) -> None:
-        """Take the errors at these weights as the unit of all others."""
-        errors = np.concatenate(self.errors(weights))
+    @cached_property
+    def scale(self) -> Array:
+        """The size of each component's error at the start weights, the unit of all others."""
+        errors = np.concatenate(self.errors(self._start))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # of components without any
             if self._robust:
                 scale = 1.4826 * np.nanmedian(np.abs(errors), axis=0)
             else:
                 scale = np.sqrt(np.nanmean(errors * errors, axis=0))
-        self._scale = np.where(scale > 0.0, scale, 1.0)
-
-    @property
-    def has_begun(self) -> bool:
-        """Whether `begin` was called."""
-        return self._scale is not None
-
-    @property
-    def scale(self) -> Array:
-        """The size of each component's error at the start."""
-        assert self._scale is not None
-        return self._scale
+        return np.where(scale > 0.0, scale, 1.0)
 
     def samples(self, weights: Weights) -> list[Array]:
         """The score of each sample of each record (T,), NaN where there is nothing to compare."""

@@ -110,7 +110,7 @@ def search_likelihood(
     """The minimum of the likelihood near a start, and its value per sample."""
     chosen = [~one.held for one in data]
     samples = sum(int(mask.sum()) for mask in chosen)
-    best = [begin.copy(), np.inf]
+    best: list[Any] = [begin.copy(), np.inf]
 
     def cost(theta: Array) -> tuple[float, Array]:
         value, slope = likelihood.gradient(theta, chosen)
@@ -123,7 +123,7 @@ def search_likelihood(
     def after(_theta: Array) -> None:
         note(best[0], best[1], False)
 
-    minimize(
+    minimize(  # type: ignore[call-overload]
         cost, begin, jac=True, method="L-BFGS-B", bounds=structure.limits, callback=after,
         options={"maxiter": _ITERATIONS, "ftol": 1e-9, "gtol": 1e-6},
     )
@@ -270,30 +270,34 @@ def limit(
         else:
             outside, outer = to, found
         if abs(found - NORMAL) < 0.03:
-            return to
+            break
         if outside is None:
             growth = np.clip(NORMAL / max(found, 1e-3), 1.2, 3.0)
             to = theta[k] + growth * (to - theta[k])
         else:
             share = np.clip((NORMAL - inner) / (outer - inner), 0.1, 0.9)
             to = inside + share * (outside - inside)
-    return to
+    return float(to)
 
 
 def refine(
     score: Score, weights_at: Callable[[Array], Weights], theta: Array, structure: Structure,
     checkpoint: Checkpoint, advance: Callable[[str], None],
 ) -> Array:
-    """The minimum of the estimator's score near the likelihood's, by differences of runs."""
+    """The minimum of the estimator's score, by differences of runs.
+
+    It begins at the likelihood's weights or, where these are worse, at those of the start.
+    """
     known, value, done = checkpoint.known("estimator")
     if done and known is not None:
         return known
-    best: list[Any] = [theta if known is None else known, value]
     low, high = np.array(structure.limits).T
+    anchor = min((theta, structure.start), key=lambda point: score.total(weights_at(point)))
+    best: list[Any] = [anchor if known is None else known, value]
 
     def total(point: Array) -> float:
         found = score.total(weights_at(point))
-        return found + _STAY * float(np.sum((point - theta) ** 2))
+        return found + _STAY * float(np.sum((point - anchor) ** 2))
 
     def cost(point: Array) -> tuple[float, Array]:
         value = total(point)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from qpmhe_solvers.values import shown
 
@@ -77,7 +77,7 @@ class CholeskyFactor:
         d = len(start)
         self._below = np.tril_indices(d, -1)
         self.names = [f"{kind} {one}" for one in labels] + [
-            f"{kind} {labels[i]} with {labels[j]}" for i, j in zip(*self._below, strict=True)
+            f"{kind} {labels[i]} with {labels[j]}" for i in range(d) for j in range(i)
         ]
         self.size = len(self.names)
         self.start = np.concatenate(
@@ -240,7 +240,8 @@ def _part(
             f"structure of the {kind} is {shown(structure)}; expected one of "
             f"{', '.join(_STRUCTURES)}, or groups of components, such as {{'positions': [0, 1]}}."
         )
-    groups, seen = {}, set()
+    groups: dict[str, list[int]] = {}
+    seen: set[int] = set()
     for name, members in structure.items():
         found = np.atleast_1d(numbers(f"group {name!r} of the {kind}", members))
         index = found.astype(np.intp).tolist()

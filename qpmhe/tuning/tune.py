@@ -195,13 +195,13 @@ def tune(
             "another initial_state or other parameters, or bound the states by System(states=...)."
         )
     score = Score(
-        data, make, observer, ahead=ahead, truth=objective == "truth",
+        data, make, observer, weights_at(plan.start), ahead=ahead, truth=objective == "truth",
         robust=threshold is not None, options=options,
     )
     if objective != "likelihood":
         if sum(map(len, data)) * len(plan.names) > _WORTH_COMPILING:
             score.compile(weights_at(plan.start))
-        score.begin(weights_at(plan.start))
+        _ = score.scale  # what is wrong with the options shows before the search
     kept = Checkpoint(
         None if checkpoint is None else Path(checkpoint),
         identity_of(data, plan, at_start, (horizon, objective, ahead, arrival, seed, starts,

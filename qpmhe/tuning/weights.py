@@ -132,16 +132,16 @@ def load(path: str | Path) -> Weights:
             "tune, or Tuning.save."
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise WeightsError(f"{target} is no TOML file ({error}); save the weights again.") from error
+        raise WeightsError(
+            f"{target} is no TOML file ({error}); save the weights again."
+        ) from error
     try:
         if content.pop("format") != _FORMAT:
             raise ValueError(f"its format is not {_FORMAT}")
         content.pop("version", None)
-        matrices = {
-            kind: np.atleast_2d(numbers(kind, content["covariances"][kind])) for kind in KINDS
-        }
-        content.pop("covariances")
-        found = Weights(**matrices, **content)
+        given = content.pop("covariances")
+        content |= {kind: np.atleast_2d(numbers(kind, given[kind])) for kind in KINDS}
+        found = Weights(**content)
         found.cost()
         found.observer()
     except (KeyError, TypeError, ValueError, InvalidInputError) as error:

@@ -10,7 +10,6 @@ from qpmhe.tuning.likelihood import Likelihood
 from qpmhe.tuning.structures import KINDS, Setting, Structure
 
 
-
 def untraced(system):
     """The same system, of whose functions there is no trace."""
     make, arguments = system.recipe

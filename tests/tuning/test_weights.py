@@ -1,0 +1,158 @@
+"""Weights in a TOML file, and the commands that write and read it."""
+
+import gzip
+import textwrap
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import qpmhe
+from qpmhe.cli.app import app
+from qpmhe.errors import ModelError, OptionError
+from qpmhe.tuning import Weights, WeightsError, load
+
+MODEL = """
+    import numpy as np
+    import qpmhe
+
+    def f(x, u):
+        return np.stack((x[..., 0] + 0.1 * x[..., 1], 0.9 * x[..., 1] + gain * u[..., 0]), axis=-1)
+
+    gain = 1.0
+
+    def make(k=0.5):
+        system = qpmhe.System(
+            lambda x, u: np.stack(
+                (x[..., 0] + 0.1 * x[..., 1], 0.9 * x[..., 1] + k * u[..., 0]), axis=-1),
+            lambda x: x[..., :1], n=2, p=1, m=1)
+        return (
+            system, qpmhe.Luenberger([[0.3], [0.3]]),
+            qpmhe.QuadraticCost(prior=np.eye(2), disturbance=100 * np.eye(2), noise=[[1.0]]),
+            {"horizon": 4, "initial_state": [0.0, 0.0], "dt": 0.5},
+        )
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "model.py").write_text(textwrap.dedent(MODEL))
+    generator = np.random.default_rng(0)
+    x, rows = np.zeros(2), ["time,y1,u1,position"]
+    for t in range(250):
+        u = np.sign(np.sin(t / 9.0))
+        y = x[0] + 0.2 * generator.standard_normal()
+        if t != 40:
+            rows.append(f"{0.5 * t},{'' if t == 60 else y},{u},{x[0]}")
+        x = np.array([x[0] + 0.1 * x[1], 0.9 * x[1] + 0.8 * u])
+        x += 0.05 * generator.standard_normal(2)
+    (tmp_path / "record.csv").write_text("\n".join(rows) + "\n")
+    return tmp_path
+
+
+def call(*arguments):
+    found = CliRunner().invoke(app, list(map(str, arguments)))
+    if found.exception is not None and not isinstance(found.exception, SystemExit):
+        raise found.exception
+    assert found.exit_code == 0, found.output
+    return found.output
+
+
+def test_what_is_saved_is_loaded(tmp_path):
+    path = tmp_path / "weights.toml"
+    made = Weights(
+        np.diag([1.0, 1e-30]), np.array([[1 / 3, 0.1], [0.1, 2.0]]), np.array([[1e20]]), 7, 0.99,
+        2.5, "constant", {"mass": 0.1 + 0.2},
+    )
+    made.save(path, "two\nlines")
+    found = load(path)
+    for kind in ("prior", "disturbance", "noise"):
+        np.testing.assert_array_equal(getattr(found, kind), getattr(made, kind))
+    for name in ("horizon", "discount", "threshold", "arrival", "parameters"):
+        assert getattr(found, name) == getattr(made, name)
+    assert isinstance(found.cost(), qpmhe.RobustCost)
+    assert isinstance(found.observer(), qpmhe.ExtendedKalman)
+    assert isinstance(found.observer(qpmhe.UnscentedKalman), qpmhe.UnscentedKalman)
+
+
+@pytest.mark.parametrize("text", [
+    "", "nonsense", "format = 1\n", "format = 2\n[covariances]\nprior = [[1]]\n",
+    "format = 1\n[covariances]\nprior = [[1]]\ndisturbance = [[1]]\nnoise = [[-1]]\n",
+    "format = 1\nhorison = 3\n[covariances]\nprior = [[1]]\ndisturbance = [[1]]\nnoise = [[1]]\n",
+])  # fmt: skip
+def test_a_file_without_weights_is_refused(tmp_path, text):
+    path = tmp_path / "weights.toml"
+    path.write_text(text)
+    with pytest.raises(WeightsError, match="save"):
+        load(path)
+
+
+def test_a_missing_file_and_a_missing_folder(tmp_path):
+    with pytest.raises(WeightsError, match="qpmhe tune"):
+        load(tmp_path / "none.toml")
+    weights = Weights(np.eye(1), np.eye(1), np.eye(1))
+    with pytest.raises(WeightsError, match="cannot write"):
+        weights.save(tmp_path / "none" / "weights.toml")
+
+
+def test_tune_then_estimate(folder):
+    shown = call(
+        "tune", "model.py:make", "record.csv", "--objective", "likelihood", "--parameter", "k=0.6",
+        "--picture", "weights.png", "--horizons", "2,4",
+    )
+    assert "noise y1" in shown
+    assert "N = 2" in shown
+    weights = load("weights.toml")
+    assert weights.parameters["k"] == pytest.approx(0.8, abs=0.1)
+    assert weights.horizon == 4
+    assert (folder / "weights.png").exists()
+    assert not (folder / "weights.toml.search").exists()
+    call(
+        "estimate", "model.py:make", "record.csv", "--weights", "weights.toml", "--out",
+        "estimates.csv", "--no-step-time",
+    )
+    found = np.genfromtxt("estimates.csv", delimiter=",", names=True, usecols=(0, 1, 2))
+    truth = np.genfromtxt("record.csv", delimiter=",", names=True)["position"]
+    assert np.sqrt(np.mean((found["filtered_x1"] - truth)[50:] ** 2)) < 0.15
+    with pytest.raises(OptionError, match="--overwrite"):
+        call("tune", "model.py:make", "record.csv")
+
+
+def test_truth_and_several_records(folder):
+    text = (folder / "record.csv").read_text()
+    with gzip.open(folder / "again.csv.gz", "wt") as file:
+        file.write(text)
+    shown = call(
+        "tune", "model.py:make", "record.csv", "again.csv.gz", "--truth", "x1=position",
+        "--structure", "scalar", "--prior", "--out", "two.toml",
+    )
+    assert "error of x1" in shown
+    assert "prior level" in shown
+
+
+@pytest.mark.parametrize(("arguments", "error", "text"), [
+    (["--truth", "position"], OptionError, "names of x1, x2"),
+    (["--truth", "x3=position"], OptionError, "names of x1, x2"),
+    (["--parameter", "k"], OptionError, "NAME=START"),
+    (["--horizons", "2;3"], OptionError, "--horizons"),
+    (["--parameter", "q=1"], ModelError, "cannot be made"),
+])  # fmt: skip
+def test_wrong_options(folder, arguments, error, text):
+    with pytest.raises(error, match=text):
+        call("tune", "model.py:make", "record.csv", *arguments)
+
+
+def test_make_may_read_the_weights(folder):
+    Weights(4.0 * np.eye(2), np.eye(2), np.eye(1), 3).save("weights.toml")
+    (folder / "own.py").write_text(textwrap.dedent("""
+        from pathlib import Path
+        import qpmhe
+        from model import make as model
+
+        def make():
+            weights = qpmhe.tuning.load(Path(__file__).with_name("weights.toml"))
+            return model()[0], weights.observer(), weights.cost(), {
+                "horizon": weights.horizon, "initial_state": [0.0, 0.0], "dt": 0.5}
+    """))
+    call("estimate", "own.py:make", "record.csv", "--out", "estimates.csv")
