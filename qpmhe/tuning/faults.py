@@ -19,12 +19,12 @@ _SHIFTS = (-2, -1, 1, 2)
 _DRIFTS = tuple(late for late in range(-16, 17) if abs(late) > 1)
 # More components than this have no factors or pairs of their own.
 _MOST = 8
-# What a fault must gain in log likelihood, in all and for each measurement that it concerns; and
-# the least effect worth a word: factors of covariances, deviations of a bias, shares of a step
-# and of an input, samples.
+# What a fault must gain in log likelihood: in all, and for each measurement unless it is local.
 _GAIN, _GAIN_EACH, _LOCAL = 12.0, 0.035, ("bias", "outliers")
 # A further fault must gain this share of what the first did: what that has left may be its shadow.
 _BESIDE = 0.05
+# The least effect worth a word: factors of covariances, deviations of a bias, shares of a step and
+# of an input, samples.
 _LEAST = {
     "noise": np.log(2.0), "disturbance": np.log(2.0), "bias": 0.5, "step": 0.02, "sign": 0.1,
     "input": 0.1, "shift": 0.3, "clock": 0.5, "outliers": 0.0, "swapped": 0.0,
