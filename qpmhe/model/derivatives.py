@@ -285,6 +285,10 @@ class Jacobian:
             other.batch = other._given.batch
         return other
 
+    def try_batched(self, x: Array, u: Array) -> None:
+        """As `BatchedFunction.try_batched`."""
+        (self.function if self._given is None else self._given).try_batched(x, u)
+
     def use(self, method: str) -> None:
         """Compute by this method from now on, unless the user gave the Jacobian."""
         if self._given is None:

@@ -17,7 +17,7 @@ from ..model.residuals import difference
 from .faults import Fault, search
 from .filter_bank import FilterBank, Filtered, Hypothesis
 from .findings import Finding, Names, describe, listed, number, percent
-from .observability import observability, prior_shares
+from .observability import observability, prior_shares, prior_units
 from .stuck import at_end_of_range, comes_back, is_dead, is_rounded, longest_repetition
 
 Array = NDArray[np.float64]
@@ -116,6 +116,9 @@ class Examination:
         _, self.nis_mean_limits = _limits(count)
         self.correlations = self._correlations(self.normalised)
         far = np.abs(self.normalised) > _OUTLIER
+        if self.along.innovations.shape == far.shape:  # those that the search has left out, if any
+            left_out = np.isfinite(self.base.measurements) & ~np.isfinite(self.along.innovations)
+            far = left_out if left_out.any() else far
         self.outliers: Array = far.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
         self.prior_shares = self._prior_shares()
         self.findings: list[Finding] = []
@@ -305,20 +308,18 @@ class Examination:
     def _unseen(self) -> Iterator[Finding]:
         """Directions that the data do not see, that no filter has learnt, and that stay."""
         view, names, length = self.view, self.names, self.horizon
-        units = np.sqrt(self.prior.diagonal())
-        units = np.where(units > 0.0, units, 1.0)
-        ends = self.along.covariances[length - 1 :]
+        _, inverse_units = prior_units(self.prior)
+        ends = inverse_units @ self.along.covariances[length - 1 :] @ inverse_units.T
         count = len(ends)
         vectors = view.directions[:count, :, 0]  # the weakest
-        learnt = np.einsum("wi,wij,wj->w", vectors / units, ends, vectors / units)
-        blind = (
-            (view.values[:count, 0] < _UNSEEN) & (view.remaining[:count, 0] > _REMAINS)
-            & (learnt > _UNLEARNT)
-        )
+        learnt = np.einsum("wi,wij,wj->w", vectors, ends, vectors)
+        blind = (view.values[:count, 0] < _UNSEEN) & (learnt > _UNLEARNT)
         edges = np.flatnonzero(np.diff(np.concatenate(([0], blind.astype(int), [0]))))
         for begin, end in edges.reshape(-1, 2):
             last = end - 1 + length
-            if last - begin < max(2 * length, 0.1 * count):
+            if last - begin < max(2 * length, 0.1 * count) or not self._stays(
+                vectors[begin], begin, last
+            ):
                 continue
             middle = vectors[(begin + end) // 2]
             whole = begin == 0 and end == count
@@ -332,6 +333,14 @@ class Examination:
                 "Excite it, give the prior or Q of it less room, or leave it out of the state.",
                 where=None if whole else names.span(*span),
             )
+
+    def _stays(self, vector: Array, begin: int, end: int) -> bool:
+        """Whether the model keeps a direction, given in deviations of the prior, for so long."""
+        units, inverse_units = prior_units(self.prior)
+        moved = units @ vector
+        for a in self.transitions[begin:end]:
+            moved = a @ moved
+        return bool(np.linalg.norm(inverse_units @ moved) > _REMAINS * np.linalg.norm(vector))
 
     def _worse(self) -> Iterator[Finding]:
         """Whether the estimator predicts worse than the filter, by the same measure."""

@@ -13,16 +13,18 @@ from .filter_bank import FilterBank, Filtered, Hypothesis
 
 Array = NDArray[np.float64]
 
-_FACTORS = (1 / 64, 1 / 16, 1 / 4, 4.0, 16.0, 64.0, 256.0, 4096.0)
+_FACTORS = (1 / 4096, 1 / 256, 1 / 16, 1 / 4, 4.0, 16.0, 64.0, 256.0, 4096.0)
 _STEPS = (0.5, 0.65, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.5, 2.0)
 _SHIFTS = (-2, -1, 1, 2)
 _DRIFTS = tuple(late for late in range(-16, 17) if abs(late) > 1)
 # More components than this have no factors or pairs of their own.
 _MOST = 8
-# What a fault must gain in log likelihood, in all and for each measurement that it concerns; and
-# the least effect worth a word: factors of covariances, deviations of a bias, shares of a step
-# and of an input, samples.
+# What a fault must gain in log likelihood: in all, and for each measurement unless it is local.
 _GAIN, _GAIN_EACH, _LOCAL = 12.0, 0.035, ("bias", "outliers")
+# A further fault must gain this share of what the first did: what that has left may be its shadow.
+_BESIDE = 0.05
+# The least effect worth a word: factors of covariances, deviations of a bias, shares of a step and
+# of an input, samples.
 _LEAST = {
     "noise": np.log(2.0), "disturbance": np.log(2.0), "bias": 0.5, "step": 0.02, "sign": 0.1,
     "input": 0.1, "shift": 0.3, "clock": 0.5, "outliers": 0.0, "swapped": 0.0,
@@ -67,16 +69,30 @@ def search(
     """
     found: list[Fault] = []
     passes: list[Filtered] = []
+    rounds = 0
     while True:
         null = bank.run([base])
         passes.append(null)
-        if len(found) == most:
+        if rounds == most:
             return found, passes
         best = _best(bank, base, null)
-        if best is None:
+        if best is None or (found and best.gain < _BESIDE * found[0].gain):
             return found, passes
-        found.append(best)
         base = best.hypothesis
+        same = [k for k, one in enumerate(found) if _is_same(one, best)]
+        for k in same:
+            best = replace(best, value=found[k].value * best.value, gain=found[k].gain + best.gain)
+        found = [one for k, one in enumerate(found) if k not in same]
+        found.insert(same[0] if same else len(found), best)
+        rounds += 1
+
+
+def _is_same(one: Fault, other: Fault) -> bool:
+    """Whether both are a factor of the same."""
+    return (
+        one.kind in ("noise", "disturbance", "step", "input")
+        and (one.kind, one.subject) == (other.kind, other.subject)
+    )
 
 
 def _best(bank: FilterBank, base: Hypothesis, null: Filtered) -> Fault | None:

@@ -12,8 +12,8 @@ from ..model.system import Function, System
 
 Array = NDArray[np.float64]
 
-# Outliers as a second normal distribution of the noise: their share, and how much wider it is.
-_SHARE, _WIDTH = 0.02, 12.0
+# Outliers have a Cauchy distribution, as they may be anything: their share, and its width.
+_SHARE, _WIDTH = 0.02, 8.0
 # Beyond this an innovation in its own deviations is an outlier rather than noise.
 _OUTLIER = 4.0
 
@@ -92,19 +92,35 @@ class FilterBank:
     ) -> None:
         self.before = before
         self.system, self._start, self._prior = system, start, prior
+        #: Whether the model knows steps of other lengths exactly.
+        self.is_timed: bool
         #: Takes the length of the step as its last input where it can.
         self.model = system if system.make_timed is None else system.timed
+        self.is_timed = self.model is not system
         self._steps = steps
         if self.is_timed and steps is None:
             self._steps = np.array([float(system.dt or 1.0)])
+        self._tried = False
         states = system.states
         self._low = None if states is None else states.lower
         self._high = None if states is None else states.upper
 
-    @property
-    def is_timed(self) -> bool:
-        """Whether the model knows steps of other lengths exactly."""
-        return self.model is not self.system
+    def _try_batched(self, inputs: Array) -> None:
+        """Let functions that no trace has proved to take many states do so if it looks like it."""
+        self._tried = True
+        if "looped" not in (self.model.f.mode, self.model.h.mode):
+            return
+        self.model = self.model.copy(traced=True)
+        generator, count = np.random.default_rng(0), 2 * self.system.n + 7
+        spread = 0.1 * np.sqrt(self._prior.diagonal())
+        x = self._start + spread * generator.standard_normal((count, self.system.n))
+        if self._low is not None:
+            x = np.clip(x, self._low, self._high)
+        u = inputs[np.arange(count) % len(inputs)]
+        for one in (
+            self.model.f, self.model.h, self.model.f_jacobian, self.model.h_jacobian
+        ):
+            one.try_batched(x, u)
 
     def full_inputs(self, inputs: Array, step: float = 1.0) -> Array:
         """The inputs of `model`: with the length of the step behind them where it takes one."""
@@ -125,9 +141,12 @@ class FilterBank:
 
     def run(self, hypotheses: Sequence[Hypothesis]) -> Filtered:
         """Filter the record under all hypotheses at once."""
-        system, model, count = self.system, self.model, len(hypotheses)
+        system, count = self.system, len(hypotheses)
         y = np.array([one.measurements for one in hypotheses])
         u = np.array([self.full_inputs(one.inputs, one.step) for one in hypotheses])
+        if not self._tried:
+            self._try_batched(u[0])
+        model = self.model
         there = np.isfinite(y)
         y = np.where(there, y, 0.0)
         noise = np.array([one.noise for one in hypotheses])
@@ -148,7 +167,7 @@ class FilterBank:
         # Outputs count in deviations of the usual noise, whatever their units.
         unit = np.sqrt(hypotheses[0].noise.diagonal())
         noise = noise / np.multiply.outer(unit, unit)
-        extreme = np.log(_SHARE / _WIDTH)
+        extreme = np.log(_SHARE / _WIDTH * np.sqrt(2.0 / np.pi))  # beside a normal distribution
         usual, any_outliers = np.log1p(-_SHARE), outliers.any()
         for t in range(total):
             now, seen = u[:, t], there[:, t]
@@ -162,9 +181,9 @@ class FilterBank:
             if any_outliers:
                 own = np.einsum("hii->hi", spread + noise)
                 far = outliers[:, None] & seen & (e * e > _OUTLIER**2 * own)
-                cost = e * e / own / _WIDTH**2 + np.log(own)
+                tail = np.log1p(e * e / own / _WIDTH**2) + 0.5 * np.log(own)
                 seen = seen & ~far
-                likelihoods += np.where(far, extreme - 0.5 * cost, 0.0).sum(axis=1)
+                likelihoods += np.where(far, extreme - tail, 0.0).sum(axis=1)
                 likelihoods += usual * (outliers * seen.sum(axis=1))
             if not seen.all():
                 both = seen[:, :, None] & seen[:, None, :]

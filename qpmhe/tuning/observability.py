@@ -30,15 +30,11 @@ class Observability:
         Singular values of :math:`L^\top \Lambda L`, the smallest first.
     directions : (W, n, n) array
         Their directions :math:`\xi`, as columns.
-    remaining : (W, n) array
-        How long :math:`\xi` is at the end of the window, if nothing but the model acts on it: near
-        zero where the system forgets it by itself.
     """
 
     matrices: Array
     values: Array
     directions: Array
-    remaining: Array
 
 
 def observability(
@@ -61,19 +57,14 @@ def observability(
     total, n = transitions.shape[:2]
     windows, eye = total - horizon + 1, np.eye(n)
     matrices = np.zeros((windows, n, n))
-    moved = np.tile(eye, (windows, 1, 1))
     for k in range(horizon - 1, -1, -1):
         a = transitions[k : k + windows]
         later = np.linalg.solve(eye + matrices @ disturbance, matrices)
         matrices = information[k : k + windows] + a.transpose(0, 2, 1) @ later @ a
         matrices = 0.5 * (matrices + matrices.transpose(0, 2, 1))
-        moved = moved @ a
-    root, inverse_root = _roots(prior)
+    root, _ = prior_units(prior)
     values, directions = np.linalg.eigh(root.T @ matrices @ root)
-    ends = inverse_root @ moved @ root @ directions
-    return Observability(
-        matrices, np.maximum(values, 0.0), directions, np.linalg.norm(ends, axis=1)
-    )
+    return Observability(matrices, np.maximum(values, 0.0), directions)
 
 
 def prior_shares(
@@ -118,11 +109,12 @@ def prior_shares(
     return shares
 
 
-def _roots(covariance: Array) -> tuple[Array, Array]:
-    """L with L L^T the covariance, and its inverse: diagonal units first, so that none matters."""
+def prior_units(covariance: Array) -> tuple[Array, Array]:
+    """L with L L^T the covariance, and its inverse, or what is nearest to one."""
     units = np.sqrt(covariance.diagonal())
+    units = np.where(units > 0.0, units, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.multiply.outer(units, units))
     roots = np.sqrt(np.maximum(values, np.finfo(float).eps))
-    whitening: Array = (vectors * roots) @ vectors.T
-    inverse: Array = (vectors / roots) @ vectors.T
-    return units[:, None] * whitening, inverse / units
+    root: Array = units[:, None] * ((vectors * roots) @ vectors.T)
+    inverse: Array = ((vectors / roots) @ vectors.T) / units
+    return root, inverse
