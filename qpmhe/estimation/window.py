@@ -564,7 +564,8 @@ class Window(Stages):
     @property
     def observer_state(self) -> Array:
         """z(t), the observer's newest state: a view."""
-        return self._z[self.end]
+        newest: Array = self._z[self.end]
+        return newest
 
     def restart(self, state: Array) -> None:
         """Set z(t), the observer's newest state, after a failed stage."""
