@@ -250,7 +250,8 @@ def _stability(search: Search, rho: float | None) -> ObserverStability:
     return sealed(
         ObserverStability(
             form.rate, *euclidean_constants(form.P, V, form.rate), kappa, gain=full,
-            region=search.region, notes=(*found.notes, *search.notes, *_left_out(search), _RUN_STAYS),
+            region=search.region,
+            notes=(*found.notes, *search.notes, *_left_out(search), _RUN_STAYS),
             P=search.embedded(form.P, free, system.n), V=V,
             Q=None if form.Q is None else search.embedded(form.Q, search.acting, system.r),
             R=form.R, margin=found.margin, cells=found.cells,

@@ -336,7 +336,7 @@ def quickly_definite(matrices: Matrices) -> NDArray[np.bool_]:
         trace = np.diagonal(A, axis1=-2, axis2=-1).sum(axis=-1)
         shift = (widest + 4.0 * (n + 4) * _UNIT * trace) * (1.0 + 1e-12)
         A[:, range(n), range(n)] -= shift[:, None]
-        proved = np.isfinite(A).all(axis=(-2, -1))
+        proved: NDArray[np.bool_] = np.all(np.isfinite(A), axis=(-2, -1))
         for k in range(n):
             pivot = A[:, k, k]
             proved &= pivot > 0.0

@@ -198,7 +198,8 @@ def supports(metric: Array, rows: Array) -> Array:
         less = rows[:, :, None] * rows[:, None, :] / squares[:, None, None]
         P = Matrices.exact(np.broadcast_to(metric, less.shape))
         if (squares > 0.0).all() and definite(P - Matrices(less, 1e-15 * np.abs(less)))[0].all():
-            return np.sqrt(squares) * _OUTWARD
+            found: Array = np.sqrt(squares) * _OUTWARD
+            return found
     return np.full(len(rows), np.inf)
 
 

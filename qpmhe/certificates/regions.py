@@ -133,13 +133,14 @@ def bounded_region(
     if isinstance(system.state_residual, Angles):
         angles = system.state_residual
         width = (where.upper - where.lower)[angles.components]
-        wide = width >= 0.5 * angles.periods
+        half = 0.5 * np.asarray(angles.periods)
+        wide = width >= half
         if wide.any():
             names = ", ".join(f"x[{j}]" for j in angles.components[wide])
             raise CertificateError(
-                f"the region is {width[wide].tolist()} wide in the angle {names}, where differences "
-                f"may wrap; expected less than half a period, {0.5 * angles.periods[wide].tolist()}"
-                ". Take a region that is narrower there."
+                f"the region is {width[wide].tolist()} wide in the angle {names}, where "
+                f"differences may wrap; expected less than half a period, {half[wide].tolist()}. Take a "
+                "region that is narrower there."
             )
     return where
 

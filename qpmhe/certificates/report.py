@@ -193,8 +193,11 @@ def certify_model(
     place = region_of(system, scenario, region, inputs, record=record)
     horizons = horizons_of(scenario.horizon if horizon is None else horizon)
     sizes = sizes_of(system, cost, scenario)
-    found = _proved_observer(system, observer, place, sizes, deadline.part(_OBSERVER))
-    observer, stability, replaced = found
+    stability, replaced = None, ""
+    if scenario.region is not None:
+        observer, stability, replaced = _proved_observer(
+            system, observer, place, sizes, deadline.part(_OBSERVER)
+        )
     certificate = examined(
         system, observer, cost, place, horizons, sizes, deadline, stability=stability
     )
@@ -233,7 +236,7 @@ def _proved_observer(
             return observer, own, ""
         why = f"its bound, {np.round(limit, 3).tolist()}, says nothing of every state"
     except (NotCertifiedError, CertificateError) as error:
-        why = str(error.args[0])
+        why = str(error.args[0]).split(". ")[0].split(" What may help")[0]
     try:
         made = synthesise_gain(
             system, region, sizes=sizes.typical(system), seconds=deadline

@@ -27,7 +27,7 @@ _MOST_CONDITION = 1e8
 # Seconds for one entry of a factorisation, as measured for 10 to 30 states: a rough guide.
 _SECONDS = 5e-9
 # Bounds on the limit, as multiples of the largest noise.
-_SMALLEST_LIMIT, _LARGEST_LIMIT = 1e-2, 1e3
+_SMALLEST_LIMIT, _LARGEST_LIMIT = 0.1, 1e3
 _DIGITS = 4  # of a gain, after the first
 _LEAST = 1e-3  # seconds for a solver, for which zero may mean no limit
 # What a noise counts as at least, of the largest one, in the sizes of states and outputs.
@@ -330,7 +330,7 @@ class GainProgram(Program):
 
     def _form(self, rate: float) -> Form:
         P, Y = self._symmetric(self._P), self._value(self._Y, self._d, self._s)
-        return ErrorContraction(P, _printable(np.linalg.solve(P, Y)), rate)
+        return ErrorContraction(P, _printable(np.asarray(np.linalg.solve(P, Y), np.float64)), rate)
 
 
 def _printable(gain: Array) -> Array:

@@ -40,6 +40,7 @@ _ROOM = (0.03, 0.06, 0.12, 0.25)
 # room and fewer Jacobians.
 _LONG, _RATES, _WIDE_ROOM = 0.3, (0.9, 0.95, 0.98), (0.2, 0.4, 0.6)
 _FEW_POINTS = 4
+_FEW_CELLS = 100
 _TOLERANCE = 1e-3  # of the smallest rate
 _LARGEST_RATE = 0.9999
 # Above the smallest feasible rate, at which constants may grow without bound, and how often
@@ -177,14 +178,15 @@ class Search:
         outputs = self.model.values(m, self.region.upper[None])
         first = self.model.n + angles.components
         width = (outputs.high - outputs.low)[0, first]
-        room = 0.5 * angles.periods - width
+        half = 0.5 * np.asarray(angles.periods)
+        room = half - width
         largest = np.broadcast_to(np.asarray(self._sizes[1]), (self.system.p,))[angles.components]
         if not (room > largest).all():
             k = int(np.argmin(room - largest))
             raise NotCertifiedError(
-                f"the angle y[{angles.components[k]}] may wrap: it moves by up to {width[k]:.3g} in "
-                f"the region, and by the noise, {largest[k]:.3g}, and half a period is "
-                f"{0.5 * angles.periods[k]:.3g}", ("a smaller region",),
+                f"the angle y[{angles.components[k]}] may wrap: it moves by up to {width[k]:.3g} "
+                f"in the region, and by the noise, {largest[k]:.3g}, and half a period is "
+                f"{half[k]:.3g}", ("a smaller region",),
             )
         return tuple(
             f"the noise of the angle y[{j}] is less than {each:.4g}: then no innovation wraps"
@@ -319,7 +321,9 @@ class Search:
 
         def measure(share: float) -> float:
             if share not in measures:
-                measures[share] = self._feasible(smallest + share * room, deadline).objective
+                rate = smallest + share * room
+                margin = self._margins(rate, given=False)[1]
+                measures[share] = self._solved(rate, margin, deadline).objective
             return measures[share]
 
         with contextlib.suppress(OutOfTimeError):
@@ -367,13 +371,18 @@ class Search:
                 refused, share = error, 3.0 * share
         raise refused
 
+    def _margins(self, rate: float, given: bool) -> list[float]:
+        """The margins to try in turn."""
+        least = [each * min(1.0, rate * rate) for each in _MARGINS]
+        if self._long:
+            return [each * (1.0 - rate * rate) for each in _WIDE_ROOM]
+        if given or self.kind not in ("observer", "synthesis"):
+            return least
+        return [least[0], *(each * (1.0 - rate * rate) for each in _ROOM)]
+
     def _find(self, rate: float, *, given: bool = True) -> Found:
         """An inequality with this rate, verified as far as can be."""
-        level, margins = 0, [each * min(1.0, rate * rate) for each in _MARGINS]
-        if self._long:
-            margins = [each * (1.0 - rate * rate) for each in _WIDE_ROOM]
-        elif not given and self.kind in ("observer", "synthesis"):
-            margins = [each * (1.0 - rate * rate) for each in _ROOM]
+        level, margins = 0, self._margins(rate, given)
         best: Found | None = None
         status = "no round was left"
         for turn in range(1, _ROUNDS + 1):
@@ -390,7 +399,8 @@ class Search:
             if answer.form is None:
                 status = answer.status
                 break
-            outcome = self._verified(answer.form)
+            # Where a few cells do, as for affine models, no room is needed.
+            outcome = self._verified(answer.form, few=not given and level == 0)
             if isinstance(outcome, Found):
                 if outcome.evidence is Evidence.PROVED or self.model.reason:
                     return outcome
@@ -409,15 +419,18 @@ class Search:
             f"(solver status: {status})"
         )
 
-    def _verified(self, form: Form) -> Found | Cover:
-        """What was shown, or the cover with the states where the inequality fails."""
+    def _verified(self, form: Form, *, few: bool = False) -> Found | Cover:
+        """What was shown, with a few cells or many, or the cover with the states where it fails."""
         if not all(definite(each)[0].all() for each in form.constants()):
             return Cover(False, 0, 0.0, np.empty((0, 0)), np.empty((0, 0, 0)))
         if self.model.reason:
             return self._sampled(
                 form, f"f and h cannot be run with intervals ({self.model.reason})"
             )
-        found = cover(self.model, self.region, form, seconds=self._deadline.part(_VERIFICATION))
+        limit = {"most_cells": _FEW_CELLS} if few else {}
+        found = cover(
+            self.model, self.region, form, seconds=self._deadline.part(_VERIFICATION), **limit
+        )
         if found.proved:
             return Found(form, Evidence.PROVED, found.margin, found.cells, ())
         if found.violations.shape[0]:

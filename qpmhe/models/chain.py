@@ -212,6 +212,9 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
     In two and three dimensions, the force of a spring is undefined where two neighbours meet:
     x = 0 is no state to start from.
 
+    No region is stated: noises of three standard deviations at each sample allow errors of the
+    positions of half a metre, and within that neighbours may meet, where the force is undefined.
+
     Once settled, the observer is as good as MHE: its gain is Kalman's, and the prior weight,
     which is that of the initial error, is a weak one. What MHE gains is the time till then.
 

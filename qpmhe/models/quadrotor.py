@@ -132,6 +132,10 @@ def quadrotor(method: str = "rk4") -> Example:
     -----
     The angles are singular at a pitch of 90 degrees; the controller tilts by 29 at most.
 
+    No region is stated: noises of three standard deviations, all the same way at each sample,
+    move the body rates by more than the flight does, so that no bound that holds for all of them
+    is smaller than the rates themselves.
+
     References
     ----------
     Bouabdallah, Design and Control of Quadrotors with Application to Autonomous Flying, PhD
