@@ -182,8 +182,8 @@ static int mhe_dense_terms(const real *Q, const real *w, mhe_terms *t)
 
 /* hessian = A' Q A + C' R C (upper half), coupling = -A' Q, own = -(A' Q w + C' R v),
  * following = Q w; A and C are in place. Q and R are of the form that touches the cost. */
-static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *k, const mhe_stage *stage,
-                          const real *w, const real *v, mhe_terms *t)
+static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
+                          const mhe_stage *stage, const real *w, const real *v, mhe_terms *t)
 {
     const real *A = t->f_jacobian, *C = t->h_jacobian;
     const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
@@ -193,8 +193,8 @@ static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *k, const m
         for (int j = 0; j < NX; j++) t->disturbance_scale[MHE_LOSS ? j : 0] = 1;
         for (int j = 0; j < NY; j++) t->noise_scale[MHE_LOSS ? j : 0] = 1;
     } else {
-        mhe_set_scale(&s->disturbance_loss, mhe_w_widening(k), NX, Q, w, t->disturbance_scale);
-        mhe_set_scale(&s->noise_loss, mhe_v_widening(k), NY, R, v, t->noise_scale);
+        mhe_set_scale(&s->disturbance_loss, mhe_w_widening(work), NX, Q, w, t->disturbance_scale);
+        mhe_set_scale(&s->noise_loss, mhe_v_widening(work), NY, R, v, t->noise_scale);
     }
     mhe_times(NX, Q, w, t->following);
     for (int i = 0; i < NX; i++)
