@@ -86,7 +86,7 @@ class Case:
 
     name: str
     system: qpmhe.System
-    region: Any
+    region: qpmhe.Box
     sizes: Sizes
     observer: Any = None  # one is synthesised if it is None
     inputs: qpmhe.Box | None = None
@@ -128,8 +128,7 @@ def two_tanks(x: Array) -> Array:
 def cases() -> list[Case]:
     """The systems of the table."""
     models = qpmhe.models
-    reactor, pendulum, cstr = models.batch_reactor(), models.pendulum(), models.cstr()
-    assert cstr.scenario.region is not None
+    reactor, pendulum = models.batch_reactor(), models.pendulum()
     return [
         Case("batch reactor", reactor.system, qpmhe.Box([0.1, -1.0], [9.0, 9.0]),
              Sizes(0.3, 0.6), reactor.observer, cost=reactor.cost),
@@ -146,8 +145,6 @@ def cases() -> list[Case]:
              qpmhe.Box([0.2, 0.2], [2.0, 2.0]), Sizes(0.005, 0.01)),
         Case("pendulum", pendulum.system, qpmhe.Box([-3.0, -10.0], [3.0, 10.0]),
              Sizes(0.01, 0.02), pendulum.observer, cost=pendulum.cost),
-        Case("exothermic reactor", cstr.system, cstr.scenario.region, Sizes(0.001, 0.1),
-             inputs=cstr.scenario.input_region),
     ]
 
 
