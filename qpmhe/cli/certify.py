@@ -162,15 +162,8 @@ def _assumptions_table(findings: Audit) -> Table:
     table = _table("Assumptions")
     for name in ("assumption", "holds", "evidence", "what was found"):
         table.add_column(name, overflow="fold")
-    if any(each.holds is False and not each.needed for each in findings.findings):
-        table.caption = (
-            "The bounds rest on no set: what is certified holds for any w and v, and the region "
-            "takes the place of X."
-        )
     for finding in findings.findings:
         holds = {True: "yes", False: "[bold red]no[/]", None: "not examined"}[finding.holds]
-        if finding.holds is False and not finding.needed:
-            holds = "no, but not needed"
         table.add_row(
             f"{finding.name} ({finding.label})", holds, str(finding.evidence or "-"),
             escape(finding.text),

@@ -13,7 +13,7 @@ from qpmhe.errors import InvalidInputError
 from .helpers import REACTOR, box, linear, unit_cost
 
 HALF, LIPSCHITZ, KAPPA = linear(0.5, 1.0), "output Lipschitz", "correction bound"
-UNMOVED, STAYS = "no correction without error", "states stay in X"
+UNMOVED = "no correction without error"
 
 
 def bounded(slope, **sets):
@@ -69,11 +69,6 @@ FINDINGS = {  # system, observer, cost, then the finding with what it holds, res
     "discount": (
         HALF, None, qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0, discount=0.9),
         "cost bounds", False, Evidence.PROVED, "discount"),
-    "f leaves X": (
-        bounded(1.5, states=box(-1.0, 1.0)), None, None,
-        STAYS, False, Evidence.PROVED, "by 0.5;"),
-    "f stays in X": (
-        bounded(0.5, states=box(-1.0, 1.0)), None, None, STAYS, True, Evidence.SAMPLED, "in X"),
     "W": (
         bounded(0.5, disturbances=box(-0.1, 0.1)), None, None,
         "candidate in the sets", None, None, "monitor"),
