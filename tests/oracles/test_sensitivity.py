@@ -804,6 +804,21 @@ def test_what_was_handed_out_stays(engine):
         np.testing.assert_array_equal(getattr(gradient, name), expected[name])
 
 
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+def test_the_estimator_goes_on_as_its_twin(engine):
+    case = Case(samples=12, horizon=5, options={"engine": engine}, **SETS["all"][0])
+    case.data.measurements[...] = case.data.measurements.mean(axis=0)
+    twin, mhe = (case.estimator(case.data._replace(
+        measurements=case.data.measurements[:3], inputs=case.data.inputs[:3]
+    )) for _ in range(2))
+    for y, u in zip(case.data.measurements[3:], case.data.inputs[3:], strict=True):
+        expected, estimate = twin.update(y, u), mhe.update(y, u)
+        np.testing.assert_array_equal(estimate.trajectory, expected.trajectory)
+        found = mhe.sensitivity()
+        for one in (found.trajectory, found.step, found.adjoint([1.0, 0.0]).noise_weights):
+            one[...] = np.nan
+
+
 def test_rows_that_were_dropped_do_not_hold():
     case = Case(states=qpmhe.Box([-1.0, -1.2], [2.0, 2.0]), noises=symmetric(1.5, 1.5))
     mhe = case.estimator(case.data)
