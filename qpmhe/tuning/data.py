@@ -85,7 +85,7 @@ class Data:
                     "System.from_ode, or resample the record."
                 )
         self.truth = None if given.states is None else _truth(
-            name, given.states, system, self.observed.any(axis=1)
+            name, given.states, system, np.asarray(self.observed.any(axis=1))
         )
         start = initial_state
         if given.initial_state is not None:
