@@ -98,8 +98,8 @@ def near(
 def table(name: str, steps: int, found: list[list[tuple[str, bool, float, bool]]]) -> Table:
     """What was found in all records of a model."""
     runs = f"{RUNS[name]} x " if name in RUNS else ""
-    made = Table(title=f"{name}, {len(found)} records of {runs}{steps} samples", title_justify="left",
-                 box=None, pad_edge=False)
+    title = f"{name}, {len(found)} records of {runs}{steps} samples"
+    made = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for title in ("", "identified", "inside", "interval, median", "named as not identified"):
         made.add_column(title, justify="left" if not title else "right")
     for rows in zip(*found, strict=True):
