@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ Array = NDArray[np.float64]
 
 # Fewer measurements than this say nothing about a covariance.
 _LEAST_SAMPLES = 30
+_WIDTH = 92  # of the text
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +84,9 @@ class Diagnosis:
         count = len(self.findings)
         head = f"{count} finding{'s' * (count != 1)}" if count else "No fault was found"
         lines = [f"{head} in {len(self.run)} samples."]
-        lines += [f"{k}. {one}" for k, one in enumerate(self.findings, start=1)]
+        lines += [_wrapped(f"{k}. ", one) for k, one in enumerate(self.findings, start=1)]
         if self.notes:
-            lines += ["", "Worth knowing:", *(f"- {one}" for one in self.notes)]
+            lines += ["", "Worth knowing:", *(_wrapped("- ", one) for one in self.notes)]
         return "\n".join(lines)
 
     def plot(self) -> Any:
@@ -109,6 +111,10 @@ class Diagnosis:
         from .health import write_page
 
         return write_page(self, path)
+
+
+def _wrapped(mark: str, one: Finding) -> str:
+    return fill(str(one), _WIDTH, initial_indent=mark, subsequent_indent=" " * len(mark))
 
 
 def diagnose(
