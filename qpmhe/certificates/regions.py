@@ -139,8 +139,8 @@ def bounded_region(
             names = ", ".join(f"x[{j}]" for j in angles.components[wide])
             raise CertificateError(
                 f"the region is {width[wide].tolist()} wide in the angle {names}, where "
-                f"differences may wrap; expected less than half a period, {half[wide].tolist()}. Take a "
-                "region that is narrower there."
+                f"differences may wrap; expected less than half a period, {half[wide].tolist()}. "
+                "Take a region that is narrower there."
             )
     return where
 

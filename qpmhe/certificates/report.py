@@ -193,11 +193,9 @@ def certify_model(
     place = region_of(system, scenario, region, inputs, record=record)
     horizons = horizons_of(scenario.horizon if horizon is None else horizon)
     sizes = sizes_of(system, cost, scenario)
-    stability, replaced = None, ""
-    if scenario.region is not None:
-        observer, stability, replaced = _proved_observer(
-            system, observer, place, sizes, deadline.part(_OBSERVER)
-        )
+    observer, stability, replaced = _proved_observer(
+        system, observer, place, sizes, deadline.part(_OBSERVER)
+    )
     certificate = examined(
         system, observer, cost, place, horizons, sizes, deadline, stability=stability
     )

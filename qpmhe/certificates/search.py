@@ -164,6 +164,7 @@ class Search:
             )
         self.scales = _typical_scales(region, self.jacobians, self.free)
         self._program: Program | None = None
+        self._few = False  # whether few cells must do
         self.notes = self._angles()
 
     def _angles(self) -> tuple[str, ...]:
@@ -400,7 +401,8 @@ class Search:
                 status = answer.status
                 break
             # Where a few cells do, as for affine models, no room is needed.
-            outcome = self._verified(answer.form, few=not given and level == 0)
+            self._few = not given and level == 0
+            outcome = self._verified(answer.form)
             if isinstance(outcome, Found):
                 if outcome.evidence is Evidence.PROVED or self.model.reason:
                     return outcome
@@ -419,15 +421,15 @@ class Search:
             f"(solver status: {status})"
         )
 
-    def _verified(self, form: Form, *, few: bool = False) -> Found | Cover:
-        """What was shown, with a few cells or many, or the cover with the states where it fails."""
+    def _verified(self, form: Form) -> Found | Cover:
+        """What was shown, or the cover with the states where the inequality fails."""
         if not all(definite(each)[0].all() for each in form.constants()):
             return Cover(False, 0, 0.0, np.empty((0, 0)), np.empty((0, 0, 0)))
         if self.model.reason:
             return self._sampled(
                 form, f"f and h cannot be run with intervals ({self.model.reason})"
             )
-        limit = {"most_cells": _FEW_CELLS} if few else {}
+        limit = {"most_cells": _FEW_CELLS} if self._few else {}
         found = cover(
             self.model, self.region, form, seconds=self._deadline.part(_VERIFICATION), **limit
         )
