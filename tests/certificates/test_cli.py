@@ -25,7 +25,7 @@ def raising(x):
         raise ValueError("no way")
     return 0.5 * x
 
-def model(gain=0.4, growth=0.7, discount=1.0, room=None, broken=False):
+def model(gain=0.4, growth=0.7, discount=1.0, room=None, broken=False, meant=None):
     A = np.array([0.9, growth])
     B = np.array([[0.9, 0.2], [-0.1, 0.7]])
     system = qpmhe.System(
@@ -35,7 +35,8 @@ def model(gain=0.4, growth=0.7, discount=1.0, room=None, broken=False):
     scenario = qpmhe.models.Scenario(
         system=system, initial_state=np.array([1.0, 0.5]), initial_estimate=np.zeros(2),
         disturbance_covariance=1e-4 * np.eye(2), noise_covariance=1e-2 * np.eye(1), dt=1.0,
-        horizon=3, steps=20, labels=("a", "b"), title="Two [bold] states")
+        horizon=3, steps=20, labels=("a", "b"), title="Two [bold] states",
+        region=None if meant is None else qpmhe.Box([-meant] * 2, [meant] * 2))
     cost = qpmhe.QuadraticCost(
         prior=np.eye(2), disturbance=1e4 * np.eye(2), noise=100.0, discount=discount)
     return system, qpmhe.Luenberger([[gain], [0.1]]), cost, scenario
@@ -116,7 +117,11 @@ def test_without_a_box_the_record_gives_one(shown):
 
 def test_an_unstable_observer_is_named_and_another_one_is_made(shown, tmp_path):
     report = tmp_path / "other.json"
-    done, text = shown("(gain=-2.0)", report=report, box="-2:2,-2:2")
+    done, text = shown("(gain=-2.0)", box="-2:2,-2:2")
+    assert not done
+    assert "Not certified: the observer: the observer's error does not contract" in text
+    assert "e-IOSS" in text  # detectability does not depend on the observer
+    done, text = shown("(gain=-2.0,meant=2.0)", report=report)  # the model states its region
     assert done
     assert text.startswith("With a gain made for the region: |x1 - z1| <= ")
     words = " ".join(text.split())
