@@ -179,6 +179,8 @@ def audit(
     """
     checked_ingredients(system, observer, cost)
     where = bounded_region(system, region, inputs)
+    points = where.sample(_SAMPLES, np.random.default_rng(_SEED))
+    evaluated("f", system.f, points[:, : system.n], points[:, system.n :])  # an error if it raises
     slope = output_lipschitz(system, where, seconds=Deadline.of(seconds))
     constants, about_cost = _cost_finding(cost)
     candidate: tuple[bool | None, Evidence | None, str] = (

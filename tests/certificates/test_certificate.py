@@ -183,8 +183,6 @@ KALMAN = qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=np.eye(2), noise=1.0)
         ({"region": None}, SetError, "region", True),
         ({"region": qpmhe.Box([0.1, -np.inf], [9.0, np.inf])}, SetError, "unbounded", True),
         ({"region": ([-1], [1])}, SetError, "region is", True),
-        ({"cost": DISCOUNTED}, CertificateError, "discount", False),
-        ({"cost": HUBER}, CertificateError, "no constants", False),
         ({"cost": None}, InvalidInputError, "cost is None", True),
         ({"cost": unit_cost()}, ShapeError, "for 1 states and 1 outputs; expected 2 and 1", True),
         ({"observer": KALMAN}, CertificateError, "constant gain", False),
@@ -202,6 +200,18 @@ def test_what_cannot_be_certified_is_named(reactor, arguments, error, words, aud
     if audited:
         with pytest.raises(error, match=words):
             audit(*(parts | arguments).values())
+
+
+@pytest.mark.parametrize(("cost", "words"), [(DISCOUNTED, "discount"), (HUBER, "no constants")])
+def test_a_cost_without_constants_leaves_the_observers_bound(reactor, cost, words):
+    certificate, _ = reactor
+    found = certify(
+        certificate.system, certificate.observer, cost, horizon=5, region=certificate.region,
+        detectability=certificate.detectability, stability=certificate.stability,
+    )
+    assert found.observer_bound is not None
+    assert not found.bounds
+    assert words in str(found.errors["the theorem"])
 
 
 def test_an_undetectable_system_is_named_with_its_mode():
