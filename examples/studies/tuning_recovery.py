@@ -24,7 +24,7 @@ import qpmhe
 # Samples of a record.
 STEPS = {
     "batch_reactor": 100, "van_der_pol": 3000, "cstr": 2000, "pendulum": 2000, "vehicle": 1000,
-    "quadrotor": 200, "chain_of_masses": 400, "battery_cell": 1000,
+    "quadrotor": 200, "chain_of_masses": 1500, "battery_cell": 1000,
 }
 # The reactor's states drift out of where its model holds: several short runs make up a record.
 RUNS = {"batch_reactor": 40}
