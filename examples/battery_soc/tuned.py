@@ -22,8 +22,8 @@ from study import DT, SETTLING, Cycle, read
 import qpmhe
 
 TRAINING = "UDDS"
-# Only ratios matter to the estimates, so the noise stays. One factor of all disturbances: slow errors
-# of one state in one cycle determine no more. Three factors lower the error on the cycle that they
+# Only ratios matter to the estimates, so the noise stays. One factor of all disturbances: slow
+# errors of one state in one cycle determine no more. Three lower the error on the cycle that they
 # are tuned on, and double it on the other one.
 STRUCTURE = {"disturbance": "scalar"}
 
