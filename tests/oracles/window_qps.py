@@ -41,7 +41,7 @@ int32_t solve(mhe_estimator *e, mhe_workspace *k, const mhe_settings *s, int32_t
         memcpy(t->h_jacobian, C + i * NY * NX, sizeof t->h_jacobian);
         for (int j = 0; j < NY; j++) e->stages[i].is_observed[j] = 1;
         mhe_set_noise_weight(s, e->stages + i);
-        mhe_set_terms(s, e->stages + i, w + i * NX, v + i * NY, t);
+        mhe_set_terms(s, 0, e->stages + i, w + i * NX, v + i * NY, t);
         k->at[i] = t;
     }
     mhe_set_limits(e, k, trial->x, trial->w, trial->v);

@@ -145,10 +145,12 @@ def test_wrong_options(folder, arguments, error, text):
 
 def test_make_may_read_the_weights(folder):
     Weights(4.0 * np.eye(2), np.eye(2), np.eye(1), 3).save("weights.toml")
+    # Other tests import modules of the name "model".
+    (folder / "plant_with_weights.py").write_text((folder / "model.py").read_text())
     (folder / "own.py").write_text(textwrap.dedent("""
         from pathlib import Path
         import qpmhe
-        from model import make as model
+        from plant_with_weights import make as model
 
         def make():
             weights = qpmhe.tuning.load(Path(__file__).with_name("weights.toml"))
