@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from qpmhe_solvers.values import shown
 
-from .._checks import Array, count, numbers
+from .._checks import Array, choice, count, numbers
 from ..costs import Cost, CostConstants
 from ..errors import InvalidInputError, OptionError, QpmheError, ShapeError
 from ..estimation.estimate import Status
@@ -34,6 +34,7 @@ from .evidence import (
     Evidence,
     MismatchError,
     NotCertifiedError,
+    OutOfTimeError,
     json_ready,
     weakest,
 )
@@ -47,6 +48,7 @@ from .window_bounds import HorizonBounds, bounds_for
 from .window_bounds import Kind as TheoremKind
 
 Kind = TheoremKind | Literal["observer"]
+_KINDS = ("observer", "paper", "summed", "weighted", "measured")
 
 #: The constants are upper bounds, what is computed from them is not: this covers its rounding.
 OUTWARD = 1.0 + 1e-9
@@ -168,6 +170,7 @@ class Certificate:
             If the source is of another system, observer, cost or horizon, or did not make
             the run.
         """
+        choice("kind", kind, _KINDS)
         if kind == "observer":
             return self._of_observer(run, disturbances, noises, initial_error, source)
         if source is not None and horizon is None:
@@ -357,6 +360,7 @@ class Certificate:
         return w, v
 
     def _check_unmeasured(self, kind: Kind) -> None:
+        choice("kind", kind, _KINDS)
         if kind == "measured":
             kinds = ["observer", *(each for each in self.kinds if each != "measured")]
             raise OptionError(
@@ -519,11 +523,11 @@ def certify(
         system, observer, cost, place, horizons, sizes, started(seconds), detectability, stability
     )
     if not found.holds:
-        # Where the state cannot be detected, no observer can be stable.
-        raise next(
-            found.errors[what] for what in ("the theorem", "detectability", "the observer")
-            if what in found.errors
-        )
+        # Where the state cannot be detected, no observer can be stable; a search that ran out of
+        # time says nothing of it.
+        order = ("the theorem", "detectability", "the observer")
+        errors = [found.errors[what] for what in order if what in found.errors]
+        raise next((each for each in errors if not isinstance(each, OutOfTimeError)), errors[-1])
     return found
 
 

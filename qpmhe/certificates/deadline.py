@@ -11,7 +11,7 @@ from ..errors import OptionError
 # For a whole certificate, and for one of its ingredients asked for by itself.
 DEFAULT_SECONDS, PART_SECONDS = 60.0, 30.0
 # What a part of a time that is over still has: enough to find out that it is over.
-_LEAST = 1e-9
+LEAST_SECONDS = 1e-9
 
 
 class Deadline:
@@ -43,4 +43,4 @@ class Deadline:
 
     def part(self, share: float) -> Deadline:
         """A deadline that leaves some of the time for what comes after."""
-        return Deadline(max(share * self.left, _LEAST))
+        return Deadline(max(share * self.left, LEAST_SECONDS))

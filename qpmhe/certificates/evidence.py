@@ -50,6 +50,11 @@ class NotCertifiedError(QpmheError):
         What may help; the text of the error lists them.
     smallest_rate : float, optional
         The smallest rate that was found to be feasible, where the one asked for was not.
+
+    Attributes
+    ----------
+    finding : str
+        The message without what may help.
     """
 
     def __init__(
@@ -57,8 +62,11 @@ class NotCertifiedError(QpmheError):
     ) -> None:
         self.suggestions = tuple(suggestions)
         self.smallest_rate = smallest_rate
-        advice = f" What may help: {'; '.join(self.suggestions)}." if self.suggestions else ""
-        super().__init__(message + advice)
+        self.finding = message.rstrip(".")
+        if self.suggestions:
+            end = "" if message.endswith((".", "!", "?")) else "."
+            message = f"{message}{end} What may help: {'; '.join(self.suggestions)}."
+        super().__init__(message)
 
 
 class OutOfTimeError(NotCertifiedError):

@@ -490,10 +490,8 @@ def design(
 
 def _sizes(system: System, sizes: SignalBounds | Sizes | None) -> SignalBounds:
     """What is stated, or else the system's W and V."""
-    if isinstance(sizes, SignalBounds):
-        return sizes
     if sizes is not None:
-        return SignalBounds(sizes.disturbance, sizes.noise)
+        return SignalBounds.stated(sizes)
     if system.disturbances is None or system.noises is None:
         raise SetError(
             "it is not known how large disturbances and noises may be: the system has no sets of "

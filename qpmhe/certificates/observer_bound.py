@@ -24,15 +24,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import Array, numbers
 from ..costs import Cost
-from ..errors import OptionError, ShapeError
+from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
 from .bound_events import CONTRADICTION, events_of
-from .contraction import certify_observer
+from .contraction import certify_observer, gain_if_constant
 from .deadline import PART_SECONDS, Deadline
-from .evidence import Evidence, json_ready
+from .evidence import Evidence, MismatchError, json_ready
 from .inequalities import Matrices, definite
 from .invariance import Invariance, certify_invariance, inner_region, supports
 from .properties import ObserverStability
@@ -171,6 +171,16 @@ class ObserverBound:
     def of_observer(self, observer: Observer) -> ObserverBound:
         """The same of an observer with this gain, which may be projected in another metric."""
         return replace(self, projection=observer.metric)
+
+    def check_gain(self, observer: Observer, system: System) -> None:
+        """Raise a `MismatchError` unless the observer has this very gain."""
+        gain = gain_if_constant(observer, system)
+        if gain is None or not np.array_equal(gain, self.gain):
+            theirs = "not constant" if gain is None else str(gain.tolist())
+            raise MismatchError(
+                f"the bound is of an observer with the gain {self.gain.tolist()}; the estimator's "
+                f"is {theirs}. Certify the estimator's observer."
+            )
 
     @cached_property
     def slopes(self) -> Array:
@@ -384,13 +394,22 @@ class ObserverBound:
 
         Raises
         ------
-        ShapeError, OptionError, SetError
+        ShapeError, OptionError, SetError, InvalidInputError
             If an argument does not fit.
+        MismatchError
+            If the run knows its estimator, and that had another gain.
         """
-        if run.source is not None and run.source.observer.metric is not self.projection:
-            other = self.of_observer(run.source.observer)
-            if other.projects != self.projects:
-                return other.along(run, disturbances, noises, initial_error=initial_error)
+        if not isinstance(run, Run):
+            raise InvalidInputError(
+                f"run is of type {type(run).__name__}; expected a qpmhe.Run, as "
+                "MovingHorizonEstimator.run returns it."
+            )
+        if run.source is not None:
+            self.check_gain(run.source.observer, run.source.system)
+            if run.source.observer.metric is not self.projection:
+                other = self.of_observer(run.source.observer)
+                if other.projects != self.projects:
+                    return other.along(run, disturbances, noises, initial_error=initial_error)
         radius = self.radii(len(run), initial_error, self.entering(disturbances, noises))
         z = run.observer_states
         events = events_of(run, self.region, self.projects)

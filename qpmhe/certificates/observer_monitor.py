@@ -21,6 +21,7 @@ from .bound_events import (
     outside,
     step_of,
 )
+from .evidence import MismatchError
 from .observer_bound import ObserverBound, largest_ratio
 from .signal_bounds import SignalBounds, Size
 
@@ -89,6 +90,8 @@ class ObserverMonitor:
     ------
     ShapeError, OptionError, SetError, InvalidInputError
         If an argument does not fit.
+    MismatchError
+        If the bound is of another system or gain than the estimator's.
 
     Examples
     --------
@@ -111,6 +114,18 @@ class ObserverMonitor:
         self, bound: ObserverBound, estimator: MovingHorizonEstimator, *, initial_error: Size,
         sizes: SignalBounds | None = None,
     ) -> None:
+        if not isinstance(bound, ObserverBound):
+            raise InvalidInputError(
+                f"bound is of type {type(bound).__name__}; expected an ObserverBound, such as "
+                "certificate.observer_bound."
+            )
+        bound.check_gain(estimator.observer, estimator.system)
+        certified = bound.stability.system
+        if certified is not None and certified is not estimator.system:
+            raise MismatchError(
+                "the bound is of another System object than the estimator's; certify the very "
+                "objects that the estimator is made of."
+            )
         chosen = bound.sizes if sizes is None else sizes
         entering = bound.entering(chosen.disturbances, chosen.noises)
         self.bound = bound.of_observer(estimator.observer)
@@ -153,6 +168,11 @@ class ObserverMonitor:
         dt : float, optional
             Length of its step, if it had one of its own.
         """
+        if not isinstance(estimate, Estimate):
+            raise InvalidInputError(
+                f"estimate is of type {type(estimate).__name__}; expected what "
+                "MovingHorizonEstimator.update returns."
+            )
         if self._lost is None:
             reason = self._barred or self._advance(estimate, u, dt)
             if reason:

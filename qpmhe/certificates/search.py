@@ -13,7 +13,7 @@ from .._checks import Array, positive, vector
 from ..model.residuals import Angles
 from ..model.system import System
 from .branch_and_bound import Cover, cover
-from .deadline import PART_SECONDS, Deadline
+from .deadline import LEAST_SECONDS, PART_SECONDS, Deadline
 from .enclosures import Enclosure, SmoothModel, evaluated, joint_jacobians
 from .evidence import CertificateError, Evidence, NotCertifiedError, OutOfTimeError
 from .inequalities import Form, Matrices, definite
@@ -210,7 +210,10 @@ class Search:
                     if who != "f" else ("a region with some width there",),
                 )
         if not self.free.size:
-            raise NotCertifiedError("the region is a single state, which has nothing to estimate")
+            raise NotCertifiedError(
+                "the region is a single state, which has nothing to estimate",
+                ("a region with some width",),
+            )
         G = np.eye(n) if self._matrix is None else self._matrix
         self.acting = np.flatnonzero(~G[fixed].any(axis=0) & G[~fixed].any(axis=0))
         self._matrix = G[np.ix_(self.free, self.acting)]
@@ -284,10 +287,11 @@ class Search:
             except OutOfTimeError:
                 raise error from None
             if not np.isfinite(smallest):
-                raise why(self, error.args[0]) from error
+                raise why(self, error.finding) from error
+            helps = (*error.suggestions, f"a larger {name}", *advice, "a smaller region")
             raise NotCertifiedError(
-                f"{error.args[0]}. Feasible at the states tried: {name} from {smallest:.4g} on",
-                (f"a larger {name}", *advice, "a smaller region"), smallest,
+                f"{error.finding}. Feasible at the states tried: {name} from {smallest:.4g} on",
+                tuple(dict.fromkeys(helps)), smallest,
             ) from error
 
     def _feasible(self, rate: float, deadline: Deadline) -> Answer:
@@ -310,8 +314,13 @@ class Search:
         return answer
 
     def _out_of_time(self, what: str) -> OutOfTimeError:
+        given = self._deadline.seconds
+        time = (
+            f"the time for this search ({given:.3g} s) was too short" if given > LEAST_SECONDS else
+            "no time was left for this search"
+        )
         return OutOfTimeError(
-            f"the time for this search ({self._deadline.seconds:.3g} s) was too short: {what}",
+            f"{time}: {what}",
             ("more seconds", "a given rate, which spares the search for one", "a smaller model"),
         )
 

@@ -75,12 +75,22 @@ class SignalBounds:
         return cls(found[0], found[1], " and ".join(dict.fromkeys(sources)))
 
     @classmethod
-    def of(cls, sizes: SignalBounds | Sizes | None, system: System, cost: Cost) -> SignalBounds:
-        """Those that are stated, or the usual ones with the weights as inverse covariances."""
+    def stated(cls, sizes: Any) -> SignalBounds:
+        """Those that the user states, or an `OptionError`."""
         if isinstance(sizes, Sizes):
             return cls(sizes.disturbance, sizes.noise)
-        if sizes is not None:
+        if isinstance(sizes, SignalBounds):
             return sizes
+        raise OptionError(
+            f"sizes is {shown(sizes)}; expected Sizes(disturbance=..., noise=...), the largest "
+            "lengths, or SignalBounds(disturbances, noises) with boxes."
+        )
+
+    @classmethod
+    def of(cls, sizes: SignalBounds | Sizes | None, system: System, cost: Cost) -> SignalBounds:
+        """Those that are stated, or the usual ones with the weights as inverse covariances."""
+        if sizes is not None:
+            return cls.stated(sizes)
         covariance, factor = inverse(cost.disturbance), cost.disturbance_factor
         if factor is not None:
             covariance = factor @ covariance @ factor.T

@@ -117,7 +117,9 @@ def decaying_sums(rate: float, entering: Array) -> Array:
 
 def checked_length(name: str, value: Any) -> float:
     """A finite number >= 0, checked."""
-    length = finite(value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value)
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
+    length = finite(value)
     if length is None or length < 0.0:
         raise OptionError(
             f"{name} is {shown(value)}; expected a finite number >= 0, which bounds a Euclidean "

@@ -12,6 +12,7 @@ from qpmhe.certificates import (
     SignalBounds,
     certify,
     certify_observer,
+    design,
     observer_bound,
 )
 from qpmhe.certificates import certificate as certification
@@ -20,6 +21,7 @@ from qpmhe.certificates.regions import bounded_region
 from qpmhe.errors import OptionError, SetError, ShapeError
 
 STEPS = 60
+ONES = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
 
 
 def bound_of(system, gain, region, disturbances, noises, metric=None):
@@ -419,3 +421,39 @@ def test_time_up_leaves_what_was_reached(monkeypatch):
     monkeypatch.setattr(observer_bound, "certify_observer", late)
     with pytest.raises(OutOfTimeError, match="more seconds"):
         scalar_certificate(0.8)
+
+
+def test_time_up_names_no_time_that_nobody_gave():
+    system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1)
+    region = qpmhe.Box([-1.0], [1.0])
+    with pytest.raises(OutOfTimeError, match=r"no time was left for this search: .*; a smaller"):
+        certify(
+            system, qpmhe.Luenberger([[0.1]]), ONES, horizon=4,
+            region=region, seconds=1e-9,
+        )
+
+
+def test_sizes_and_kinds_that_are_none_are_named():
+    system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1)
+    region = qpmhe.Box([-1.0], [1.0])
+    cost, observer = ONES, qpmhe.Luenberger([[0.1]])
+    with pytest.raises(OptionError, match=r"sizes is \(0.1, 0.1\); expected Sizes\("):
+        certify(system, observer, cost, horizon=4, region=region, sizes=(0.1, 0.1))
+    with pytest.raises(OptionError, match=r"sizes is \(0.1, 0.1\); expected Sizes\("):
+        design(system, region, sizes=(0.1, 0.1))
+    certificate = scalar_certificate(0.8)
+    for asked in (
+        lambda: certificate.bound(None, [0.1], [0.1], initial_error=0.1, kind="own"),
+        lambda: certificate.limit(kind="own"),
+    ):
+        with pytest.raises(OptionError, match="kind is 'own'; expected one of 'observer', 'paper'"):
+            asked()
+    with pytest.raises(OptionError, match=r"initial_error is -0\.1;"):
+        certificate.observer_bound.initial(-0.1)
+
+
+def test_what_may_help_is_a_sentence_of_its_own():
+    for ending in ("", "."):
+        error = NotCertifiedError(f"f may jump there{ending}", ("a smaller region",))
+        assert str(error) == "f may jump there. What may help: a smaller region."
+        assert error.finding == "f may jump there"

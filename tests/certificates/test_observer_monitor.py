@@ -1,6 +1,7 @@
 """The observer's bound beside each estimate, and each event that ends it, at its sample."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from qpmhe.certificates import (
     certify,
     certify_observer,
 )
+from qpmhe.certificates.evidence import MismatchError
 from qpmhe.errors import InvalidInputError, ShapeError
 
 A = np.array([[0.9, 0.2], [-0.1, 0.7]])
@@ -227,7 +229,8 @@ def test_model_failures_end_it(certificate):
         return x @ A.T
 
     system = qpmhe.System(f, lambda x: x[..., :1], n=2, p=1)
-    bound = certify(linear(), certificate.observer, COST, horizon=4, region=REGION).observer_bound
+    bound = certificate.observer_bound
+    bound = replace(bound, stability=replace(bound.stability))  # by hand: of any system
     mhe = qpmhe.MovingHorizonEstimator(
         system, certificate.observer, COST, horizon=4, initial_state=[0.0, 0.0]
     )
@@ -509,3 +512,29 @@ def test_stated_constants_have_no_norm_to_follow():
     )
     assert certificate.observer_bound is None
     assert certificate.bounds
+
+
+def test_a_bound_of_another_observer_is_refused(certificate):
+    other = qpmhe.MovingHorizonEstimator(
+        certificate.system, qpmhe.Luenberger(2.0 * GAIN), COST, horizon=4, initial_state=[0.0, 0.0]
+    )
+    bound = certificate.observer_bound
+    with pytest.raises(MismatchError, match=r"\[\[0.4\], \[0.1\]\]; the estimator's is \[\[0.8\]"):
+        bound.along(other.run(record()[1]), initial_error=START)
+    with pytest.raises(MismatchError, match=r"the estimator's is \[\[0.8\]"):
+        ObserverMonitor(bound, other, initial_error=START)
+    twin = qpmhe.MovingHorizonEstimator(
+        linear(), certificate.observer, COST, horizon=4, initial_state=[0.0, 0.0]
+    )
+    with pytest.raises(MismatchError, match="another System object"):
+        ObserverMonitor(bound, twin, initial_error=START)
+
+
+def test_what_is_no_bound_estimate_or_run_is_named(certificate):
+    mhe, bound = estimator(certificate), certificate.observer_bound
+    with pytest.raises(InvalidInputError, match=r"Certificate; .* certificate\.observer_bound"):
+        ObserverMonitor(certificate, mhe, initial_error=START)
+    with pytest.raises(InvalidInputError, match=r"NoneType; .* MovingHorizonEstimator\.update"):
+        ObserverMonitor(bound, mhe, initial_error=START).check(None)
+    with pytest.raises(InvalidInputError, match="type ndarray; expected"):
+        certificate.bound(np.ones(3), initial_error=START)
