@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import positive
-from ..errors import InvalidInputError, ShapeError
+from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.run import Run, RunSource
 from .examination import Correlations, Examination
 from .findings import Finding, Names
@@ -226,6 +226,8 @@ def _names(
         ("labels", labels, "x", system.n), ("outputs", outputs, "y", system.p),
         ("inputs", inputs, "u", system.m),
     ):
+        if given is not None and not isinstance(given, Iterable):
+            raise ShapeError(f"{name} is {given!r}; expected {size} strings.")
         found = [f"{letter}{i + 1}" for i in range(size)] if given is None else list(given)
         if name == "inputs" and given is not None:  # parameters behind the inputs have no name
             found += [f"u{i + 1}" for i in range(len(found), size)]
@@ -240,5 +242,7 @@ def _names(
         scale = 1.0 if dt is None or system.dt is None else dt / system.dt
         times[1:] = np.cumsum(source.steps[:-1])
         times *= scale
+    if not (time_unit is None or isinstance(time_unit, str)):
+        raise OptionError(f"time_unit is {time_unit!r}; expected a string, such as 'h'.")
     unit = "samples" if step is None else time_unit or "s"
     return Names(sizes["labels"], sizes["outputs"], sizes["inputs"], times, unit)

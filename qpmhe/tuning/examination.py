@@ -270,15 +270,20 @@ class Examination:
                 own[lag, j] = _correlation(bounded[lag:, j], bounded[: total - lag, j])
                 for k in range(both.shape[1]):
                     inputs[lag, j, k] = _correlation(bounded[lag:, j], both[: total - lag, k])
-        return Correlations(own, inputs, 1.96 / np.sqrt(total))
+        seen = int(np.isfinite(normalised).any(axis=1).sum())
+        return Correlations(own, inputs, 1.96 / np.sqrt(max(seen, 1)))
 
     def _correlated(self) -> Iterator[Finding]:
-        found = self._correlations(_normalised(self.best))
+        innovations = _normalised(self.best)
+        found, there = self._correlations(innovations), np.isfinite(innovations)
         total, names = len(self.normalised), self.names
         lags = len(found.own) - 1
+        weights = total * (total + 2) / (total - np.arange(1, lags + 1)) ** 2
         for j, name in enumerate(names.outputs):
             own = found.own[1:, j]
-            portmanteau = total * (total + 2) * np.sum(own**2 / (total - np.arange(1, lags + 1)))
+            # Only pairs of which both were measured are evidence.
+            pairs = [(there[lag:, j] & there[:-lag, j]).sum() for lag in range(1, lags + 1)]
+            portmanteau = np.sum(weights * pairs * own**2)
             k = int(np.argmax(np.abs(own)))
             if chi2.sf(portmanteau, lags) < _SURE and abs(own[k]) > _CORRELATED:
                 yield Finding(
@@ -292,8 +297,9 @@ class Examination:
     def _input_notes(self) -> Iterator[Finding]:
         names, found = self.names, self.correlations
         signals = [*names.inputs, *(f"the change of {one}" for one in names.inputs)]
-        sure = np.sqrt(chi2.isf(_SURE, 1) / len(self.normalised))
+        counts = np.isfinite(self.normalised).sum(axis=0)
         for j, k in np.ndindex(*found.inputs.shape[1:]):
+            sure = np.sqrt(chi2.isf(_SURE, 1) / max(int(counts[j]), 1))
             strongest = float(np.abs(found.inputs[:, j, k]).max())
             if strongest > max(_CORRELATED, sure):
                 yield Finding(

@@ -103,7 +103,7 @@ class Names:
 
 def number(value: float) -> str:
     """Two significant digits, or all digits of a whole number."""
-    if value == round(value) and abs(value) < 1e6:
+    if abs(value) < 1e6 and value == round(value):
         return f"{value:.0f}"
     text = f"{value:.2g}"
     return text if "e" not in text or abs(value) >= 1e5 or abs(value) < 1e-3 else f"{value:.0f}"

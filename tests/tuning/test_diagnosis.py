@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 import qpmhe
 from qpmhe.cli.app import app
-from qpmhe.errors import InvalidInputError, ShapeError
+from qpmhe.errors import InvalidInputError, OptionError, ShapeError
 from qpmhe.tuning import observability
 from qpmhe.tuning.filter_bank import FilterBank, Hypothesis
 from qpmhe.tuning.observability import prior_shares
@@ -121,6 +121,27 @@ def test_missing_measurements_are_no_fault():
     assert kinds(qpmhe.diagnose(case._replace(measurements=y).run())) == ["missing"]
 
 
+def test_few_measurements_are_no_evidence_of_correlation():
+    case = planted.healthy("vehicle", 1)
+    y = np.full_like(case.measurements[:120], np.nan)
+    y[:30] = case.measurements[:30]
+    few = case._replace(
+        measurements=y, inputs=case.inputs[:120], settings={**case.settings, "horizon": 40}
+    )
+    found = qpmhe.diagnose(few.run())
+    assert found.is_healthy
+    assert found.correlations.limit > 0.5
+
+
+def test_measurement_beyond_all_measure():
+    case = planted.healthy("vehicle", 1)
+    y = case.measurements.copy()
+    y[50] = 1e300
+    found = qpmhe.diagnose(case._replace(measurements=y).run())
+    assert not found.is_healthy
+    assert str(found)
+
+
 def test_sensor_that_never_changes():
     case = planted.healthy("batch_reactor", 0)
     found = qpmhe.diagnose(case._replace(measurements=np.full((150, 1), 3.0)).run())
@@ -174,6 +195,10 @@ def test_bad_input():
         qpmhe.diagnose(case._replace(measurements=np.full((50, 1), np.nan)).run())
     with pytest.raises(ShapeError, match=r"labels is .* expected 2 strings"):
         qpmhe.diagnose(run, labels=["a"])
+    with pytest.raises(ShapeError, match=r"labels is 3; expected 2 strings"):
+        qpmhe.diagnose(run, labels=3)
+    with pytest.raises(OptionError, match=r"time_unit is 3; expected a string"):
+        qpmhe.diagnose(run, time_unit=3)
     with pytest.raises(InvalidInputError, match="does not know its measurements"):
         qpmhe.diagnose(qpmhe.Run.of(run.states[0], []))
     with pytest.raises(InvalidInputError, match="a folder"):
