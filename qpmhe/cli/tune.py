@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from .._checks import Array
+from .._checks import Array, make_folder
 from ..errors import OptionError
 from ..models.loading import build, find
 from .values import arguments_of, read_state, with_arguments
@@ -93,6 +93,7 @@ def tune(
         raise OptionError(
             f"{out} exists already; give another --out, or replace it by --overwrite."
         )
+    make_folder(out.parent)
     wanted = _numbers("--horizons", horizons)
     started = _parameters(parameter or [])
     source = find(model)

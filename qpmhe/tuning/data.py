@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qpmhe_solvers.values import shown
+from qpmhe_solvers.values import finite, shown
 
 from .._checks import Array, numbers, record, vector
 from ..errors import InvalidInputError, OptionError, ShapeError
@@ -56,6 +56,8 @@ class Data:
         self.y = record(f"measurements of {name}", given.measurements, system.p)
         self.observed: Mask = np.isfinite(self.y)
         samples = len(self.y)
+        if not samples:
+            raise InvalidInputError(f"{name} has no samples; leave this record out.")
         if not self.observed.any():
             raise InvalidInputError(
                 f"all measurements of {name} are missing; leave this record out, or check its "
@@ -159,8 +161,9 @@ def checked_data(
 
 def hold_out(data: list[Data], share: float, least: int) -> None:
     """Cut each record into blocks of at least so many samples; hold some of them out."""
-    if not 0.0 <= share <= 0.5:
-        raise OptionError(f"held_out is {share!r}; expected a share from 0 to 0.5.")
+    part = finite(share)
+    if part is None or not 0.0 <= part <= 0.5:
+        raise OptionError(f"held_out is {shown(share)}; expected a share from 0 to 0.5.")
     count = 0
     for one in data:
         parts = max(1, min(_BLOCKS, len(one) // least))
@@ -191,6 +194,13 @@ def check_enough(data: list[Data], names: Sequence[str], noise: Sequence[int]) -
                 f"output {j + 1} is missing in all blocks that tune, so its noise cannot be tuned; "
                 "leave it out of the structure of the noise, as in structure={'noise': "
                 "{'level': [0]}, 'disturbance': 'diagonal'}, or hold out other blocks."
+            )
+        values = [one.y[:, j][one.observed[:, j]] for one in data]
+        if np.ptp(np.concatenate(values)) == 0.0:
+            raise InvalidInputError(
+                f"output {j + 1} never changes: all its measurements are {values[0][0]:g}, so its "
+                "noise cannot be tuned. Check the sensor and the column, or leave it out of the "
+                "structure of the noise."
             )
     if int(np.sum(seen)) < _LEAST * len(names):
         raise InvalidInputError(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from qpmhe_solvers.values import shown
+from qpmhe_solvers.values import finite, shown
 
 from .._checks import Array, choice, numbers, positive_definite, positive_semidefinite
 from .._linalg import cholesky
@@ -271,11 +271,13 @@ def checked_start(
                 f"parameters[{name!r}] starts at 0, which has no size; start at a typical value."
             )
         given[str(name)] = start
-    if threshold is not None and not (np.isfinite(threshold) and threshold > 0.0):
+    known = finite(threshold)
+    if threshold is not None and (known is None or known <= 0.0):
         raise OptionError(
-            f"threshold is {threshold!r}; expected a number > 0, in standard deviations of the "
-            "noise, or None for a quadratic loss."
+            f"threshold is {shown(threshold)}; expected a number > 0, in standard deviations of "
+            "the noise, or None for a quadratic loss."
         )
-    if not 0.5 < discount <= 1.0:
-        raise OptionError(f"discount is {discount!r}; expected a number above 0.5, at most 1.")
-    return Setting(first, second, third, float(discount), threshold, given)
+    share = finite(discount)
+    if share is None or not 0.5 < share <= 1.0:
+        raise OptionError(f"discount is {shown(discount)}; expected a number above 0.5, at most 1.")
+    return Setting(first, second, third, share, known, given)

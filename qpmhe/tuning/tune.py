@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from qpmhe_solvers.values import shown
 
-from .._checks import Array, choice, count, dimension
+from .._checks import Array, checked_path, choice, count, dimension
 from ..errors import InvalidInputError, ModelError, OptionError, QpmheError
 from ..model.system import System
 from ..observers import ExtendedKalman, Observer
@@ -23,7 +23,7 @@ from .likelihood import Likelihood
 from .score import Score
 from .search import Checkpoint, identity_of, polish, refine, search_all
 from .structures import KINDS, Setting, Structure, checked_start
-from .weights import Weights
+from .weights import ARRIVALS, Weights
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -147,13 +147,19 @@ def tune(
     """
     began = perf_counter()
     choice("objective", objective, _OBJECTIVES)
-    choice("arrival", arrival, ("observer", "constant"))
+    choice("arrival", arrival, ARRIVALS)
     dimension("horizon", horizon, 1)
     dimension("ahead", ahead, 1)
     dimension("starts", starts, 1)
     dimension("jobs", jobs, 1)
     count("seed", seed, 0)
-    started = dict(parameters or {})
+    started = _mapping("parameters", parameters, "{'mass': 0.5}")
+    if not callable(observer):
+        raise OptionError(
+            f"observer is {shown(observer)}; expected what makes one from prior, disturbance and "
+            "noise, such as qpmhe.ExtendedKalman."
+        )
+    kept_in = None if checkpoint is None else checked_path("checkpoint", checkpoint)
     make, remade = _maker(system, started)
     first = make(started)
     inputs = first.m if remade else first.m - len(started)
@@ -164,6 +170,7 @@ def tune(
         )
     sizes = {"prior": first.n, "disturbance": first.r, "noise": first.p}
     start = checked_start(sizes, prior, disturbance, noise, discount, threshold, started)
+    _check_observer(observer, start)
     data = checked_data(records, first, inputs, initial_state)
     hold_out(data, held_out, 2 * ahead)
     labels = _labels(first, names)
@@ -203,7 +210,7 @@ def tune(
             score.compile(weights_at(plan.start))
         _ = score.scale  # what is wrong with the options shows before the search
     kept = Checkpoint(
-        None if checkpoint is None else Path(checkpoint),
+        kept_in,
         identity_of(data, plan, at_start, (horizon, objective, ahead, arrival, seed, starts,
                                            _plain(start), sorted(options.items(), key=str))),
     )
@@ -282,8 +289,34 @@ class _Making:
         return self._function(**parameters)
 
 
+def _check_observer(kind: Callable[..., Observer], start: Setting) -> None:
+    """Make one, so that what is wrong shows before the search."""
+    try:
+        made = kind(prior=start.prior, disturbance=start.disturbance, noise=start.noise)
+    except QpmheError:
+        raise
+    except Exception as error:
+        raise OptionError(
+            f"observer(prior=..., disturbance=..., noise=...) raised {type(error).__name__}: "
+            f"{error}; expected what makes an observer of these covariances, such as "
+            "qpmhe.ExtendedKalman."
+        ) from error
+    if not isinstance(made, Observer):
+        raise OptionError(
+            f"observer(prior=..., disturbance=..., noise=...) returned {shown(made)}; expected an "
+            "observer, as qpmhe.ExtendedKalman makes it."
+        )
+
+
+def _mapping(name: str, given: Any, example: str) -> dict[str, Any]:
+    """A dict, empty for None."""
+    if not (given is None or isinstance(given, Mapping)):
+        raise OptionError(f"{name} is {shown(given)}; expected a dict, such as {example}.")
+    return dict(given or {})
+
+
 def _labels(system: System, names: Mapping[str, Sequence[str]] | None) -> dict[str, list[str]]:
-    given = dict(names or {})
+    given = _mapping("names", names, "{'states': ['position', 'speed']}")
     found = {}
     for kind, letter, size in (("states", "x", system.n), ("outputs", "y", system.p)):
         labels = [str(one) for one in given.pop(kind, [])]

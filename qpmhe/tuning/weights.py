@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array, checked_path, numbers
+from .._checks import Array, checked_path, choice, dimension, numbers
 from .._linalg import inverse
 from .._version import __version__
 from ..costs import Cost, Huber, ObserverPrior, QuadraticCost, RobustCost
@@ -20,6 +20,8 @@ from ..observers import ExtendedKalman, Observer
 from .structures import KINDS
 
 _FORMAT = 1
+#: What may weigh the prior.
+ARRIVALS = ("observer", "constant")
 
 
 class WeightsError(QpmheError):
@@ -141,14 +143,25 @@ def load(path: str | Path) -> Weights:
         content.pop("version", None)
         given = content.pop("covariances")
         content |= {kind: np.atleast_2d(numbers(kind, given[kind])) for kind in KINDS}
+        unknown = sorted(set(content) - {one.name for one in fields(Weights)})
+        if unknown:
+            raise ValueError(f"it has {', '.join(map(repr, unknown))}, which is no field of them")
         found = Weights(**content)
+        dimension("horizon", found.horizon, 1)
+        choice("arrival", found.arrival, ARRIVALS)
         found.cost()
         found.observer()
     except (KeyError, TypeError, ValueError, InvalidInputError) as error:
         raise WeightsError(
-            f"{target} holds no weights of qpmhe ({error}); save them again."
+            f"{target} holds no weights of qpmhe ({_reason(error)}); save them again."
         ) from error
     return found
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, KeyError):
+        return f"{error} is missing"
+    return str(error).rstrip(".")
 
 
 def covariances_of(observer: Observer, cost: Cost) -> dict[str, ArrayLike]:

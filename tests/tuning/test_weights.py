@@ -88,6 +88,34 @@ def test_a_file_without_weights_is_refused(tmp_path, text):
         load(path)
 
 
+@pytest.mark.parametrize(("line", "text"), [
+    ('arrival = "smoothed"', "arrival is 'smoothed'; expected one of 'observer'"),
+    ("horizon = 0", "horizon is 0; expected an integer"),
+    ("horizon = 2.5", r"horizon is 2\.5; expected an integer"),
+    ("discount = 3", "discount is 3; expected a number"),
+    ("horison = 3", r"it has 'horison', which is no field of them\)"),
+    ("threshold = -1", "threshold"),
+])  # fmt: skip
+def test_a_field_that_is_wrong_is_named_with_the_file(tmp_path, line, text):
+    path = tmp_path / "weights.toml"
+    path.write_text(
+        f"format = 1\n{line}\n[covariances]\nprior = [[1]]\ndisturbance = [[1]]\nnoise = [[1]]\n"
+    )
+    with pytest.raises(WeightsError, match=rf"weights\.toml holds no weights .*{text}"):
+        load(path)
+    path.write_text("format = 1\n[covariances]\nprior = [[1]]\ndisturbance = [[1]]\n")
+    with pytest.raises(WeightsError, match="'noise' is missing"):
+        load(path)
+
+
+def test_the_folder_of_the_weights_is_made(folder):
+    call(
+        "tune", "model.py:make", "record.csv", "--objective", "likelihood", "--structure", "scalar",
+        "--out", "new/weights.toml",
+    )
+    assert [one.name for one in (folder / "new").iterdir()] == ["weights.toml"]
+
+
 def test_a_missing_file_and_a_missing_folder(tmp_path):
     with pytest.raises(WeightsError, match="qpmhe tune"):
         load(tmp_path / "none.toml")
