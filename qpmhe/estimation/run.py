@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .._checks import numbers
 from ..costs import Cost
 from ..model.system import System
 from ..observers import Observer
@@ -128,6 +129,7 @@ class Run:
         observer_start : (n,) array, optional
             The observer's state before the first update; the estimate if left out, as at time 0.
         """
+        start = numbers("start", start)
         n = start.size
         first = start if observer_start is None else observer_start
         nothing = np.full(n, np.nan)

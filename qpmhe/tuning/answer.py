@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,8 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qpmhe_solvers.values import shown
+
 from .._checks import Array, dimension
 from ..costs import Cost
+from ..errors import OptionError
 from ..observers import Observer
 from ..plots.style import STYLES, panels
 from .data import Data
@@ -331,6 +334,8 @@ class Tuning:
             In the order of ``horizons``; scores have the unit of those before tuning.
         """
         rows = []
+        if not isinstance(horizons, Iterable):
+            raise OptionError(f"horizons is {shown(horizons)}; expected several, such as (5, 10).")
         for horizon in horizons:
             dimension("horizon", horizon, 1)
             for arrival in arrivals:

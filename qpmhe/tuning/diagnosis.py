@@ -129,10 +129,11 @@ def diagnose(
     r"""Look for faults in a run, its record, model and weights; no truth is needed.
 
     An extended Kalman filter with the model, and with the inverse weights Q, R as covariances,
-    runs over the record from the N-th sample on. If all is well, its innovations are white and
-    as large as it says. Where they are not, each fault below has a filter of its own, which
-    takes the record for what it would be without the fault; the one under which the record is
-    most likely is the first finding, and the search goes on beside it.
+    runs over the record from the N-th sample on, or from the tenth. If all is well, its
+    innovations are white and as large as it says. Where they are not, each fault below has a
+    filter of its own, which takes the record for what it would be without the fault; the one under
+    which the record is most likely is the first finding, and the search goes on beside it. Ten
+    measurements after a gap of ten samples or more are no evidence.
 
     * R or Q, of all or of one component, too small or too large by a factor;
     * a biased sensor, throughout or for a time; two sensors that are swapped;

@@ -40,6 +40,8 @@ _FAILING, _KEPT, _WEAK_PRIOR = 0.02, 0.5, 0.1
 _SUITS = 0.3, 1.5
 # Correlations of innovations that matter, and how sure they must be.
 _CORRELATED, _SURE = 0.2, 1e-6
+# Samples at the start, at least, that are no evidence: a filter needs some to forget it.
+_START = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +79,7 @@ class Examination:
         given = source.observer.initial_covariance() if cost.observer_prior is not None else None
         self.prior = inverse(np.asarray(cost.prior)) if given is None else given
         total = len(run)
-        self.first = min(source.settings.horizon, total // 5)
+        self.first = min(max(source.settings.horizon, _START), total // 5)
         u = np.zeros((total, 0)) if source.inputs is None else source.inputs
         self.inputs = _held(u)
         self.measurements = source.measurements.copy()
@@ -357,6 +359,7 @@ class Examination:
         errors = self.base.measurements - expected
         if system.output_residual is not None:
             system.output_residual.wrap(errors, self.base.measurements)
+        errors[~np.isfinite(self.null.innovations)] = np.nan
         spread = np.sqrt(np.diagonal(self.null.innovation_covariances, axis1=1, axis2=2))
         own = np.nanmean(np.clip(errors / spread, -_OUTLIER, _OUTLIER) ** 2)
         filter_s = np.nanmean(np.clip(self.normalised, -_OUTLIER, _OUTLIER) ** 2)

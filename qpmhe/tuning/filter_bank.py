@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 _SHARE, _WIDTH = 0.02, 8.0
 # Beyond this an innovation in its own deviations is an outlier rather than noise.
 _OUTLIER = 4.0
+# Samples without any measurement that make a gap, and measured ones after it that are no evidence.
+_GAP = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +171,10 @@ class FilterBank:
         noise = noise / np.multiply.outer(unit, unit)
         extreme = np.log(_SHARE / _WIDTH * np.sqrt(2.0 / np.pi))  # beside a normal distribution
         usual, any_outliers = np.log1p(-_SHARE), outliers.any()
+        recovers = _recovering(there[0].any(axis=1))
         for t in range(total):
             now, seen = u[:, t], there[:, t]
+            known = likelihoods.copy() if recovers[t] else None
             c = _values(model.h_jacobian.batch, x, now, (p, n)) / unit[:, None]
             e = y[:, t] - _values(model.h.batch, x, now, (p,))
             if system.output_residual is not None:
@@ -205,7 +209,9 @@ class FilterBank:
                 np.einsum("hi,hij,hj->h", e, inverse, e) + np.linalg.slogdet(spread)[1]
             )
             first.states[t], first.outputs[t], first.gains[t] = x[0], c[0], gain[0]
-            first.innovations[t] = np.where(seen[0], e[0], np.nan)
+            first.innovations[t] = np.where(seen[0] & ~recovers[t], e[0], np.nan)
+            if known is not None:
+                likelihoods[...] = known
             first.innovation_covariances[t] = spread[0]
             x = x + np.einsum("hij,hj->hi", gain, e)
             closed = eye_n - gain @ c
@@ -233,6 +239,19 @@ class FilterBank:
         first.outputs[...] *= unit[:, None]
         first.gains[...] /= unit
         return first
+
+
+def _recovering(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Samples soon after a long gap: a linearised filter is as uncertain there as at the start."""
+    found, missing, left = np.zeros(len(seen), np.bool_), 0, 0
+    for t, there in enumerate(seen):
+        if there and missing >= _GAP:
+            left = _GAP
+        missing = 0 if there else missing + 1
+        found[t] = left > 0
+        left -= int(there and left > 0)
+    # Where measurements are always that rare, they are the evidence.
+    return found & (2 * (found & seen).sum() <= seen.sum())
 
 
 def _inverses(matrices: Array, alive: NDArray[np.bool_]) -> Array:

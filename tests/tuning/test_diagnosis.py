@@ -133,6 +133,30 @@ def test_few_measurements_are_no_evidence_of_correlation():
     assert found.correlations.limit > 0.5
 
 
+@pytest.mark.parametrize("seed", [300, 302, 303])
+def test_what_follows_a_gap_is_no_evidence(seed):
+    case = planted.healthy("cstr", seed)
+    y = case.measurements.copy()
+    y[60:110] = np.nan
+    found = kinds(qpmhe.diagnose(case._replace(measurements=y).run()))
+    assert not {"step", "disturbance", "bias"} & set(found)
+
+
+def test_rare_measurements_are_evidence_nevertheless():
+    case = planted.healthy("batch_reactor", 0)
+    y = np.vstack([case.measurements] * 4)
+    y[np.arange(len(y)) % 12 > 0] = np.nan
+    found = qpmhe.diagnose(case._replace(measurements=y).run())
+    assert np.isfinite(found.innovations).any(axis=1).sum() >= 40
+
+
+def test_short_horizon_leaves_the_start_out():
+    for seed in (300, 302):
+        case = planted.healthy("battery_cell", seed)
+        case = case._replace(settings={**case.settings, "horizon": 1})
+        assert qpmhe.diagnose(case.run()).is_healthy
+
+
 def test_measurement_beyond_all_measure():
     case = planted.healthy("vehicle", 1)
     y = case.measurements.copy()
@@ -271,7 +295,7 @@ def test_filters_are_kalman_filters():
     system = qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T, n=2, p=1)
     prior, disturbance, noise = np.diag([1.0, 2.0]), np.diag([0.01, 0.02]), np.array([[0.3]])
     y = np.random.default_rng(0).standard_normal((60, 1))
-    y[20:30] = np.nan
+    y[20:28] = np.nan
     mhe = qpmhe.MovingHorizonEstimator(
         system, qpmhe.ExtendedKalman(prior=prior, disturbance=disturbance, noise=noise),
         qpmhe.QuadraticCost.from_covariances(prior=prior, disturbance=disturbance, noise=noise),
@@ -284,7 +308,7 @@ def test_filters_are_kalman_filters():
     assert found.states == pytest.approx(run.states[:-1], rel=1e-9, abs=1e-12)
     assert found.corrected == pytest.approx(run.filtered, rel=1e-9, abs=1e-12)
     # In units of the noise of the first hypothesis.
-    told = alone.likelihoods[0] - 25.0 * np.log(9.0)
+    told = alone.likelihoods[0] - 26.0 * np.log(9.0)
     assert told == pytest.approx(found.likelihoods[1])
 
 
