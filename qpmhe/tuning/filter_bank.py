@@ -251,7 +251,8 @@ def _recovering(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         found[t] = left > 0
         left -= int(there and left > 0)
     # Where measurements are always that rare, they are the evidence.
-    return found & (2 * (found & seen).sum() <= seen.sum())
+    usual = 2 * (found & seen).sum() <= seen.sum()
+    return found if usual else np.zeros_like(found)
 
 
 def _inverses(matrices: Array, alive: NDArray[np.bool_]) -> Array:
