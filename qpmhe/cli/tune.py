@@ -128,15 +128,19 @@ def tune(
 
         system = make
     found = covariances_of(mhe.observer, mhe.cost)
-    tuning = run(
-        system, records, horizon=mhe.horizon, initial_state=mhe.initial_state, structure=plan,
-        prior=found["prior"], disturbance=found["disturbance"], noise=found["noise"],
-        parameters=started, threshold=threshold,
-        objective=objective, held_out=held_out, starts=starts, seed=seed, jobs=jobs,
-        names={"states": loaded.states, "outputs": loaded.outputs},
-        checkpoint=out.with_name(f"{out.name}.search"), progress=Console(stderr=True),
-        engine=mhe.settings.engine,
-    )
+    try:
+        tuning = run(
+            system, records, horizon=mhe.horizon, initial_state=mhe.initial_state, structure=plan,
+            prior=found["prior"], disturbance=found["disturbance"], noise=found["noise"],
+            parameters=started, threshold=threshold,
+            objective=objective, held_out=held_out, starts=starts, seed=seed, jobs=jobs,
+            names={"states": loaded.states, "outputs": loaded.outputs},
+            checkpoint=out.with_name(f"{out.name}.search"), progress=Console(stderr=True),
+            engine=mhe.settings.engine,
+        )
+    except KeyboardInterrupt:
+        Console(stderr=True).print("interrupted; the same command resumes.", highlight=False)
+        raise
     console.print(str(tuning), highlight=False, markup=False, soft_wrap=True)
     for row in tuning.horizons(wanted) if wanted else ():
         console.print(

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -220,7 +223,7 @@ def tune(
         np.clip(plan.start + _SPREAD * generator.standard_normal(len(low)), low, high)
         for _ in range(starts - 1)
     ]
-    with _shown(progress) as advance:
+    with _interruptible(), _shown(progress) as advance:
         found, _ = search_all(likelihood, plan, data, beginnings, kept, jobs, advance)
         found, hessian = polish(likelihood, found, plan, data)
         seconds = {"likelihood": perf_counter() - began}
@@ -349,6 +352,30 @@ def _constant_inputs(data: list[Data], needed: bool) -> list[int]:
             "or leave parameters out."
         )
     return still
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C as a KeyboardInterrupt: within a call of CasADi, it comes out as another error."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+    came = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+        before(number, frame)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    except Exception as error:
+        if came:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

@@ -1,7 +1,10 @@
 """Weights from records: what is found, what is refused, and a search that resumes."""
 
+import contextlib
 import functools
 import json
+import signal
+import sys
 
 import numpy as np
 import pytest
@@ -9,6 +12,8 @@ import pytest
 import qpmhe
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError, ShapeError
 from qpmhe.tuning import TuningCheckpointError, TuningRecord, search
+
+tuning_module = sys.modules["qpmhe.tuning.tune"]
 
 A = np.array([[0.5, 1.0], [0.0, 0.8]])
 
@@ -271,6 +276,19 @@ def test_a_search_that_was_stopped_resumes(tmp_path, monkeypatch):
     path.write_text("{")
     with pytest.raises(TuningCheckpointError, match="remove it"):
         tuned(checkpoint=path)
+
+
+def test_an_interrupt_that_casadi_turns_into_another_error(monkeypatch):
+    def interrupted(*_):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise NotImplementedError("Wrong number or type of arguments")
+
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(tuning_module, "search_all", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        tuned()
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_it_prints_a_table_and_draws():
