@@ -252,7 +252,7 @@ class Cost(ABC):
         return (self.prior.minimum or 0.0) * np.eye(self.n)
 
     def graduated(self, progress: float) -> Cost:
-        """The surrogate to minimise when this share of the first window is full."""
+        """The surrogate to minimise when a share ``progress`` of the first window is full."""
         return self
 
     @property

@@ -26,7 +26,7 @@ class RunSource(NamedTuple):
 
     Parameters
     ----------
-    system, observer, cost, settings
+    system, observer, cost, settings : System, Observer, Cost and Settings
         Those of the estimator, with what `MovingHorizonEstimator.set` has changed.
     measurements : (T, p) array
         y, NaN where it is missing.

@@ -244,7 +244,7 @@ LOSSES = {Whole: "cost of its own", Branching: "", Together: "depends on others"
          {"observer": lambda: qpmhe.OutputInjection(lambda z, v: 0.3 * v if v[0] > 0 else v)}),
         ("OwnInjection has no C form", {"observer": lambda: OwnInjection(lambda z, v: 0.3 * v)}),
         *((rf"{kind.__name__}, the loss of noise, has no C form \(.*{why}.*\); take Quadratic, "
-           "Huber or Power",
+           "Huber, Power or Barron",
            {"cost": lambda kind=kind: qpmhe.RobustCost(**(ONES | {"noise": kind(1.0)}))})
           for kind, why in LOSSES.items()),
         ("OwnRobustCost has no C form", {"cost": lambda: OwnRobustCost(**ONES)}),
