@@ -325,8 +325,8 @@ class Cost(ABC):
     ) -> Array:
         """Derivatives by the weights of the slopes of the stage costs in some directions.
 
-        Directions are (..., K, n + p), and the derivatives symmetric (..., K, r + p, r + p), by
-        weights of (w, v).
+        ``directions`` are (..., K, n + p), and the derivatives symmetric (..., K, r + p, r + p), by
+        ``weights`` of (w, v); for both and ``residuals`` see `stage_costs`.
         """
         raise self._no_second_derivatives()
 
@@ -337,7 +337,7 @@ class Cost(ABC):
     def prior_weight_gradient(
         self, offset: Array, directions: Array, weight: Array
     ) -> Array:
-        """The prior's counterpart of `stage_weight_gradient`: (..., n) to (..., n, n)."""
+        """The prior's counterpart: (..., n) to (..., n, n); see `stage_weight_gradient`."""
         raise self._no_second_derivatives()
 
     def _no_second_derivatives(self) -> InvalidInputError:
