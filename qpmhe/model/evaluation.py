@@ -18,6 +18,8 @@ Buffers = tuple[Array, Array, dict[str, Array], Callable[[], object]]
 Maker = Callable[[int, tuple[str, ...]], Buffers]
 
 _MOST_KEPT = 64
+# Estimators of several threads may share a system, and so the symbols of its expressions.
+_MAKING = threading.RLock()
 NAMES = ("f", "h", "f_jacobian", "h_jacobian")
 VALUES = ("f", "h")
 RESIDUALS = ("residuals",)
@@ -172,9 +174,10 @@ class VirtualMachine:
         if names == RESIDUALS:
             return self._residuals(count)
         model, timed = self._model, self._timed
-        function, functions = self._functions(names)
-        if count > 1:
-            function = function.map(count)
+        with _MAKING:
+            function, functions = self._functions(names)
+            if count > 1:
+                function = function.map(count)
         states, inputs = np.zeros((count, model.n)), np.zeros((count, model.m + timed))
         results = results_of(model, count, names)
         all_inputs = inputs if timed else np.full((count, model.m + 1), model.dt or 0.0)

@@ -3,6 +3,7 @@
 import pickle
 import subprocess
 import sys
+import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 
@@ -398,6 +399,25 @@ def test_threads_may_share_a_system():
     with ThreadPoolExecutor(4) as pool:
         for states in pool.map(lambda _: estimator(system).run(ys).states, range(12)):
             np.testing.assert_array_equal(states, expected)
+
+
+def test_threads_make_the_expressions_of_a_system_at_once():
+    ys = np.random.default_rng(0).normal(size=4)
+    expected = estimator(Plant().system()).run(ys).states
+
+    def begin(system):
+        together.wait()
+        return estimator(system).run(ys).states
+
+    together, interval = threading.Barrier(6), sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # threads take turns in the midst of everything
+    try:
+        with ThreadPoolExecutor(6) as pool:
+            for _ in range(15):
+                for states in pool.map(begin, [Plant().system()] * 6):
+                    np.testing.assert_array_equal(states, expected)
+    finally:
+        sys.setswitchinterval(interval)
 
 
 def test_a_system_alone_imports_no_casadi():

@@ -364,7 +364,7 @@ def test_a_model_that_fails_at_the_start_is_named():
         f_jacobian=lambda x: np.eye(2), states=qpmhe.Box([0.0, 0.0], [100.0, 100.0]),
     )
     with pytest.raises(ModelError, match="not finite at the start"):
-        tuned([np.ones((60, 1))], system, initial_state=[1.0, 1.0])
+        tuned([np.linspace(0.9, 1.1, 60)[:, None]], system, initial_state=[1.0, 1.0])
 
 
 def test_an_output_that_is_never_there():
