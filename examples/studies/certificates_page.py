@@ -67,7 +67,7 @@ says nothing.
 
 - **Against the observer**: each disturbance and noise points along its influence on the last error,
   which the linearised error dynamics carry backwards; the run is repeated with the new ones, and
-  the direction is that of the last error. {starts} starts, {directions} directions and windows of
+  the direction is the last error's. {starts} starts, {directions} directions and windows of
   {steps} steps are tried.
 - **Against the estimates**: signals along P(x - x̂), step by step; and from the best of all runs on,
   along the differences of the last error when one component of one sample is changed.

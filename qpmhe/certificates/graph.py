@@ -5,7 +5,7 @@ JAX are traced to it. Nodes that compute the same are one node, and what is zero
 
 A choice by a condition is continuous if both sides agree where the condition changes, as
 polynomials of what they are made of. If they differ by a constant in the size of rounding errors,
-as pieces of a table do, the graph is that of the function whose pieces are moved to meet, and
+as pieces of a table do, the graph describes the function whose pieces are moved to meet, and
 encloses how far.
 """
 

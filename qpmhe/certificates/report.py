@@ -262,7 +262,7 @@ def region_of(
         The model; the scenario is simulated where something is left out.
     region, inputs : optional
         What is given. Left out, the scenario's; else the system's own X if that is bounded, or a
-        box around the simulated record, and that of the record's inputs.
+        box around the simulated record, and the box around its inputs.
     record : Record, optional
         The simulated record, where there is one already.
     option : str

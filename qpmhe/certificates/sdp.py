@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import math
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -71,7 +72,7 @@ def expected_seconds(n: int, p: int, kind: Kind) -> float:
     return _SECONDS * (size * (size + 1) / 2) ** 3
 
 
-class Program:
+class Program(ABC):
     """A semidefinite program at some Jacobians, in numbers without units."""
 
     def __init__(self, kind: Kind, jacobians: Array, scales: Scales) -> None:
@@ -86,9 +87,9 @@ class Program:
         self._rate2, self._margin, self._rest = (self._cp.Parameter(nonneg=True) for _ in range(3))
         self._P = self._cp.Variable((n, n), symmetric=True)
 
+    @abstractmethod
     def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
         """Solve for a rate."""
-        raise NotImplementedError
 
     def _definite(self, rows: list[list[Any]]) -> Any:
         """The constraint that blocks form a matrix that is positive semidefinite."""
@@ -174,7 +175,7 @@ class DetectabilityProgram(Program):
         )
 
     def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
-        """Solve for a rate; its measure is that of the program, up to a factor the limit."""
+        """Solve for a rate; the measure is the program's, up to a factor the limit."""
         answer = self._answer(self._problem, self._form, rate, margin, seconds)
         if answer.form is None:
             return answer
