@@ -142,7 +142,8 @@ class Certificate:
         Parameters
         ----------
         run : Run or None
-            The run. Without one, ``kind="observer"`` bounds the observer's error, and disturbances or noises give the number of samples.
+            The run. Without one, ``kind="observer"`` bounds the observer's error, and
+            disturbances or noises give the number of samples.
         disturbances, noises : array_like or set, optional
             w(t) and v(t) as (T, n) and (T, p), their Euclidean lengths (T,), a number that bounds
             the length at all times or, for ``kind="observer"``, a set; `sizes` if left out.
