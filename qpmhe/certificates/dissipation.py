@@ -117,17 +117,7 @@ class DesignProgram(Program):
             cp.diag(sides[r:]) - cp.multiply(np.outer(share, share), R) >> 0,
             self._definite([[P - X - self._margin * P, PG], [PG.T, Q - self._margin * Q]]),
         ]
-        top, low = X - self._margin * P, self._rest * P
-        for A, C in zip(self._A, self._C, strict=True):
-            if kind == "output weight":
-                rows = [[top, P @ A], [A.T @ P, low + C.T @ R @ C]]
-            else:
-                side, mixed = P @ A + Y @ C, C.T @ N - M.T
-                rows = [
-                    [top, side, -Y], [side.T, low + C.T @ M + M.T @ C, mixed],
-                    [-Y.T, mixed.T, R - N - N.T - self._margin * R],
-                ]
-            constraints.append(self._definite(rows))
+        constraints += self._detectable(kind, X - self._margin * P, R, Y, M, N)
         self._problem = cp.Problem(cp.Minimize(cp.sum(shares)), constraints)
 
     def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:

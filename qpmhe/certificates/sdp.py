@@ -91,6 +91,21 @@ class Program(ABC):
     def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
         """Solve for a rate."""
 
+    def _detectable(self, kind: Kind, top: Any, R: Any, Y: Any, M: Any, N: Any) -> list[Any]:
+        """The inequality of detectability at each Jacobian, with its first block ``top``."""
+        P, low, found = self._P, self._rest * self._P, []
+        for A, C in zip(self._A, self._C, strict=True):
+            if kind == "output weight":
+                rows = [[top, P @ A], [A.T @ P, low + C.T @ R @ C]]
+            else:
+                side, mixed = P @ A + Y @ C, C.T @ N - M.T
+                rows = [
+                    [top, side, -Y], [side.T, low + C.T @ M + M.T @ C, mixed],
+                    [-Y.T, mixed.T, R - N - N.T - self._margin * R],
+                ]
+            found.append(self._definite(rows))
+        return found
+
     def _definite(self, rows: list[list[Any]]) -> Any:
         """The constraint that blocks form a matrix that is positive semidefinite."""
         matrix = self._cp.bmat(rows)
@@ -158,17 +173,7 @@ class DetectabilityProgram(Program):
             P - square >> 0, condition * square - P >> 0, condition <= _MOST_CONDITION,
             R >> 0, output * output_square - R >> 0,
         ]
-        top, low = P - self._margin * P, self._rest * P
-        for A, C in zip(self._A, self._C, strict=True):
-            if kind == "output weight":
-                rows = [[top, P @ A], [A.T @ P, low + C.T @ R @ C]]
-            else:
-                side, mixed = P @ A + Y @ C, C.T @ N - M.T
-                rows = [
-                    [top, side, -Y], [side.T, low + C.T @ M + M.T @ C, mixed],
-                    [-Y.T, mixed.T, R - N - N.T - self._margin * R],
-                ]
-            constraints.append(self._definite(rows))
+        constraints += self._detectable(kind, P - self._margin * P, R, Y, M, N)
         first, second = weights
         self._problem = cp.Problem(
             cp.Minimize(first**2 * condition + second**2 * output), constraints
@@ -206,9 +211,9 @@ class ObserverProgram(Program):
         \begin{pmatrix} X - B \Delta B^\top & (A - L C) X \\ \cdot & \rho^2 X \end{pmatrix}
         \succeq 0, \quad \sum_j d_j^2 / \Delta_j \le 1 - \rho^2,
 
-    in states of the region's size. With P the inverse of X, S that of the first block, and
-    diag(Q, R) that of :math:`\Delta`, it is the pair of inequalities of `ErrorContraction`, with
-    :math:`|e|_P \le 1` in the limit. :math:`\Delta` is diagonal; a length d is shared by its
+    in states of the region's size. With P the inverse of X, S the inverse of the first block, and
+    diag(Q, R) the inverse of :math:`\Delta`, it is the pair of inequalities of `ErrorContraction`,
+    with :math:`|e|_P \le 1` in the limit. :math:`\Delta` is diagonal; a length d is shared by its
     components. A rate hardly above the smallest leaves no room between S and P: then X is
     the first block, and :math:`|B d|_P \le 1`.
     """

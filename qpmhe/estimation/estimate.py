@@ -158,8 +158,8 @@ class Estimate:
     candidate : (N_t + 1, n) array
         The observer's trajectory.
     observer_state : (n,) array
-        z(t+1), the state from which the observer goes on. With ``candidate="reinitialized"`` it
-        is that of the observer that started anew at the window's first estimate.
+        z(t+1), the state from which the observer goes on. With ``candidate="reinitialized"``
+        this observer started anew at the window's first estimate.
     delayed : (n,) array or None
         Estimate of x(t+1-k) for the estimator's delay k; None until the window reaches it.
     dropped : tuple of DroppedRow

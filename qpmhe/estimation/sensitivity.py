@@ -211,7 +211,7 @@ class _Point:
     @property
     def by_discount(self) -> tuple[Array, Array]:
         """Derivatives by the discount of J's by the states themselves, and by the residuals."""
-        # The prior has the age of the window, the newest state that of the newest stage.
+        # The prior has the age of the window, the newest state the age of the newest stage.
         ages = np.append(np.arange(len(self.residuals) - 1, -1, -1.0), 0.0) / self.cost.discount
         states = ages[:, None] * self.rows.penalty_on_states
         states[0] += len(self.residuals) / self.cost.discount * self.prior_force

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _CRUDE = 0.3
 # Wider 95 % intervals, either way: a factor for standard deviations, else a share or a number.
 _WIDEST_LOG, _WIDEST = float(np.log(10.0)), 1.0
-# Uncertainties that are as correlated as this are told in one sentence.
+# Uncertainties that are as correlated as this are named in one sentence.
 _TOGETHER = 0.8
 # Eigenvalues of the Hessian below this count as it; an interval is infinite then.
 _FLAT = 1e-6
@@ -51,7 +51,7 @@ class HorizonScore:
     arrival : str
         What weighs the prior, "observer" or "constant".
     score : float
-        The held-out score, with 1 that of the start weights.
+        The held-out score, as a share of the start weights' score.
     seconds : float
         For a sample.
     """
@@ -71,7 +71,7 @@ class Tuning:
         What was found, as a whole.
     start, values : dict
         What each name stands for: standard deviations of disturbance, noise and prior in the
-        units of state and output, of a group that of its first component; parameters. At the
+        units of state and output (a group has the unit of its first component); parameters. At the
         start, and as tuned.
     intervals : dict
         Its 95 % interval (low, high) by the likelihood's curvature. That is honest where the

@@ -98,7 +98,7 @@ class Examination:
         self.null = self.bank.run([self.base])
         self.found, self.best = self._search()
         self.normalised = _normalised(self.null)
-        # What the windows see is told along the states of the filter that explains the record.
+        # What the windows see is examined along the states of the filter that explains the record.
         same = len(self.best.states) == len(self.null.states)
         self.along = self.best if same and np.isfinite(self.best.likelihoods[0]) else self.null
         self.information = self._information(self.along)
@@ -464,8 +464,8 @@ class Examination:
         """Whether the prior's weight suits the observer whose states it weighs.
 
         A filter's error is orthogonal to all that the data say, the observer's state included: so
-        the mean square of the observer's error is that of its distance from the filter, and the
-        filter's variance.
+        the mean square of the observer's error is the mean square of its distance from the filter
+        plus the filter's variance.
         """
         z, names = self.run.observer_states[self.first : len(self.run)], self.names
         apart = difference(self.source.system.state_residual, z, self.along.corrected)
