@@ -1,7 +1,7 @@
 """Suboptimal moving horizon estimation by sequences of convex QPs, with a stability promise."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from . import batch, codegen, errors, models, solvers
 from ._version import __version__
@@ -53,6 +53,10 @@ from .observers import (
     design_luenberger,
 )
 
+if TYPE_CHECKING:
+    from . import certificates, plots, records, studies, tuning
+    from .tuning import diagnose, tune
+
 
 def _compiled_engine(
     system: System, observer: Observer, cost: Cost, settings: Settings, initial_state: Any
@@ -67,12 +71,23 @@ def _compiled_engine(
 register_engine("compiled", _compiled_engine)
 
 
+# What most programs do without is imported when it is first named.
+_LATE_MODULES = ("certificates", "plots", "records", "studies", "tuning")
+_LATE_FUNCTIONS = {"diagnose": "tuning", "tune": "tuning"}
+
+
 def __getattr__(name: str) -> Any:
-    """Names of `qpmhe.tuning`, which most programs do without."""
-    if name in ("diagnose", "tune", "tuning"):
-        tuning = import_module(f"{__name__}.tuning")
-        return tuning if name == "tuning" else getattr(tuning, name)
+    if name in _LATE_MODULES:
+        return import_module(f"{__name__}.{name}")
+    if name in _LATE_FUNCTIONS:
+        value = getattr(import_module(f"{__name__}.{_LATE_FUNCTIONS[name]}"), name)
+        globals()[name] = value
+        return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
 
 
 __all__ = [
@@ -118,9 +133,11 @@ __all__ = [
     "angles",
     "augment_parameters",
     "batch",
+    "certificates",
     "codegen",
     "compile",
     "design_luenberger",
+    "diagnose",
     "errors",
     "from_casadi",
     "from_control",
@@ -128,5 +145,10 @@ __all__ = [
     "from_sympy",
     "models",
     "noisy_inputs",
+    "plots",
+    "records",
     "solvers",
+    "studies",
+    "tune",
+    "tuning",
 ]
