@@ -33,8 +33,9 @@ def compare(
         typer.Option(help="QP backend; may be repeated. All installed ones if left out."),
     ] = None,
     qps: Annotated[
-        str, typer.Option(help="QPs per sample, between commas; 0 is the observer.")
-    ] = "0,1,2,5,converged",
+        str, typer.Option(help="QPs per sample, between commas; 0 is the observer, none iterates "
+                          "to convergence.")
+    ] = "0,1,2,5,none",
     solver_iterations: Annotated[
         str, typer.Option(help="Caps on the iterations inside each QP, between commas.")
     ] = "1,2,5,10,none",

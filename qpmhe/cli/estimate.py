@@ -41,7 +41,8 @@ def estimate(
     horizon: Annotated[int | None, typer.Option(help="N; default is the model's.")] = None,
     backend: Annotated[str | None, typer.Option(help="QP backend.")] = None,
     max_qps: Annotated[
-        str | None, typer.Option(help="QPs per sample; 0 is the observer, or: converged.")
+        str | None, typer.Option(help="QPs per sample; 0 is the observer, none iterates to "
+                                "convergence.")
     ] = None,
     max_solver_iterations: Annotated[
         str | None, typer.Option(help="Cap on the iterations inside each QP, or: none.")
@@ -137,10 +138,10 @@ def estimate(
         name: value for name, value in locals().items() if value is not None
     }
     if max_qps is not None:
-        options["max_qps"] = _number("--max-qps", max_qps, "converged")
+        options["max_qps"] = _number("--max-qps", max_qps)
     if max_solver_iterations is not None:
         options["max_solver_iterations"] = _number(
-            "--max-solver-iterations", max_solver_iterations, "none"
+            "--max-solver-iterations", max_solver_iterations
         )
     if initial_state is not None:
         options["initial_state"] = read_state(initial_state)
@@ -275,10 +276,10 @@ def _print(console: Console, summary: Any, out: str) -> None:
         console.print(f"[yellow]note:[/] {escape(note)}", highlight=False, soft_wrap=True)
 
 
-def _number(option: str, text: str, word: str) -> int | None:
-    if text.strip() == word:
+def _number(option: str, text: str) -> int | None:
+    if text.strip() == "none":
         return None
     try:
         return int(text)
     except ValueError:
-        raise OptionError(f"{option} is {text!r}; expected an integer, or {word!r}.") from None
+        raise OptionError(f"{option} is {text!r}; expected an integer, or 'none'.") from None

@@ -1,8 +1,8 @@
 """What a study compares: models, backends, caps, horizons and seeds; in Python or in a TOML file.
 
-In a TOML file the keys are the parameters of `Study`. TOML has no None: ``"converged"`` stands for
-it in ``qps``, ``"none"`` in ``solver_iterations``, ``"default"`` in ``horizons``. Paths of models
-are relative to the file.
+In a TOML file the keys are the parameters of `Study`. TOML has no None: ``"none"`` stands for it
+in ``qps`` (iterate to convergence) and ``solver_iterations``, ``"default"`` in ``horizons``. Paths
+of models are relative to the file.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Measure = Literal["both", "accuracy", "time"]
 #: Where the sequence of QPs begins: at the candidate, or warm-started where that is better.
 Start = Literal["candidate", "best"]
 #: What stands for None in files and on the command line.
-WORDS = {"qps": "converged", "solver_iterations": "none", "horizons": "default"}
+WORDS = {"qps": "none", "solver_iterations": "none", "horizons": "default"}
 
 
 class StudyError(OptionError):

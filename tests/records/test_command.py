@@ -39,7 +39,7 @@ def test_standard_output_is_the_default(call):
 @pytest.mark.parametrize(
     ("arguments", "options"),
     [
-        ("--horizon 3 --backend osqp --max-qps converged --max-solver-iterations 7",
+        ("--horizon 3 --backend osqp --max-qps none --max-solver-iterations 7",
          {"horizon": 3, "backend": "osqp", "max_qps": None, "max_solver_iterations": 7}),
         ("--max-qps 0 --max-solver-iterations none --initial-state -0.1,0.25",
          {"max_qps": 0, "max_solver_iterations": None, "initial_state": [-0.1, 0.25]}),
@@ -82,7 +82,7 @@ def test_resume_and_overwrite(call):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--max-qps", "many"], "'converged'"),
+        (["--max-qps", "many"], "'none'"),
         (["--max-solver-iterations", "1.5"], "'none'"),
         (["--initial-state", "0;1"], "between commas"),
         (["--engine", "steam"], "steam"),

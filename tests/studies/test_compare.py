@@ -35,7 +35,7 @@ def shown(monkeypatch):
 def test_compare_runs_the_study_of_its_options(tmp_path, shown):
     path, out = tmp_path / "store.sqlite", tmp_path / "report"
     text = command(
-        "compare", "--store", path, "--out", out, "--backend", "daqp", "--qps", "0,2, converged",
+        "compare", "--store", path, "--out", out, "--backend", "daqp", "--qps", "0,2, none",
         "--solver-iterations", "none", "--horizons", "default,3", "--seeds", 1, "--steps", 10,
         "--jobs", 1,
     )
@@ -51,8 +51,8 @@ def test_compare_runs_the_study_of_its_options(tmp_path, shown):
 @pytest.mark.parametrize(
     ("option", "value", "words"),
     [
-        ("--qps", "0,two", "--qps has 'two'; expected integers between commas, or 'converged'"),
-        ("--qps", "none", "--qps has 'none'"),
+        ("--qps", "0,two", "--qps has 'two'; expected integers between commas, or 'none'"),
+        ("--qps", "converged", "--qps has 'converged'"),
         ("--solver-iterations", "", "--solver-iterations has ''"),
         ("--horizons", "converged", "--horizons has 'converged'"),
     ],

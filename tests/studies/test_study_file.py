@@ -12,7 +12,7 @@ models = [
 ]
 backends = ["daqp", "osqp"]
 qps = [0, 2,
-       "converged"]
+       "none"]
 solver_iterations = [5, "none"]
 horizons = ["default", 4]
 starts = ["best"]
@@ -52,7 +52,7 @@ def test_what_is_left_out_has_its_default(tmp_path):
 
 
 def test_single_words_stand_for_lists(tmp_path):
-    text = 'backends = "osqp"\nqps = "converged"\nsolver_iterations = "none"\nseeds = 1\n'
+    text = 'backends = "osqp"\nqps = "none"\nsolver_iterations = "none"\nseeds = 1\n'
     (cell,) = Study.from_toml(written(tmp_path, text)).cells()
     assert (cell.qps, cell.solver_iterations) == (None, None)
 
@@ -74,7 +74,7 @@ def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
         ('"batch_reactor"', '"missing.py:make"', "missing.py"),
         ('"osqp"', '"osq"', "backend 'osq' is not known; expected one of auto"),
         ('["daqp", "osqp"]', "[]", "backends is empty"),
-        ('"converged"', '"convergd"', '\'convergd\'; expected an integer >= 0. "converged"'),
+        ('"none"', '"converged"', '\'converged\'; expected an integer >= 0. "none"'),
         ("[0, 2,", "[0, -2,", "qps is -2"),
         ('[5, "none"]', "[]", "solver_iterations is empty"),
         ("[5, ", "[5, 0, ", "solver_iterations is 0"),
