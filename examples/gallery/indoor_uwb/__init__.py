@@ -1,0 +1,1 @@
+"""A robot finds its way by one distance at a time, without knowing where it heads at first."""

@@ -1,0 +1,9 @@
+"""``python -m examples.gallery.indoor_uwb --data DIR --out results``."""
+
+import sys
+
+from ..command import main
+from .robot import SOURCE, draw, problems
+
+if __name__ == "__main__":
+    sys.exit(main("indoor_uwb", __doc__, problems, draw, SOURCE))

@@ -1,0 +1,119 @@
+"""The table of a problem, in the terminal and as files, and its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+
+from qpmhe.plots.style import LIGHT, REAL, STYLES
+
+from .problem import Array, Problem, Result
+
+BY_HAND, TUNED = "by hand", "tuned"
+
+
+def frame(results: Sequence[Result]) -> pd.DataFrame:
+    """The figures of all runs; errors in the problem's unit, times in seconds."""
+    rows = [{
+        "weights": one.weights, "record": one.record, "estimator": one.estimator,
+        "runs": len(one.errors), "median": np.median(one.errors), "worst": one.errors.max(),
+        "lost": one.lost, "whole median": np.median(one.whole), "whole worst": one.whole.max(),
+        "step": one.seconds, "engine": one.engine,
+    } for one in results]
+    return pd.DataFrame(rows)
+
+
+def cells(row: Any, whole: bool) -> list[str]:
+    """A row of the table as text."""
+    texts = [row["estimator"], number(row["median"]), number(row["worst"])]
+    if whole:
+        texts += [number(row["whole median"]), number(row["whole worst"])]
+    engine = "C" if row["engine"] == "compiled" else "Python"
+    return [*texts, f"{100 * row['lost']:.0f}", f"{1e6 * row['step']:.0f}", engine]
+
+
+def number(value: float) -> str:
+    """Three digits, or the power of ten of what is beyond all bounds."""
+    if not np.isfinite(value):
+        return "-"
+    return f"{value:.3g}" if 1e-3 <= abs(value) < 1e4 or not value else f"{value:.0e}"
+
+
+def headings(problem: Problem, whole: bool) -> list[str]:
+    """Those of `cells`."""
+    names = [f"median ({problem.unit})", "worst"]
+    if whole:
+        names += ["whole record", "worst"]
+    return ["estimator", *names, "lost %", "us", "engine"]
+
+
+def verdict(problem: Problem, rows: pd.DataFrame, baselines: Sequence[str]) -> str:
+    """Which estimator has the lowest median error, and whether it is a baseline."""
+    best = rows.loc[rows["median"].idxmin()]
+    others = rows[rows["estimator"].isin(baselines)]
+    rival = others.loc[others["median"].idxmin()]
+    least = f"{best['estimator']} ({number(best['median'])} {problem.unit})"
+    if best["estimator"] in baselines:
+        return f"Lowest median error: {least}, a baseline: it wins."
+    return (f"Lowest median error: {least}; of the baselines {rival['estimator']} "
+            f"({number(rival['median'])} {problem.unit}).")
+
+
+def write(
+    problem: Problem, results: Sequence[Result], baselines: Sequence[str], console: Console,
+    out: Path,
+) -> list[Path]:
+    """Print the tables, and write them as Markdown and CSV."""
+    table = frame(results)
+    out.mkdir(parents=True, exist_ok=True)
+    table.to_csv(out / f"{problem.name}.csv", index=False)
+    whole = any(record.tunes for record in problem.records)
+    columns, text = headings(problem, whole), [f"# {problem.title}", ""]
+    for (weights, record), rows in table.groupby(["weights", "record"], sort=False):
+        title = f"{record}, weights {weights}, {rows['runs'].iloc[0]} runs"
+        shown = Table(*columns, title=f"{problem.title}: {title}", box=None, title_justify="left")
+        lines = [cells(row, whole) for _, row in rows.iterrows()]
+        shown.columns[0].no_wrap = True
+        for column in shown.columns[1:]:
+            column.justify = "right"
+        for line in lines:
+            shown.add_row(*line)
+        words = verdict(problem, rows, baselines)
+        console.print(shown, f"{words}\n", highlight=False)
+        text += [f"## {title}", "", *markdown(columns, lines), "", words, ""]
+    if problem.note:
+        console.print(problem.note, "", highlight=False)
+        text += [problem.note, ""]
+    (out / f"{problem.name}.md").write_text("\n".join(text), encoding="utf-8")
+    return [out / f"{problem.name}.md", out / f"{problem.name}.csv"]
+
+
+def markdown(columns: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
+    """A table's lines."""
+    ruler = ["---", *["---:"] * (len(columns) - 1)]
+    return ["| " + " | ".join(line) + " |" for line in (columns, ruler, *lines)]
+
+
+def tracks(
+    truth: Array, estimates: Mapping[str, Array], *, unit: str = "m",
+    labels: tuple[str, str] = ("x", "y"), landmarks: Array | None = None, axes: Any = None,
+) -> Any:
+    """Paths on a map: the true one, and at most six estimates (T, 2) of it."""
+    if axes is None:
+        with rc_context(LIGHT):
+            axes = Figure(figsize=(6.4, 6.0), layout="constrained").subplots()
+    axes.plot(truth[:, 0], truth[:, 1], **REAL)
+    for style, (name, path) in zip(STYLES, estimates.items(), strict=False):
+        axes.plot(path[:, 0], path[:, 1], linewidth=1.2, label=name, **style)
+    if landmarks is not None:
+        axes.plot(landmarks[:, 0], landmarks[:, 1], "^", color="0.2", label="anchors")
+    axes.set(xlabel=f"{labels[0]} ({unit})", ylabel=f"{labels[1]} ({unit})", aspect="equal")
+    return axes
