@@ -7,6 +7,7 @@ from . import batch, codegen, errors, models, solvers
 from ._version import __version__
 from .adapters.casadi import from_casadi
 from .adapters.control import from_control
+from .adapters.iosystem import to_iosystem
 from .adapters.jax import from_jax
 from .adapters.sympy import from_sympy
 from .batch import BatchEstimator
@@ -149,6 +150,7 @@ __all__ = [
     "records",
     "solvers",
     "studies",
+    "to_iosystem",
     "tune",
     "tuning",
 ]
