@@ -123,6 +123,14 @@ def estimate(
     ] = None,
     decimal: Annotated[Literal["auto", ".", ","], typer.Option(help="Decimal mark.")] = "auto",
     encoding: Annotated[str, typer.Option(help="Of a CSV file.")] = "utf-8",
+    skip_lines: Annotated[
+        int, typer.Option(min=0, help="Lines of a CSV file above its header.")
+    ] = 0,
+    time_format: Annotated[
+        str | None,
+        typer.Option(help="Form of the dates, such as '%d/%m/%Y %H:%M:%S'; ISO dates and "
+                     "DD.MM.YYYY need none."),
+    ] = None,
     missing: Annotated[
         list[str] | None,
         typer.Option(metavar="WORD", help="Word for a missing value; may be repeated."),

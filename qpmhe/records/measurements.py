@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._checks import Array
+from .._checks import Array, count
 from ..errors import InvalidInputError, OptionError
 from .tables import RecordError, Row, open_table
 
@@ -24,6 +24,8 @@ _NAMES_SHOWN, _LETTERS_SHOWN = 40, 60
 _MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "null", "none"})
 _WHOLE = re.compile(r"[+-]?[0-9]{1,19}")
 _NANOSECONDS = re.compile(r":\d\d[.,]\d{6}(\d{1,3})(?!\d)")
+# 04.05.2026, the fourth of May; a date with slashes may begin with the month.
+_DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?=\s|T|$)")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -51,14 +53,16 @@ class RecordReader:
     def __init__(
         self, path: str, names: ColumnNames, *, separator: str | None = None,
         encoding: str = "utf-8", decimal: str = "auto", missing: Sequence[str] = (),
-        skip_repeated: bool = False,
+        skip_repeated: bool = False, skip_lines: int = 0, time_format: str | None = None,
     ) -> None:
         self.is_stream = path == "-"
         self.held = self.repeated = self.blank = 0
         self.cut: int | None = None
         self._skip_repeated = skip_repeated
-        self._reader = FieldReader(decimal, missing)
-        self._table = table = open_table(path, separator, encoding)
+        self._reader = FieldReader(decimal, missing, time_format)
+        self._table = table = open_table(
+            path, separator, encoding, count("--skip-lines", skip_lines, 0)
+        )
         self.name, self.total = table.name, table.total
         try:
             self._columns = names.find(table.header, table.name, table.header_line)
@@ -134,7 +138,8 @@ class RecordReader:
             shown = field if len(field) <= 40 else f"{field[:40]}..."
             is_time = position == self._columns.time
             remedy = (
-                "expected a number or a date such as 2026-05-04T12:00:00" if is_time
+                "expected a number, or a date such as 2026-05-04T12:00:00 or 04.05.2026 12:00:00; "
+                "choose another form by --time-format, such as '%d/%m/%Y %H:%M:%S'" if is_time
                 else "correct it, or leave it blank if it is missing"
             )
             what = f"{shown!r} {error}; {remedy}." if shown else f"the time {error}."
@@ -229,7 +234,10 @@ class _Header:
         lower = [name.lower() for name in self.names]
         bare = [_UNIT.sub("", name) for name in lower]
         for name in wanted:
-            for names, one in ((self.names, name), (lower, name.lower()), (bare, name.lower())):
+            small = name.lower()
+            for names, one in (
+                (self.names, name), (lower, small), (bare, small), (bare, _UNIT.sub("", small)),
+            ):
                 found = [i for i, each in enumerate(names) if each == one]
                 if len(found) == 1:
                     return found[0]
@@ -261,6 +269,7 @@ def _chosen(
     indices = {f"{letter}{i + 1}": i for i in range(len(names))}
     if len(names) == 1:
         indices[letter] = 0
+    indices |= {_UNIT.sub("", name): i for i, name in enumerate(names)}
     indices |= {name: i for i, name in enumerate(names)}
     known = ", ".join(indices) or f"none: the model has no {option}"
     items = [item.strip() for item in next(csv.reader([text], skipinitialspace=True), [])]
@@ -300,10 +309,16 @@ def seconds_between(before: Time, after: Time) -> float:
 
 
 class FieldReader:
-    """Reads fields, with one decimal mark in the whole record: the first one, if ``auto``."""
+    """Reads fields, with one decimal mark in all measurements: the first one, if ``auto``.
 
-    def __init__(self, decimal: str = "auto", missing: Sequence[str] = ()) -> None:
+    Times may have another one: clocks often write a point where the measurements have commas.
+    """
+
+    def __init__(
+        self, decimal: str = "auto", missing: Sequence[str] = (), time_format: str | None = None
+    ) -> None:
         self._mark = "" if decimal == "auto" else decimal
+        self._format = time_format
         words = [str(word).strip().lower() for word in missing]
         if not all(words):
             raise OptionError("--missing is blank; expected a word. Blank fields are missing.")
@@ -321,21 +336,34 @@ class FieldReader:
         text = field.strip()
         if text.lower() in self._missing:
             return math.nan
-        value = self._parse(text)
+        value, mark = _parse(text)
+        self._mark = self._mark or mark
+        if mark and mark != self._mark:
+            raise ValueError(
+                f"has the decimal mark {mark!r}, where {self._mark!r} is expected; use the same "
+                "one in all numbers, or choose it by --decimal"
+            )
         return math.nan if value in self._numbers else value
 
     def time(self, field: str) -> Time:
-        """The time in a field, a number or an ISO date; ValueError where it is neither."""
+        """The time in a field, a number or a date; ValueError where it is neither."""
         text = field.strip()
         if text.lower() in _MISSING:
             raise ValueError("is blank; every line needs its time")
+        if self._format is not None:
+            try:
+                return _date(datetime.strptime(text, self._format), text)
+            except ValueError:
+                raise ValueError(f"does not have the form {self._format!r}") from None
         if _WHOLE.fullmatch(text):
             return Time("number", int(text), text)
         try:
-            value = self._parse(text)
+            value, _ = _parse(text)
         except ValueError:
+            day = _DAY_FIRST.match(text)
+            iso = f"{day[3]}-{day[2]:0>2}-{day[1]:0>2}{text[day.end():]}" if day else text
             try:
-                moment = datetime.fromisoformat(text)
+                moment = datetime.fromisoformat(iso)
             except ValueError:
                 pass
             else:
@@ -345,25 +373,19 @@ class FieldReader:
             raise ValueError("is not finite")
         return Time("number", value, text.replace(",", "."))
 
-    def _parse(self, text: str) -> float:
-        comma, point = "," in text, "." in text
-        try:
-            value = float(text.replace(",", "" if point else ".") if comma else text)
-        except ValueError:
-            raise ValueError("is not a number") from None
-        if "_" in text:  # 1_000 is a number in Python only
-            raise ValueError("is not a number")
-        if comma and point:
-            raise ValueError("has two kinds of decimal marks; leave out the thousands separator")
-        if comma or point:
-            mark = "," if comma else "."
-            self._mark = self._mark or mark
-            if mark != self._mark:
-                raise ValueError(
-                    f"has the decimal mark {mark!r}, where {self._mark!r} is expected; use the "
-                    "same one in all numbers, or choose it by --decimal"
-                )
-        return value
+
+def _parse(text: str) -> tuple[float, str]:
+    """A number, and its decimal mark if it has one."""
+    comma, point = "," in text, "." in text
+    try:
+        value = float(text.replace(",", "" if point else ".") if comma else text)
+    except ValueError:
+        raise ValueError("is not a number") from None
+    if "_" in text:  # 1_000 is a number in Python only
+        raise ValueError("is not a number")
+    if comma and point:
+        raise ValueError("has two kinds of decimal marks; leave out the thousands separator")
+    return value, "," if comma else "." if point else ""
 
 
 def _date(moment: datetime, text: str) -> Time:

@@ -99,6 +99,8 @@ def estimate_record(
     decimal: str = "auto",
     encoding: str = "utf-8",
     missing: Sequence[str] = (),
+    skip_lines: int = 0,
+    time_format: str | None = None,
     dt: float | None = None,
     time_scale: float = 1.0,
     equal_steps: bool = False,
@@ -137,6 +139,11 @@ def estimate_record(
         How a CSV file is written, where the file does not show it.
     missing : sequence of str
         Words (or numbers) that stand for a missing value, besides the usual ones.
+    skip_lines : int
+        Lines of a CSV file above its header.
+    time_format : str, optional
+        Form of the dates, as for `datetime.datetime.strptime`; if left out, ISO dates, and those
+        with dots and the day first.
     dt, time_scale : float, optional
         Usual step of a discrete-time model, in its unit of time; the record's unit in the model's.
     equal_steps, skip_repeated : bool
@@ -206,7 +213,8 @@ def estimate_record(
         reader = RecordReader(
             str(record), ColumnNames(loaded.outputs, loaded.inputs, time, outputs, inputs),
             separator=separator, decimal=decimal, encoding=encoding, skip_repeated=skip_repeated,
-            missing=(missing,) if isinstance(missing, str) else missing,
+            missing=(missing,) if isinstance(missing, str) else missing, skip_lines=skip_lines,
+            time_format=time_format,
         )
         stack.callback(reader.close)
         identity = plain(loaded.identity | {

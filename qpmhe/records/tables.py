@@ -12,6 +12,7 @@ import stat
 import sys
 import zlib
 from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import Any, BinaryIO, NamedTuple
 
 from .._checks import need
@@ -56,7 +57,9 @@ class Row(NamedTuple):
     ended: bool
 
 
-def open_table(record: str, separator: str | None, encoding: str) -> CsvTable | ParquetTable:
+def open_table(
+    record: str, separator: str | None, encoding: str, skip_lines: int = 0
+) -> CsvTable | ParquetTable:
     """Open a record, a file or ``-`` for standard input, as the kind that its first bytes say."""
     piped = record == "-"
     name = "standard input" if piped else record
@@ -75,13 +78,18 @@ def open_table(record: str, separator: str | None, encoding: str) -> CsvTable | 
         if total is not None and (
             head.startswith(_PARQUET) or record.lower().endswith((".parquet", ".pq"))
         ):
+            if skip_lines:
+                raise OptionError(
+                    f"--skip-lines is {skip_lines}, but {name} is a Parquet file, which has no "
+                    "lines; leave it out."
+                )
             return ParquetTable(name)
         for magic, remedy in _UNREADABLE.items():
             if head.startswith(magic):
                 raise RecordError(remedy, name)
         if head.startswith(_GZIP):
             stream, total = gzip.GzipFile(fileobj=stream), None
-        table = CsvTable(stream, name, separator, encoding, total)
+        table = CsvTable(stream, name, separator, encoding, total, skip_lines)
         table.close = opened.pop_all().close
         return table
 
@@ -92,7 +100,8 @@ class CsvTable:
     unit = "line"
 
     def __init__(
-        self, stream: BinaryIO, name: str, separator: str | None, encoding: str, total: int | None
+        self, stream: BinaryIO, name: str, separator: str | None, encoding: str, total: int | None,
+        skip_lines: int = 0,
     ) -> None:
         self._stream, self.name, self._encoding, self.total = stream, name, encoding, total
         self._separator = _SEPARATOR_NAMES.get(separator or "", separator)
@@ -114,14 +123,17 @@ class CsvTable:
             )
         self.position = self.line = 0
         self.close: Callable[[], None] = stream.close
-        self._lines = filter(str.strip, self._read_lines())
+        self._lines = filter(str.strip, islice(self._read_lines(), skip_lines, None))
         text = next(self._lines, None)
         note = re.fullmatch(r"\s*sep=(.)\s*", text or "", re.IGNORECASE)
         if note:  # a spreadsheet writes its separator above the header
             self._separator = self._separator or note[1]
             text = next(self._lines, None)
         if text is None:
-            raise RecordError("it is empty; expected a header with the columns' names.", name)
+            below = f" below the {skip_lines} lines that --skip-lines skips" if skip_lines else ""
+            raise RecordError(
+                f"it is empty{below}; expected a header with the columns' names.", name
+            )
         if self._separator is None:  # the first that separates anything
             self._separator = next((mark for mark in _SEPARATORS if mark in text), ",")
         self.header = self._split(text)
@@ -134,8 +146,8 @@ class CsvTable:
         word = _SEPARATORS.get(self._separator, repr(self._separator))
         #: What an error of the columns adds.
         self.hint = (
-            f" The separator is taken to be {word}; choose another one by --separator. Delete "
-            "lines above the header, and comments."
+            f" The separator is taken to be {word}; choose another one by --separator. Skip "
+            "lines above the header by --skip-lines N, and delete comments."
         )
 
     def __iter__(self) -> Iterator[Row]:

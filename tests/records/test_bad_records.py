@@ -47,6 +47,8 @@ def after(wrong, end="\n"):
         (",0.5,0", ["column 'time'", "blank"]),
         ("inf,0.5,0", ["column 'time'", "not finite"]),
         ("noon,0.5,0", ["column 'time'", "'noon' is not a number", "2026-05-04T12:00:00"]),
+        ("04/05/2026,0.5,0", ["'04/05/2026' is not a number", "--time-format"]),
+        ("32.05.2026,0.5,0", ["'32.05.2026' is not a number", "--time-format"]),
         ("2026-01-01 00:00:00,0.5,0", ["column 'time'", "a date, and in line 4 a number"]),
         ("0.3;0.5;0", ["it has 1 field, and the header 3", "correct"]),
         ("0.3,0.5", ["it has 2 fields, and the header 3", "correct"]),

@@ -67,6 +67,14 @@ def test_options_are_handed_on(call, arguments, options):
     assert written == Path("expected.csv").read_bytes()
 
 
+def test_options_of_messy_files_are_handed_on(call):
+    rows = [f"{k // 10}s{k % 10},0.5,0" for k in range(12)]
+    Path("record.csv").write_text("\n".join(["plant 3", "time,y,u", *rows, ""]))
+    answer = call("--out", "out.csv", "--skip-lines", "1", "--time-format", "%Ss%f")
+    assert answer.exception is None
+    assert Path("out.csv").read_text().splitlines()[-1].startswith("1s1,")
+
+
 def test_resume_and_overwrite(call):
     Path("record.csv").write_text("\n".join([*lines(30)[:20], "x"]))
     cut = ["--out", "out.csv", "--checkpoint-every", "5", "--no-step-time"]

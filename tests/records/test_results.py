@@ -196,6 +196,37 @@ def test_ways_of_writing_csv_make_no_difference(here, mark, decimal, prefix, end
     assert Path("out.csv").read_bytes() == Path("o.csv").read_bytes()
 
 
+MESSY = {
+    "milliseconds and decimal commas": ("time;y1;y2", "{t:.3f}", "1,5", {}),
+    "days first": ("time;y1;y2", "04.05.2026 12:00:{t:02.0f}", "1,5", {}),
+    "days first, milliseconds": ("time;y1;y2", "4.5.2026 12:00:{t:06.3f}", "1,5", {}),
+    "a form": (
+        "time;y1;y2", "05/04/2026 {t:02.0f}", "1.5", {"time_format": "%m/%d/%Y %S"},
+    ),
+    "lines above the header": ("Plant 3; log\n\n# by hand\ntime;y1;y2", "{t}", "1,5",
+                               {"skip_lines": 3}),
+    "units in the header": ("time (s);Level / m;Flow [l/s]", "{t}", "1.5",
+                            {"outputs": "y1=Level,y2=flow", "time": "Time"}),
+    "units in the options": ("time;Level;Flow", "{t}", "1.5",
+                             {"outputs": "y1=Level [m],y2=Flow (l/s)", "time": "time (s)"}),
+}
+
+
+@pytest.mark.parametrize(("header", "time", "value", "options"), MESSY.values(), ids=MESSY)
+def test_messy_files_are_read_as_tidy_ones(here, header, time, value, options):
+    rows = [f"{time.format(t=k)};{value};{k}" for k in range(12)]
+    Path("record.csv").write_text("\n".join([header, *rows, ""]))
+    tidy = [f"{k},1.5,{k}" for k in range(12)]
+    Path("tidy.csv").write_text("\n".join(["time,y1,y2", *tidy, ""]))
+    estimate_record(DISCRETE, "record.csv", "out.csv", step_time=False, **options)
+    estimate_record(DISCRETE, "tidy.csv", "expected.csv", step_time=False)
+    found, expected = (
+        [line.split(",")[1:] for line in Path(name).read_text().splitlines()[1:]]
+        for name in ("out.csv", "expected.csv")
+    )
+    assert found == expected
+
+
 def test_repeated_lines_are_passed_over_if_asked(here):
     text = lines(15)
     Path("record.csv").write_text("\n".join(text))

@@ -149,5 +149,5 @@ def test_inputs_that_are_true_or_false(here):
 def test_dates_that_no_calendar_has(here):
     time = pa.array([2**62, 2**62 + 1], pa.int64()).cast(pa.timestamp("us"))
     pq.write_table(table(time), "record.parquet")
-    with pytest.raises(RecordError, match=r"row 1, column 'time'.*expected a number or a date"):
+    with pytest.raises(RecordError, match=r"row 1, column 'time'.*expected a number, or a date"):
         estimate_record(DISCRETE, "record.parquet", "out.csv", **OPTIONS)
