@@ -198,7 +198,8 @@ class Estimate:
     __slots__ = (
         "_filtered", "_rejected", "_residuals", "_width", "candidate", "candidate_cost",
         "corrections", "cost", "delayed", "dropped", "message", "nearest_points",
-        "observer_state", "qps", "solve_time", "solver_iterations", "state", "status", "step_time", "time", "trajectory",
+        "observer_state", "qps", "solve_time", "solver_iterations", "state", "status", "step_time",
+        "time", "trajectory",
     )
 
     engine = "python"
