@@ -44,7 +44,9 @@ from .model.sets import Box, ConvexSet, Polytope, SoftSet
 from .model.system import System
 from .observers import (
     ExtendedKalman,
+    Gate,
     HighGain,
+    HuberInnovation,
     Luenberger,
     Observer,
     OutputInjection,
@@ -105,10 +107,12 @@ __all__ = [
     "DroppedRow",
     "Estimate",
     "ExtendedKalman",
+    "Gate",
     "GemanMcClure",
     "Gradient",
     "HighGain",
     "Huber",
+    "HuberInnovation",
     "Loss",
     "Luenberger",
     "MovingHorizonEstimator",

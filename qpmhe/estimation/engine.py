@@ -307,6 +307,7 @@ class PythonEngine:
             filtered,
             self._disturbances,
             window.observer_state.copy(),
+            window.rejected,
         )
         if window.newest_failed and outcome.improved:
             window.restart(estimate.state)

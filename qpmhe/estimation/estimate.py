@@ -37,6 +37,8 @@ class Status(enum.Flag):
     OBSERVER_FAR = enum.auto()
     TIME_UP = enum.auto()
     GRADUATED = enum.auto()
+    SENSORS_REJECTED = enum.auto()
+    ALL_REJECTED = enum.auto()
 
     def explain(self) -> str:
         """What happened, and what can be done about it, in sentences."""
@@ -97,6 +99,15 @@ _TEXTS = {
     Status.GRADUATED: (
         "The first window was not full: the QPs minimised the cost with a widened loss, whose "
         "minimiser is the estimate where its true cost is below the candidate's."
+    ),
+    Status.SENSORS_REJECTED: (
+        "At the newest sample the observer's gate rejected the sensors in "
+        "estimate.rejected_sensors: its covariance does not explain their innovations."
+    ),
+    Status.ALL_REJECTED: (
+        "These are all sensors of the sample, and the observer only predicted. Where this lasts, "
+        "the observer is lost until its gate opens again: raise the covariances of prior or "
+        "disturbance, or lower the gate's reopen."
     ),
 }
 
@@ -165,6 +176,8 @@ class Estimate:
     dropped : tuple of DroppedRow
         The inequalities that the estimate violates because no trajectory was found that
         satisfies all of them at a cost not above the candidate's.
+    rejected_sensors : tuple of int
+        The sensors that the observer's gate rejected at the newest sample; see `qpmhe.Gate`.
     status : Status
         Outcome and events.
     message : str
@@ -183,9 +196,10 @@ class Estimate:
     """
 
     __slots__ = (
-        "_filtered", "_residuals", "_width", "candidate", "candidate_cost", "corrections", "cost",
-        "delayed", "dropped", "message", "nearest_points", "observer_state", "qps", "solve_time",
-        "solver_iterations", "state", "status", "step_time", "time", "trajectory",
+        "_filtered", "_rejected", "_residuals", "_width", "candidate", "candidate_cost",
+        "corrections", "cost", "delayed", "dropped", "message", "nearest_points",
+        "observer_state", "qps", "solve_time", "solver_iterations", "state", "status", "step_time",
+        "time", "trajectory",
     )
 
     engine = "python"
@@ -210,8 +224,10 @@ class Estimate:
         filtered: Array | None = None,
         disturbances: int | None = None,
         observer_state: Array | None = None,
+        rejected: NDArray[np.bool_] | None = None,
     ) -> None:
         self.time = time
+        self._rejected = rejected
         self._width = trajectory.shape[1] if disturbances is None else disturbances
         self.trajectory = trajectory
         self.state: Array = trajectory[-1]
@@ -244,9 +260,21 @@ class Estimate:
         """v(i) along the trajectory, NaN where y is missing."""
         return self._residuals[:, self._width :]
 
+    @property
+    def rejected(self) -> NDArray[np.bool_]:
+        """Whether the observer's gate rejected each of its sensors, (s,); empty without a gate."""
+        return np.zeros(0, np.bool_) if self._rejected is None else self._rejected
+
+    @property
+    def rejected_sensors(self) -> tuple[int, ...]:
+        """The sensors that the observer's gate rejected."""
+        return tuple(np.flatnonzero(self.rejected).tolist())
+
     def explain(self) -> str:
         """What happened, and what can be done about it, in sentences; with any dropped rows."""
         text = self.status.explain()
+        if self.rejected_sensors:
+            text += f" Rejected sensors: {', '.join(map(str, self.rejected_sensors))}."
         if self.dropped:
             text += f" Dropped: {'; '.join(map(str, self.dropped))}."
         elif Status.CANDIDATE_OUTSIDE in self.status:

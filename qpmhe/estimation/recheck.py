@@ -38,6 +38,8 @@ def check_stages(window: Window, loaded: Window, terms: bool) -> None:
             window._z[k + 1] = loaded._z[k + 1]
             if window._covariances is not None and loaded._covariances is not None:
                 window._covariances[k + 1] = loaded._covariances[k + 1]
+            if window._rejections is not None and loaded._rejections is not None:
+                window._rejections[k + 1] = loaded._rejections[k + 1]
 
 
 def _difference(window: Window, k: int, time: int, loaded: Window, terms: bool) -> str:
@@ -71,6 +73,8 @@ def _comparisons(
         expected = window._covariances[k + 1]
         spread = np.sqrt(np.abs(expected.diagonal()))
         yield "observer", loaded._covariances[k + 1], expected, np.outer(spread, spread)
+    if window._rejections is not None and loaded._rejections is not None:
+        yield "observer", loaded._rejections[k + 1] * 1.0, window._rejections[k + 1] * 1.0, 0.0
     r, weight = saved.residuals[k], loaded._weights[k]
     cost = window._evaluate_costs(r[None], weight)[0]
     size = np.abs(r).dot(np.abs(weight)).dot(np.abs(r)) if window._quadratic else cost

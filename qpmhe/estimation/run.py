@@ -72,6 +72,8 @@ class Run:
     covariances : (T, n, n) array, optional
         Covariances of the estimates of x(1), ..., x(T), if requested; NaN where the model
         could not be linearised.
+    rejected_sensors : (T, s) bool array, optional
+        Whether the gate of the observer rejected each of its s sensors; s is 0 without a gate.
     engine : str
         What ran the steps: ``python``, ``compiled``, or ``compiled, then python`` where a model
         has changed since it was compiled.
@@ -102,6 +104,7 @@ class Run:
         flags: NDArray[np.integer[Any]],
         observer_states: Array,
         covariances: Array | None = None,
+        rejected_sensors: NDArray[np.bool_] | None = None,
         engine: str = "python",
     ) -> None:
         self.states, self.filtered, self.delayed = states, filtered, delayed
@@ -110,6 +113,9 @@ class Run:
         self.qps, self.solver_iterations = qps, solver_iterations
         self.flags, self.covariances, self.engine = flags, covariances, engine
         self.observer_states = observer_states
+        if rejected_sensors is None:
+            rejected_sensors = np.zeros((flags.size, 0), np.bool_)
+        self.rejected_sensors = rejected_sensors
 
     @classmethod
     def of(
@@ -151,6 +157,7 @@ class Run:
             flags=np.array([e.status.value for e in estimates], dtype=np.intp),
             observer_states=np.array([first, *(e.observer_state for e in estimates)]),
             covariances=covariances,
+            rejected_sensors=np.array([e.rejected for e in estimates]) if estimates else None,
             engine=", then ".join(dict.fromkeys(one.engine for one in estimates)) or "python",
         )
 

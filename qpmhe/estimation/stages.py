@@ -68,6 +68,7 @@ class Stages:
         stage_weight: Array,
         quadratic: bool,
         step: float,
+        sensors: int = 0,
     ) -> None:
         self.horizon, self._step = horizon, step
         room = horizon + max(horizon // 4, 32)
@@ -92,6 +93,8 @@ class Stages:
         self._stage_costs = np.zeros(room)
         self.terms = StageTerms(room, n, p)
         self._covariances = None if covariance is None else np.zeros((room + 1, n, n))  # of z
+        # How often in a row the observer has rejected each of its sensors, before each stage.
+        self._rejections = np.zeros((room + 1, sensors), np.int64) if sensors else None
         # For observers and losses: a user's code cannot write into the window.
         self._read_only_covariances = (
             None if self._covariances is None else read_only(self._covariances)
@@ -169,6 +172,14 @@ class Stages:
         return None if self._covariances is None else self._covariances[self.start]
 
     @property
+    def rejected(self) -> NDArray[np.bool_] | None:
+        """Which sensors the observer rejected at the newest stage; None without a gate."""
+        if self._rejections is None:
+            return None
+        grown: NDArray[np.bool_] = self._rejections[self.end] > self._rejections[self.end - 1]
+        return grown
+
+    @property
     def initial_state(self) -> Array:
         """The first state of the window."""
         state: Array = self._z[self.start].copy()
@@ -185,6 +196,8 @@ class Stages:
             found["majorising_weights"] = self._majorising_weights
         if self._covariances is not None:
             found["covariance"] = self._covariances
+        if self._rejections is not None:
+            found["rejections"] = self._rejections
         return found
 
     def _last_good(self, before: int) -> tuple[Array, Array | None]:
@@ -282,7 +295,9 @@ class Stages:
         """
         time = check_size("time", state["time"], lambda found: found >= 0)
         length, arrays = min(time, self.horizon), self._arrays()
-        for name, what in (("covariance", "observer"), ("majorising_weights", "cost")):
+        for name, what in (
+            ("covariance", "observer"), ("rejections", "observer"), ("majorising_weights", "cost"),
+        ):
             if (name in arrays) != (name in state):
                 raise mismatch(what)
         for name, array in arrays.items():
@@ -296,6 +311,8 @@ class Stages:
         if self._covariances is not None:
             saved, shape = state["earlier_covariance"], self._covariances.shape[1:]
             self._earlier_covariance = checked_array("earlier_covariance", saved, shape)
+        if self._rejections is not None and (self._rejections[: length + 1] < 0).any():
+            raise ValueError("a sensor's rejections are fewer than none")
         if not (self._stage_costs[:length] >= 0.0).all():
             raise ValueError("a stage's cost is not a number >= 0")
         steps, irregular = self._u[:length, -1], self._irregular[:length]

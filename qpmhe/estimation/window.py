@@ -29,6 +29,7 @@ _MISSING, _MODEL_FAILED = Status.MISSING.value, Status.MODEL_FAILED.value
 _PROJECTED, _PREDICTION_OUTSIDE, _METRIC_SINGULAR = (
     Status.OBSERVER_PROJECTED.value, Status.PREDICTION_OUTSIDE.value, Status.METRIC_SINGULAR.value
 )
+_SENSORS_REJECTED, _ALL_REJECTED = Status.SENSORS_REJECTED.value, Status.ALL_REJECTED.value
 _OF_PROJECTION = _PROJECTED | _PREDICTION_OUTSIDE | _METRIC_SINGULAR
 # Observers run side by side if they hold at most this many numbers; otherwise `replay` does it.
 _MOST_RUNNING = 2**23
@@ -65,7 +66,7 @@ class Window(Stages):
         self._with_jacobians = with_terms or observer.needs_jacobians
         super().__init__(
             n, p, m, horizon, initial_state, observer.initial_covariance(), cost.stage_weight,
-            cost.quadratic, system.dt or 0.0,
+            cost.quadratic, system.dt or 0.0, len(observer.sensors),
         )
         self._sample = Sample(system, np.zeros(m))
         self._usual = usual
@@ -219,6 +220,8 @@ class Window(Stages):
             self._u[:length, m - parameters.size : m] = parameters
         if self._covariances is not None:
             self._covariances[0] = kept["covariance"][0]
+        if self._rejections is not None:
+            self._rejections[0] = kept["rejections"][0]
         self._earlier_state, self._earlier_covariance = other._last_good(other.start)
         self.smoothed_prior = other.smoothed_prior
         if self.metric is not None and other.metric is not None:
@@ -317,6 +320,19 @@ class Window(Stages):
             self.events |= _MISSING
         if model_failed or jacobian_failed:
             self.events |= _MODEL_FAILED
+        if self._rejections is not None and not model_failed:
+            self._report_rejected(k)
+
+    def _report_rejected(self, k: int) -> None:
+        """Add the flags of sensors that were rejected at stage k."""
+        rejections = self._rejections
+        assert rejections is not None
+        rejected, observed = rejections[k + 1] > rejections[k], self._observed[k]
+        if rejected.any():
+            self.events |= _SENSORS_REJECTED
+            sensors = zip(self._observer.sensors, rejected, strict=True)
+            if all(no or not observed[list(outputs)].any() for outputs, no in sensors):
+                self.events |= _ALL_REJECTED
 
     def _find_observed(self, k: int, time: int) -> NDArray[np.bool_] | None:
         """Mark the missing components of y at stage k; return which are there, or None for all."""
@@ -434,6 +450,10 @@ class Window(Stages):
             sample.f_jacobian, sample.h_jacobian = -terms.minus_a, -terms.minus_c
         if self._read_only_covariances is not None:
             sample.covariance = self._read_only_covariances[k]
+        rejections = self._rejections
+        if rejections is not None:
+            rejections[k + 1] = rejections[k]
+            sample.rejections, sample.next_rejections = rejections[k], rejections[k + 1]
         correction, posterior = self._correct(view.arguments[0], view.error, sample)
         terms.disturbance[...] = correction
         predicted = z_next.copy() if self._nearest is not None else None
@@ -555,6 +575,8 @@ class Window(Stages):
         self._z[k + 1], covariance = self._last_good(k)
         if self._covariances is not None:
             self._covariances[k + 1] = covariance
+        if self._rejections is not None:
+            self._rejections[k + 1] = self._rejections[k]
         stage = self._stage_views[k].terms
         stage.linear[:, 0], stage.linear[:, 1:] = 0.0, self._minus_stand_in
         self._majorising_weights[k] = self._weights[k]

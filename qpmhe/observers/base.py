@@ -5,16 +5,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import NoneType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qpmhe_solvers.values import shown
+
 from .._checks import Array, positive_definite, positive_semidefinite
 from .._linalg import inverse
-from ..errors import ShapeError
+from ..errors import OptionError, ShapeError
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..model.tracing import Traced
+from .innovation import Counts, Innovation, Mask, Verdict
 
 #: Two inversions of a covariance change its correlations by no more.
 SAME_COVARIANCE = 1e-9
@@ -39,6 +43,9 @@ class Sample:
         This sample's own weight of the disturbance; None if it has none.
     states : ConvexSet or None
         The X that this sample came with; None for the system's.
+    rejections, next_rejections : (s,) int array or None
+        How often in a row the observer has rejected each of its `Observer.sensors`, before this
+        sample, and where `Observer.correct` writes the counts behind it.
     """
 
     system: System
@@ -50,6 +57,8 @@ class Sample:
     covariance: Array | None = None
     disturbance_weight: Array | None = None
     states: ConvexSet | None = None
+    rejections: Counts | None = None
+    next_rejections: Counts | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +79,8 @@ class ObserverForm:
         Distance of sigma points from the state, in standard deviations.
     correction : callable or None
         The CasADi form of a function L(z, v), from the sizes of its arguments.
+    innovation : Innovation or None
+        How a Kalman filter judges its innovations.
     """
 
     kind: str
@@ -82,6 +93,7 @@ class ObserverForm:
     h_jacobian: Array | None = None
     spread: float = 0.0
     correction: Callable[[int, int], Traced] | None = None
+    innovation: Innovation | None = None
 
 
 class Observer(ABC):
@@ -124,6 +136,11 @@ class Observer(ABC):
     def initial_covariance(self) -> Array | None:
         """The covariance (n, n) of the initial estimate; None for observers without one."""
         return None
+
+    @property
+    def sensors(self) -> tuple[tuple[int, ...], ...]:
+        """The outputs of each sensor whose rejections in a row it counts; empty without a gate."""
+        return ()
 
     @abstractmethod
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array | None]:
@@ -175,13 +192,23 @@ class KalmanType(Observer):
     """An observer with covariances of initial error (n, n), disturbance (r, r) and noise (p, p).
 
     The first two may be singular. r is n, or the number of columns of the system's
-    ``disturbance_matrix``.
+    ``disturbance_matrix``. The innovation is a `Gate`, a `HuberInnovation` or None.
     """
 
-    def __init__(self, *, prior: ArrayLike, disturbance: ArrayLike, noise: ArrayLike) -> None:
+    def __init__(
+        self, *, prior: ArrayLike, disturbance: ArrayLike, noise: ArrayLike,
+        innovation: Innovation | None = None,
+    ) -> None:
         self._prior, _ = positive_semidefinite("prior covariance", prior)
         self._disturbance, _ = positive_semidefinite("disturbance covariance", disturbance)
         self._noise = positive_definite("noise covariance", noise)
+        if not isinstance(innovation, (Innovation, NoneType)):
+            raise OptionError(
+                f"innovation is {shown(innovation)}; expected qpmhe.Gate(...), "
+                "qpmhe.HuberInnovation(...) or None."
+            )
+        self._innovation = innovation
+        self._sensors = () if innovation is None else innovation.sensors(len(self._noise))
 
     def check(self, system: System, initial_state: Array) -> None:
         """Check the covariances' dimensions; see `Observer.check`."""
@@ -199,11 +226,34 @@ class KalmanType(Observer):
         """P(0)."""
         return self._prior
 
+    @property
+    def sensors(self) -> tuple[tuple[int, ...], ...]:
+        """The outputs of each sensor of its gate; see `Observer.sensors`."""
+        return self._sensors
+
     def _form(self, kind: str) -> ObserverForm:
         """The observer's C form, with its covariances."""
         return ObserverForm(
-            kind, prior=self._prior, disturbance=self._disturbance, noise=self._noise
+            kind, prior=self._prior, disturbance=self._disturbance, noise=self._noise,
+            innovation=self._innovation,
         )
+
+    def _judge(self, spread: Array, noise: Array, v: Array, sample: Sample) -> Verdict:
+        """How much the outputs that are there count; see `Innovation.judge`."""
+        if self._innovation is None:
+            return Verdict(1.0, None, noise, None)
+        observed: Mask | None = sample.observed
+        if observed is None:
+            observed = np.ones(v.size, np.bool_)
+        rejections = sample.rejections
+        if rejections is None:
+            rejections = np.zeros(len(self._sensors), np.int64)
+        return self._innovation.judge(spread, noise, v, observed, rejections)
+
+    def _remember(self, verdict: Verdict, sample: Sample) -> None:
+        """Write the counts behind this sample."""
+        if sample.next_rejections is not None and verdict.rejections is not None:
+            sample.next_rejections[...] = verdict.rejections
 
     def _noise_of(self, sample: Sample) -> Array:
         """The covariance of this sample's noise."""

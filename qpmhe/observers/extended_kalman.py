@@ -7,6 +7,7 @@ import numpy as np
 from .._checks import Array
 from .._linalg import solve
 from .base import KalmanType, ObserverForm, Sample
+from .innovation import Verdict
 
 
 class ExtendedKalman(KalmanType):
@@ -29,11 +30,17 @@ class ExtendedKalman(KalmanType):
         Covariances P(0) of the initial error x(0) - z(0), Q of w and R of v. P(0) and Q may be
         singular. r is n, or the number of columns of the system's ``disturbance_matrix`` G, in
         whose place :math:`G Q G^\top` then stands above.
+    innovation : Gate or HuberInnovation, optional
+        What to make of innovations that S does not explain; without it all correct alike. K and
+        :math:`P^+` are then those of the outputs that pass, with the P and R of the rule; K takes
+        finitely many forms, each bounded, so (eq:kappa) holds as before.
 
     Raises
     ------
     WeightError, ShapeError
         If a covariance is not square, symmetric and positive semidefinite, R definite.
+    OptionError
+        If ``innovation`` is none of these, or a group of its gate has an output beyond R's.
 
     References
     ----------
@@ -45,12 +52,16 @@ class ExtendedKalman(KalmanType):
     @property
     def c_form(self) -> ObserverForm | None:
         """The covariances, unless a derived class may compute otherwise."""
-        return self._form("extended") if type(self) is ExtendedKalman else None
+        own = type(self) is ExtendedKalman and self._innovation is None
+        return self._form("extended") if own else None
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""
         a, c, covariance = _given(sample)
-        c, r, v = self._seen(c, v, sample)
+        c, r, v, verdict = self._seen(c, v, covariance, sample)
+        if verdict.growth > 1.0:
+            covariance = verdict.growth * covariance
+        self._remember(verdict, sample)
         cross = a @ covariance @ c.T
         gain = solve(c @ covariance @ c.T + r, cross.T).T if v.size else cross
         # Joseph's form: symmetric, and positive semidefinite by construction.
@@ -62,7 +73,9 @@ class ExtendedKalman(KalmanType):
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """The filter's measurement update; see `Observer.filter`."""
         _, c, covariance = _given(sample)
-        c, r, v = self._seen(c, v, sample)
+        c, r, v, verdict = self._seen(c, v, covariance, sample)
+        if verdict.growth > 1.0:
+            covariance = verdict.growth * covariance
         if not v.size:
             return z, covariance
         cross = covariance @ c.T
@@ -70,12 +83,18 @@ class ExtendedKalman(KalmanType):
         closed = np.eye(z.size) - gain @ c
         return z + gain @ v, closed @ covariance @ closed.T + gain @ r @ gain.T
 
-    def _seen(self, c: Array, v: Array, sample: Sample) -> tuple[Array, Array, Array]:
-        """Rows of C, covariance of the noise, and fitting error of the outputs that are there."""
+    def _seen(
+        self, c: Array, v: Array, covariance: Array, sample: Sample
+    ) -> tuple[Array, Array, Array, Verdict]:
+        """Rows of C, covariance of the noise, and fitting error of the outputs that correct."""
         r, there = self._noise_of(sample), sample.observed
-        if there is None:
-            return c, r, v
-        return c[there], r[np.ix_(there, there)], v[there]
+        if there is not None:
+            c, r, v = c[there], r[np.ix_(there, there)], v[there]
+        verdict = self._judge(c @ covariance @ c.T, r, v, sample)
+        kept, r = verdict.kept, verdict.noise
+        if kept is not None:
+            c, r, v = c[kept], r[np.ix_(kept, kept)], v[kept]
+        return c, r, v, verdict
 
 
 def _given(sample: Sample) -> tuple[Array, Array, Array]:

@@ -13,6 +13,7 @@ from .._linalg import cholesky, solve
 from ..model.residuals import difference
 from ..model.sets import ConvexSet
 from .base import KalmanType, ObserverForm, Sample
+from .innovation import Innovation, Verdict
 
 # A sigma point is drawn back into the state set, but not closer to z than this share.
 _CLOSEST = 1e-3
@@ -60,13 +61,16 @@ class UnscentedKalman(KalmanType):
         c, the distance of the sigma points from z in standard deviations, above 0:
         :math:`\sqrt{n + \lambda}` or :math:`\alpha \sqrt{n + \kappa}` of the textbooks.
         :math:`\sqrt 3` matches the fourth moments of a Gaussian along each direction.
+    innovation : Gate or HuberInnovation, optional
+        As for `ExtendedKalman`, with :math:`\sum_j H_j H_j^\top` in place of
+        :math:`C P C^\top`. Where P grows, the deviations grow by its root.
 
     Raises
     ------
     WeightError, ShapeError
         If a covariance is not square, symmetric and positive semidefinite, R definite.
     OptionError
-        If the spread is not positive.
+        If the spread is not positive, or ``innovation`` is none of these.
 
     References
     ----------
@@ -76,15 +80,15 @@ class UnscentedKalman(KalmanType):
 
     def __init__(
         self, *, prior: ArrayLike, disturbance: ArrayLike, noise: ArrayLike,
-        spread: float = math.sqrt(3.0),
+        spread: float = math.sqrt(3.0), innovation: Innovation | None = None,
     ) -> None:
-        super().__init__(prior=prior, disturbance=disturbance, noise=noise)
+        super().__init__(prior=prior, disturbance=disturbance, noise=noise, innovation=innovation)
         self._spread = positive("spread", spread)
 
     @property
     def c_form(self) -> ObserverForm | None:
         """The covariances and the spread, unless a derived class may compute otherwise."""
-        if type(self) is not UnscentedKalman:
+        if type(self) is not UnscentedKalman or self._innovation is not None:
             return None
         return replace(self._form("unscented"), spread=self._spread)
 
@@ -93,7 +97,10 @@ class UnscentedKalman(KalmanType):
         _, points, roots, inputs = self._sigma_points(z, sample)
         f = sample.system.f.batch(points, inputs)
         ahead: Array = difference(sample.system.state_residual, f[1:], f[0]) * roots
-        seen, r, v = self._seen(points, inputs, roots, v, sample)
+        seen, r, v, verdict = self._seen(points, inputs, roots, v, sample)
+        if verdict.growth > 1.0:
+            ahead = math.sqrt(verdict.growth) * ahead
+        self._remember(verdict, sample)
         if v.size == 0:
             return np.zeros_like(z), ahead.T @ ahead + self._disturbance_of(sample)
         gain = solve(seen.T @ seen + r, seen.T @ ahead).T
@@ -105,7 +112,9 @@ class UnscentedKalman(KalmanType):
         """The filter's measurement update with the same sigma points; see `Observer.filter`."""
         moves, points, roots, inputs = self._sigma_points(z, sample)
         around: Array = moves * roots
-        seen, r, v = self._seen(points, inputs, roots, v, sample)
+        seen, r, v, verdict = self._seen(points, inputs, roots, v, sample)
+        if verdict.growth > 1.0:
+            around = math.sqrt(verdict.growth) * around
         if v.size == 0:
             return z, around.T @ around
         gain = solve(seen.T @ seen + r, seen.T @ around).T
@@ -130,13 +139,18 @@ class UnscentedKalman(KalmanType):
 
     def _seen(
         self, points: Array, inputs: Array, roots: Array, v: Array, sample: Sample
-    ) -> tuple[Array, Array, Array]:
-        """Deviations, noise covariance and fitting error of the outputs that are there."""
+    ) -> tuple[Array, Array, Array, Verdict]:
+        """Deviations, noise covariance and fitting error of the outputs that correct."""
         h, r, there = sample.system.h.batch(points, inputs), self._noise_of(sample), sample.observed
         seen = difference(sample.system.output_residual, h[1:], h[0])
         if there is not None:
             seen, r, v = seen[:, there], r[np.ix_(there, there)], v[there]
-        return seen * roots, r, v
+        seen = seen * roots
+        verdict = self._judge(seen.T @ seen, r, v, sample)
+        kept, r = verdict.kept, verdict.noise
+        if kept is not None:
+            seen, r, v = seen[:, kept], r[np.ix_(kept, kept)], v[kept]
+        return math.sqrt(verdict.growth) * seen, r, v, verdict
 
 
 def _inside(z: Array, moves: Array, states: ConvexSet) -> tuple[Array, Array]:
