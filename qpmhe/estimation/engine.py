@@ -312,6 +312,8 @@ class PythonEngine:
         if window.newest_failed and outcome.improved:
             window.restart(estimate.state)
             estimate.observer_state = estimate.state.copy()
+        if problem.hold is not None:
+            window.trust(problem.hold, trajectory if outcome.improved else None)
         # The estimate's arrays are the user's.
         self._trajectory = (trajectory if outcome.followed is None else outcome.followed).copy()
         estimate.step_time = perf_counter() - began
@@ -366,6 +368,7 @@ class PythonEngine:
         self._solver.forget()
         window = self._fresh_window(initial_state, self._tools)
         window.enter_states(0, 0)
+        window.trust_start()
         self.replace(Memory(self._tools, window, None, (0, 0), [window.initial_state]))
 
     def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
@@ -418,12 +421,13 @@ class PythonEngine:
     def take_over(
         self, usual: Conditions, time: int, state: Array, covariance: Array | None,
         samples: Sequence[Taken], trajectory: Array | None, history: list[Array],
-        watched: tuple[int, int], smoothed: Array | None,
+        watched: tuple[int, int], smoothed: Array | None, trusted: Array | None,
     ) -> None:
         """Continue where another engine stands, whose window starts at a time and state.
 
         With the observer's covariance there if it has one, the samples since then, the last
-        estimate's trajectory, the last states that were estimated, and the smoothed prior.
+        estimate's trajectory, the last states that were estimated, the smoothed prior,
+        and the trusted values of held parameters.
         """
         tools = self._tools if usual is self._tools.usual else self._tools_for(usual)
         window = self._fresh_window(state, tools)
@@ -435,6 +439,7 @@ class PythonEngine:
                 window.push(*one)
             if self._reinitialized and samples:
                 window.reinitialize(history[:-1])
+        window.trusted = trusted
         self.replace(Memory(tools, window, trajectory, watched, history))
 
     def run(self, ys: Array, us: Array | None) -> None:
@@ -451,7 +456,7 @@ class PythonEngine:
                 raise InvalidInputError("the model has no finite values along the estimate.")
             return window_covariances(
                 problem.model, trial.trajectory, problem.inputs, trial.weights,
-                problem.prior_weight_at(problem.offset(trial.trajectory)),
+                problem.first_weight_at(problem.offset(trial.trajectory)),
                 problem.constraints.basis,
             )
 

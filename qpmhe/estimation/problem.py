@@ -21,6 +21,7 @@ from ..observers import Observer
 from .conditions import Conditions
 from .constraints import Constraints
 from .estimate import DroppedRow
+from .hold import Hold, WindowHold
 from .limits import FEASIBLE
 from .prior import PriorWeights
 from .softened import Penalties, WindowPenalties
@@ -86,6 +87,10 @@ class Formulation:
         covariance = inverse(regular)
         self.functions = system.constraints
         self.constraints = Constraints(system, cost, covariance)
+        #: What holds parameters that a window does not see; None where none is held.
+        self.hold: Hold | None = None
+        if system.held:
+            self.hold = Hold(system.held, covariance, self.constraints.basis, cost.disturbance)
         self.constrained = bool(self.constraints)
         penalties = Penalties(system, cost, covariance)
         #: The soft sets and soft constraints; None without any.
@@ -159,12 +164,14 @@ class Problem:
         Time of the first state.
     wraps : bool
         Whether the system has residual functions.
+    hold : WindowHold or None
+        The part of J that holds parameters which the window does not see.
     """
 
     __slots__ = (
         "_candidate_residuals", "_clip", "_counting", "_formulation", "_has_noise_free",
         "_prior_band", "candidate", "constrained", "constraints", "discounts", "distance_weight",
-        "inputs", "measurements", "model", "observed", "penalties", "prior", "prior_moved",
+        "hold", "inputs", "measurements", "model", "observed", "penalties", "prior", "prior_moved",
         "prior_weight", "rolled_out", "span", "stage_weights", "surrogate", "time",
         "usual_disturbances", "wraps",
     )
@@ -203,6 +210,15 @@ class Problem:
         self.candidate = Trial(
             view.candidate, view.residuals, weights, window.candidate_cost_of(view)
         )
+        self.hold: WindowHold | None = None
+        if formulation.hold is not None and window.trusted is not None and window.has_terms:
+            n = formulation.system.n
+            noise = self.stage_weights[..., n:, n:]
+            self.hold = formulation.hold.of_window(
+                view.span.minus_jacobian, noise, window.trusted[0]
+            )
+            self.candidate.cost += self._hold_cost(view.candidate)
+            self._prior_band = band_of(self.prior_weight + self.hold.whole)
         self.prior_moved = False
         if window.smoothed_prior is not None:
             self._move_prior(window.smoothed_prior)
@@ -334,6 +350,8 @@ class Problem:
             else:
                 prior_cost = formulation.prior_cost(offset, prior_weight)
             cost += prior_cost if self.discounts is None else float(self.discounts[0]) * prior_cost
+            if self.hold is not None:
+                cost += self._hold_cost(trajectory)
         except Exception as error:  # a model function outside its domain, or a user's loss
             residuals = np.full_like(self.candidate.residuals, np.nan)
             return Trial(trajectory, residuals, self.stage_weights, math.inf, math.inf, error)
@@ -367,6 +385,8 @@ class Problem:
         except Exception as error:  # a user's loss
             return replace(trial, cost=math.inf, error=error)
         cost += prior if self.discounts is None else float(self.discounts[0]) * prior
+        if self.hold is not None:
+            cost += self._hold_cost(trial.trajectory)
         return replace(trial, weights=weights, cost=cost + trial.penalty)
 
     def failure(self, trial: Trial) -> str:
@@ -449,6 +469,27 @@ class Problem:
         weights = np.broadcast_to(np.abs(trial.weights), (len(sizes), *trial.weights.shape[-2:]))
         return float(np.einsum("ki,kij,kj->", sizes, weights, sizes))
 
+    def _hold_cost(self, trajectory: Array) -> float:
+        """What the hold adds to J."""
+        assert self.hold is not None
+        cost = self.hold.cost(trajectory[0])
+        return cost if self.discounts is None else float(self.discounts[0]) * cost
+
+    def hold_force(self, trajectory: Array) -> Array:
+        """Half the derivative (n,) of it by the first state; zeros where nothing is held."""
+        if self.hold is None:
+            return np.zeros_like(self.prior)
+        force = self.hold.force(trajectory[0])
+        return force if self.discounts is None else self.discounts[0] * force
+
+    def first_weight_at(self, offset: Array) -> Array:
+        """Weight (n, n) of the first state: the prior's of `prior_weight_at`, and the hold's."""
+        weight = self.prior_weight_at(offset)
+        if self.hold is None:
+            return weight
+        held = self.hold.whole
+        return weight + (held if self.discounts is None else self.discounts[0] * held)
+
     def prior_weight_at(self, offset: Array) -> Array:
         """Weight (n, n) of the form that majorises the prior's cost where x_0 - prior = offset."""
         weight, formulation = self.prior_weight, self._formulation
@@ -456,11 +497,11 @@ class Problem:
             weight = formulation.cost.majorise_prior(offset, weight)
         return weight if self.discounts is None else self.discounts[0] * weight
 
-    def prior_band_at(self, offset: Array) -> Array:
-        """The same weight as a band panel."""
+    def first_band_at(self, offset: Array) -> Array:
+        """`first_weight_at` as a band panel."""
         if self._formulation.quadratic and self.discounts is None:
             return self._prior_band
-        return band_of(self.prior_weight_at(offset))
+        return band_of(self.first_weight_at(offset))
 
 
 class Solved(NamedTuple):

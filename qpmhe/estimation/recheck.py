@@ -79,7 +79,7 @@ def _comparisons(
     cost = window._evaluate_costs(r[None], weight)[0]
     size = np.abs(r).dot(np.abs(weight)).dot(np.abs(r)) if window._quadratic else cost
     yield "cost", loaded._stage_costs[k], cost, size
-    if not (terms and (window._with_terms or window._quadratic)):
+    if not (terms and (window.has_terms or window._quadratic)):
         return
     jacobian, weight = mine.linear[k, :, 1:], window._majorising_weights[k]
     size = np.nan_to_num(np.abs(jacobian)).max(axis=1, keepdims=True)

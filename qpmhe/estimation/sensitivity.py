@@ -147,8 +147,11 @@ class _Point:
         self.reductions = _reductions(solved)
         self.jacobian = _jacobian(problem, self.trajectory[:-1])
         self.prior_weight, self.offset = problem.prior_weight, problem.offset(self.trajectory)
-        self.prior_majorised = 2.0 * problem.prior_weight_at(self.offset)
-        self.prior_force = self.prior_majorised @ self.offset
+        prior = 2.0 * problem.prior_weight_at(self.offset)
+        # What is held has its weight and its value before the step: both are data.
+        self.first_force = prior @ self.offset + 2.0 * problem.hold_force(self.trajectory)
+        self.first_majorised = 2.0 * problem.first_weight_at(self.offset)
+        self.first_held = self.first_majorised - prior
         self.prior_bent = self.factors[0] * self.cost.prior_hessian(self.offset, self.prior_weight)
         self.majorised = np.broadcast_to(2.0 * trial.weights, (count, *trial.weights.shape[-2:]))
         self.cost_forces = np.einsum("kij,kj->ki", self.majorised, self.residuals)
@@ -161,7 +164,7 @@ class _Point:
         self.curvature = second.at(self.trajectory[:-1], inputs, forces)
         bent = self.factors[1:, None, None] * self.cost.stage_hessian(self.residuals, self.weights)
         self.bent = bent + self.rows.penalty_bent
-        own, below = self._blocks(self.prior_bent, self.bent)
+        own, below = self._blocks(self.prior_bent + self.first_held, self.bent)
         own[:-1] -= self.curvature.own
         own += self.rows.curvature(second.scales)
         if not all(np.isfinite(one).all() for one in (own, below, *self.curvature)):
@@ -178,7 +181,7 @@ class _Point:
     def gradient(self, multipliers: Array) -> Array:
         """The derivative (K + 1, n) of L by the states."""
         found = self.rows.on_states(multipliers) + self.rows.penalty_on_states
-        found[0] += self.prior_force
+        found[0] += self.first_force
         return found + self.of_states(self.forces(multipliers))
 
     def of_states(self, forces: Array) -> Array:
@@ -196,7 +199,7 @@ class _Point:
 
     def regular(self) -> tuple[Array, Array]:
         """The blocks of the Gauss-Newton Hessian, which is positive definite."""
-        return self._blocks(self.prior_majorised, self.majorised + self.rows.penalty_bent)
+        return self._blocks(self.first_majorised, self.majorised + self.rows.penalty_bent)
 
     def _blocks(self, prior: Array, bent: Array) -> tuple[Array, Array]:
         """Diagonal blocks (K + 1, n, n), and those below them (K, n, n)."""
@@ -214,7 +217,7 @@ class _Point:
         # The prior has the age of the window, the newest state the age of the newest stage.
         ages = np.append(np.arange(len(self.residuals) - 1, -1, -1.0), 0.0) / self.cost.discount
         states = ages[:, None] * self.rows.penalty_on_states
-        states[0] += len(self.residuals) / self.cost.discount * self.prior_force
+        states[0] += len(self.residuals) / self.cost.discount * self.first_force
         return states, ages[:-1, None] * (self.cost_forces + self.rows.penalty_forces)
 
 

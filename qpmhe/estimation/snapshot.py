@@ -38,6 +38,8 @@ def described(
         "candidate": settings.candidate, "arrival": settings.arrival, "sampling time": system.dt,
     }
     _describe("disturbance_matrix", system.disturbance_matrix, found)
+    if system.held:
+        found["hold"] = np.array(list(system.held.items()))
     if settings.parameters:
         found["number of parameters"] = len(settings.parameters)
     for name in SET_NAMES:

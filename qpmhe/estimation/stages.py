@@ -35,6 +35,7 @@ class Mark(NamedTuple):
     unusual: bool
     own: dict[int, Conditions]
     smoothed_prior: Array | None
+    trusted: Array | None
     metric: tuple[Array, bool] | None
     arrays: dict[str, Array] | None
 
@@ -113,6 +114,9 @@ class Stages:
         self.metric: ErrorMetric | None = None
         #: Prior mean in place of z(t-N), with ``arrival="smoothed"``; replaced, never changed.
         self.smoothed_prior: Array | None = None
+        #: Trusted values of held parameters, (2, k): of this window, and of the next; replaced,
+        #: never changed. None where none is held.
+        self.trusted: Array | None = None
         self.time = 0  # number of samples pushed: the window ends at x(time)
         self.start = self.end = 0
         # Time up to which running observers have taken the samples; -1 makes them start again.
@@ -253,7 +257,7 @@ class Stages:
         """What `roll_back` needs; all stages if ``whole``."""
         return Mark(
             self.start, self.end, self.time, self.unusual,
-            self._own.copy() if self._own else {}, self.smoothed_prior,
+            self._own.copy() if self._own else {}, self.smoothed_prior, self.trusted,
             None if self.metric is None else self.metric.state,
             self._copies() if whole else None,
         )
@@ -263,6 +267,7 @@ class Stages:
         self._advanced_to = -1
         self.start, self.end, self.time = mark.start, mark.end, mark.time
         self._own, self.smoothed_prior = mark.own, mark.smoothed_prior
+        self.trusted = mark.trusted
         if self.metric is not None and mark.metric is not None:
             self.metric.state = mark.metric
         if mark.arrays is not None:
@@ -281,6 +286,7 @@ class Stages:
             "earlier_covariance": None if covariance is None else covariance.copy(),
             "time": self.time,
             "smoothed_prior": None if self.smoothed_prior is None else self.smoothed_prior.copy(),
+            "trusted": None if self.trusted is None else self.trusted.copy(),
             "own": {time: own.state_dict() for time, own in self._own.items()},
             "metric": metric and (metric[0].copy(), metric[1]),
         }
@@ -308,6 +314,8 @@ class Stages:
         self._earlier_state = checked_array("earlier", state["earlier"], self._earlier_state.shape)
         if (prior := state["smoothed_prior"]) is not None:
             self.smoothed_prior = checked_array("smoothed_prior", prior, self._earlier_state.shape)
+        if self.trusted is not None:
+            self.trusted = checked_array("trusted", state["trusted"], self.trusted.shape)
         if self._covariances is not None:
             saved, shape = state["earlier_covariance"], self._covariances.shape[1:]
             self._earlier_covariance = checked_array("earlier_covariance", saved, shape)

@@ -222,7 +222,7 @@ class Subproblem:
         offset = self._no_offset if at_prior else trial.trajectory[0] - problem.prior
         if problem.wraps and not at_prior:
             offset = problem.offset(trial.trajectory)
-        prior_band = problem.prior_band_at(offset)
+        prior_band = problem.first_band_at(offset)
         if prior_band is not self._prior_band:
             self._added_bands[0] = self._prior_band = prior_band
         gradient_first, gradient_rest, gradient_last, band_rest, band_last = self._views
@@ -232,6 +232,8 @@ class Subproblem:
         gradient_first[...] = span.gradient_first
         if not at_prior:
             gradient_first += problem.prior_weight_at(offset).dot(offset)
+        if problem.hold is not None:
+            gradient_first += problem.hold_force(trial.trajectory)
         gradient_last[...] = span.next_gradient_last
         self._minus_jacobian = span.minus_jacobian
         slopes = None

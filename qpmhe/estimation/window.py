@@ -17,6 +17,7 @@ from ..observers import Observer, Sample
 from ..observers.projection import ErrorMetric, NearestPoint
 from .conditions import USUAL, Conditions
 from .estimate import Status
+from .hold import WindowHold
 from .limits import LARGEST
 from .linearization import Stage
 from .running import RunningObservers
@@ -61,13 +62,17 @@ class Window(Stages):
     ) -> None:
         n, p, m = system.n, system.p, system.m
         self._system, self._observer, self._cost = system, observer, cost
-        self._n, self._m, self._with_terms = n, m, with_terms
+        #: Whether the stages have the terms of QPs.
+        self.has_terms: bool = with_terms
+        self._n, self._m = n, m
         self._quadratic = cost.quadratic
         self._with_jacobians = with_terms or observer.needs_jacobians
         super().__init__(
             n, p, m, horizon, initial_state, observer.initial_covariance(), cost.stage_weight,
             cost.quadratic, system.dt or 0.0, len(observer.sensors),
         )
+        self._held = list(system.held)
+        self.trust_start()
         self._sample = Sample(system, np.zeros(m))
         self._usual = usual
         self._filled: Conditions | None = None  # those that are in the sample now
@@ -143,6 +148,8 @@ class Window(Stages):
             self.make_room()
         moves = self.projects and self.moves_state(own)
         failed = moves and self.time > 0 and self.newest_failed
+        if self.trusted is not None:
+            self.trusted = self.trusted[[1, 1]]
         k, m, time = self.end, self._m, self.time
         self.end, self.time = k + 1, time + 1
         view = self._stage_views[k]
@@ -223,7 +230,7 @@ class Window(Stages):
         if self._rejections is not None:
             self._rejections[0] = kept["rejections"][0]
         self._earlier_state, self._earlier_covariance = other._last_good(other.start)
-        self.smoothed_prior = other.smoothed_prior
+        self.smoothed_prior, self.trusted = other.smoothed_prior, other.trusted
         if self.metric is not None and other.metric is not None:
             self.metric.state = other.metric.state
         self._own = {time: own.without(changes) for time, own in other._own.items()}
@@ -286,7 +293,7 @@ class Window(Stages):
                 view.costs[...] = checked = self.terms.set_all(self.length, weights, self.start)
             else:
                 view.costs[...] = checked = self._evaluate_costs(residuals, read_only(weights))
-                if self._with_terms:
+                if self.has_terms:
                     weights = self._majorise(residuals, read_only(weights))
                     self._majorising_weights[self.start : self.end] = weights
                     checked = checked + self.terms.set_all(self.length, weights, self.start)
@@ -312,7 +319,7 @@ class Window(Stages):
         if model_failed:
             self._fill_failed(k)
         self._stage_costs[k] = cost
-        jacobian_failed = not model_failed and self._with_terms and not self._jacobians_finite
+        jacobian_failed = not model_failed and self.has_terms and not self._jacobians_finite
         if (model_failed or jacobian_failed) and not self.failure:
             what = "the model, the observer or the cost" if model_failed else "a Jacobian"
             self.failure = f"{what} is not finite at x = {self._stage_views[k].z.tolist()}."
@@ -554,13 +561,13 @@ class Window(Stages):
             cost = float(self._evaluate_costs(residual[None], weight)[0])
             if not math.isfinite(cost):
                 return math.inf
-            if self._with_terms and not self._quadratic:
+            if self.has_terms and not self._quadratic:
                 self._majorising_weights[k] = self._majorise(residual[None], weight)[0]
                 weight = self._majorising_weights[k]
         except Exception as error:  # a user's loss
             self.failure = raised("the cost", error, self._stage_views[k].z)
             return math.inf
-        if self._with_terms:
+        if self.has_terms:
             jacobian = stage.linear[:, 1:].ravel()
             # Terms that overflow with finite Jacobians go into the QP, which then fails.
             cost_of_terms = terms.set_stage(stage, weight)
@@ -580,7 +587,7 @@ class Window(Stages):
         stage = self._stage_views[k].terms
         stage.linear[:, 0], stage.linear[:, 1:] = 0.0, self._minus_stand_in
         self._majorising_weights[k] = self._weights[k]
-        if self._with_terms:
+        if self.has_terms:
             self.terms.set_stage(stage, self._weights[k])
 
     @property
@@ -588,6 +595,18 @@ class Window(Stages):
         """z(t), the observer's newest state: a view."""
         newest: Array = self._z[self.end]
         return newest
+
+    def trust_start(self) -> None:
+        """Trust the initial state's values of the parameters that are held."""
+        if self._held:
+            self.trusted = np.tile(self._z[0, self._held], (2, 1))
+
+    def trust(self, hold: WindowHold, trajectory: Array | None) -> None:
+        """Let the next window's trusted values follow an estimate; None leaves them."""
+        following = hold.target
+        if trajectory is not None:
+            following = hold.followed(trajectory[int(self.length == self.horizon)])
+        self.trusted = np.stack((hold.target, following))
 
     def restart(self, state: Array) -> None:
         """Set z(t), the observer's newest state, after a failed stage."""

@@ -40,7 +40,9 @@ class Augmentation:
     """
 
     def __init__(self, n: int, m: int, constants: Array, moved: Index) -> None:
-        self._n, self.m, self._constants, self._moved = n, m, constants, moved
+        #: Number of states x, and of inputs u.
+        self.x, self.m = n, m
+        self._constants, self._moved = constants, moved
         #: Number of states z.
         self.n = n + moved.size
 
@@ -59,7 +61,7 @@ class Augmentation:
         ``join`` makes one column of several and of single entries. With a ``factor``, this
         multiple of s stands behind the value.
         """
-        n = self._n
+        n = self.x
 
         def evaluate(z: Any, u: Any = ()) -> Any:
             value = function(z[:n], join(*self.inputs(u, z[n:])))
@@ -69,7 +71,7 @@ class Augmentation:
 
     def over_leading(self, function: BatchedFunction, factor: float | None = None) -> Trusted:
         """The same of a NumPy function, over leading dimensions."""
-        n, m, constants, moved = self._n, self.m, self._constants, self._moved
+        n, m, constants, moved = self.x, self.m, self._constants, self._moved
         size, inputs = function.shape[0], self.m + self._constants.size
         nothing: Array = np.zeros(0)
 
@@ -95,11 +97,14 @@ def augmented(system: System, change: Augmentation, **options: Unpack[SystemOpti
             "take over; leave them out, or write the augmented model as functions of a System."
         )
     if system.make_augmented is not None:
-        return system.make_augmented(change, options)
-    return System(
-        change.over_leading(system.f, 1.0), change.over_leading(system.h),
-        n=change.n, p=system.p, m=change.m, **options,
-    )
+        found = system.make_augmented(change, options)
+    else:
+        found = System(
+            change.over_leading(system.f, 1.0), change.over_leading(system.h),
+            n=change.n, p=system.p, m=change.m, **options,
+        )
+    found.held = dict(system.held)
+    return found
 
 
 def chosen(name: str, given: ArrayLike | None, size: int, kind: str) -> Index:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qpmhe_solvers.values import shown
+from qpmhe_solvers.values import finite, shown
 
 from .._checks import dimension, flag, numbers
 from ..errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
@@ -40,6 +40,7 @@ def augment_parameters(
     disturbances: ConvexSet | None = None,
     noises: ConvexSet | None = None,
     parameter_bounds: ConvexSet | None = None,
+    hold: ArrayLike | Mapping[int, float] | None = None,
 ) -> System:
     r"""The system whose state is the model's state together with its unknown constants.
 
@@ -90,6 +91,10 @@ def augment_parameters(
     parameter_bounds : Box or Polytope, optional
         Where the estimated parameters are, in their order. The model is also tried out
         within these bounds, which helps where it is not defined everywhere.
+    hold : float, array_like or mapping, optional
+        Within how many deviations of its prior an estimated parameter is held at its last trusted
+        value while the window does not see it, such as 0.1: one number for all, one for each, or
+        a mapping from the indices of some to theirs. Nothing is held if left out. See Notes.
 
     Returns
     -------
@@ -102,13 +107,34 @@ def augment_parameters(
     ------
     InvalidInputError, ShapeError
         If a parameter has no finite nominal value, ``estimated`` does not name parameters, or a
-        system has fewer inputs than there are parameters.
+        system has fewer inputs than there are parameters; if ``hold`` is not positive, or is of a
+        parameter that is not estimated.
     ModelError
         If a function does not take the arguments above, or returns a wrong shape.
     SetError
         If a set has the wrong dimension, or a nominal value is outside of its bounds.
     OptionError
         If a size, dt or the method is out of range, or given with a system or without dt.
+
+    Notes
+    -----
+    Data without excitation say nothing about some parameters. An estimate then follows the
+    observer, which noise leads astray, or falls back to the nominal value; with a disturbance so
+    small that neither happens, it is too stiff to follow a change later on.
+
+    With ``hold``, J has one more term :math:`|\theta_0 - \bar\theta|_H^2`, on the parameters at
+    the start of the window. Its weight H and the trusted value :math:`\bar\theta`, at first the
+    nominal one, are fixed before each step, and the candidate's J has the same term: so
+    J(estimate) <= J(candidate) is a statement about one function. What a window sees is measured
+    by the singular values of its Gauss-Newton matrix in deviations of the first prior, as in
+    `Diagnosis`, with the other states eliminated. A direction with a singular value up to 1, of
+    which the data say no more than that prior, is held fully; above, its weight falls as the
+    inverse square, and the trusted value follows the estimate. See `WindowHold`.
+
+    The observer is not held: it stays the one that the theorem is about, but the theorem does not
+    cover this term. Kalman-type observers need no more than a disturbance of the parameter that
+    lets them follow changes; that their covariance grows while the parameter is unseen then
+    speeds recovery up.
 
     Examples
     --------
@@ -127,10 +153,12 @@ def augment_parameters(
     """
     values = _nominal(nominal)
     moved = chosen("estimated", estimated, values.size, "parameter")
+    held = _held(hold, moved)
     arguments = {
         "f": f, "h": h, "nominal": values, "n": n, "p": p, "m": m, "estimated": moved,
         "drifting": drifting, "dt": dt, "method": method, "states": states,
         "disturbances": disturbances, "noises": noises, "parameter_bounds": parameter_bounds,
+        "hold": hold,
     }
     if isinstance(f, System):
         n, p, m = f.n, f.p, _other_inputs(arguments, values.size)
@@ -161,6 +189,7 @@ def augment_parameters(
         probes = _probes(probe_points(states, n, m), values, moved, parameter_bounds)
         functions = _function("f", f, n, m, probes), _function("h", h, p, m, probes)
         system = _of_functions(change, *functions, dt, method, options)
+    system.held |= {change.x + place: within for place, within in held.items()}
     system.recipe = augment_parameters, arguments
     return system
 
@@ -210,6 +239,41 @@ def _nominal(given: ArrayLike) -> Array:
             "number. A poor guess will do, with a small prior weight."
         )
     return values
+
+
+def _held(hold: ArrayLike | Mapping[int, float] | None, moved: Index) -> dict[int, float]:
+    """Within how many deviations of the prior a parameter is held, by its place in ``moved``."""
+    if hold is None:
+        return {}
+    if isinstance(hold, Mapping):
+        places = {int(j): place for place, j in enumerate(moved)}
+        for j in hold:
+            if isinstance(j, (bool, np.bool_)) or j not in places:
+                raise InvalidInputError(
+                    f"hold has the key {shown(j)}, which is no estimated parameter; expected "
+                    f"indices among {moved.tolist()}. To hold parameter {shown(j)}, name it in "
+                    "estimated, too."
+                )
+        found = {places[int(j)]: within for j, within in hold.items()}
+    elif isinstance(hold, (bool, np.bool_)):
+        found = {0: hold}
+    else:
+        given = numbers("hold", hold, finite=False)
+        if given.shape not in ((), moved.shape):
+            raise ShapeError(
+                f"hold has shape {given.shape}; expected one number, or {moved.shape}, one for "
+                "each estimated parameter, or a mapping from some of their indices."
+            )
+        found = dict(enumerate(np.broadcast_to(given, moved.shape).tolist()))
+    for within in found.values():
+        size = finite(within)
+        if size is None or size <= 0.0:
+            raise InvalidInputError(
+                f"hold is {shown(within)}; expected numbers above 0, in deviations of the "
+                "parameter's prior, such as 0.1. For a parameter that is not to be held, leave it "
+                "out of a mapping."
+            )
+    return {place: float(within) for place, within in found.items()}
 
 
 def _check_bounds(bounds: ConvexSet | None, nominal: Array) -> None:

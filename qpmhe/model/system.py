@@ -218,6 +218,9 @@ class System:
         if scales is not None:
             self._give_scales(scales)
         # What follows is set by the functions that make systems: `from_ode` and the adapters.
+        #: Parameters among the states that a window without information on them holds, by index:
+        #: within how many deviations of the prior.
+        self.held: dict[int, float] = {}
         #: Sampling time of a discretised ODE; None for a discrete-time model.
         self.dt: float | None = None
         #: Evaluates f, h and their Jacobians in one call, where the model can.

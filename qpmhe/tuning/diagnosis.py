@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from .._checks import positive
 from ..errors import InvalidInputError, OptionError, ShapeError
+from ..estimation.observability import Observability
 from ..estimation.run import Run, RunSource
 from .examination import Correlations, Examination
 from .findings import Finding, Names
-from .observability import Observability
 
 Array = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from scipy.stats import chi2
 from .._linalg import inverse
 from ..costs import RobustCost
 from ..estimation.estimate import Status
+from ..estimation.observability import observability, prior_shares, prior_units
 from ..estimation.run import Run, RunSource
 from ..model.residuals import difference
 from .faults import Fault, search
 from .filter_bank import FilterBank, Filtered, Hypothesis
 from .findings import Finding, Names, describe, listed, number, percent
-from .observability import observability, prior_shares, prior_units
 from .stuck import at_end_of_range, comes_back, is_dead, is_rounded, longest_repetition
 
 Array = NDArray[np.float64]

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 import qpmhe
 from qpmhe.cli.app import app
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError
+from qpmhe.estimation.observability import prior_shares
 from qpmhe.tuning import observability
 from qpmhe.tuning.filter_bank import FilterBank, Hypothesis
-from qpmhe.tuning.observability import prior_shares
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "studies"))
 

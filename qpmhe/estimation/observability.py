@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,17 +55,30 @@ def observability(
     horizon : int
         N <= T.
     """
-    total, n = transitions.shape[:2]
-    windows, eye = total - horizon + 1, np.eye(n)
-    matrices = np.zeros((windows, n, n))
-    for k in range(horizon - 1, -1, -1):
-        a = transitions[k : k + windows]
-        later = np.linalg.solve(eye + matrices @ disturbance, matrices)
-        matrices = information[k : k + windows] + a.transpose(0, 2, 1) @ later @ a
-        matrices = 0.5 * (matrices + matrices.transpose(0, 2, 1))
+    windows = len(transitions) - horizon + 1
+    a, seen = (
+        [one[k : k + windows] for k in range(horizon)] for one in (transitions, information)
+    )
+    matrices = window_information(a, seen, disturbance)
     root, _ = prior_units(prior)
     values, directions = np.linalg.eigh(root.T @ matrices @ root)
     return Observability(matrices, np.maximum(values, 0.0), directions)
+
+
+def window_information(
+    transitions: Sequence[Array] | Array, information: Sequence[Array] | Array, disturbance: Array
+) -> Array:
+    """What the data of windows say about their first states, (..., n, n).
+
+    ``transitions`` and ``information`` are, stage by stage, those of `observability`, (..., n, n).
+    """
+    eye = np.eye(len(disturbance))
+    found = np.zeros_like(information[0])
+    for k in range(len(transitions) - 1, -1, -1):
+        later = np.linalg.solve(eye + found @ disturbance, found)
+        found = information[k] + transitions[k].swapaxes(-1, -2) @ later @ transitions[k]
+        found = 0.5 * (found + found.swapaxes(-1, -2))
+    return found
 
 
 def prior_shares(

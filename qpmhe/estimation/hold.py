@@ -1,0 +1,145 @@
+"""Parameters held at their last trusted values where a window does not see them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .._linalg import cholesky, inverse
+from .observability import prior_units, window_information
+
+Array = NDArray[np.float64]
+
+
+class Hold:
+    r"""What holds the parameters of all windows, in deviations of the first prior.
+
+    The window's data add :math:`\Lambda` to what the first prior, of covariance :math:`\Pi`, says
+    of the window's first state. Of the held parameters, :math:`\theta = L \eta` with
+    :math:`\Pi_{\theta\theta} = L L^\top`, this leaves the share
+
+    .. math::
+        E = L^{-1} \left[(\Pi^{-1} + \Lambda)^{-1}\right]_{\theta\theta} L^{-\top}
+        = V \operatorname{diag}\Big(\frac{1}{1 + s_i}\Big) V^\top
+
+    of the prior's variance: :math:`s_i` is the singular value of direction i, with the other
+    states eliminated. See `WindowHold` for what is done with them.
+
+    Parameters
+    ----------
+    held : mapping
+        By the index of a state, within how many deviations of the prior it is held.
+    prior : (n, n) array
+        Covariance of the initial error.
+    basis : (n, r) array
+        The directions in which there are disturbances.
+    disturbance : (n, n) array
+        Weight of the disturbances.
+    """
+
+    def __init__(
+        self, held: Mapping[int, float], prior: Array, basis: Array, disturbance: Array
+    ) -> None:
+        #: Which states are held.
+        self.components = components = np.array(list(held), np.intp)
+        self.stiffness: Array = 1.0 / np.array(list(held.values()))
+        #: Of all states; the matrices below are in these.
+        self.deviations: Array = np.sqrt(prior.diagonal())
+        scaled = prior / np.multiply.outer(self.deviations, self.deviations)
+        self.root, _ = prior_units(scaled)
+        self.units, self.inverse_units = prior_units(prior[np.ix_(components, components)])
+        rows = self.deviations[components, None] * self.root[components]
+        self.pick: Array = self.inverse_units @ rows
+        spread = cholesky(inverse(basis.T @ disturbance @ basis)) if basis.size else basis.T @ basis
+        spread = basis @ spread / self.deviations[:, None]
+        self.spread: Array = spread @ spread.T
+
+    def of_window(self, minus_jacobian: Array, noise: Array, trusted: Array) -> WindowHold:
+        """The hold of a window.
+
+        Parameters
+        ----------
+        minus_jacobian : (K, n + p, n) array
+            Along the candidate, of f and h.
+        noise : (p, p) or (K, p, p) array
+            Weights of the noise, zero for what is missing.
+        trusted : (k,) array
+            The last trusted values.
+        """
+        n, eye = self.deviations.size, np.eye(self.components.size)
+        jacobian = minus_jacobian * -self.deviations
+        a, c = jacobian[:, :n] / self.deviations[:, None], jacobian[:, n:]
+        seen = c.transpose(0, 2, 1) @ noise @ c
+        values, vectors = np.zeros(self.components.size), eye
+        try:
+            matrix = self.root.T @ window_information(a, seen, self.spread) @ self.root
+            left = self.pick @ np.linalg.solve(np.eye(n) + matrix, self.pick.T)
+            left, vectors = np.linalg.eigh(0.5 * (left + left.T))
+            values = (1.0 - left) / np.maximum(left, 0.0)
+        except np.linalg.LinAlgError:  # numbers beyond all measure: nothing is seen
+            values, vectors = np.zeros(self.components.size), eye
+        return WindowHold(self, values, vectors, trusted)
+
+
+class WindowHold:
+    r"""The hold of one window, fixed before its step.
+
+    With :math:`\varphi_i = \min(1, s_i^{-2})`, J of every trajectory, the candidate's too, has the
+    term :math:`|\theta_0 - \bar\theta|_H^2`, which is discounted as the prior is, with
+
+    .. math::
+        H = L^{-\top} D^{-1} V \operatorname{diag}(\varphi) V^\top D^{-1} L^{-1}
+
+    for the deviations D. What the data see no better than the first prior is held fully; what
+    they see well is free, and there the trusted value follows the estimate:
+
+    .. math::
+        \bar\theta^+ = \bar\theta
+        + L\, V \operatorname{diag}(1 - \varphi) V^\top L^{-1} (\hat\theta - \bar\theta)
+
+    Attributes
+    ----------
+    components : (k,) array of int
+        The states that are held.
+    target : (k,) array
+        The trusted values, in the parameters' units.
+    values : (k,) array
+        Singular values s, the best seen direction first.
+    shares : (k,) array
+        By how much of the full hold each parameter is held: 0 where the window sees it well, 1
+        where it does not.
+    weight : (k, k) array
+        H.
+    """
+
+    def __init__(self, hold: Hold, values: Array, vectors: Array, target: Array) -> None:
+        self.components, self.target, self.values = hold.components, target, values
+        # Whatever is not a number above 1 is not seen.
+        held = np.where(values > 1.0, 1.0 / np.square(np.where(values > 1.0, values, 1.0)), 1.0)
+        inner = (vectors * held) @ vectors.T
+        self.shares: Array = inner.diagonal().copy()
+        stiff = hold.inverse_units.T * hold.stiffness
+        self.weight: Array = stiff @ inner @ stiff.T
+        self._follow = hold.units @ (np.eye(held.size) - inner) @ hold.inverse_units
+        n = hold.deviations.size
+        #: H among the weights of all states (n, n).
+        self.whole: Array = np.zeros((n, n))
+        self.whole[np.ix_(self.components, self.components)] = self.weight
+
+    def cost(self, first: Array) -> float:
+        """The term of a trajectory's first state."""
+        offset = first[self.components] - self.target
+        return float(offset.dot(self.weight).dot(offset))
+
+    def force(self, first: Array) -> Array:
+        """Half the derivative (n,) of the term."""
+        found = np.zeros(len(self.whole))
+        found[self.components] = self.weight.dot(first[self.components] - self.target)
+        return found
+
+    def followed(self, estimate: Array) -> Array:
+        """The trusted values after an estimate (n,) of the next window's first state."""
+        moved: Array = self.target + self._follow.dot(estimate[self.components] - self.target)
+        return moved
