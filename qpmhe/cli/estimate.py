@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from ..errors import InvalidInputError, OptionError
+from ..errors import InvalidInputError, ModelError, OptionError
+from . import options
 from .values import read_box, read_numbers, read_state, with_arguments
 
 if TYPE_CHECKING:
@@ -19,10 +20,7 @@ if TYPE_CHECKING:
 
 
 def estimate(
-    model: Annotated[
-        str,
-        typer.Argument(help="Model of the zoo, package.module:function or file.py:function."),
-    ],
+    model: options.Model,
     record: Annotated[
         str,
         typer.Argument(help="CSV (also .gz) or Parquet file with a time column; - is standard "
@@ -31,14 +29,10 @@ def estimate(
     out: Annotated[
         str, typer.Option(help="What to write: .csv, .parquet, or - for standard output.")
     ] = "-",
-    time: Annotated[str | None, typer.Option(help="Column of the time.")] = None,
-    outputs: Annotated[
-        str | None, typer.Option(help="Columns of the outputs: y1=COLUMN,y2=COLUMN.")
-    ] = None,
-    inputs: Annotated[
-        str | None, typer.Option(help="Columns of the inputs: u1=COLUMN,u2=COLUMN.")
-    ] = None,
-    horizon: Annotated[int | None, typer.Option(help="N; default is the model's.")] = None,
+    time: options.Time = None,
+    outputs: options.Outputs = None,
+    inputs: options.Inputs = None,
+    horizon: options.Horizon = None,
     backend: Annotated[str | None, typer.Option(help="QP backend.")] = None,
     max_qps: Annotated[
         str | None, typer.Option(help="QPs per sample; 0 is the observer, none iterates to "
@@ -47,13 +41,8 @@ def estimate(
     max_solver_iterations: Annotated[
         str | None, typer.Option(help="Cap on the iterations inside each QP, or: none.")
     ] = None,
-    initial_state: Annotated[
-        str | None, typer.Option(help="Numbers between commas; default is the model's.")
-    ] = None,
-    engine: Annotated[
-        str | None,
-        typer.Option(help="python, compiled, or auto: compiled where qpmhe compile made it."),
-    ] = None,
+    initial_state: options.InitialState = None,
+    engine: options.Engine = None,
     weights: Annotated[
         Path | None,
         typer.Option(help="File of qpmhe tune: observer, cost, horizon and parameters of the "
@@ -95,18 +84,12 @@ def estimate(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an estimation that was interrupted.")
     ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace existing files.")
-    ] = False,
+    overwrite: options.Overwrite = False,
     checkpoint_every: Annotated[
         int | None, typer.Option(min=1, help="Samples between checkpoints; default 100.")
     ] = None,
-    dt: Annotated[
-        float | None, typer.Option(help="Usual step of a discrete-time model, in its time unit.")
-    ] = None,
-    time_scale: Annotated[
-        float, typer.Option(help="The record's unit of time in the model's.")
-    ] = 1.0,
+    dt: options.Step = None,
+    time_scale: options.TimeScale = 1.0,
     equal_steps: Annotated[
         bool,
         typer.Option("--equal-steps", help="Require equal steps; each row is written at once."),
@@ -142,23 +125,23 @@ def estimate(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
 ) -> None:
     """Estimate the states of a measured record; in a pipe, line by line."""
-    options: dict[str, Any] = {
+    given: dict[str, Any] = {
         name: value for name, value in locals().items() if value is not None
     }
     if max_qps is not None:
-        options["max_qps"] = _number("--max-qps", max_qps)
+        given["max_qps"] = _number("--max-qps", max_qps)
     if max_solver_iterations is not None:
-        options["max_solver_iterations"] = _number(
+        given["max_solver_iterations"] = _number(
             "--max-solver-iterations", max_solver_iterations
         )
     if initial_state is not None:
-        options["initial_state"] = read_state(initial_state)
-    bounds = {name: options.pop(name, None) for name in _OF_BOUND}
+        given["initial_state"] = read_state(initial_state)
+    bounds = {name: given.pop(name, None) for name in _OF_BOUND}
     if bound or any(value is not None for value in bounds.values()):
-        options["bound"] = bound_options(**bounds)
+        given["bound"] = bound_options(**bounds)
     if weights is not None:
-        options = _weighted(options)
-    run(Console(stderr=True), **options)
+        given = _weighted(given)
+    run(Console(stderr=True), **given)
 
 
 _OF_BOUND = ("bound_box", "bound_input_box", "initial_error", "max_disturbance", "max_noise")
@@ -181,15 +164,34 @@ def bound_options(
     )
 
 
-def _weighted(options: dict[str, Any]) -> dict[str, Any]:
+def _weighted(given: dict[str, Any]) -> dict[str, Any]:
     """The options, with what the file of weights says of observer, cost, model and horizon."""
-    from ..tuning import load
+    from ..models.loading import find
+    from ..records.record_model import load_system
+    from ..tuning import WeightsError, load
 
-    found = load(options.pop("weights"))
+    path, model = given.pop("weights"), given["model"]
+    found = load(path)
+    named = with_arguments(model, found.parameters)
+    remedy = f"make weights for this model: qpmhe tune {model} RECORD --out FILE."
+    try:
+        system = load_system(find(named))
+    except ModelError as error:
+        if not found.parameters:
+            raise
+        raise WeightsError(
+            f"{path} holds the parameters {', '.join(found.parameters)}, and with these "
+            f"{str(error).rstrip('.')}; {remedy}"
+        ) from error
+    sizes = [len(each) for each in (found.prior, found.disturbance, found.noise)]
+    if sizes != [system.n, system.r, system.p]:
+        raise WeightsError(
+            f"{path} holds weights of {sizes[0]} states, {sizes[1]} disturbances and {sizes[2]} "
+            f"outputs, and model {model!r} has {system.n}, {system.r} and {system.p}; {remedy}"
+        )
     return {
-        "horizon": found.horizon, **options,
-        "model": with_arguments(options["model"], found.parameters),
-        "observer": found.observer(), "cost": found.cost(),
+        "horizon": found.horizon, **given, "model": named, "observer": found.observer(),
+        "cost": found.cost(),
     }
 
 

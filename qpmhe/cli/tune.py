@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 
-from .._checks import Array, make_folder
-from ..errors import OptionError
-from ..models.loading import build, find
+from .._checks import make_folder
+from ..errors import OptionError, QpmheError
+from ..models.loading import ModelSource, find
+from . import options
 from .values import arguments_of, read_state, with_arguments
+
+if TYPE_CHECKING:
+    from ..records.record_model import RecordModel
+    from ..tuning import TuningRecord
 
 
 def tune(
-    model: Annotated[
-        str, typer.Argument(help="Model of the zoo, package.module:function or file.py:function.")
-    ],
+    model: options.Model,
     record: Annotated[
         list[str], typer.Argument(help="CSV (also .gz) or Parquet files with a time column.")
     ],
     out: Annotated[Path, typer.Option(help="What to write, a TOML file.")] = Path("weights.toml"),
-    horizon: Annotated[int | None, typer.Option(help="N; default is the model's.")] = None,
+    horizon: options.Horizon = None,
     structure: Annotated[
         Literal["diagonal", "scalar", "full"],
         typer.Option(help="What is tuned of the covariances of disturbance and noise."),
@@ -49,16 +55,10 @@ def tune(
     truth: Annotated[
         str | None, typer.Option(help="Columns of true states: x1=COLUMN,x2=COLUMN.")
     ] = None,
-    time: Annotated[str | None, typer.Option(help="Column of the time.")] = None,
-    outputs: Annotated[
-        str | None, typer.Option(help="Columns of the outputs: y1=COLUMN,y2=COLUMN.")
-    ] = None,
-    inputs: Annotated[
-        str | None, typer.Option(help="Columns of the inputs: u1=COLUMN,u2=COLUMN.")
-    ] = None,
-    initial_state: Annotated[
-        str | None, typer.Option(help="Numbers between commas; default is the model's.")
-    ] = None,
+    time: options.Time = None,
+    outputs: options.Outputs = None,
+    inputs: options.Inputs = None,
+    initial_state: options.InitialState = None,
     held_out: Annotated[float, typer.Option(help="Share of the blocks that judge.")] = 0.25,
     horizons: Annotated[
         str | None, typer.Option(help="Horizons to compare afterwards, between commas.")
@@ -66,81 +66,55 @@ def tune(
     starts: Annotated[int, typer.Option(min=1, help="Starts of the search.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the starts.")] = 0,
     jobs: Annotated[int, typer.Option(min=1, help="Starts at a time.")] = 1,
-    engine: Annotated[str | None, typer.Option(help="python, compiled, or auto.")] = None,
-    dt: Annotated[
-        float | None, typer.Option(help="Usual step of a discrete-time model, in its time unit.")
-    ] = None,
-    time_scale: Annotated[
-        float, typer.Option(help="The record's unit of time in the model's.")
-    ] = 1.0,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an existing file of weights.")
-    ] = False,
+    engine: options.Engine = None,
+    dt: options.Step = None,
+    time_scale: options.TimeScale = 1.0,
+    overwrite: options.Overwrite = False,
     picture: Annotated[
         Path | None, typer.Option(help="PNG of the weights and the held-out scores.")
     ] = None,
 ) -> None:
     """Choose the weights of an estimator from records; if it is stopped, the same call resumes."""
     from ..plots import save
-    from ..records.measurements import ColumnNames
     from ..records.record_model import load_record_model
-    from ..tuning import TuningRecord
     from ..tuning import tune as run
     from ..tuning.weights import covariances_of
 
-    console = Console()
     if out.exists() and not overwrite:
         raise OptionError(
             f"{out} exists already; give another --out, or replace it by --overwrite."
         )
     make_folder(out.parent)
-    wanted = _numbers("--horizons", horizons)
-    started = _parameters(parameter or [])
-    source = find(model)
-    named = with_arguments(source.name, started)
-    chosen: dict[str, Any] = {} if engine is None else {"engine": engine}
-    if horizon is not None:
-        chosen["horizon"] = horizon
-    if initial_state is not None:
-        chosen["initial_state"] = read_state(initial_state)
-    loaded = load_record_model(named, **chosen)
-    mhe = loaded.estimator
-    columns = ColumnNames(loaded.outputs, loaded.inputs, time, outputs, inputs)
-    count = len(loaded.states)
-    known = ColumnNames(
-        tuple(f"x{i + 1}" for i in range(count)), (), time,
-        None if truth is None else _truth_columns(truth, count), None,
+    wanted, started, source = _integers("--horizons", horizons), _starts(parameter), find(model)
+    given: dict[str, Any] = {
+        "engine": engine, "horizon": horizon,
+        "initial_state": None if initial_state is None else read_state(initial_state),
+    }
+    loaded = load_record_model(
+        with_arguments(source.name, started),
+        **{name: value for name, value in given.items() if value is not None},
     )
-    step = loaded.dt if dt is None else dt
-    records = []
-    for path in record:
-        y, u, lengths = _read(path, columns, mhe.system, step, time_scale)
-        states = None if truth is None else _read(path, known, mhe.system, step, time_scale)[0]
-        records.append(TuningRecord(y, u, states, lengths))
-    plan: Any = structure
-    if prior:
-        plan = {"prior": "scalar", "disturbance": structure, "noise": structure}
-    system: Any = mhe.system
-    if started:
-        def make(**parameters: float) -> Any:
-            made = build(replace(source, arguments=arguments_of(parameters)))
-            return made[0] if isinstance(made, (tuple, list)) else made.system
-
-        system = make
-    found = covariances_of(mhe.observer, mhe.cost)
+    mhe = loaded.estimator
+    records = [
+        _record(path, loaded, time, outputs, inputs, truth, dt, time_scale) for path in record
+    ]
     try:
-        tuning = run(
-            system, records, horizon=mhe.horizon, initial_state=mhe.initial_state, structure=plan,
-            prior=found["prior"], disturbance=found["disturbance"], noise=found["noise"],
-            parameters=started, threshold=threshold,
-            objective=objective, held_out=held_out, starts=starts, seed=seed, jobs=jobs,
-            names={"states": loaded.states, "outputs": loaded.outputs},
-            checkpoint=out.with_name(f"{out.name}.search"), progress=Console(stderr=True),
-            engine=mhe.settings.engine,
-        )
+        with _named_as_options():
+            tuning = run(
+                _maker(source) if started else mhe.system, records,
+                **covariances_of(mhe.observer, mhe.cost), horizon=mhe.horizon,
+                initial_state=mhe.initial_state, parameters=started, threshold=threshold,
+                structure={"prior": "scalar" if prior else None, "disturbance": structure,
+                           "noise": structure},
+                objective=objective, held_out=held_out, starts=starts, seed=seed, jobs=jobs,
+                names={"states": loaded.states, "outputs": loaded.outputs},
+                checkpoint=out.with_name(f"{out.name}.search"), progress=Console(stderr=True),
+                engine=mhe.settings.engine,
+            )
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted; the same command resumes.", highlight=False)
         raise
+    console = Console()
     console.print(str(tuning), highlight=False, markup=False, soft_wrap=True)
     for row in tuning.horizons(wanted) if wanted else ():
         console.print(
@@ -156,59 +130,54 @@ def tune(
     )
 
 
-def _read(
-    path: str, columns: Any, system: Any, usual: float | None, scale: float
-) -> tuple[Array, Array | None, Array | None]:
-    """Outputs, inputs and lengths of the steps of a file, gaps filled by missing samples."""
-    import numpy as np
+def _record(
+    path: str, loaded: RecordModel, time: str | None, outputs: str | None, inputs: str | None,
+    truth: str | None, dt: float | None, scale: float,
+) -> TuningRecord:
+    """A file, with true states where it has columns of these."""
+    from ..records.arrays import read_arrays
+    from ..records.measurements import ColumnNames
+    from ..tuning import TuningRecord
 
-    from ..records.measurements import RecordReader, seconds_between
-    from ..records.steps import Steps
+    system, step = loaded.estimator.system, loaded.dt if dt is None else dt
+    columns = ColumnNames(loaded.outputs, loaded.inputs, time, outputs, inputs)
+    y, u, lengths = read_arrays(path, columns, system, step, scale)
+    states = None
+    if truth is not None:
+        columns = ColumnNames(loaded.states, (), time, truth, option="truth")
+        states = read_arrays(path, columns, system, step, scale)[0]
+    return TuningRecord(y, u, states, lengths, name=path)
 
-    reader, steps = RecordReader(path, columns), Steps(system, usual=usual, scale=scale)
-    ys, us, lengths, before = [], [], [], None
+
+def _maker(source: ModelSource) -> Any:
+    from ..records.record_model import load_system
+
+    return lambda **parameters: load_system(replace(source, arguments=arguments_of(parameters)))
+
+
+@contextmanager
+def _named_as_options() -> Iterator[None]:
+    """Errors of `qpmhe.tune` with its arguments as options of the command."""
+    names = (
+        "held_out", "initial_state", "structure", "objective", "threshold", "horizon", "starts",
+        "seed", "jobs",
+    )
     try:
-        for sample in reader.samples():
-            if before is not None:
-                value = sample.time.value
-                size = abs(value) if isinstance(value, float) else 0.0
-                try:
-                    step = steps.between(seconds_between(before.time, sample.time), size)
-                except ValueError as error:
-                    raise reader.error(f"{error}.", sample.line) from error
-                for _ in range(step.inserted):
-                    ys.append(np.full(sample.y.size, np.nan))
-                    us.append(before.u)
-                lengths += [np.nan if step.length is None else step.length] * (step.inserted + 1)
-            ys.append(sample.y)
-            us.append(sample.u)
-            before = sample
-    finally:
-        reader.close()
-    if not ys:
-        raise reader.error("it has a header and no samples; expected a line for each.", None)
-    dt = np.array([*lengths, np.nan])
-    own = None
-    if np.isfinite(dt).any():
-        own = np.where(np.isfinite(dt), dt, steps.usual or np.nan)
-    return np.array(ys), np.array(us) if us[0].size else None, own
+        yield
+    except QpmheError as error:
+        text = str(error)
+        for name in names:
+            option = f"--{name.replace('_', '-')}"
+            text = re.sub(rf"\b{name}=(['\"]?)(\w[\w.]*)\1", rf"{option} \2", text)
+            text = re.sub(rf"\b{name}(?= is\b)", option, text)
+        text = re.sub(r"\bparameters\['(\w+)'\]", r"--parameter \1", text)
+        error.args = (text,)
+        raise
 
 
-def _truth_columns(truth: str, count: int) -> str:
-    """The columns of true states, with no column for states that the option does not name."""
-    named = {item.partition("=")[0].strip() for item in truth.split(",")}
-    states = [f"x{i + 1}" for i in range(count)]
-    if "=" not in truth or named - set(states):
-        raise OptionError(
-            f"--truth is {truth!r}; expected NAME=COLUMN between commas, with names of "
-            f"{', '.join(states)}."
-        )
-    return ",".join([truth, *(f"{name}=" for name in states if name not in named)])
-
-
-def _parameters(given: list[str]) -> dict[str, float]:
+def _starts(given: list[str] | None) -> dict[str, float]:
     found = {}
-    for item in given:
+    for item in given or []:
         name, equals, value = (part.strip() for part in item.partition("="))
         try:
             found[name] = float(value)
@@ -221,7 +190,7 @@ def _parameters(given: list[str]) -> dict[str, float]:
     return found
 
 
-def _numbers(option: str, text: str | None) -> list[int]:
+def _integers(option: str, text: str | None) -> list[int]:
     try:
         return [int(item) for item in text.split(",")] if text else []
     except ValueError:

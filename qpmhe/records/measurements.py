@@ -17,6 +17,10 @@ from ..errors import InvalidInputError, OptionError
 from .tables import RecordError, Row, open_table
 
 _TIMES = ("time", "t", "timestamp", "datetime", "date_time")
+# By option: the letter of its signals, and what one of them is.
+_KINDS = {
+    "outputs": ("y", "output"), "inputs": ("u", "input"), "truth": ("x", "true state"),
+}
 # "Voltage (V)", "Voltage [V]", "Voltage / V"
 _UNIT = re.compile(r"\s*(\([^()]*\)|\[[^\[\]]*\]|/\s*\S+)$")
 # An error shows so many names, and so much of each.
@@ -178,27 +182,33 @@ class Columns(NamedTuple):
 
 @dataclass(frozen=True)
 class ColumnNames:
-    """The model's names of y and u, and the options --time, --outputs and --inputs."""
+    """The model's names of y and u, and the options --time, --outputs and --inputs.
+
+    With ``option="truth"`` the true states stand in the place of the outputs; those without a
+    column have no truth.
+    """
 
     outputs: tuple[str, ...]
     inputs: tuple[str, ...]
     time: str | None = None
     output_columns: str | None = None
     input_columns: str | None = None
+    option: str = "outputs"
 
     def find(self, header: Sequence[str], file: str, line: int | None = None) -> Columns:
         """The columns in a header; RecordError where one is missing or ambiguous."""
         table = _Header([name.strip() for name in header], file, line)
         times = _TIMES if self.time is None else (self.time,)
         time = table.find(times, "the time", "name it by --time COLUMN.")
-        outputs = _find(table, "outputs", self.outputs, self.output_columns)
+        outputs = _find(table, self.option, self.outputs, self.output_columns)
         inputs = _find(table, "inputs", self.inputs, self.input_columns)
         if all(position < 0 for position in outputs):
-            raise OptionError("--outputs leaves all outputs out; expected a column for one.")
+            kind = _KINDS[self.option][1]
+            raise OptionError(f"--{self.option} leaves all {kind}s out; expected a column for one.")
         if time in (*outputs, *inputs):
             raise OptionError(
-                f"column {header[time]!r} is both the time and an output or input; choose a "
-                "different column for each by --time, --outputs and --inputs."
+                f"column {header[time]!r} is both the time and something else; choose a different "
+                f"column for each by --time, --{self.option} and --inputs."
             )
         return Columns(time, outputs, inputs)
 
@@ -206,7 +216,7 @@ class ColumnNames:
 def _find(
     table: _Header, option: str, names: tuple[str, ...], given: str | None
 ) -> tuple[int, ...]:
-    letter = "y" if option == "outputs" else "u"
+    letter, kind = _KINDS[option]
     chosen = _chosen(option, given, letter, names)
     found = []
     for i, name in enumerate(names):
@@ -214,12 +224,13 @@ def _find(
         remedy = f"name it by --{option} {letter}{i + 1}=COLUMN"
         if option == "outputs":
             remedy += f", or leave it out by --outputs {letter}{i + 1}= (no column)"
+        elif option == "truth":
+            remedy += ", or leave it out: then the state has no truth"
+            guesses = [""]
         elif chosen.get(i) == "":
             raise OptionError(f"--inputs gives no column for {name!r}; inputs are needed.")
         wanted = [chosen[i]] if i in chosen else guesses
-        found.append(
-            -1 if wanted == [""] else table.find(wanted, f"{option[:-1]} {name!r}", f"{remedy}.")
-        )
+        found.append(-1 if wanted == [""] else table.find(wanted, f"{kind} {name!r}", f"{remedy}."))
     return tuple(found)
 
 

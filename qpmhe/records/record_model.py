@@ -8,8 +8,9 @@ from typing import Any
 
 from ..errors import ModelError, OptionError, QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
+from ..model.system import System
 from ..models import Scenario
-from ..models.loading import build, check_parts, code_place, find
+from ..models.loading import ModelSource, build, check_parts, code_place, find
 
 _SIZES = {"states": "n", "outputs": "p", "inputs": "m"}
 _EXPECTED = (
@@ -78,6 +79,12 @@ def load_record_model(text: str, engine_at_work: str | None = None, **options: A
     return RecordModel(
         estimator, **names, dt=dt, identity=identity, time_unit=unit, scenario=scenario
     )
+
+
+def load_system(source: ModelSource) -> System:
+    """The system of a model alone."""
+    system: System = _parts(source.name, build(source))[0][0]
+    return system
 
 
 def _parts(name: str, made: Any) -> tuple[tuple[Any, ...], dict[str, Any]]:

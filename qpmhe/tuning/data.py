@@ -38,6 +38,8 @@ class TuningRecord:
         Length of each step, from t to t + 1, where they are not the sampling time.
     initial_state : (n,) array_like, optional
         The estimate of x(0); the one given to `qpmhe.tune` if left out.
+    name : str, optional
+        What messages call it, such as its file.
     """
 
     measurements: ArrayLike
@@ -45,6 +47,7 @@ class TuningRecord:
     states: ArrayLike | None = None
     dt: ArrayLike | None = None
     initial_state: ArrayLike | None = None
+    name: str | None = None
 
 
 class Data:
@@ -155,7 +158,7 @@ def checked_data(
                 f"records[{k}] is {shown(one)}; expected (Y,), (Y, U), (Y, U, X) or a "
                 "qpmhe.tuning.TuningRecord."
             )
-        found.append(Data(f"records[{k}]", made, system, inputs, start))
+        found.append(Data(made.name or f"records[{k}]", made, system, inputs, start))
     return found
 
 
@@ -192,7 +195,7 @@ def check_enough(data: list[Data], names: Sequence[str], noise: Sequence[int]) -
         if not seen[j]:
             raise InvalidInputError(
                 f"output {j + 1} is missing in all blocks that tune, so its noise cannot be tuned; "
-                "leave it out of the structure of the noise, as in structure={'noise': "
+                "take structure='scalar', name the others only, as in structure={'noise': "
                 "{'level': [0]}, 'disturbance': 'diagonal'}, or hold out other blocks."
             )
         values = [one.y[:, j][one.observed[:, j]] for one in data]

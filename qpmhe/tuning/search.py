@@ -51,13 +51,19 @@ class Checkpoint:
             return
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            if content["format"] != _FORMAT:
-                raise ValueError(f"its format is not {_FORMAT}")
             found, self.searches = content["identity"], dict(content["searches"])
-        except (OSError, KeyError, TypeError, ValueError) as error:
+            is_ours = content["format"] == _FORMAT
+        except OSError as error:
             raise TuningCheckpointError(
-                f"the checkpoint {path} cannot be read ({error}); remove it to start again."
+                f"cannot read the checkpoint {path}: {error.strerror or error}."
             ) from error
+        except (KeyError, TypeError, ValueError):
+            is_ours = False
+        if not is_ours:
+            raise TuningCheckpointError(
+                f"{path} is no checkpoint of this version of qpmhe.tune, or it is damaged; remove "
+                "it to start again, or name another file."
+            )
         if found != identity:
             raise TuningCheckpointError(
                 f"the checkpoint {path} is of another search: records, model or options differ. "

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .._checks import Array, checked_path, choice, dimension, numbers
 from .._linalg import inverse
@@ -164,7 +163,7 @@ def _reason(error: Exception) -> str:
     return str(error).rstrip(".")
 
 
-def covariances_of(observer: Observer, cost: Cost) -> dict[str, ArrayLike]:
+def covariances_of(observer: Observer, cost: Cost) -> dict[str, Any]:
     """The covariances that the weights of a cost stand for, to start from."""
     first = observer.initial_covariance()
     if not isinstance(cost.prior, ObserverPrior):

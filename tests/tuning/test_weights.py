@@ -9,8 +9,9 @@ from typer.testing import CliRunner
 
 import qpmhe
 from qpmhe.cli.app import app
-from qpmhe.errors import ModelError, OptionError
-from qpmhe.tuning import Weights, WeightsError, load
+from qpmhe.errors import InvalidInputError, ModelError, OptionError
+from qpmhe.records import RecordError
+from qpmhe.tuning import TuningCheckpointError, Weights, WeightsError, load
 
 MODEL = """
     import numpy as np
@@ -160,8 +161,12 @@ def test_truth_and_several_records(folder):
 
 
 @pytest.mark.parametrize(("arguments", "error", "text"), [
-    (["--truth", "position"], OptionError, "names of x1, x2"),
-    (["--truth", "x3=position"], OptionError, "names of x1, x2"),
+    (["--truth", "position"], OptionError, "--truth has 'position'.* a name of x1, x2"),
+    (["--truth", "x3=position"], OptionError, "--truth has 'x3=position'.* a name of x1, x2"),
+    (["--truth", "x1=WRONG"], RecordError, r"name it by --truth x1=COLUMN, or leave it out: then"),
+    (["--truth", "x1="], OptionError, "--truth leaves all true states out"),
+    (["--held-out", "0.9"], OptionError, r"--held-out is 0\.9"),
+    (["--parameter", "k=0"], InvalidInputError, "--parameter k starts at 0"),
     (["--parameter", "k"], OptionError, "NAME=START"),
     (["--horizons", "2;3"], OptionError, "--horizons"),
     (["--parameter", "q=1"], ModelError, "cannot be made"),
@@ -169,6 +174,35 @@ def test_truth_and_several_records(folder):
 def test_wrong_options(folder, arguments, error, text):
     with pytest.raises(error, match=text):
         call("tune", "model.py:make", "record.csv", *arguments)
+
+
+def test_messages_name_the_file_and_the_option(folder):
+    lines = (folder / "record.csv").read_text().splitlines()
+    (folder / "short.csv").write_text("\n".join(lines[:15]))
+    with pytest.raises(InvalidInputError, match=r"or give --held-out 0: then nothing"):
+        call("tune", "model.py:make", "short.csv")
+    with pytest.raises(InvalidInputError, match="take --structure scalar or groups"):
+        call("tune", "model.py:make", "short.csv", "--held-out", "0")
+    (folder / "blank.csv").write_text("time,y1,u1\n0,,1\n0.5,,1\n1,,1\n")
+    with pytest.raises(InvalidInputError, match=r"all measurements of blank\.csv are missing"):
+        call("tune", "model.py:make", "blank.csv")
+
+
+@pytest.mark.parametrize(("size", "parameters", "text"), [
+    (3, {}, "3 states, 3 disturbances and 1 outputs, and model 'model.py:make' has 2, 2 and 1"),
+    (2, {"mass": 2.0}, "holds the parameters mass, .*mass"),
+])  # fmt: skip
+def test_weights_of_another_model_are_named(folder, size, parameters, text):
+    Weights(np.eye(size), np.eye(size), np.eye(1), parameters=parameters).save("other.toml")
+    with pytest.raises(WeightsError, match=rf"^other\.toml .*{text}.* qpmhe tune model"):
+        call("estimate", "model.py:make", "record.csv", "--weights", "other.toml", "--out", "x.csv")
+
+
+def test_a_file_in_the_place_of_the_checkpoint(folder):
+    for text in ("{", "[]", "{}", '{"format": 7, "identity": "", "searches": {}}'):
+        (folder / "weights.toml.search").write_text(text)
+        with pytest.raises(TuningCheckpointError, match=r"search is no checkpoint .*; remove it"):
+            call("tune", "model.py:make", "record.csv", "--objective", "likelihood")
 
 
 def test_make_may_read_the_weights(folder):
