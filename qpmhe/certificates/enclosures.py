@@ -146,18 +146,6 @@ class Enclosure:
             errors.append(error + rounding)
         return np.concatenate(moved, axis=1), np.max(errors, axis=0)
 
-    def with_rows(
-        self, at: NDArray[np.intp], other: Enclosure, rows: NDArray[np.bool_]
-    ) -> Enclosure:
-        """The same, and some rows of another enclosure in place of its own at these cells."""
-        parts = [self.centre.copy(), self.slopes.copy(), self.error.copy(), self.excess.copy()]
-        for mine, theirs in zip(
-            parts, (other.centre, other.slopes, other.error, other.excess), strict=True
-        ):
-            mine[at] = theirs[rows]
-        centre, slopes, error, excess = parts
-        return Enclosure(centre, slopes, error, excess, self.jacobian)
-
 
 class SmoothModel:
     """f and h of a system as one expression graph, to be enclosed over cells of states and inputs.
@@ -174,7 +162,7 @@ class SmoothModel:
         self._system, self._region = system, region
         self.n, self.p = system.n, system.p
         self._graph = Graph(system.n + system.m)
-        self._slopes = Slopes(self._graph, system.n)
+        self._slopes = Slopes(self._graph)
         self._programs: dict[str, Program] = {}
         self._plans: dict[bool, _Plan] = {}
         self._unknown: tuple[Array, Array] | None = None
@@ -185,7 +173,10 @@ class SmoothModel:
         self._rows = following + self._output
         self.affine_output = not (
             self.output_reason
-            or any(self._slopes.second(root) for root in self._output)
+            or any(
+                self._slopes.of(slope) or self._graph.open_conditions([slope])
+                for root in self._output for slope in self._slopes.of(root).values()
+            )
             or self._obstacle("h", region.lower, region.upper)
         )
 
@@ -279,43 +270,42 @@ class SmoothModel:
             return found
         # At almost every point of a segment, what depends on a condition has the derivatives of
         # the side that the condition is on there: those of both sides are enclosed one by one.
-        order = np.cumsum(open_ends[kinked], axis=1) - 1
-        sides = [
-            plan.enclosed(
-                lower[kinked], upper[kinked],
-                np.where(open_ends[kinked], (k >> order) & 1, np.nan),
-            )[0]
+        order, given = np.cumsum(open_ends, axis=1) - 1, open_ends & kinked[:, None]
+        sides = tuple(
+            plan.enclosed(lower, upper, np.where(given, (k >> np.maximum(order, 0)) & 1, np.nan))[0]
             for k in range(2 ** int(count[kinked].max()))
-        ]
-        known = np.all([np.isfinite(side.error).all(axis=(1, 2)) for side in sides], axis=0)
-        at = np.flatnonzero(kinked)[known]
-        every = tuple(found.with_rows(at, side, known) for side in sides)
+        )
         # Cells are divided by what the sides of a kink leave open, not by the kink.
-        return replace(found, sides=every, excess=np.max([side.excess for side in every], axis=0))
+        return replace(found, sides=sides, excess=np.max([side.excess for side in sides], axis=0))
 
 
 class _Plan:
     """The programs for the Jacobian of some nodes by the first n variables, over cells."""
 
-    def __init__(self, graph: Graph, derivatives: Slopes, roots: list[int], n: int) -> None:
+    def __init__(self, graph: Graph, slopes: Slopes, roots: list[int], n: int) -> None:
         self._q, self._n = len(roots), n
         first = [
             (row, i, node) for row, root in enumerate(roots)
-            for i, node in derivatives.first(root).items() if i < n
+            for i, node in slopes.of(root).items() if i < n
         ]
         # Each second derivative in all places that it has.
         second = [
-            (row, this, other, node) for row, root in enumerate(roots)
-            for (i, j), node in derivatives.second(root).items()
+            (row, this, other, node) for row, i, slope in first
+            for j, node in slopes.of(slope).items() if i <= j
             for this, other in sorted({(i, j), (j, i)}) if this < n
         ]
-        self._first = _columns(first, 2)
-        self._second = _columns(second, 3)
-        slopes = [one[-1] for one in first]
-        self._conditions = graph.open_conditions([*slopes, *(one[-1] for one in second)])
+        self._first, self._second = (
+            np.array([one[:-1] for one in table], np.intp).reshape(-1, count).T
+            for table, count in ((first, 2), (second, 3))
+        )
+        nodes = [one[-1] for one in first]
+        self._conditions = graph.open_conditions(nodes)
         decisions = [pair[0] for pair in self._conditions]
-        self._point = Program(graph, roots + slopes + decisions)
-        self._cell = Program(graph, roots + slopes + [one[-1] for one in second] + decisions)
+        self._depends = np.array([
+            [one in above for one in decisions] for above in map(set, map(lambda one: graph.ancestors([one]), nodes))
+        ], np.bool_).reshape(len(nodes), len(decisions))
+        self._point = Program(graph, roots + nodes + decisions)
+        self._cell = Program(graph, roots + nodes + [one[-1] for one in second] + decisions)
 
     def obstacle(self, lower: Array, upper: Array) -> str:
         """What is not defined on all of a cell (N,), in words; blank if all is."""
@@ -334,40 +324,36 @@ class _Plan:
             for k, pair in enumerate(self._conditions)
             for node, sign in zip(pair, (True, False), strict=False)
         }
-        centre = 0.5 * lower + 0.5 * upper
-        half = np.nextafter(np.maximum(upper - centre, centre - lower), np.inf)
-        half = np.where(upper == lower, 0.0, half)
-        centre = np.where(upper == lower, lower, centre)
+        centre, half = middles(lower, upper)
         point, cell = self._point(centre, centre, forced), self._cell(lower, upper, forced)
-        # What is not finite has no derivative, whatever its parts have.
-        lost = ~cell[:q].known.all(axis=0)
-        rows, columns = self._first
-        count = q + rows.size
+        (rows, columns), (row, this, other) = self._first, self._second
+        ends = np.cumsum([q, rows.size, row.size])
+        over, bends, decided = (
+            cell[a:b] for a, b in zip(ends, (*ends[1:], None), strict=True)
+        )
+        slope, at_kink = point[q : ends[1]], point[ends[1] :]
 
         def dense(values: Array) -> Array:
             matrix = np.zeros((cells, q, n))
             matrix[:, rows, columns] = values.T
             return matrix
 
-        jacobian, rounding = dense(point[q:count].middle), dense(point[q:count].radius)
-        at_kink, open_ends = (
-            (one.low != one.high).T for one in (
-                point[count:], cell[count + self._second[0].size :]
-            )
-        )
-        bends = cell[count : count + self._second[0].size]
+        open_ends: NDArray[np.bool_] = (decided.low != decided.high).T
+        jacobian, rounding = dense(slope.middle), dense(slope.radius)
         slopes, spread = np.zeros((2, cells, N, q, n))
-        row, this, other = self._second
         slopes[:, other, row, this] = bends.middle.T * half[:, other]
         spread[:, other, row, this] = bends.radius.T * half[:, other]
         # Fixed coordinates bend nothing, whatever is known of it.
         fixed = half == 0.0
         slopes[fixed], spread[fixed] = 0.0, 0.0
+        # Where a condition may change, what depends on it may jump.
+        at, entry = np.nonzero(open_ends @ self._depends.T)
+        spread[at, columns[entry], rows[entry], columns[entry]] = np.nan
         error = (spread.sum(axis=1) + rounding + 1e-15 * np.abs(slopes).sum(axis=1)) * (
             1.0 + 1e-14 * (N + 4)
         )
         # Without second derivatives, as at kinks, an entry is where its values over the cell are.
-        middle, radius = dense(cell[q:count].middle), dense(cell[q:count].radius)
+        middle, radius = dense(over.middle), dense(over.radius)
         kinked = ~np.isfinite(error) & np.isfinite(radius)
         at, row, i = np.nonzero(kinked)
         culprits = ~np.isfinite(spread[at, :, row, i] + slopes[at, :, row, i])
@@ -376,22 +362,23 @@ class _Plan:
         spread[at, :, row, i] = share * radius[at, row, i][:, None]
         error[kinked] = radius[kinked]
         enclosed = np.where(kinked, middle, jacobian)
-        unknown = lost | ~(
-            np.isfinite(enclosed).all(axis=(1, 2)) & np.isfinite(error).all(axis=(1, 2))
-        )
+        # What is not finite has no derivative, whatever its parts have.
+        unknown = ~cell[:q].known.all(axis=0) | ~np.isfinite(enclosed + error).all(axis=(1, 2))
         # NaN alone: infinities would make invalid operations later on.
         slopes[unknown], error[unknown] = np.nan, np.nan
-        sure = np.isfinite(jacobian).all(axis=(1, 2)) & ~at_kink.any(axis=1)
-        jacobian = np.where(sure[:, None, None], jacobian, np.nan)
+        jacobian[(at_kink.low != at_kink.high).any(axis=0)] = np.nan
+        jacobian[~np.isfinite(jacobian).all(axis=(1, 2))] = np.nan
+        enclosed[unknown] = jacobian[unknown]
         return Enclosure(
-            np.where(unknown[:, None, None], jacobian, enclosed), slopes, error,
-            spread.sum(axis=(2, 3)), jacobian,
+            enclosed, slopes, error, spread.sum(axis=(2, 3)), jacobian
         ), open_ends
 
 
-def _columns(places: list[Any], count: int) -> tuple[NDArray[np.intp], ...]:
-    """The first columns of a table, as indices."""
-    return tuple(np.array([one[k] for one in places], np.intp) for k in range(count))
+def middles(lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Centres and half-widths of cells, which cover them; zero where there is no width."""
+    centre = np.where(lower == upper, lower, 0.5 * lower + 0.5 * upper)
+    half = np.nextafter(np.maximum(upper - centre, centre - lower), np.inf)
+    return centre, np.where(lower == upper, 0.0, half)
 
 
 def _at_each(function: Any, x: Array, u: Array) -> Array:

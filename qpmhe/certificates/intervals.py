@@ -165,18 +165,6 @@ class Interval:
             np.isfinite(low) & np.isfinite(high)
         )
 
-    def pieces(self, function: Callable[[Interval], Interval], *turns: float) -> Interval:
-        """A function that is monotone between the numbers at which it turns.
-
-        ``function`` encloses it; between the numbers beside these ones it turns.
-        """
-        found = function(Interval.of(self.low)).hull(function(Interval.of(self.high)))
-        for turn in turns:
-            about = _outward(np.array(turn), np.array(turn))
-            reached = (self.low <= about.high) & (self.high >= about.low)
-            found = found.hull(function(about), reached)
-        return found
-
     def sin(self) -> Interval:
         """The sine."""
         return self._wave(np.sin, 0.25)
@@ -310,13 +298,6 @@ OPERATIONS: dict[str, Callable[..., Interval]] = {
     "atanh": lambda s: s.increasing(np.arctanh), "erf": _erf,
     "sigmoid": lambda s: (1.0 + (-s).increasing(np.exp, 0.0)).power(-1),
     "near": lambda s, distance: s + Interval(-distance, distance),
-    # Second derivatives, or parts of them, whose factors would be enclosed one by one.
-    "atan''": lambda s: s.pieces(
-        lambda t: -2.0 * (t * (1.0 + t.power(2)).power(-2)), -(3.0**-0.5), 3.0**-0.5),
-    "t-t^3": lambda s: s.pieces(lambda t: t - t.power(3), -(3.0**-0.5), 3.0**-0.5),
-    "t-t^2": lambda s: s.pieces(lambda t: t - t.power(2), 0.5),
-    "t-3t^2+2t^3": lambda s: s.pieces(
-        lambda t: t * ((1.0 - t) * (1.0 - 2.0 * t)), 0.5 - 12.0**-0.5, 0.5 + 12.0**-0.5),
     "angle": angle, "length": length, "share": share,
     # What is decided is one of the two, also beyond where it is.
     "max": lambda c, s, t: either(c, s, t, maximum(s, t)),
@@ -330,7 +311,6 @@ OPERATIONS: dict[str, Callable[..., Interval]] = {
     "and": minimum, "or": maximum,
     "either": either, "jump": lambda c, s, t: either(c.where(_decided(c)), s, t),
     "truth": lambda c: c.where(_decided(c)),
-    "smooth": lambda c, s: s.where(_decided(c)),
     "floor": _step(np.floor), "ceil": _step(np.ceil), "sign": _step(np.sign),
     "trunc": _step(np.trunc), "unknown": lambda: Interval(np.nan, np.nan),
 }
