@@ -52,16 +52,14 @@ from x̂ of the set around z that holds the true state, at the time of the worst
 `certificate.bound(run)`; the estimator has two QPs a sample. Lengths are Euclidean, in the units of
 the states; *time* is that of `certify`, and of finding the gain where it was synthesised (†).
 
-| system | Lyapunov: N | bound | worst | any QPs: N | bound | paper's theorem: N | bound \
-| region's diameter |
-|---|---|---|---|---|---|---|---|---|
+| system | Lyapunov: N | bound | worst | paper's theorem: N | bound | region's diameter |
+|---|---|---|---|---|---|---|
 {second}
 
 *Lyapunov*: the discounted cost and the horizon of `qpmhe.certificates.design` with the
-re-initialised candidate; the bound is a minimiser's, the worst error that with two QPs. *Any QPs*:
-the same for any number of QPs, with twice the least N for which that contracts. *Paper's theorem*:
-the constants of the proof, which show stability for each N; beyond the region's diameter, a bound
-says nothing.
+re-initialised candidate; the bound is a minimiser's, the worst error that with two QPs. *Paper's
+theorem*: the constants of the proof, which show stability for each N; beyond the region's diameter,
+a bound says nothing.
 
 ## The adversary
 
@@ -240,21 +238,18 @@ def attack(row: Row) -> None:
     climbed(with_bound)
     try:
         row.plan = plan = design(
-            system, case.region, observer=certificate.observer, sizes=case.sizes,
-            inputs=case.inputs, stability=certificate.stability, seconds=SECONDS,
+            system, case.region, sizes=case.sizes, inputs=case.inputs, seconds=SECONDS,
         )
     except qpmhe.errors.QpmheError as error:
         print(f"{case.name}: no design: {error}", flush=True)
         return
 
     def with_plan(mhe: Any, run: Any, signals: Signals, errors: Array) -> float:
-        for kind in set(plan.kinds) - {"minimiser"}:
-            known = plan.length(plan.along(
-                run, mhe, initial_error=np.zeros(system.n), disturbances=signals.w,
-                noises=signals.v, kind=kind,
-            ))
-            compare(errors, known[: len(errors)])
-            row.compared += len(errors)
+        known = plan.length(plan.along(
+            run, mhe, initial_error=np.zeros(system.n), disturbances=signals.w, noises=signals.v,
+        ))
+        compare(errors, known[: len(errors)])
+        row.compared += len(errors)
         return float(errors.max())
 
     row.designed = climbed(
@@ -304,14 +299,11 @@ def first_line(row: Row) -> str:
 
 def second_line(row: Row) -> str:
     plan, certificate = row.plan, row.certificate
-    cells = ["-"] * 5
+    cells = ["-"] * 3
     if plan is not None:
-        cells[:3] = [str(plan.horizon), *(
-            short(each) for each in (float(plan.length(plan.limit(kind="minimiser"))), row.designed)
+        cells = [str(plan.horizon), *(
+            short(each) for each in (float(plan.length(plan.limit())), row.designed)
         )]
-        least = plan.least_horizon("decrease") if "decrease" in plan.kinds else None
-        if least is not None:
-            cells[3:] = str(2 * least), short(float(plan.length(plan.limit(2 * least))))
     paper = ["-", "-"]
     if certificate.bounds:
         limit = certificate.limit(

@@ -3,6 +3,7 @@ r"""The matrix inequality of the Lyapunov design, and the search for its unknown
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +14,7 @@ from ..model.sets import ConvexSet
 from ..model.system import System
 from .branch_and_bound import Cover
 from .deadline import Deadline
+from .evidence import NotCertifiedError, OutOfTimeError
 from .inequalities import Form, Matrices, OutputInjection, OutputWeight, norms
 from .regions import Region
 from .sdp import Answer, Kind, Program, Scales, _columns
@@ -169,6 +171,7 @@ class DesignSearch(Search):
         states = np.where(half > 0.0, half, 1.0) / (half.max() or 1.0)
         outputs = np.abs(self.jacobians[:, system.n :] * states).sum(axis=2).max(axis=0)
         self.scales = Scales(states, np.where(outputs > 0.0, outputs, 1.0))  # of any units
+        self._answers: list[Answer] = []
 
     @property
     def program(self) -> Program:
@@ -182,6 +185,26 @@ class DesignSearch(Search):
             )
         return self._program
 
+    def answer(
+        self, name: str, rate: float | None, advice: tuple[str, ...],
+        why: Callable[[Search, str], NotCertifiedError],
+    ) -> Found:
+        """As `Search.answer`; when the time is over, the best weights that pass the samples."""
+        try:
+            return super().answer(name, rate, advice, why)
+        except OutOfTimeError:
+            for one in sorted(self._answers, key=lambda each: each.objective):
+                assert one.form is not None
+                found = self._verified(one.form)
+                if isinstance(found, Found):
+                    return found
+            raise
+
+    def _solved(self, rate: float, margin: float, deadline: Deadline) -> Answer:
+        answer = super()._solved(rate, margin, deadline)
+        if answer.form is not None:
+            self._answers.append(answer)
+        return answer
 
     def _verified(self, form: Form) -> Found | Cover:
         """As `Search` does, after a look at the samples, which is cheap."""

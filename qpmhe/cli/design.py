@@ -15,7 +15,6 @@ from ..certificates.report import Report
 _MEANING: dict[Kind, str] = {
     "minimiser": "J(estimate) <= J(truth), as of a global minimiser",
     "measured": "J(estimate), known once it is there",
-    "decrease": "J(estimate) <= J(candidate), any number of QPs",
 }
 
 
@@ -23,13 +22,13 @@ def show_design(
     console: Console, found: Report, horizons: list[int], seconds: float
 ) -> Design | None:
     """Design for the model, region and sizes of a report, and print what is to be pasted."""
-    system, observer, certificate = found.example.system, found.example.observer, found.certificate
+    system, certificate = found.example.system, found.certificate
     horizon = horizons[0] if len(horizons) == 1 else None
     with console.status("looking for a Lyapunov function"):
         try:
             made = design(
-                system, found.region, observer=observer, sizes=certificate.sizes, horizon=horizon,
-                stability=certificate.stability, seconds=Deadline(seconds),
+                system, found.region, sizes=certificate.sizes, horizon=horizon,
+                seconds=Deadline(seconds),
             )
         except NotCertifiedError as error:
             console.print(f"[bold red]No design:[/] {escape(str(error))}", highlight=False)
@@ -38,7 +37,7 @@ def show_design(
         f"\n[bold]Lyapunov design ({made.evidence})[/], for {escape(str(made.sizes))}",
         highlight=False,
     )
-    console.print(_table(made, horizon is not None), highlight=False)
+    console.print(_table(made), highlight=False)
     for note in made.notes:
         console.print(f"Note: {escape(note)}", highlight=False)
     console.print()
@@ -46,8 +45,8 @@ def show_design(
     return made
 
 
-def _table(made: Design, fixed: bool) -> Table:
-    """What holds for the horizon proposed; in advance for any QPs, also for a longer one."""
+def _table(made: Design) -> Table:
+    """What holds for the horizon proposed."""
     table = Table(
         box=boxes.SIMPLE, padding=(0, 1, 0, 0), caption_justify="left",
         caption="Contraction: by which factor the error shrinks over a window that starts at an "
@@ -62,17 +61,16 @@ def _table(made: Design, fixed: bool) -> Table:
     for name in ("\nN", "contrac-\ntion", "least\nN"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column(f"limit\n{', '.join(names)}", overflow="fold")
-    for kind in made.kinds:
-        least, N, limits = made.least_horizon(kind), made.horizon, "-"
-        if kind == "decrease" and least is not None and not fixed:
-            N = max(N, 2 * least)
-        factor = made.contraction(N, kind)
-        if kind != "measured" and factor < 1.0:
-            found = made.components(made.limit(N, kind))
+    for kind, meaning in _MEANING.items():
+        least, limits = "1", "-"
+        if kind == "minimiser":
+            least = str(made.least_horizon() or "-")
+            found = made.components(made.limit())
             widths = (made.region.upper - made.region.lower)[: found.size]
             limits = ", ".join(
                 f"{value:.3g}" if value < width else f"({value:.3g})"
                 for value, width in zip(found.tolist(), widths.tolist(), strict=True)
             )
-        table.add_row(_MEANING[kind], str(N), f"{factor:.3g}", str(least or "-"), limits)
+        factor = made.contraction(kind=kind)
+        table.add_row(meaning, str(made.horizon), f"{factor:.3g}", least, limits)
     return table

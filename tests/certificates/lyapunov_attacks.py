@@ -6,49 +6,25 @@ import numpy as np
 
 import qpmhe
 from qpmhe.certificates import Sizes
-from qpmhe.certificates.contraction import synthesise_gain
-from qpmhe.certificates.lyapunov import design
-from qpmhe.estimation.run import Run
+from qpmhe.certificates.lyapunov import KINDS
 
 from .attacks import NOISES, inside
 
 
 def scalar():
     system = qpmhe.System(lambda x: 1.2 * x, lambda x: x, n=1, p=1)
-    return system, qpmhe.Box([-10.0], [10.0]), Sizes(0.1, 0.2)
+    return system, qpmhe.Box([-10.0], [10.0]), Sizes(0.1, 0.2), [[0.8]]
 
 
 def swap():
     A = np.array([[0.0, 1.0], [1.1, 0.0]])
     system = qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1)
-    return system, qpmhe.Box([-10.0, -10.0], [10.0, 10.0]), Sizes(0.1, 0.2)
+    return system, qpmhe.Box([-10.0, -10.0], [10.0, 10.0]), Sizes(0.1, 0.2), [[0.0], [1.1]]
 
 
 def reactor():
-    system = qpmhe.models.batch_reactor().system
-    return system, qpmhe.Box([0.1, -1.0], [9.0, 9.0]), Sizes(0.03, 0.06)
-
-
-def fitzhugh_nagumo():
-    def f(x):
-        a, b = x[..., 0], x[..., 1]
-        return np.stack([a + 0.1 * (a - a**3 / 3 - b + 0.5), b + 0.008 * (a + 0.7 - 0.8 * b)], -1)
-
-    system = qpmhe.System(f, lambda x: x[..., :1], n=2, p=1)
-    return system, qpmhe.Box([-2.5, -1.0], [2.5, 2.0]), Sizes(0.01, 0.02)
-
-
-def van_der_pol():
-    system = qpmhe.models.van_der_pol().system
-    return system, qpmhe.Box([-2.5, -3.0], [2.5, 3.0]), Sizes(0.01, 0.02)
-
-
-def coupled():
-    def f(x):
-        return 0.8 * x + 0.1 * np.sin(np.roll(x, 1, axis=-1)) + 0.1 * np.roll(x, -1, axis=-1)
-
-    system = qpmhe.System(f, lambda x: x[..., ::2], n=4, p=2)
-    return system, qpmhe.Box(-2.0 * np.ones(4), 2.0 * np.ones(4)), Sizes(0.01, 0.01)
+    system, observer, *_ = qpmhe.models.batch_reactor()
+    return system, qpmhe.Box([0.1, -1.0], [9.0, 9.0]), Sizes(0.03, 0.06), observer.gain
 
 
 def bent_output():
@@ -57,26 +33,10 @@ def bent_output():
         return np.stack([a + 0.1 * b, 0.9 * b - 0.1 * np.sin(a)], -1)
 
     system = qpmhe.System(f, lambda x: x[..., :1] + 0.1 * np.sin(x[..., :1]), n=2, p=1)
-    return system, qpmhe.Box([-2.0, -2.0], [2.0, 2.0]), Sizes(0.01, 0.02)
+    return system, qpmhe.Box([-2.0, -2.0], [2.0, 2.0]), Sizes(0.01, 0.02), [[0.4], [0.1]]
 
 
-SYSTEMS = (scalar, swap, reactor, fitzhugh_nagumo, van_der_pol, coupled, bent_output)
-
-
-def designed(make, seconds=60.0):
-    """A design with an observer that was synthesised for the region."""
-    system, region, sizes = make()
-    made = synthesise_gain(
-        system, region, sizes=(sizes.disturbance, sizes.noise), seconds=seconds
-    )
-    plan = design(
-        system, region, observer=made.observer, stability=made.stability, sizes=sizes,
-        seconds=seconds,
-    )
-    return plan, made.observer
-
-
-def attack(plan, observer, *, trials, steps=25, seed=0):
+def attack(plan, gain, *, trials, steps=25, seed=0):
     """The largest error as a share of each bound, and how many errors were compared.
 
     Disturbances and noises reach the sizes of the design, some push along the error. Runs count
@@ -84,15 +44,11 @@ def attack(plan, observer, *, trials, steps=25, seed=0):
     at most the truth's.
     """
     rng, system, region = np.random.default_rng(seed), plan.system, plan.region
-    least = plan.least_horizon("minimiser")
-    horizons = sorted({1, 3, least, min(plan.horizon, 20)})
-    turns = itertools.cycle(itertools.product(
-        horizons, (0, 1, 2, None), ("reinitialized", "observer")
-    ))
+    horizons = sorted({1, 3, plan.least_horizon(), min(plan.horizon, 20)})
+    turns = itertools.cycle(itertools.product(horizons, (0, 1, 2, None)))
+    shares, compared, kinds = dict.fromkeys(KINDS, 0.0), 0, list(NOISES)
     nothing = np.zeros(system.m)
-    shares = dict.fromkeys(("measured", "decrease", "minimiser"), 0.0)
-    compared, kinds = 0, list(NOISES)
-    for (N, cap, candidate), _ in zip(turns, range(trials), strict=False):
+    for (N, cap), _ in zip(turns, range(trials), strict=False):
         points = region.sample(8, rng)[:, : system.n]
         start, other = points[rng.integers(len(points), size=2)]
         start, guess = (
@@ -104,41 +60,39 @@ def attack(plan, observer, *, trials, steps=25, seed=0):
             for width, size in ((system.n, plan.sizes.disturbances), (system.p, plan.sizes.noises))
         )
         mhe = qpmhe.MovingHorizonEstimator(
-            system, observer, plan.cost(), horizon=N, initial_state=guess, max_qps=cap,
-            candidate=candidate, engine="python", project_observer=False,
+            system, qpmhe.Luenberger(gain), plan.cost(), horizon=N, initial_state=guess,
+            max_qps=cap, candidate="reinitialized", engine="python", project_observer=False,
         )
-        pushing, x, estimates, lasts = rng.random() < 0.5, [start], [], steps
-        lowest = np.zeros(steps, bool)
+        pushing, x, lasts, lowest = rng.random() < 0.5, [start], steps, np.zeros(steps, bool)
+        estimates = []
         for t in range(steps):
-            if pushing and plan.sizes.disturbances > 0.0:
+            if pushing:
                 gap = mhe.state - x[-1]
                 w[t] = -plan.sizes.disturbances * gap / max(float(np.linalg.norm(gap)), 1e-300)
             ahead = np.asarray(system.f(x[-1], nothing))
             estimates.append(mhe.update(system.h(x[-1], nothing) + v[t]))
             x.append(ahead + w[t])
             latest = estimates[-1]
-            seen = np.vstack((x[-1:], latest.candidate, latest.trajectory))
             lowest[t] = latest.cost <= true_cost(plan, latest, x, w, v)
+            seen = np.vstack((x[-1:], latest.candidate, latest.trajectory))
             if not region.contains(seen).all():
                 lasts = t
                 break
-        run = Run.of(guess, estimates)
         if not lasts:
             continue
-        x, count = np.array(x), len(estimates)
-        error = np.sqrt(np.einsum(
-            "ti,ij,tj->t", run.states - x, plan.prior, run.states - x
-        ))[: lasts + 1]
-        for kind in shares:
+        run, x, count = qpmhe.estimation.run.Run.of(guess, estimates), np.array(x), len(estimates)
+        away = run.states - x
+        error = np.sqrt(np.einsum("ti,ij,tj->t", away, plan.prior, away))
+        for kind in KINDS:
             until = lasts
             if kind == "minimiser":
                 until = int(np.argmin(np.append(lowest[:lasts], False)))
             bound = plan.along(
                 run, mhe, initial_error=start - guess, disturbances=w[:count], noises=v[:count],
                 kind=kind,
-            )[: until + 1]
-            there = bound[1:] > 1e-9
-            ratio = error[1 : until + 1][there] / bound[1:][there]
+            )[1 : until + 1]
+            there = bound > 1e-9
+            ratio = error[1 : until + 1][there] / bound[there]
             shares[kind] = max(shares[kind], float(ratio.max(initial=0.0)))
             compared += int(there.sum())
     return shares, compared
@@ -153,8 +107,7 @@ def bounded(rng, noise, size):
 
 def true_cost(plan, estimate, x, w, v):
     """J of the truth, with the prior of an estimate's window."""
-    K = len(estimate.trajectory) - 1
-    t = estimate.time + 1
+    K, t = len(estimate.trajectory) - 1, estimate.time + 1
     ages = plan.discount ** np.arange(K - 1.0, -1.0, -1.0)
     own = x[t - K] - estimate.candidate[0]
     stages = np.einsum("ti,ij,tj->t", w[t - K : t], plan.disturbance, w[t - K : t])
