@@ -302,7 +302,8 @@ class _Plan:
         self._conditions = graph.open_conditions(nodes)
         decisions = [pair[0] for pair in self._conditions]
         self._depends = np.array([
-            [one in above for one in decisions] for above in map(set, map(lambda one: graph.ancestors([one]), nodes))
+            [one in above for one in decisions]
+            for above in [set(graph.ancestors([node])) for node in nodes]
         ], np.bool_).reshape(len(nodes), len(decisions))
         self._point = Program(graph, roots + nodes + decisions)
         self._cell = Program(graph, roots + nodes + [one[-1] for one in second] + decisions)
