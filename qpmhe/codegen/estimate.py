@@ -47,7 +47,7 @@ class CompiledEstimate(Estimate):
     ) -> None:
         self._block, self._numbers, self.time = block, numbers, time
         self._sizes, self._delay, self.dropped = sizes, delay, dropped
-        self._to_disturbances = to_disturbances
+        self._to_disturbances, self._rejected = to_disturbances, None
         n = sizes[0]
         end = 2 + (numbers[0] + 1) * n
         self.state = block[end - n : end]

@@ -32,6 +32,7 @@ from .problem import Solved
 from .run import Run, RunSource
 from .sensitivity import Sensitivity
 from .settings import Settings
+from .snapshot import read, written
 
 Array = NDArray[np.float64]
 
@@ -638,17 +639,18 @@ class MovingHorizonEstimator:
         return value
 
     def state_dict(self) -> dict[str, Any]:
-        """A snapshot of the estimator's memory, as plain arrays and numbers.
+        """A snapshot of the estimator's memory: arrays by name, and a text of all the rest.
 
-        An estimator made with the same arguments continues bit for bit after
-        `load_state_dict`, in the same process or another.
+        ``numpy.savez(file, **state)`` writes it down, and so does
+        ``json.dumps(state, default=numpy.ndarray.tolist)``. An estimator made with the same
+        arguments continues bit for bit after `load_state_dict`, in the same process or another.
 
         Returns
         -------
         dict
             Copies; safe to keep, to pickle, or to write down.
         """
-        return self._engine.state_dict()
+        return written(self._engine.state_dict())
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue where another estimator stopped.
@@ -656,7 +658,8 @@ class MovingHorizonEstimator:
         Parameters
         ----------
         state : dict
-            What `state_dict` of an estimator with the same arguments returned.
+            What `state_dict` of an estimator with the same arguments returned, or what
+            ``numpy.load`` or ``json.load`` read of it.
 
         Raises
         ------
@@ -670,7 +673,8 @@ class MovingHorizonEstimator:
         It computes every stored stage again and compares the results. With ``engine="auto"`` the
         estimator goes on with the engine that the snapshot was taken with.
         """
-        pinned = state.get("engine", "python") if isinstance(state, dict) else None
+        memory = read(state)
+        pinned = memory.get("engine")
         is_other = isinstance(pinned, str) and pinned != self.engine
         # Whole or, if interrupted, not at all.
         if is_other and self.settings.engine == "auto":
@@ -678,10 +682,10 @@ class MovingHorizonEstimator:
                 pinned, self._own_system, self.observer, self.cost, self.settings,
                 self._initial_state,
             )
-            engine.load_state_dict(state)
+            engine.load_state_dict(memory)
             self._engine = engine
         else:
-            self._engine.load_state_dict(state)
+            self._engine.load_state_dict(memory)
 
     def __getstate__(self) -> dict[str, Any]:
         solver = self.settings.backend
@@ -698,12 +702,13 @@ class MovingHorizonEstimator:
             "arguments": (self.system, self.observer, self.cost),
             "settings": self.settings,
             "initial_state": self.initial_state,
+            "engine": self.engine,
             "state": self.state_dict(),
         }
 
     def __setstate__(self, saved: dict[str, Any]) -> None:
         # Construction checks everything again: a snapshot is input like any other.
-        options = vars(saved["settings"]) | {"engine": saved["state"]["engine"]}
+        options = vars(saved["settings"]) | {"engine": saved["engine"]}
         self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
             *saved["arguments"], initial_state=saved["initial_state"], **options
         )

@@ -1,7 +1,8 @@
-"""Validation of a snapshot: undamaged, and of an estimator with the same arguments."""
+"""Snapshots: how they are written down, and whether they fit the estimator that reads them."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -23,6 +24,67 @@ SET_NAMES = ("states", "disturbances", "noises")
 # Two machines compute the same number with at most this difference: as a share of its size, and
 # as a share of the largest entry of its array.
 _ROUNDING, _FLOOR = 1e-7, 1e-10
+
+_STRUCTURE = "structure"
+
+
+def written(memory: dict[str, Any]) -> dict[str, Any]:
+    """An engine's memory as arrays by name, and the rest as one JSON text.
+
+    `numpy.savez` writes such a dict without pickle, and JSON with ``numpy.ndarray.tolist``.
+    """
+    arrays: dict[str, Any] = {}
+
+    def without_arrays(value: Any, path: str) -> Any:
+        if isinstance(value, np.ndarray):
+            arrays[path] = value
+            return {"array": path, "dtype": value.dtype.str, "shape": value.shape}
+        if isinstance(value, Mapping):
+            return {key: without_arrays(one, f"{path}/{key}") for key, one in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [without_arrays(one, f"{path}/{k}") for k, one in enumerate(value)]
+        return value
+
+    parts = {key: without_arrays(value, key) for key, value in memory.items()}
+    return {_STRUCTURE: json.dumps(parts)} | arrays
+
+
+def read(state: Any) -> dict[str, Any]:
+    """The memory that `written` wrote down; arrays may have become lists."""
+    if not isinstance(state, Mapping):
+        raise InvalidInputError(
+            f"the state is a {type(state).__name__}; expected the dict that state_dict gave."
+        )
+    given = dict(state)
+    if _STRUCTURE not in given:
+        names = ", ".join(map(repr, list(given)[:10]))
+        raise InvalidInputError(
+            f"the state has no {_STRUCTURE!r} ({f'only {names}' if names else 'it is empty'}); "
+            "expected the whole dict that state_dict gave."
+        )
+
+    def with_arrays(value: Any) -> Any:
+        if isinstance(value, list):
+            return [with_arrays(one) for one in value]
+        if not isinstance(value, dict):
+            return value
+        if set(value) != {"array", "dtype", "shape"}:
+            return {key: with_arrays(one) for key, one in value.items()}
+        name = value["array"]
+        if name not in given:
+            raise _MisfitError(
+                f"the state has no {name!r}; expected the whole dict that state_dict gave."
+            )
+        array = given[name]
+        if isinstance(array, list):
+            array = np.array(array, value["dtype"]).reshape(value["shape"])
+        return array
+
+    with reading():
+        found = with_arrays(json.loads(str(given[_STRUCTURE])))
+        if not isinstance(found, dict):
+            raise TypeError(f"{_STRUCTURE} is {found!r}")
+    return found
 
 
 def described(
@@ -128,13 +190,13 @@ def near(found: Array | float, expected: Array | float, size: Array | float) -> 
     return bool((~finite | close).all())
 
 
-class _OtherEstimatorError(InvalidInputError):
-    """The state is of another estimator."""
+class _MisfitError(InvalidInputError):
+    """The state is of another estimator, or not whole."""
 
 
 def mismatch(what: str) -> InvalidInputError:
     """The error to raise where the estimators differ in ``what``."""
-    return _OtherEstimatorError(
+    return _MisfitError(
         f"the state is of an estimator with another {what} (or it is damaged); make this one "
         "with the arguments of the one that it was taken from."
     )
@@ -145,7 +207,7 @@ def reading() -> Iterator[None]:
     """Turn any exception while reading a snapshot into `InvalidInputError`."""
     try:
         yield
-    except _OtherEstimatorError:
+    except _MisfitError:
         raise
     except Exception as error:
         raise InvalidInputError(

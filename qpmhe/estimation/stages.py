@@ -287,7 +287,7 @@ class Stages:
             "time": self.time,
             "smoothed_prior": None if self.smoothed_prior is None else self.smoothed_prior.copy(),
             "trusted": None if self.trusted is None else self.trusted.copy(),
-            "own": {time: own.state_dict() for time, own in self._own.items()},
+            "own": [(time, own.state_dict()) for time, own in self._own.items()],
             "metric": metric and (metric[0].copy(), metric[1]),
         }
 
@@ -314,6 +314,8 @@ class Stages:
         self._earlier_state = checked_array("earlier", state["earlier"], self._earlier_state.shape)
         if (prior := state["smoothed_prior"]) is not None:
             self.smoothed_prior = checked_array("smoothed_prior", prior, self._earlier_state.shape)
+        if (self.trusted is None) != (state["trusted"] is None):
+            raise ValueError("there must be trusted values if and only if parameters are held")
         if self.trusted is not None:
             self.trusted = checked_array("trusted", state["trusted"], self.trusted.shape)
         if self._covariances is not None:
@@ -328,7 +330,7 @@ class Stages:
             may_be_irregular and np.isfinite(steps).all() and (steps > 0.0).all()
         )):
             raise ValueError("a step's length is impossible")
-        for when, own in state["own"].items():
+        for when, own in state["own"]:
             when = check_size("a sample's time", when, lambda t: time - length <= t < time)
             self._own[when] = read(own)
         if (self.metric is None) != (state["metric"] is None):

@@ -8,6 +8,7 @@ import pytest
 import qpmhe
 from qpmhe import Status
 from qpmhe.codegen.compiler import find_compiler
+from qpmhe.estimation.snapshot import read, written
 
 from .cases import CASES, case
 
@@ -130,7 +131,7 @@ def test_damaged_conditions_are_refused(name, part):
         mhe.update(**sample)
         if t in one.changes:
             mhe.set(**one.changes[t])
-    state = mhe.state_dict()
+    state = read(mhe.state_dict())
     memory = state["memory"].view(mhe._engine._memory.dtype)[0]
     stages, usual = memory["stages"], state["usual"]
     if part in usual:
@@ -149,5 +150,5 @@ def test_damaged_conditions_are_refused(name, part):
         pytest.skip("it has none")
     before = mhe._engine._memory.tobytes(), mhe._engine.usual
     with pytest.raises(qpmhe.errors.InvalidInputError, match="the state is"):
-        mhe.load_state_dict(state)
+        mhe.load_state_dict(written(state))
     assert before == (mhe._engine._memory.tobytes(), mhe._engine.usual)

@@ -6,6 +6,7 @@ from scipy.optimize import least_squares
 
 import qpmhe
 from qpmhe import Status
+from qpmhe.estimation.snapshot import read, written
 
 from .plain import Record, huber, is_minimum, quadratic
 from .test_candidates import GAIN, START, P, Q, R, check_numbers, estimator, record, seen, swing
@@ -211,15 +212,15 @@ def test_snapshots_keep_the_prior(stop):
 def test_snapshots_of_another_arrival_or_without_its_prior_are_refused(stop):
     mhe = estimator(arrival="smoothed")
     mhe.run(record(stop))
-    state = mhe.state_dict()
+    state = read(mhe.state_dict())
     with pytest.raises(qpmhe.errors.InvalidInputError, match="another arrival"):
-        estimator().load_state_dict(state)
+        estimator().load_state_dict(written(state))
     prior = state["window"]["smoothed_prior"]
     assert (prior is None) == (stop == 3)
     for damaged in (None if prior is not None else START, np.full(2, np.nan), START[:1]):
         state["window"]["smoothed_prior"] = damaged
         with pytest.raises(qpmhe.errors.InvalidInputError, match="damaged"):
-            mhe.load_state_dict(state)
+            mhe.load_state_dict(written(state))
     before = mhe.update([0.1]).trajectory
     assert np.isfinite(before).all()
 

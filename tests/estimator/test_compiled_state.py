@@ -9,6 +9,7 @@ import pytest
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
+from qpmhe.estimation.snapshot import read
 from tests.codegen.test_agreement import ARRAYS
 
 from .test_compiled import STEPS, both, estimator, input_at, made
@@ -133,10 +134,11 @@ def test_damaged_snapshots_are_refused_whole():
     for one in (mhe, twin):
         one.update(model.Y[0])
         one.update(model.Y[1])
-    good = mhe.state_dict()
+    kept = mhe.state_dict()
+    good = read(kept)
     memory = good["memory"]
     damaged = [
-        None, 5, "state", [], {}, {**good, "problem": None}, {**good, "problem": (2, 1, 0, 99)},
+        {}, {**good, "problem": None}, {**good, "problem": (2, 1, 0, 99)},
         {**good, "problem": [np.zeros(2)] * 4}, {**good, "engine": "python"},
         {**good, "memory": None}, {**good, "memory": "abc"}, {**good, "memory": memory[:-1]},
         {**good, "memory": np.concatenate((memory, memory))}, {**good, "memory": memory[:0]},
@@ -145,10 +147,17 @@ def test_damaged_snapshots_are_refused_whole():
         {**good, "memory": np.full(memory.shape, np.nan)},
         {**good, "memory": [300] * memory.size},
         *({key: value for key, value in good.items() if key != left} for left in good),
-        estimator(model, "python").state_dict(),
     ]
     for state in damaged:
         with pytest.raises(InvalidInputError):
+            mhe._engine.load_state_dict(state)
+    for state in (
+        None, 5, "state", [], {}, {**kept, "structure": "{"}, {**kept, "structure": 3},
+        {**kept, "memory": "abc"}, *(
+            {key: value for key, value in kept.items() if key != left} for left in kept
+        ), estimator(model, "python").state_dict(),
+    ):
+        with pytest.raises(InvalidInputError, match="the state "):
             mhe.load_state_dict(state)
     for t in range(2, 6):
         equal(mhe.update(model.Y[t]), twin.update(model.Y[t]))

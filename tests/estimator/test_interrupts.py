@@ -8,6 +8,7 @@ import pytest
 
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
+from qpmhe.estimation.snapshot import read
 
 from .test_own_memory import (
     BATCHES,
@@ -97,7 +98,7 @@ def interrupted(mhe, do, generator, stride):
 
 
 def state_of(mhe):
-    state = mhe.state_dict()
+    state = read(mhe.state_dict())
     for name in ("modes", "methods"):  # behind them, how the model is called with an unusual dt
         if name in state:
             state[name] = state[name][:2]

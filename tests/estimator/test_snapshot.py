@@ -1,3 +1,4 @@
+import json
 import pickle
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import pytest
 
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
+from qpmhe.estimation.snapshot import read, written
 from qpmhe.models.batch_reactor import casadi_output, casadi_rate
 
 OPTIONS = {
@@ -185,7 +187,6 @@ def test_another_process_continues_bit_for_bit(tmp_path):
 @pytest.mark.parametrize(
     ("state", "words"),
     [
-        (None, "None"),
         ({}, "None"),
         ({"problem": (2, 1, 0, 7)}, r"\(2, 1, 0, 7\); expected \(2, 1, 0, 6\)"),
     ],
@@ -195,7 +196,7 @@ def test_a_state_of_another_problem_is_refused(state, words):
     feed(mhe, record(8))
     before = mhe.state.copy()
     with pytest.raises(qpmhe.errors.InvalidInputError, match=words):
-        mhe.load_state_dict(state)
+        mhe.load_state_dict(written(state))
     assert mhe.state.tolist() == before.tolist()
     assert mhe.time == 8
 
@@ -203,12 +204,12 @@ def test_a_state_of_another_problem_is_refused(state, words):
 def damaged(key, value):
     mhe = make()
     feed(mhe, record(8))
-    state = mhe.state_dict()
+    state = read(mhe.state_dict())
     if value is None:
         del state[key]
     else:
         state[key] = value
-    return state
+    return written(state)
 
 
 @pytest.mark.parametrize(
@@ -267,10 +268,10 @@ def test_how_models_of_other_steps_are_called_goes_along():
     other.load_state_dict(one.state_dict())
     assert other._own_system.timed.f.mode == "looped"
     assert other.system.timed.f.mode == "batched"
-    state = one.state_dict()
+    state = read(one.state_dict())
     state["modes"] = state["modes"][:3]
     with pytest.raises(qpmhe.errors.InvalidInputError, match="damaged"):
-        other.load_state_dict(state)
+        other.load_state_dict(written(state))
 
 
 @pytest.mark.parametrize("name", OPTIONS)
@@ -281,3 +282,56 @@ def test_a_long_window_keeps_no_views_and_is_the_same(name, monkeypatch):
     assert isinstance(kept._engine._window._stage_views, list)
     assert not isinstance(fresh._engine._window._stage_views, list)
     assert_equal(feed(fresh, measurements), feed(kept, measurements))
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+@pytest.mark.parametrize("how", ["npz", "json"])
+def test_files_without_pickle_keep_every_bit(how, engine, tmp_path):
+    if engine == "compiled":
+        pytest.importorskip("casadi")
+    system, _, cost, scenario = qpmhe.models.batch_reactor()
+    covariances = {"prior": np.eye(2), "disturbance": 0.01 * np.eye(2), "noise": [[0.04]]}
+
+    def make():
+        return qpmhe.MovingHorizonEstimator(
+            system, qpmhe.ExtendedKalman(**covariances), cost, horizon=6,
+            initial_state=scenario.initial_estimate, engine=engine,
+        )
+
+    mhe, other = make(), make()
+    _, Y = scenario.simulate(1)
+    for t in range(9):
+        mhe.update([np.nan] if t == 4 else Y[t], noise_weight=[[30.0]] if t == 6 else None)
+    if how == "npz":
+        np.savez(tmp_path / "state.npz", **mhe.state_dict())
+        with np.load(tmp_path / "state.npz") as file:
+            other.load_state_dict(file)
+    else:
+        text = json.dumps(mhe.state_dict(), default=np.ndarray.tolist)
+        other.load_state_dict(json.loads(text))
+    for t in range(9, 14):
+        one, two = mhe.update(Y[t]), other.update(Y[t])
+        np.testing.assert_array_equal(one.trajectory, two.trajectory)
+        assert (one.cost, one.candidate_cost) == (two.cost, two.candidate_cost)
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        (3, "the state is a int; expected the dict that state_dict gave"),
+        ({}, "the state has no 'structure' .it is empty.; expected the whole dict"),
+        ({"z": 1}, "the state has no 'structure' .only 'z'."),
+    ],
+)
+def test_what_is_no_state_is_refused_with_what_is_missing(state, words):
+    with pytest.raises(qpmhe.errors.InvalidInputError, match=words):
+        make().load_state_dict(state)
+
+
+def test_an_array_that_is_missing_is_named():
+    mhe = make()
+    feed(mhe, record(8))
+    state = mhe.state_dict()
+    del state["trajectory"]
+    with pytest.raises(qpmhe.errors.InvalidInputError, match="the state has no 'trajectory'"):
+        make().load_state_dict(state)
