@@ -253,8 +253,8 @@ class Design:
             )
         if source.system.held:
             raise MismatchError(
-                "the estimator holds parameters, a term of J that the bound does not have; make its "
-                "system without hold."
+                "the estimator holds parameters, a term of J that the bound does not have; make "
+                "its system without hold."
             )
         if settings.candidate != "reinitialized":
             raise MismatchError(

@@ -78,7 +78,7 @@ def augment_parameters(
         none with an empty list, which gives the model at its nominal parameters.
     drifting : bool
         Whether the parameters change from step to step by a disturbance, which the cost weighs
-        with the others. ``engine="compiled"`` needs it: it takes no component without disturbance.
+        with the others.
     dt : float, optional
         Sampling time. If given, f is a rate, which is discretised with u held over the step, and
         the system takes steps of other lengths.
@@ -202,12 +202,13 @@ class _Parameters(NamedTuple):
 def _of_system(f: System, m: int, parameters: _Parameters) -> System:
     """The augmented system of one whose last inputs, behind ``m`` others, are the parameters."""
     change, k = parameters.change(f.n, m), parameters.moved.size
-    return augmented(
-        f, change, noises=f.noises, disturbance_matrix=extended_matrix(f, k),
-        output_residual=f.output_residual,
-        state_residual=extended(f.state_residual, f.n, change.n),
-        **parameters.sets(f.states, f.n, f.disturbances, f.r),
-    )
+    options: SystemOptions = {
+        "noises": f.noises, "disturbance_matrix": extended_matrix(f, k),
+        "output_residual": f.output_residual,
+        "state_residual": extended(f.state_residual, f.n, change.n),
+    }
+    options.update(parameters.sets(f.states, f.n, f.disturbances, f.r))
+    return augmented(f, change, **options)
 
 
 def _of_functions(given: dict[str, Any], parameters: _Parameters) -> System:
@@ -271,6 +272,11 @@ def _held(hold: ArrayLike | Mapping[int, float] | None, moved: Index) -> dict[in
     """Within how many deviations of the prior a parameter is held, by its place in ``moved``."""
     if hold is None:
         return {}
+    if not moved.size:
+        raise InvalidInputError(
+            f"hold is {shown(hold)}, but no parameter is estimated; leave it out."
+        )
+    found: dict[int, Any]
     if isinstance(hold, Mapping):
         places = {int(j): place for place, j in enumerate(moved)}
         for j in hold:

@@ -574,7 +574,7 @@ def _held(
         u = np.array([np.sin(0.7 * t) if t < STEPS or t >= 2 * STEPS else 0.0])
         y = system.h(x, np.append(u, nominal)) + 0.1 * generator.standard_normal(2)
         samples.append({"y": y, "u": u})
-        x = system.f(x, np.append(u, nominal + [0.3, -0.2]))
+        x = system.f(x, np.append(u, nominal + np.array([0.3, -0.2])))
     gain = [[0.3, 0.0], [0.0, 0.3], [0.02, 0.0], [0.0, 0.01]]
     one = Case(
         augmented, qpmhe.Luenberger(gain), qpmhe.QuadraticCost(**weights),

@@ -46,7 +46,7 @@ def rate(x: Array, u: Array, inertia: Array) -> Array:
     return 1e3 * (TORQUE * u - FRICTION * x) / inertia
 
 
-def speed(x: Array, u: Array, inertia: Array) -> Array:
+def speed(x: Array, *_: Array) -> Array:
     """What the encoder gives."""
     return x
 
@@ -73,7 +73,7 @@ def simulate(seed: int) -> tuple[Array, Array, Array]:
     return y, u, inertias[:, None]
 
 
-def problems(folder: Path, quick: bool) -> list[Problem]:
+def problems(_: Path, quick: bool) -> list[Problem]:
     """The same runs, judged while the inertia is unseen and where it is seen again."""
     time, records = np.arange(END), []
     for name, judged in (
@@ -110,8 +110,8 @@ def own(problem: Problem, given: Weights) -> dict[str, Way]:
     }
 
 
-def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Any:
-    """Speed, and the inertia with its estimates in the run of median error."""
+def draw(_: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Any:
+    """Speed, and the inertia with its estimates in the first run."""
     found, time = results[0], DT * np.arange(END)
     y, _, truth = simulate(0)
     with rc_context(LIGHT):
