@@ -251,6 +251,11 @@ class Design:
                 "the estimator has other weights, another discount, or arrival='smoothed'; make it "
                 "with cost=design.cost() and leave arrival out."
             )
+        if source.system.held:
+            raise MismatchError(
+                "the estimator holds parameters, a term of J that the bound does not have; make "
+                "its system without hold."
+            )
         if settings.candidate != "reinitialized":
             raise MismatchError(
                 f"the estimator has candidate={settings.candidate!r}, whose prior is the running "

@@ -340,6 +340,11 @@ def _barred(estimator: MovingHorizonEstimator) -> str:
             "the estimator's prior is a smoothed estimate, which the theorem does not cover; "
             "make it with arrival='observer'."
         )
+    if estimator.system.held:
+        return (
+            "the estimator holds parameters, a term of J that the theorem does not cover; make its "
+            "system without hold."
+        )
     if estimator.has_changed or estimator.settings.parameters:
         return (
             "the estimator has parameters, or its weights or bounds were changed by set(...); "

@@ -330,6 +330,8 @@ class CompiledEngine:
             )
             offset = difference(system.state_residual, trajectory[0], mean)
             prior = cost.majorise_prior(offset, weight)
+            if system.held and (hold := self.solved().problem.hold) is not None:
+                prior = prior + hold.whole
             return window_covariances(
                 model,
                 trajectory,
@@ -418,6 +420,8 @@ class CompiledEngine:
         smoothed = self._settings.arrival == "smoothed" and time > horizon
         if record["has_smoothed"] != smoothed or not np.isfinite(record["smoothed"]).all():
             raise ValueError("there must be a smoothed prior once the window has moved on")
+        if self._system.held and not np.isfinite(record["trusted"]).all():
+            raise ValueError("a trusted value is not finite")
         self._check_metric(record)
         covariances = self._covariances_of(record, places)
         computed, usual = [self._recomputed(memory)], tools.record

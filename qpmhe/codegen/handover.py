@@ -43,7 +43,7 @@ def hand_over(record: Any, directions: Directions, usual: Conditions, engine: Py
         record["trajectory"][: length + 1].copy() if record["has_trajectory"] else None,
         history, (int(record["far"]), int(record["dropped"])),
         record["smoothed"].copy() if record["has_smoothed"] else None,
-        None,
+        record["trusted"].copy() if "trusted" in names else None,
     )
 
 

@@ -16,6 +16,7 @@ from ..errors import OptionError
 from ..estimation.conditions import USUAL, Conditions
 from ..estimation.constraints import Constraints, Rows
 from ..estimation.estimate import DroppedRow, Status
+from ..estimation.hold import Hold
 from ..estimation.limits import c_definitions
 from ..estimation.prior import PriorWeights
 from ..estimation.settings import Infeasible, Settings
@@ -85,6 +86,8 @@ class Layout:
     #: Directions without a disturbance, and the numbers of W's rows in `DroppedRow` then.
     quiet: int = 0
     numbers: tuple[int, ...] | None = None
+    #: States that are held where the window does not see them.
+    held: int = 0
 
     @classmethod
     def of(
@@ -118,6 +121,7 @@ class Layout:
             lapack=lapack and system.n >= _LAPACK_STATES, clock=clock,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
+            held=len(system.held),
         )
 
     @property
@@ -137,7 +141,7 @@ class Layout:
             "output_residual": self.residuals[0], "state_residual": self.residuals[1],
             "observer": self.observer, "covariance": int(self.covariance),
             "observer_prior": int(self.observer_prior),
-            "turns": int(self.turns), "quiet": self.quiet,
+            "turns": int(self.turns), "quiet": self.quiet, "held": self.held,
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
@@ -162,6 +166,12 @@ class Layout:
                 ("initial", r, n * n), ("disturbance", r, n * n), ("noise", r, p * p),
                 ("f_jacobian", r, n * n), ("h_jacobian", r, p * n), ("minimum", r),
                 ("maximum", r), ("least", r), ("spread", r), ("typical", r, n),
+            ])))
+        if k := self.held:
+            fields.append(("hold", _struct([
+                ("deviations", r, n), ("root", r, n * n), ("spread", r, n * n),
+                ("pick", r, k * n), ("units", r, k * k), ("inverse_units", r, k * k),
+                ("stiffness", r, k), ("components", np.int32, k),
             ])))
         fields += [
             ("discount", r), ("sample_time", r), ("tolerance", r),
@@ -274,7 +284,8 @@ class Layout:
             ("length", np.int32), ("newest", np.int32), ("has_trajectory", np.int32),
             ("has_smoothed", np.int32), ("far", np.int32), ("dropped", np.int32),
             ("metric_settled", np.int32), ("metric", r, self.metric_size),
-            ("smoothed", r, n), ("last_good", r, n), ("z_end", r, n),
+            ("smoothed", r, n), *([("trusted", r, (2, self.held))] if self.held else []),
+            ("last_good", r, n), ("z_end", r, n),
             *self._if_covariance("last_good_covariance", "covariance_end"),
             ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
             ("places", np.int8, self.rows), ("stages", stage, count),
@@ -373,6 +384,11 @@ def _filled(
         rows = one.matrix.shape[0]
         part["rows"][: one.matrix.size] = one.matrix.ravel()
         part["row_lower"][:rows], part["row_upper"][:rows] = one.row_lower, one.row_upper
+    if layout.held:
+        basis = directions.constraints_of(system, cost).basis
+        hold = Hold(system.held, inverse(regular), basis, cost.disturbance)
+        for name in record["hold"].dtype.names or ():
+            _fill(record["hold"], name, getattr(hold, name))
     if system.states is not None:
         metric = observer.metric
         record["metric"] = inverse(initial if metric is None else metric).ravel()
@@ -421,7 +437,7 @@ def _kind(residual: Residual | None) -> int:
     return 0 if residual is None else 2 if residual.periods is None else 1
 
 
-def _fill(record: NDArray[Any], name: str, value: NDArray[np.float64] | None) -> None:
+def _fill(record: NDArray[Any], name: str, value: NDArray[Any] | None) -> None:
     """Fill a field where there is something to fill in."""
     if value is not None:
         record[name] = value.ravel()

@@ -28,6 +28,7 @@ from ..observers.projection import NearestPoint
 from .conditions import ConditionReader, Conditions
 from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
+from .hold import WindowHold
 from .problem import Solved
 from .run import Run, RunSource
 from .sensitivity import Sensitivity
@@ -280,6 +281,16 @@ class MovingHorizonEstimator:
     def usual(self) -> Conditions:
         """What `set` has changed, and the parameters."""
         return self._engine.usual
+
+    @property
+    def hold(self) -> WindowHold | None:
+        """What held parameters in the last step, see `augment_parameters`.
+
+        None where nothing is held: without ``hold``, without QPs, or before the first measurement.
+        """
+        if not (self.system.held and self.time):
+            return None
+        return self._engine.solved().problem.hold
 
     def update(
         self,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .._linalg import cholesky, inverse
+from .._linalg import cholesky, inverse, solve
 from .observability import prior_units, window_information
 
 Array = NDArray[np.float64]
@@ -68,36 +69,37 @@ class Hold:
         trusted : (k,) array
             The last trusted values.
         """
-        n, eye = self.deviations.size, np.eye(self.components.size)
+        n, count = self.deviations.size, self.components.size
         jacobian = minus_jacobian * -self.deviations
         a, c = jacobian[:, :n] / self.deviations[:, None], jacobian[:, n:]
         seen = c.transpose(0, 2, 1) @ noise @ c
-        values, vectors = np.zeros(self.components.size), eye
-        try:
+        values, vectors = np.zeros(count), np.eye(count)  # of numbers beyond all measure
+        with suppress(np.linalg.LinAlgError):
             matrix = self.root.T @ window_information(a, seen, self.spread) @ self.root
             left = self.pick @ np.linalg.solve(np.eye(n) + matrix, self.pick.T)
-            left, vectors = np.linalg.eigh(0.5 * (left + left.T))
-            values = (1.0 - left) / np.maximum(left, 0.0)
-        except np.linalg.LinAlgError:  # numbers beyond all measure: nothing is seen
-            values, vectors = np.zeros(self.components.size), eye
+            if np.isfinite(left).all():
+                left, vectors = np.linalg.eigh(0.5 * (left + left.T))
+                values = (1.0 - left) / np.maximum(left, 0.0)
         return WindowHold(self, values, vectors, trusted)
 
 
 class WindowHold:
     r"""The hold of one window, fixed before its step.
 
-    With :math:`\varphi_i = \min(1, s_i^{-2})`, J of every trajectory, the candidate's too, has the
-    term :math:`|\theta_0 - \bar\theta|_H^2`, which is discounted as the prior is, with
+    With the singular values s of `Hold`, their directions V and the deviations D, J of every
+    trajectory, the candidate's too, has the term :math:`|\theta_0 - \bar\theta|_H^2`, discounted as
+    the prior is, with
 
     .. math::
-        H = L^{-\top} D^{-1} V \operatorname{diag}(\varphi) V^\top D^{-1} L^{-1}
+        H = L^{-\top} \Psi L^{-1}, \qquad \Psi = D^{-1} \Phi D^{-1}, \qquad
+        \Phi = V \operatorname{diag}(\min(1, 1/s_i)) V^\top
 
-    for the deviations D. What the data see no better than the first prior is held fully; what
-    they see well is free, and there the trusted value follows the estimate:
+    What the data see no better than the first prior is held fully, and what they see well is free.
+    There, the trusted value follows the estimate, the less the more it was held:
 
     .. math::
         \bar\theta^+ = \bar\theta
-        + L\, V \operatorname{diag}(1 - \varphi) V^\top L^{-1} (\hat\theta - \bar\theta)
+        + L (I + \Psi)^{-1} (I - \Phi) L^{-1} (\hat\theta - \bar\theta)
 
     Attributes
     ----------
@@ -117,12 +119,12 @@ class WindowHold:
     def __init__(self, hold: Hold, values: Array, vectors: Array, target: Array) -> None:
         self.components, self.target, self.values = hold.components, target, values
         # Whatever is not a number above 1 is not seen.
-        held = np.where(values > 1.0, 1.0 / np.square(np.where(values > 1.0, values, 1.0)), 1.0)
+        held = np.where(values > 1.0, 1.0 / np.where(values > 1.0, values, 1.0), 1.0)
         inner = (vectors * held) @ vectors.T
         self.shares: Array = inner.diagonal().copy()
-        stiff = hold.inverse_units.T * hold.stiffness
-        self.weight: Array = stiff @ inner @ stiff.T
-        self._follow = hold.units @ (np.eye(held.size) - inner) @ hold.inverse_units
+        eye, stiff = np.eye(held.size), inner * np.multiply.outer(hold.stiffness, hold.stiffness)
+        self.weight: Array = hold.inverse_units.T @ stiff @ hold.inverse_units
+        self._follow = hold.units @ solve(eye + stiff, eye - inner) @ hold.inverse_units
         n = hold.deviations.size
         #: H among the weights of all states (n, n).
         self.whole: Array = np.zeros((n, n))

@@ -40,9 +40,7 @@ class Augmentation:
     """
 
     def __init__(self, n: int, m: int, constants: Array, moved: Index) -> None:
-        #: Number of states x, and of inputs u.
-        self.x, self.m = n, m
-        self._constants, self._moved = constants, moved
+        self._n, self.m, self._constants, self._moved = n, m, constants, moved
         #: Number of states z.
         self.n = n + moved.size
 
@@ -61,7 +59,7 @@ class Augmentation:
         ``join`` makes one column of several and of single entries. With a ``factor``, this
         multiple of s stands behind the value.
         """
-        n = self.x
+        n = self._n
 
         def evaluate(z: Any, u: Any = ()) -> Any:
             value = function(z[:n], join(*self.inputs(u, z[n:])))
@@ -71,7 +69,7 @@ class Augmentation:
 
     def over_leading(self, function: BatchedFunction, factor: float | None = None) -> Trusted:
         """The same of a NumPy function, over leading dimensions."""
-        n, m, constants, moved = self.x, self.m, self._constants, self._moved
+        n, m, constants, moved = self._n, self.m, self._constants, self._moved
         size, inputs = function.shape[0], self.m + self._constants.size
         nothing: Array = np.zeros(0)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,8 +16,8 @@ from ..errors import InvalidInputError, ModelError, OptionError, SetError, Shape
 from .augmentation import Augmentation, augmented, chosen, extended_matrix, product
 from .functions import BatchedFunction, Parametric, Probes
 from .residuals import extended
-from .sets import Box, ConvexSet
-from .system import System, checked_set, probe_points
+from .sets import Box, ConvexSet, SoftSet
+from .system import System, SystemOptions, checked_set, probe_points
 
 Array = NDArray[Any]
 Index = NDArray[np.intp]
@@ -78,7 +78,7 @@ def augment_parameters(
         none with an empty list, which gives the model at its nominal parameters.
     drifting : bool
         Whether the parameters change from step to step by a disturbance, which the cost weighs
-        with the others. ``engine="compiled"`` needs it: it takes no component without disturbance.
+        with the others.
     dt : float, optional
         Sampling time. If given, f is a rate, which is discretised with u held over the step, and
         the system takes steps of other lengths.
@@ -129,7 +129,7 @@ def augment_parameters(
     by the singular values of its Gauss-Newton matrix in deviations of the first prior, as in
     `Diagnosis`, with the other states eliminated. A direction with a singular value up to 1, of
     which the data say no more than that prior, is held fully; above, its weight falls as the
-    inverse square, and the trusted value follows the estimate. See `WindowHold`.
+    inverse of the singular value, and the trusted value follows the estimate. See `WindowHold`.
 
     The observer is not held: it stays the one that the theorem is about, but the theorem does not
     cover this term. Kalman-type observers need no more than a disturbance of the parameter that
@@ -160,53 +160,80 @@ def augment_parameters(
         "disturbances": disturbances, "noises": noises, "parameter_bounds": parameter_bounds,
         "hold": hold,
     }
-    if isinstance(f, System):
-        n, p, m = f.n, f.p, _other_inputs(arguments, values.size)
-        states, disturbances, noises = f.states, f.disturbances, f.noises
-        r, matrix = f.r, extended_matrix(f, moved.size)
-    else:
-        n, p = dimension("n", n, 1), dimension("p", p, 1)
-        m = dimension("m", 0 if m is None else m, 0)
-        r, matrix = n, None
-        alone = ", the dimension of x alone: the parameters are added here"
-        checked_set("states", states, n, alone)
-        checked_set("disturbances", disturbances, n, alone)
     _check_bounds(parameter_bounds, values[moved])
-    constants = values.copy()
-    constants[moved] = 0.0
-    change, k = Augmentation(n, m, constants, m + moved), moved.size
+    k = moved.size
     still = None if flag("drifting", drifting) or not k else Box(np.zeros(k), np.zeros(k))
-    options: Any = {
-        "states": product(states, n, parameter_bounds, k),
-        "disturbances": product(disturbances, r, still, k),
-        "noises": noises, "disturbance_matrix": matrix,
-    }
+    parameters = _Parameters(values, moved, parameter_bounds, still)
     if isinstance(f, System):
-        options["output_residual"] = f.output_residual
-        options["state_residual"] = extended(f.state_residual, n, change.n)
-        system = augmented(f, change, **options)
+        system = _of_system(f, _other_inputs(arguments, values.size), parameters)
     else:
-        probes = _probes(probe_points(states, n, m), values, moved, parameter_bounds)
-        functions = _function("f", f, n, m, probes), _function("h", h, p, m, probes)
-        system = _of_functions(change, *functions, dt, method, options)
-    system.held |= {change.x + place: within for place, within in held.items()}
+        system = _of_functions(arguments, parameters)
+    system.held |= {system.n - k + place: within for place, within in held.items()}
     system.recipe = augment_parameters, arguments
     return system
 
 
-def _of_functions(
-    change: Augmentation, f: BatchedFunction, h: BatchedFunction, dt: float | None,
-    method: str | None, options: Any,
-) -> System:
-    sizes: Any = {"n": change.n, "p": h.shape[0], "m": change.m}
+class _Parameters(NamedTuple):
+    """Values of all, the indices of the estimated ones, their bounds, and their part of W."""
+
+    nominal: Array
+    moved: Index
+    bounds: ConvexSet | None
+    still: ConvexSet | None
+
+    def change(self, n: int, m: int) -> Augmentation:
+        """What makes states of the estimated ones and constants of the others."""
+        constants = self.nominal.copy()
+        constants[self.moved] = 0.0
+        return Augmentation(n, m, constants, m + self.moved)
+
+    def sets(
+        self, states: ConvexSet | SoftSet | None, n: int,
+        disturbances: ConvexSet | SoftSet | None, r: int,
+    ) -> SystemOptions:
+        """X and W of the augmented system, of those of x alone."""
+        k = self.moved.size
+        return {
+            "states": product(states, n, self.bounds, k),
+            "disturbances": product(disturbances, r, self.still, k),
+        }
+
+
+def _of_system(f: System, m: int, parameters: _Parameters) -> System:
+    """The augmented system of one whose last inputs, behind ``m`` others, are the parameters."""
+    change, k = parameters.change(f.n, m), parameters.moved.size
+    options: SystemOptions = {
+        "noises": f.noises, "disturbance_matrix": extended_matrix(f, k),
+        "output_residual": f.output_residual,
+        "state_residual": extended(f.state_residual, f.n, change.n),
+    }
+    options.update(parameters.sets(f.states, f.n, f.disturbances, f.r))
+    return augmented(f, change, **options)
+
+
+def _of_functions(given: dict[str, Any], parameters: _Parameters) -> System:
+    """The augmented system of functions, from the arguments of `augment_parameters`."""
+    n, p = dimension("n", given["n"], 1), dimension("p", given["p"], 1)
+    m = dimension("m", 0 if given["m"] is None else given["m"], 0)
+    alone = ", the dimension of x alone: the parameters are added here"
+    states, disturbances = given["states"], given["disturbances"]
+    checked_set("states", states, n, alone)
+    checked_set("disturbances", disturbances, n, alone)
+    nominal, moved, bounds, _ = parameters
+    probes = _probes(probe_points(states, n, m), nominal, moved, bounds)
+    f, h = _function("f", given["f"], n, m, probes), _function("h", given["h"], p, m, probes)
+    change, dt, method = parameters.change(n, m), given["dt"], given["method"]
     output = change.over_leading(h)
+    options: Any = {
+        "n": change.n, "p": p, "m": change.m, "noises": given["noises"],
+        **parameters.sets(states, n, disturbances, n),
+    }
     if dt is None and method is not None:
         raise OptionError(f"method is {shown(method)}, but dt is missing; give both or neither.")
     if dt is None:
-        return System(change.over_leading(f, 1.0), output, **sizes, **options)
-    return System.from_ode(
-        change.over_leading(f, 0.0), output, dt=dt, method=method or "rk4", **sizes, **options
-    )
+        return System(change.over_leading(f, 1.0), output, **options)
+    rate = change.over_leading(f, 0.0)
+    return System.from_ode(rate, output, dt=dt, method=method or "rk4", **options)
 
 
 def _other_inputs(arguments: dict[str, Any], parameters: int) -> int:
@@ -245,6 +272,11 @@ def _held(hold: ArrayLike | Mapping[int, float] | None, moved: Index) -> dict[in
     """Within how many deviations of the prior a parameter is held, by its place in ``moved``."""
     if hold is None:
         return {}
+    if not moved.size:
+        raise InvalidInputError(
+            f"hold is {shown(hold)}, but no parameter is estimated; leave it out."
+        )
+    found: dict[int, Any]
     if isinstance(hold, Mapping):
         places = {int(j): place for place, j in enumerate(moved)}
         for j in hold:

@@ -39,6 +39,10 @@ class IpoptEstimator:
             raise InvalidInputError(
                 "the comparison with Ipopt takes systems without inputs and constant prior weights."
             )
+        if system.held:
+            raise InvalidInputError(
+                "the comparison with Ipopt holds no parameters; make the system without hold."
+            )
         if cost.directions(system.disturbance_matrix) is not None:
             raise InvalidInputError(
                 "the comparison with Ipopt takes no disturbance_matrix and no singular covariance "

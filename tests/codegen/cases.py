@@ -549,6 +549,42 @@ def _with_own_w(one: Case) -> Case:
     return replace(one, samples=tuple(samples))
 
 
+def _held(
+    hold: Any = 0.2, drifting: bool = True, observer: Any = None, cost: Any = None,
+    bounds: Any = None, **options: Any,
+) -> Case:
+    """Two unknown parameters, which are seen only while the input acts."""
+    import casadi
+
+    system = qpmhe.from_casadi(
+        lambda x, u: [0.8 * x[0] + 0.2 * u[1] * u[0] + 0.05 * x[1],
+                      0.7 * x[1] + 0.3 * u[2] * casadi.sin(x[0])],
+        lambda x: [x[0], x[1] + 0.1 * x[0] ** 2], n=2, m=3, compiled=False, **options,
+    )
+    nominal, r = np.array([1.0, 0.5]), system.r + 2
+    augmented = qpmhe.augment_parameters(
+        system, nominal=nominal, drifting=drifting, parameter_bounds=bounds, hold=hold
+    )
+    weights = {
+        "prior": spd(8, 4), "disturbance": np.diag([400.0] * (r - 2) + [2500.0, 900.0]),
+        "noise": np.diag([100.0, 60.0]),
+    }
+    generator, x, samples = np.random.default_rng(12), np.array([0.2, 0.1]), []
+    for t in range(3 * STEPS):
+        u = np.array([np.sin(0.7 * t) if t < STEPS or t >= 2 * STEPS else 0.0])
+        y = system.h(x, np.append(u, nominal)) + 0.1 * generator.standard_normal(2)
+        samples.append({"y": y, "u": u})
+        x = system.f(x, np.append(u, nominal + np.array([0.3, -0.2])))
+    gain = [[0.3, 0.0], [0.0, 0.3], [0.02, 0.0], [0.0, 0.01]]
+    one = Case(
+        augmented, qpmhe.Luenberger(gain), qpmhe.QuadraticCost(**weights),
+        np.append([0.0, 0.0], nominal), tuple(samples), {"horizon": 6, "max_qps": 2},
+    )
+    if cost is not None:
+        one = replace(one, cost=cost(weights))
+    return one if observer is None else _filtered(observer, one)
+
+
 OTHER_GAIN = [[0.2, 0.0], [0.1, 0.05], [0.0, 0.2]]
 
 #: Each is made when it is asked for; `case` keeps it.
@@ -607,6 +643,27 @@ CASES: dict[str, Callable[[], Case]] = {
         OTHER_GAIN, disturbances=qpmhe.Box([0.01, -np.inf], [0.01, np.inf])
     ).with_options(max_qps=None),
     "singular covariance": lambda: _singular().with_gaps(),
+    "held": lambda: _held(),
+    "held with gaps": lambda: with_changes(case("held").with_gaps()),
+    "held observer": lambda: case("held").with_options(max_qps=0),
+    "held constants": lambda: _held([0.3, 0.1], drifting=False),
+    "held, one of two": lambda: _held(
+        {1: 0.1}, observer=qpmhe.ExtendedKalman
+    ).with_options(arrival="smoothed"),
+    "held in sets": lambda: _held(
+        {1: 0.1, 0: 0.4}, bounds=qpmhe.Box([0.9, 0.2], [1.2, 0.6]),
+        noises=qpmhe.Box([-0.2, -0.3], [0.2, 0.3]),
+    ).with_options(warm_start=True, solver_tolerance=1e-10),
+    "held, fewer disturbances": lambda: _held(
+        observer=qpmhe.UnscentedKalman, disturbance_matrix=[[1.0], [0.5]]
+    ).with_gaps(),
+    "held reinitialized": lambda: with_conditions(case("held")).with_options(
+        candidate="reinitialized", max_qps=None
+    ),
+    "held, graduated": lambda: with_outliers(_held(cost=lambda weights: qpmhe.RobustCost(
+        prior=_huber(0.5)(weights["prior"]), disturbance=weights["disturbance"],
+        noise=qpmhe.GemanMcClure(weights["noise"], per_component=True), discount=0.9,
+    ))).with_options(warm_start=True),
     "many states": lambda: _many_states(False),
     "many states, dense": lambda: _many_states(True),
     "many states with gaps": lambda: case("many states").with_gaps(),

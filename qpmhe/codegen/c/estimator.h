@@ -56,6 +56,7 @@ typedef $real mhe_real;
 #define MHE_OBSERVER_PRIOR $observer_prior /* whether it weighs the prior */
 #define MHE_TURNS $turns  /* whether the set of states bounds angles */
 #define MHE_QUIET $quiet /* directions of x(t+1) - f without a disturbance */
+#define MHE_HELD $held    /* states that are held where the window does not see them */
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
@@ -153,6 +154,19 @@ typedef struct {
 } mhe_covariances;
 #endif
 
+#if MHE_HELD
+/* What holds parameters that a window does not see, in deviations of the first prior. */
+typedef struct {
+    mhe_real deviations[MHE_NX];           /* units of the matrices on all states */
+    mhe_real root[MHE_NX * MHE_NX];        /* of the prior's covariance */
+    mhe_real spread[MHE_NX * MHE_NX];      /* covariance of the disturbances */
+    mhe_real pick[MHE_HELD * MHE_NX];      /* from columns of `root` to held parameters */
+    mhe_real units[MHE_HELD * MHE_HELD], inverse_units[MHE_HELD * MHE_HELD];
+    mhe_real stiffness[MHE_HELD];
+    int32_t components[MHE_HELD];
+} mhe_hold;
+#endif
+
 typedef struct {
     mhe_real gain[MHE_NX * MHE_NY];
     mhe_real filter_gain[MHE_NX * MHE_NY]; /* of the observer's own measurement update */
@@ -165,6 +179,9 @@ typedef struct {
     mhe_real turn_middle[MHE_NX]; /* of an angle's bounds; infinite where there are none */
 #if MHE_COVARIANCE
     mhe_covariances covariances; /* of the observer */
+#endif
+#if MHE_HELD
+    mhe_hold hold;
 #endif
     mhe_real discount;         /* factor on a stage's cost for each step of age */
     mhe_real sample_time;      /* of the rate; 0 where f is a map */
@@ -243,6 +260,9 @@ typedef struct {
     int32_t metric_settled;        /* whether the metric below is for good */
     mhe_real metric[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)]; /* of the observer, as a covariance */
     mhe_real smoothed[MHE_NX];     /* the prior in place of the window's first z */
+#if MHE_HELD
+    mhe_real trusted[2 * MHE_HELD]; /* values of held parameters: for this window and the next */
+#endif
     mhe_real last_good[MHE_NX];    /* of the stages that have left the window */
     mhe_real z_end[MHE_NX];        /* the observer's state behind the last stage */
 #if MHE_COVARIANCE
@@ -296,6 +316,12 @@ typedef struct {
     const mhe_real *mean, *weight, *distance_weight;
     mhe_real own_weight[MHE_OBSERVER_PRIOR ? MHE_NX * MHE_NX : 1];
     mhe_real own_distance[MHE_OBSERVER_PRIOR ? MHE_NX * MHE_NX : 1];
+#if MHE_HELD
+    /* Of the present window: the weight of held parameters, how their trusted values follow, and the
+     * first state of the trajectory around which the QP is. */
+    mhe_real held[MHE_HELD * MHE_HELD], follow[MHE_HELD * MHE_HELD];
+    const mhe_real *first;
+#endif
 } mhe_prior;
 
 typedef struct {

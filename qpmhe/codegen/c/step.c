@@ -38,6 +38,9 @@ static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 #else
     memcpy(e->trajectory, o->best->x, size);
 #endif
+#if MHE_HELD
+    mhe_trust(e, k, o->best != o->candidate ? o->best->x : 0);
+#endif
     e->has_trajectory = 1;
     if (!isfinite(newest->cost) && o->best != o->candidate)
         memcpy(e->z_end, o->best->x + e->length * NX, sizeof e->z_end);
@@ -71,6 +74,9 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
         memcpy(e->smoothed, e->trajectory + NX, sizeof e->smoothed);
         e->has_smoothed = 1;
     }
+#if MHE_HELD
+    memcpy(e->trusted, e->trusted + MHE_HELD, sizeof e->trusted / 2);
+#endif
 #if CONSTRAINED
     if (before == MHE_HORIZON) mhe_shift_places(e);
 #endif
@@ -140,6 +146,9 @@ void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
 #endif
     memcpy(e->last_good, e->z_end, sizeof e->last_good);
     memcpy(e->history, e->z_end, sizeof e->z_end);
+#if MHE_HELD
+    mhe_trust_start(e);
+#endif
 #if MHE_COVARIANCE
     memcpy(e->last_good_covariance, settings->covariances.initial, sizeof e->covariance_end);
     memcpy(e->covariance_end, settings->covariances.initial, sizeof e->covariance_end);

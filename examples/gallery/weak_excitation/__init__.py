@@ -1,0 +1,1 @@
+"""A motor's inertia, which the data do not see while the speed is steady."""

@@ -1,0 +1,431 @@
+"""Parameters that a window does not see: held, without drift and without getting stiff."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.certificates.monitor import _barred
+from qpmhe.codegen.compiler import find_compiler
+from qpmhe.errors import InvalidInputError, ShapeError
+
+DT = 0.1
+PRIOR = np.array([1.0, 0.5])  # standard deviations of speed and of gain
+NOISE, WANDER = 0.05, 0.01
+HORIZON = 10
+# Seen; unseen for ten horizons, in which the gain changes after five; seen again.
+UNSEEN, CHANGE, AGAIN, END = (k * HORIZON for k in (5, 11, 16, 19))
+ENGINES = [
+    "python",
+    pytest.param("compiled", marks=pytest.mark.skipif(
+        find_compiler() is None, reason="there is no C compiler"
+    )),
+]
+
+
+def rate(x, u, gain):
+    return -0.5 * x + gain * u
+
+
+def output(x, u, gain):
+    return x
+
+
+def motor(hold, **options):
+    return qpmhe.augment_parameters(
+        rate, output, n=1, p=1, m=1, dt=DT, nominal=[1.0], hold=hold,
+        **({"drifting": True} | options),
+    )
+
+
+def estimator(hold, drift=0.1, gain=None, constants=False, **options):
+    """With an extended Kalman filter, or with a constant gain and weight."""
+    covariances = {
+        "prior": np.diag(PRIOR**2), "disturbance": np.diag([WANDER, drift]) ** 2,
+        "noise": [[NOISE**2]],
+    }
+    observer, prior = qpmhe.ExtendedKalman(**covariances), qpmhe.ObserverPrior()
+    if gain is not None:
+        observer, prior = qpmhe.Luenberger([[0.3], [gain]]), covariances["prior"]
+    cost = qpmhe.QuadraticCost.from_covariances(**covariances | {"prior": prior})
+    options = {"horizon": HORIZON, "initial_state": [0.0, 1.0], "max_qps": 2} | options
+    return qpmhe.MovingHorizonEstimator(
+        motor(hold, drifting=not constants), observer, cost, **options
+    )
+
+
+def record(seed, bias=0.02):
+    """Measurements, inputs and gains; while unseen, a little current that does nothing."""
+    generator, x = np.random.default_rng(seed), 0.0
+    t = np.arange(END)
+    gains = np.where(t < CHANGE, 1.3, 0.7)
+    steady = (t >= UNSEEN) & (t < AGAIN)
+    u = np.where(steady, 0.0, np.sign(np.sin(t / 4.0)))
+    y = np.empty(END)
+    for k in t:
+        y[k] = x + NOISE * generator.standard_normal()
+        x += DT * (-0.5 * x + gains[k] * u[k]) + 0.3 * WANDER * generator.standard_normal()
+    return y, (u + bias * steady)[:, None], gains
+
+
+def drift_and_error(mhe, seed):
+    """In deviations of the prior: how far the gain moves while unseen, and its later error."""
+    y, u, gains = record(seed)
+    run = mhe.run(y, u)
+    assert (run.costs <= run.candidate_costs).all()
+    found = run.states[1:, 1]
+    moved = np.abs(found[UNSEEN:AGAIN] - found[UNSEEN - 1]).max()
+    recovered = AGAIN + 2 * HORIZON
+    return moved / PRIOR[1], np.abs(found[recovered - 1] - gains[recovered - 1]) / PRIOR[1]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_unseen_parameter_neither_drifts_nor_gets_stiff(engine, seed):
+    quick, stiff = ({"drift": one, "engine": engine} for one in (0.1, 1e-3))
+    moved, _ = drift_and_error(estimator(None, **quick), seed)
+    assert moved > 1.0
+    _, error = drift_and_error(estimator(None, **stiff), seed)
+    assert error > 0.5
+    moved, error = drift_and_error(estimator(0.1, **quick), seed)
+    assert moved < 0.6
+    assert error < 0.3
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.1])
+def test_an_unseen_parameter_does_not_fall_back_to_the_observers(gain):
+    for constants in (True, False):
+        moved = [
+            drift_and_error(estimator(hold, 0.02, gain, constants), 0) for hold in (None, 0.1)
+        ]
+        assert moved[0][0] > 0.5
+        assert moved[1][0] < 0.5 * moved[0][0]
+        assert moved[1][1] < 0.3
+
+
+def test_nothing_is_measured_for_ten_horizons():
+    mhe = estimator(0.1)
+    y, u, _ = record(0)
+    for t in range(UNSEEN):
+        mhe.update(y[t], u[t])
+    for _ in range(HORIZON):
+        mhe.update(None, [1.0])
+    target, weight = mhe.hold.target, mhe.hold.weight
+    assert abs(target[0] - 1.3) < 0.5 * PRIOR[1]
+    np.testing.assert_allclose(weight, [[1.0 / (0.1 * PRIOR[1]) ** 2]], rtol=1e-12)
+    for _ in range(9 * HORIZON):
+        estimate = mhe.update(None, [1.0])
+        np.testing.assert_array_equal(mhe.hold.target, target)
+        np.testing.assert_array_equal(mhe.hold.values, [0.0])
+        np.testing.assert_array_equal(mhe.hold.shares, [1.0])
+        assert abs(estimate.trajectory[0, 1] - target[0]) < 0.02 * PRIOR[1]
+
+
+def random_problem(draw):
+    """A random small model with inputs and parameters, some of them held; its estimator."""
+    n, k, p, m = (int(draw.integers(1, most)) for most in (3, 4, 3, 3))
+    a, b = draw.normal(size=(n, n)), draw.normal(size=(n, k))
+    c, d = draw.normal(size=(p, n)), draw.normal(size=(m, k))
+    a *= 0.9 / np.abs(np.linalg.eigvals(a)).max()
+
+    def f(x, u, theta):
+        return x @ a.T + 0.2 * np.sin(x) + ((u @ d) * theta) @ b.T
+
+    def h(x, u, theta):
+        return x @ c.T + 0.05 * (x @ c.T) ** 2
+
+    held = draw.permutation(k)[: draw.integers(1, k + 1)]
+    system = qpmhe.augment_parameters(
+        f, h, n=n, p=p, m=m, nominal=draw.normal(size=k), drifting=bool(draw.random() < 0.7),
+        hold={int(j): float(draw.uniform(0.05, 1.0)) for j in held},
+        parameter_bounds=qpmhe.Box([-4.0] * k, [4.0] * k) if draw.random() < 0.3 else None,
+    )
+    root = draw.normal(size=(n + k, n + k))
+    prior = root @ root.T + 0.2 * np.eye(n + k)
+    covariances = {
+        "disturbance": np.diag(draw.uniform(1e-3, 0.1, n + k)),
+        "noise": np.diag(draw.uniform(0.01, 0.5, p)),
+    }
+    kind = int(draw.integers(3))
+    observer = qpmhe.ExtendedKalman(prior=prior, **covariances)
+    if kind == 0:
+        gain = 0.3 * np.vstack((a @ np.linalg.pinv(c), 0.2 * draw.normal(size=(k, p))))
+        observer = qpmhe.Luenberger(gain)
+    discount = float(draw.choice([1.0, 0.9]))
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=qpmhe.ObserverPrior() if kind == 2 else prior, discount=discount, **covariances
+    )
+    start = np.append(draw.normal(size=n), system.recipe[1]["nominal"])
+    options = {
+        "horizon": int(draw.integers(1, 7)), "max_qps": [1, 2, None][draw.integers(3)],
+        "warm_start": bool(draw.random() < 0.3),
+        "candidate": ("observer", "reinitialized")[int(draw.random() < 0.2)],
+    }
+    mhe = qpmhe.MovingHorizonEstimator(system, observer, cost, initial_state=start, **options)
+    return mhe, prior
+
+
+def plain_j(mhe, x, u, y, weight, prior):
+    """J of a trajectory, stage by stage, with the hold that the estimator states."""
+    system, cost, hold = mhe.system, mhe.cost, mhe.hold
+    count = len(x) - 1
+    factors = cost.discount ** np.arange(count - 1, -1, -1.0)
+    offset, parameter = x[0] - prior, x[0][hold.components] - hold.target
+    total = offset @ weight @ offset + parameter @ hold.weight @ parameter
+    total *= cost.discount**count
+    for i in range(count):
+        w, v = x[i + 1] - system.f(x[i], u[i]), y[i] - system.h(x[i], u[i])
+        v = np.where(np.isfinite(v), v, 0.0)
+        noise = np.where(np.isnan(y[i])[:, None] | np.isnan(y[i]), 0.0, cost.noise)
+        total += factors[i] * (w @ cost.disturbance @ w + v @ noise @ v)
+    return total
+
+
+def dense_hold(mhe, candidate, u, y, prior):
+    """H and the matrix by which the trusted values follow, by dense inverses of all states."""
+    system, cost, count = mhe.system, mhe.cost, len(candidate) - 1
+    n, held = system.n, mhe.hold.components
+    spread = np.linalg.inv(cost.disturbance)
+    fixed = [] if system.disturbances is None else system.disturbances.fixed_components
+    spread[fixed] = spread[:, fixed] = 0.0
+    # Parameters of the window: x_0 and each disturbance; the outputs are linear in them.
+    size = n * (count + 1)
+    covariance = np.zeros((size, size))
+    covariance[:n, :n] = prior
+    slopes, information = np.zeros((n, size)), np.zeros((size, size))
+    slopes[:, :n] = np.eye(n)
+    for i in range(count):
+        covariance[n * (i + 1) : n * (i + 2), n * (i + 1) : n * (i + 2)] = spread
+        rows = system.h_jacobian(candidate[i], u[i]) @ slopes
+        there = ~np.isnan(y[i])
+        information += rows[there].T @ cost.noise[np.ix_(there, there)] @ rows[there]
+        slopes = system.f_jacobian(candidate[i], u[i]) @ slopes
+        slopes[:, n * (i + 1) : n * (i + 2)] += np.eye(n)
+    left = covariance @ np.linalg.inv(np.eye(size) + information @ covariance)
+    part = prior[np.ix_(held, held)]
+    units = np.sqrt(part.diagonal())
+    values, vectors = np.linalg.eigh(part / np.outer(units, units))
+    root = units[:, None] * ((vectors * np.sqrt(values)) @ vectors.T)
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ left[np.ix_(held, held)] @ inverse.T)
+    low = np.minimum(values, 0.5)
+    shares = (vectors * (low / (1.0 - low))) @ vectors.T
+    stiffness = np.diag([1.0 / system.held[int(j)] for j in held])
+    stiff = stiffness @ shares @ stiffness
+    follow = root @ np.linalg.inv(np.eye(held.size) + stiff) @ (np.eye(held.size) - shares)
+    return inverse.T @ stiff @ inverse, follow @ inverse
+
+
+@pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
+@pytest.mark.parametrize("seed", range(40))
+def test_promise_and_formulas_on_random_problems(seed):
+    draw = np.random.default_rng(seed)
+    mhe, prior = random_problem(draw)
+    system, horizon = mhe.system, mhe.horizon
+    parameters = 3 * draw.normal(size=system.n)
+    x = np.append(draw.normal(size=1), parameters)[: system.n]
+    ys, us, target = [], [], None
+    for t in range(4 * horizon + 6):
+        ys.append(system.h(x, np.zeros(system.m)) + 0.2 * draw.normal(size=system.p))
+        ys[-1][draw.random(system.p) < 0.1] = np.nan
+        us.append(draw.normal(size=system.m) * (t // horizon % 2))
+        x = system.f(x, us[-1])
+        estimate = mhe.update(ys[-1], us[-1])
+        assert estimate.cost <= estimate.candidate_cost
+        if np.abs(estimate.candidate).max() > 100.0:  # an observer that runs away
+            target = None
+            continue
+        y, u, hold = ys[-horizon:], us[-horizon:], mhe.hold
+        if target is not None:
+            np.testing.assert_allclose(hold.target, target, rtol=1e-9, atol=1e-9)
+        weight, follow = dense_hold(mhe, estimate.candidate, u, y, prior)
+        np.testing.assert_allclose(hold.weight, weight, rtol=1e-6, atol=1e-7 * np.abs(weight).max())
+        problem = mhe._engine.solved().problem
+        for trajectory, cost in (
+            (estimate.trajectory, estimate.cost), (estimate.candidate, estimate.candidate_cost)
+        ):
+            found = plain_j(mhe, trajectory, u, y, problem.prior_weight, estimate.candidate[0])
+            if np.isfinite(cost):
+                assert cost == pytest.approx(found, rel=1e-8, abs=1e-10)
+        target = hold.target
+        if estimate.improved:
+            first = estimate.trajectory[int(len(u) == horizon)][hold.components]
+            target = target + follow @ (first - target)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("stop", [0, 1, UNSEEN, AGAIN + 3])
+def test_a_restored_estimator_continues_bit_for_bit(engine, stop):
+    y, u, _ = record(1)
+    mhe = estimator({0: 0.1}, engine=engine)
+    mhe.run(y[:stop], u[:stop])
+    if stop > 1:
+        mhe.amend(stop - 2, [y[stop - 2] + 0.01])
+    state = pickle.loads(pickle.dumps(mhe.state_dict()))
+    restored, copied = estimator(0.1, engine=engine), pickle.loads(pickle.dumps(mhe))
+    restored.load_state_dict(state)
+    expected = mhe.run(y[stop:], u[stop:])
+    for other in (restored, copied):
+        found = other.run(y[stop:], u[stop:])
+        np.testing.assert_array_equal(found.states, expected.states)
+        np.testing.assert_array_equal(found.candidate_costs, expected.candidate_costs)
+        np.testing.assert_array_equal(other.hold.target, mhe.hold.target)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_snapshots_of_other_holds_and_damaged_ones_are_refused(engine):
+    y, u, _ = record(2)
+    mhe = estimator(0.1, engine=engine)
+    mhe.run(y[:15], u[:15])
+    state = mhe.state_dict()
+    for other in (estimator(None, engine=engine), estimator(0.2, engine=engine)):
+        with pytest.raises(InvalidInputError, match="another"):
+            other.load_state_dict(state)
+    if engine == "python":
+        state["window"]["trusted"] = np.full((2, 1), np.nan)
+    else:
+        record_of = state["memory"].view(mhe._engine._memory.dtype)
+        record_of["trusted"] = np.nan
+    with pytest.raises(InvalidInputError, match="damaged"):
+        mhe.load_state_dict(state)
+
+
+def test_an_interrupted_step_leaves_the_trusted_value():
+    y, u, _ = record(3)
+    mhe, other = estimator(0.1), estimator(0.1)
+    mhe.run(y[:30], u[:30])
+    other.run(y[:30], u[:30])
+    engine, watch = mhe._engine, mhe._engine._watch.note
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    engine._watch.note = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        mhe.update(y[30] + 1.0, u[30])
+    engine._watch.note = watch
+    for t in range(30, 40):
+        assert mhe.update(y[t], u[t]).cost == other.update(y[t], u[t]).cost
+    np.testing.assert_array_equal(mhe.hold.target, other.hold.target)
+
+
+def test_reset_trusts_the_new_start():
+    y, u, _ = record(4)
+    mhe = estimator(0.1)
+    mhe.run(y[:40], u[:40])
+    mhe.reset([0.0, 0.8])
+    assert mhe.hold is None
+    mhe.update(y[0], u[0])
+    np.testing.assert_array_equal(mhe.hold.target, [0.8])
+
+
+@pytest.mark.parametrize("exponents", [(9, -14, 4), (-20, 7, -3)])
+def test_no_unit_matters(exponents):
+    """Speed, gain and output in other units: the same numbers, in these."""
+    sx, sg, sy = np.ldexp(1.0, exponents)
+    y, u, _ = record(5)
+
+    def run(sx, sg, sy):
+        system = qpmhe.augment_parameters(
+            lambda x, u, g: -0.5 * x + (g / sg) * u * sx, lambda x, u, g: x / sx * sy,
+            n=1, p=1, m=1, dt=DT, nominal=[sg], drifting=True, hold=0.1,
+        )
+        scale = np.array([sx, sg])
+        covariances = {
+            "prior": np.diag((PRIOR * scale) ** 2),
+            "disturbance": np.diag(([WANDER, 0.05] * scale) ** 2), "noise": [[(NOISE * sy) ** 2]],
+        }
+        cost = qpmhe.QuadraticCost.from_covariances(
+            **covariances | {"prior": qpmhe.ObserverPrior()}
+        )
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.ExtendedKalman(**covariances), cost, horizon=HORIZON,
+            initial_state=[0.0, sg], max_qps=2, engine="python",
+        )
+        found = mhe.run(y * sy, u)
+        return found.states / scale, found.costs
+
+    for expected, found in zip(run(1.0, 1.0, 1.0), run(sx, sg, sy), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_sensitivity_has_the_hold():
+    """By the newest measurement, on which neither target nor weight rests here."""
+    y, u, _ = record(6)
+    mhe = estimator(0.1, max_qps=None, tolerance=1e-15)
+    mhe.run(y[: UNSEEN + 6], u[: UNSEEN + 6])
+    state, k = mhe.state_dict(), UNSEEN + 6
+    mhe.update(y[k], u[k])
+    assert mhe.hold.shares[0] > 0.05
+    found = mhe.sensitivity().measurements[-1, :, -1, 0]
+    ends = []
+    for step in (1e-4, -1e-4):
+        mhe.load_state_dict(state)
+        ends.append(mhe.update(y[k] + step, u[k]).state)
+    np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2e-4, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_batch_holds_as_single_estimators_do(engine):
+    mhe = estimator(0.1, engine=engine)
+    starts = np.array([[0.0, 1.0], [0.2, 1.2]])
+    parts = mhe.system, mhe.observer, mhe.cost
+    batch = qpmhe.BatchEstimator(
+        *parts, members=2, horizon=HORIZON, initial_states=starts, max_qps=2, engine=engine
+    )
+    records = [record(seed) for seed in (7, 8)]
+    run = batch.run(
+        np.array([one[0][:, None] for one in records]), np.array([one[1] for one in records])
+    )
+    for k, (y, u, _) in enumerate(records):
+        mhe.reset(starts[k])
+        np.testing.assert_allclose(run.states[k], mhe.run(y, u).states, rtol=1e-9, atol=1e-9)
+
+
+def test_what_is_held_survives_pickles_and_further_augmentations():
+    system = motor({0: 0.2})
+    assert pickle.loads(pickle.dumps(system)).held == system.held == {1: 0.2}
+    assert qpmhe.noisy_inputs(system).held == {1: 0.2}
+    again = qpmhe.augment_parameters(system, nominal=[0.0], hold=0.3)
+    assert again.held == {1: 0.2, 2: 0.3}
+
+
+def test_the_theorem_does_not_cover_it():
+    assert _barred(estimator(None)) == ""
+    assert "without hold" in _barred(estimator(0.1))
+
+
+@pytest.mark.parametrize(
+    ("hold", "error", "text"),
+    [
+        (0.0, InvalidInputError, "hold is 0.0"),
+        (-1.0, InvalidInputError, "above 0"),
+        ([0.1, np.nan], InvalidInputError, "hold is nan"),
+        ([0.1, np.inf], InvalidInputError, "leave it out"),
+        (True, InvalidInputError, "hold is True"),
+        ("stiff", InvalidInputError, "hold is 'stiff'"),
+        ({0: "stiff"}, InvalidInputError, "hold is 'stiff'"),
+        ({0: True}, InvalidInputError, "hold is True"),
+        ([0.1], ShapeError, r"expected one number, or \(2,\)"),
+        ([[0.1, 0.1]], ShapeError, r"shape \(1, 2\)"),
+        ({1: 0.1}, InvalidInputError, r"key 1, which is no estimated parameter.*\[0, 2\]"),
+        ({"inertia": 0.1}, InvalidInputError, "key 'inertia'"),
+        ({True: 0.1}, InvalidInputError, "key True"),
+        ({-1: 0.1}, InvalidInputError, "key -1"),
+        ({0: 0.0}, InvalidInputError, "hold is 0.0"),
+    ],
+)
+def test_bad_holds_are_refused(hold, error, text):
+    with pytest.raises(error, match=text):
+        qpmhe.augment_parameters(
+            lambda x, theta: x, lambda x, theta: x, n=1, p=1, nominal=[1.0, 2.0, 3.0],
+            estimated=[0, 2], hold=hold,
+        )
+
+
+def test_hold_without_estimated_parameters_is_refused():
+    with pytest.raises(InvalidInputError, match="no parameter is estimated"):
+        qpmhe.augment_parameters(
+            lambda x, theta: x, lambda x, theta: x, n=1, p=1, nominal=[1.0], estimated=[], hold=0.1
+        )
