@@ -52,8 +52,7 @@ class ExtendedKalman(KalmanType):
     @property
     def c_form(self) -> ObserverForm | None:
         """The covariances, unless a derived class may compute otherwise."""
-        own = type(self) is ExtendedKalman and self._innovation is None
-        return self._form("extended") if own else None
+        return self._form("extended") if type(self) is ExtendedKalman else None
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""

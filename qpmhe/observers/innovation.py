@@ -24,6 +24,9 @@ Counts = NDArray[np.int64]
 #: the covariance of the noise would be lost in rounding.
 GROWTH, MOST_GROWTH = 4.0, 20
 
+#: After so many times the usual number of failures, no sensor that passes keeps another one shut.
+LONGEST = 10
+
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
@@ -131,11 +134,16 @@ class Innovation(ABC):
         shares = np.zeros(0)
         if late:
             known = [place for k in np.flatnonzero(passes) for place in parts[k]]
-            shares = prediction.shares([place for k in late for place in parts[k]], noise)
+            doubted = [place for k in late for place in parts[k]]
+            shares = prediction.shares(doubted, noise)
+            given = [
+                [] if len(doubted) > len(known) or failures >= LONGEST * self.reopen else known
+                for failures in rejections.tolist()
+            ]
 
             def passing(factor: float) -> list[int]:
                 larger = prediction.spread_of(prediction.grown(shares, factor)) + noise
-                return [k for k in late if _distance(larger, v, known, parts[k]) <= limits[k]]
+                return [k for k in late if _distance(larger, v, given[k], parts[k]) <= limits[k]]
 
             late = passing(GROWTH**MOST_GROWTH)
             return _Judged(parts, passes, counts, late, shares, passing)
@@ -199,10 +207,12 @@ class Gate(Innovation):
     counts start anew. So the covariance explains what the observer corrects by, and the gain is
     near one along it.
 
-    A sensor stays rejected, and due, while no k up to 20 makes it pass: the sensors that pass
-    contradict it, however wrong P is, or P spans nothing of what it sees. So a sensor with a
-    lasting fault stays shut where others show the same, and is followed where it alone does.
-    Samples in which a sensor is missing do not count.
+    A sensor stays rejected, and due, while no k up to 20 makes it pass: P spans nothing of what it
+    sees, or the sensors that pass contradict it, however wrong P is. So a sensor with a lasting
+    fault stays shut where others show the same, and is followed where it alone does. As it may be
+    the others that are wrong, they are no longer given where they have fewer outputs than the
+    sensors that are due, or for a sensor that was rejected ten times ``reopen`` times in a row: at
+    the latest then it opens. Samples in which a sensor is missing do not count.
 
     Parameters
     ----------

@@ -89,7 +89,7 @@ class UnscentedKalman(KalmanType):
     @property
     def c_form(self) -> ObserverForm | None:
         """The covariances and the spread, unless a derived class may compute otherwise."""
-        if type(self) is not UnscentedKalman or self._innovation is not None:
+        if type(self) is not UnscentedKalman:
             return None
         return replace(self._form("unscented"), spread=self._spread)
 
