@@ -109,27 +109,8 @@ def test_a_step_is_the_mean_of_many_small_ones(cell):
     np.testing.assert_allclose(coarse.h(start, u), np.mean(outputs, axis=0), atol=1e-3)
 
 
-def test_without_doubt_the_guarded_filter_is_the_kalman_filter(cell):
-    arguments = {"prior": model.PRIOR, "disturbance": model.disturbance(cell, DT),
-                 "noise": model.noise(DT)}
-    plain, guarded = qpmhe.ExtendedKalman(**arguments), model.GuardedKalman(**arguments)
-    system, z, u = model.system_of(cell, DT), model.START, np.array([-3.0])
-    sample = qpmhe.Sample(
-        system, u, system.f_jacobian(z, u), system.h_jacobian(z, u), covariance=model.PRIOR
-    )
-    for v in (0.0, 0.04, -0.3):
-        for one, other in zip(
-            plain.correct(z, np.array([v]), sample), guarded.correct(z, np.array([v]), sample),
-            strict=True,
-        ):
-            np.testing.assert_array_equal(one, other)
-    sample.covariance = 1e-4 * model.PRIOR
-    few, many = (guarded.correct(z, np.array([v]), sample)[0] for v in (-0.1, -3.0))
-    np.testing.assert_array_equal(few, many)
-
-
 def test_an_implausible_prior_is_scaled_back(cell):
-    huge = model.GuardedKalman(
+    huge = model.robust_kalman(
         prior=100.0 * np.eye(4), disturbance=model.disturbance(cell, DT), noise=model.noise(DT)
     )
     assert np.all(np.sqrt(np.diag(huge.initial_covariance())) <= 0.3001)

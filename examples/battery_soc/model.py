@@ -46,8 +46,9 @@ PRIOR = np.diag([0.3, 0.010, 0.010, 0.15]) ** 2
 _LARGEST = np.array([0.3, 0.020, 0.030, 0.3])
 # OCV rises by about 1 V from empty to full: a time constant of 200 s, a few of the model error's.
 _GAIN_PER_SECOND = np.array([1 / 200.0, 0.0, 0.0, 0.0])
-# The standard deviation of SOC that the filter settles at where OCV is at its flattest.
-_SETTLED = 0.015
+# Samples beyond the threshold after which the filter doubts its covariance: 6 s, which the model's
+# faster time constant takes.
+_PATIENCE = 3
 HORIZON = 120.0  # s
 
 
@@ -173,18 +174,11 @@ def noise(dt: float) -> Array:
     return np.array([[_NOISE / dt]])
 
 
-class GuardedKalman(qpmhe.ExtendedKalman):
-    r"""An extended Kalman filter that neither outliers nor a wrong prior covariance lead astray.
+def robust_kalman(*, prior: Array, disturbance: Array, noise: Array) -> qpmhe.ExtendedKalman:
+    """An extended Kalman filter that neither outliers nor a wrong prior covariance lead astray.
 
-    The fitting error is clipped at what the covariance and the model's error make plausible,
-
-    .. math::
-        L(z, v) = K\,\mathrm{clip}(v, \pm b), \qquad b = b_0 + 3 \sqrt{C P C^\top},
-
-    so that (eq:kappa) holds as for the filter itself. Where :math:`|v| > b`, the variance of SOC
-    also grows by a factor, 1.1 at first and up to 2 the larger it is already: a single outlier
-    does next to nothing, but a fitting error that persists opens the gain within a minute. The
-    stated prior covariance is scaled back to what is plausible.
+    Innovations beyond what the model's error reaches count as Huber counts them, and the stated
+    prior covariance is scaled back to what is plausible.
 
     Parameters
     ----------
@@ -193,26 +187,11 @@ class GuardedKalman(qpmhe.ExtendedKalman):
     disturbance, noise : array_like
         As for `qpmhe.ExtendedKalman`.
     """
-
-    def __init__(self, *, prior: Array, disturbance: Array, noise: Array) -> None:
-        scale = np.minimum(1.0, _LARGEST / np.sqrt(np.diag(prior)))
-        super().__init__(
-            prior=prior * np.outer(scale, scale), disturbance=disturbance, noise=noise
-        )
-
-    def correct(self, z: Array, v: Array, sample: qpmhe.Sample) -> tuple[Array, Array]:
-        """The correction and the next covariance; see `qpmhe.Observer.correct`."""
-        c, covariance = sample.h_jacobian, sample.covariance
-        if c is None or covariance is None:
-            raise ValueError("the observer needs Jacobians and a covariance")
-        bound = _GROSS + 3.0 * float(np.sqrt((c @ covariance @ c.T)[0, 0]))
-        correction, following = super().correct(z, np.clip(v, -bound, bound), sample)
-        if abs(v[0]) > bound:
-            deviation = float(np.sqrt(following[0, 0]))
-            growth = np.sqrt(np.clip(deviation / _SETTLED, 1.1, 2.0))
-            scale = np.array([min(growth, _LARGEST[0] / deviation), 1.0, 1.0, 1.0])
-            following = following * np.outer(scale, scale)
-        return correction, following
+    scale = np.minimum(1.0, _LARGEST / np.sqrt(np.diag(prior)))
+    return qpmhe.ExtendedKalman(
+        prior=prior * np.outer(scale, scale), disturbance=disturbance, noise=noise,
+        innovation=qpmhe.HuberInnovation(_threshold(np.asarray(noise)), reopen=_PATIENCE),
+    )
 
 
 def constant_gain(dt: float) -> qpmhe.Luenberger:
@@ -230,13 +209,15 @@ def cost_of(cell: Cell, dt: float, prior: Array | qpmhe.ObserverPrior) -> qpmhe.
     prior : (4, 4) array or ObserverPrior
         Weight of the prior.
     """
-    weight = np.linalg.inv(noise(dt))
-    # In standard deviations of the white noise, which is larger than the error is ever.
-    threshold = _GROSS * float(np.sqrt(weight[0, 0]))
     return qpmhe.RobustCost(
         prior=prior, disturbance=np.linalg.inv(disturbance(cell, dt)),
-        noise=qpmhe.Huber(weight, threshold=threshold),
+        noise=qpmhe.Huber(np.linalg.inv(noise(dt)), threshold=_threshold(noise(dt))),
     )
+
+
+def _threshold(noise: Array) -> float:
+    """Huber's threshold, in standard deviations of the white noise."""
+    return _GROSS / float(np.sqrt(noise[0, 0]))
 
 
 def estimator(
@@ -261,11 +242,11 @@ def estimator(
     prior : (4, 4) array
         Covariance of its error, as somebody states it.
     observer : Observer, optional
-        Another one than `GuardedKalman`; without a covariance, the prior's weight is constant.
+        Another one than `robust_kalman`; without a covariance, the prior's weight is constant.
     """
     weight: Array | qpmhe.ObserverPrior = qpmhe.ObserverPrior()
     if observer is None:
-        observer = GuardedKalman(
+        observer = robust_kalman(
             prior=prior, disturbance=disturbance(cell, dt), noise=noise(dt)
         )
     if observer.initial_covariance() is None:

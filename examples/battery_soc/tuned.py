@@ -14,7 +14,7 @@ from time import perf_counter
 
 import numpy as np
 from measurements import DataError, drive_cycles
-from model import HORIZON, PRIOR, START, Cell, GuardedKalman, cost_of, disturbance, noise, system_of
+from model import HORIZON, PRIOR, START, Cell, cost_of, disturbance, noise, robust_kalman, system_of
 from rich.console import Console
 from rich.table import Table
 from study import DT, SETTLING, Cycle, read
@@ -38,7 +38,7 @@ def record(cycle: Cycle) -> qpmhe.tuning.TuningRecord:
 def error(cell: Cell, weights: qpmhe.tuning.Weights, cycle: Cycle) -> float:
     """Root mean square error of the state of charge after settling, in %."""
     mhe = qpmhe.MovingHorizonEstimator(
-        system_of(cell, DT), weights.observer(GuardedKalman), weights.cost(),
+        system_of(cell, DT), weights.observer(robust_kalman), weights.cost(),
         horizon=weights.horizon, initial_state=START,
     )
     found = mhe.run(cycle.voltage, cycle.current).states[:, 0] - cycle.soc
@@ -65,7 +65,7 @@ def main() -> int:
     began = perf_counter()
     tuning = qpmhe.tune(
         system_of(cell, DT), [record(cycles[TRAINING])], **by_hand, horizon=round(HORIZON / DT),
-        structure=STRUCTURE, threshold=threshold, observer=GuardedKalman, max_qps=0,
+        structure=STRUCTURE, threshold=threshold, observer=robust_kalman, max_qps=0,
         names={"states": ("SOC", "v1", "v2", "rho"), "outputs": ("voltage",)},
         checkpoint=arguments.out / "battery_weights.search",
     )

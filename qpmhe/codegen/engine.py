@@ -101,6 +101,7 @@ class CompiledEngine:
         self._amending, self._undoing, self._result = (memory, workspace), (memory, before), out
         self._call = library.update
         self._observer, self._watch = observer, CompiledWatch(horizon)
+        self._rejects = observer.rejects
         self._time = self._memory["time"]
         # Holds the present window where that is asked for.
         self._mirror: PythonEngine | None = None
@@ -244,9 +245,17 @@ class CompiledEngine:
         if numbers[1] & _ROWS_DROPPED:
             sides = self._out[0]["dropped"][: numbers[0] + 1]
             dropped = self._library.layout.dropped_rows(sides, time + 1 - numbers[0])
+        rejected = None
+        if self._rejects:
+            rejected = self._out[0]["rejected"].astype(np.bool_)
         return CompiledEstimate(
-            block, numbers, time, self._sizes, self._delay, dropped, self._to_disturbances
+            block, numbers, time, self._sizes, self._delay, dropped, self._to_disturbances,
+            rejected,
         )
+
+    def _rejecting(self, rejected: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
+        """Which sensors of a gate were rejected; None without a gate."""
+        return rejected.astype(np.bool_) if self._rejects else None
 
     def amend(self, time: int, y: Array) -> Estimate:
         """Put a late measurement in its place, and estimate again."""
@@ -292,7 +301,7 @@ class CompiledEngine:
             candidate_costs=log.candidate_costs, times=times,
             solve_times=np.full(samples, np.nan), qps=log.qps.astype(np.intp),
             solver_iterations=log.iterations.astype(np.intp), delayed=log.delayed,
-            flags=log.flags, engine=self.name,
+            flags=log.flags, engine=self.name, rejected_sensors=self._rejecting(log.rejected),
             observer_states=np.vstack((observer_start, log.observer_states)),
         )
 
@@ -425,6 +434,7 @@ class CompiledEngine:
         self._check_metric(record)
         covariances = self._covariances_of(record, places)
         computed, usual = [self._recomputed(memory)], tools.record
+        self._check_rejections(record, computed[0][0][0], places)
         if record["metric_settled"] and not usual["metric_settled"]:
             # Some stages may have been computed before the metric settled.
             before = memory.copy()
@@ -528,6 +538,19 @@ class CompiledEngine:
         )
         if not near(stage["cost"], value, size):
             raise mismatch("cost")
+
+    def _check_rejections(self, record: Any, again: Any, places: NDArray[np.intp]) -> None:
+        """Compare the counts of its sensors with those that follow from the stages."""
+        if not self._library.layout.sensors:
+            return
+        found, expected = (
+            np.vstack((one["stages"]["rejections"][places], one["rejections_end"]))
+            for one in (record, again)
+        )
+        if (found < 0).any():
+            raise ValueError("a sensor's failures are fewer than none")
+        if not np.array_equal(found, expected):
+            raise mismatch("observer")
 
     def _covariances_of(self, record: Any, places: NDArray[np.intp]) -> Array | None:
         """The observer's covariances (K + 1, n, n) along the window; None if it has none."""

@@ -44,10 +44,11 @@ class CompiledEstimate(Estimate):
     def __init__(
         self, block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int], delay: int,
         dropped: tuple[DroppedRow, ...] = (), to_disturbances: Array | None = None,
+        rejected: NDArray[np.bool_] | None = None,
     ) -> None:
         self._block, self._numbers, self.time = block, numbers, time
         self._sizes, self._delay, self.dropped = sizes, delay, dropped
-        self._to_disturbances, self._rejected = to_disturbances, None
+        self._to_disturbances, self._rejected = to_disturbances, rejected
         n = sizes[0]
         end = 2 + (numbers[0] + 1) * n
         self.state = block[end - n : end]
@@ -55,7 +56,7 @@ class CompiledEstimate(Estimate):
     def __reduce__(self) -> tuple[Any, ...]:
         arguments = (
             self._block, self._numbers, self.time, self._sizes, self._delay, self.dropped,
-            self._to_disturbances,
+            self._to_disturbances, self._rejected,
         )
         return _restored, (arguments, self.step_time)
 

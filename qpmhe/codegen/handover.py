@@ -35,11 +35,14 @@ def hand_over(record: Any, directions: Directions, usual: Conditions, engine: Py
     covariance = None
     if "covariance_end" in names:
         covariance = (first["covariance"] if length else record["covariance_end"]).copy()
+    rejections = None
+    if "rejections_end" in names:
+        rejections = (first["rejections"] if length else record["rejections_end"]).copy()
     count = min(time, horizon) + 1
     history = [record["history"][(newest - k) % (horizon + 1)].copy() for k in range(count)][::-1]
     engine.take_over(
         usual, time - length, (first["z"] if length else record["z_end"]).copy(),
-        covariance, samples_of(record, directions),
+        covariance, rejections, samples_of(record, directions),
         record["trajectory"][: length + 1].copy() if record["has_trajectory"] else None,
         history, (int(record["far"]), int(record["dropped"])),
         record["smoothed"].copy() if record["has_smoothed"] else None,

@@ -71,6 +71,9 @@ class Layout:
     #: What corrects the observer, by its number in C, and whether its covariance is computed.
     observer: int = 0
     covariance: bool = False
+    #: How innovations are judged, by its number in C, and the sensors whose are.
+    innovation: int = 0
+    sensors: int = 0
     #: Whether the covariance weighs the prior.
     observer_prior: bool = False
     #: Which terms have a user's loss, in the order of `TERMS`, as bits.
@@ -117,7 +120,8 @@ class Layout:
             own_losses=sum((one.kind == "own") << k for k, one in enumerate(losses)),
             # The covariance of a constant gain's error has no other use.
             covariance=own.prior is not None and (kind > 0 or weighs or projects),
-            observer_prior=weighs,
+            innovation=0 if own.innovation is None else 1 if own.innovation.rejects else 2,
+            sensors=len(observer.sensors), observer_prior=weighs,
             lapack=lapack and system.n >= _LAPACK_STATES, clock=clock,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
@@ -141,6 +145,7 @@ class Layout:
             "output_residual": self.residuals[0], "state_residual": self.residuals[1],
             "observer": self.observer, "covariance": int(self.covariance),
             "observer_prior": int(self.observer_prior),
+            "innovation": self.innovation, "sensors": self.sensors,
             "turns": int(self.turns), "quiet": self.quiet, "held": self.held,
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
@@ -173,6 +178,10 @@ class Layout:
                 ("pick", r, k * n), ("units", r, k * k), ("inverse_units", r, k * k),
                 ("stiffness", r, k), ("components", np.int32, k),
             ])))
+        if self.sensors:
+            fields.append(("innovation", _struct([
+                ("limits", r, p), ("sensor_of", np.int32, p), ("reopen", np.int32),
+            ])))
         fields += [
             ("discount", r), ("sample_time", r), ("tolerance", r),
             ("solver_tolerance", r),
@@ -202,7 +211,7 @@ class Layout:
             ("noises", r, (count, p)), ("observer_state", r, n), ("filtered", r, n),
             ("time", np.int64), ("length", np.int32), ("status", np.int32), ("qps", np.int32),
             ("iterations", np.int32), ("corrections", np.int32), ("nearest_points", np.int32),
-            ("dropped", np.uint8, self.rows),
+            ("dropped", np.uint8, self.rows), *self._if_sensors(np.uint8, "rejected"),
         ])
 
     def set_type(self, name: str) -> np.dtype[Any]:
@@ -277,7 +286,8 @@ class Layout:
                 if there
             ),
             ("cost", r), *((flag, np.int32) for flag in STAGE_FLAGS), ("is_observed", np.uint8, p),
-            ("is_sampled", np.uint8, p), *self._if_covariance("covariance"), ("terms", terms),
+            ("is_sampled", np.uint8, p), *self._if_covariance("covariance"),
+            *self._if_sensors(np.int32, "rejections"), ("terms", terms),
         ])
         return _struct([
             ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
@@ -287,9 +297,13 @@ class Layout:
             ("smoothed", r, n), *([("trusted", r, (2, self.held))] if self.held else []),
             ("last_good", r, n), ("z_end", r, n),
             *self._if_covariance("last_good_covariance", "covariance_end"),
+            *self._if_sensors(np.int32, "rejections_end"),
             ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
             ("places", np.int8, self.rows), ("stages", stage, count),
         ])
+
+    def _if_sensors(self, kind: Any, name: str) -> list[Any]:
+        return [(name, kind, (self.sensors,))] if self.sensors else []
 
     def _if_covariance(self, *names: str) -> list[Any]:
         n = self.nx
@@ -349,6 +363,11 @@ def _filled(
         part["least"] = _LEAST_SINGLE if single else SINGULAR
         rule = cost.observer_prior
         part["minimum"], part["maximum"] = (rule and rule.bounds) or (0.0, 0.0)
+    if own.innovation is not None:
+        part, limits = record["innovation"], own.innovation.limits(system.p)
+        part["limits"][: limits.size], part["reopen"] = limits, own.innovation.reopen
+        for k, outputs in enumerate(observer.sensors):
+            part["sensor_of"][list(outputs)] = k
     record["discount"] = form.discount
     for name, loss in zip(TERMS, form.losses, strict=True):
         _fill(record, f"{name}_weight", getattr(form, name))

@@ -217,18 +217,19 @@ def _engine_files(model: CasadiModel, layout: Layout, record: NDArray[Any]) -> d
 class RunLog:
     """Arrays for what `mhe_run` writes, and the structure that points to them."""
 
-    def __init__(self, shape: tuple[int, ...], n: int) -> None:
+    def __init__(self, shape: tuple[int, ...], n: int, sensors: int) -> None:
         self.states, self.filtered, self.delayed, self.observer_states = (
             np.empty((*shape, n)) for _ in range(4)
         )
         self.costs, self.candidate_costs = np.empty(shape), np.empty(shape)
         self.flags, self.qps, self.iterations = (np.empty(shape, np.int32) for _ in range(3))
+        self.rejected = np.zeros((*shape, sensors), np.uint8)
 
     def pointers(self, first: int) -> Any:
         """The C structure of pointers to the entries from an index on."""
         arrays = (
             self.states, self.filtered, self.delayed, self.costs, self.candidate_costs,
-            self.flags, self.qps, self.iterations, self.observer_states,
+            self.flags, self.qps, self.iterations, self.observer_states, self.rejected,
         )
         addresses = [array.ctypes.data + first * array.strides[0] for array in arrays]
         return (ctypes.c_void_p * len(addresses))(*addresses)
@@ -382,4 +383,4 @@ class EstimatorLibrary:
 
     def log(self, shape: tuple[int, ...]) -> RunLog:
         """Where `run` is to write of so many samples."""
-        return RunLog(shape, self.layout.nx)
+        return RunLog(shape, self.layout.nx, self.layout.sensors)

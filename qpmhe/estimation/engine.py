@@ -420,20 +420,23 @@ class PythonEngine:
 
     def take_over(
         self, usual: Conditions, time: int, state: Array, covariance: Array | None,
-        samples: Sequence[Taken], trajectory: Array | None, history: list[Array],
+        rejections: NDArray[np.integer[Any]] | None, samples: Sequence[Taken],
+        trajectory: Array | None, history: list[Array],
         watched: tuple[int, int], smoothed: Array | None, trusted: Array | None,
     ) -> None:
         """Continue where another engine stands, whose window starts at a time and state.
 
-        With the observer's covariance there if it has one, the samples since then, the last
-        estimate's trajectory, the last states that were estimated, the smoothed prior,
-        and the trusted values of held parameters.
+        With the observer's covariance and its sensors' failures there if it has any, the samples
+        since then, the last estimate's trajectory, the last states that were estimated, the
+        smoothed prior, and the trusted values of held parameters.
         """
         tools = self._tools if usual is self._tools.usual else self._tools_for(usual)
         window = self._fresh_window(state, tools)
         window.time, window.smoothed_prior = time, smoothed
         if window._covariances is not None and covariance is not None:
             window._covariances[0] = covariance
+        if window._rejections is not None and rejections is not None:
+            window._rejections[0] = rejections
         with np.errstate(all="ignore"):
             for one in samples:
                 window.push(*one)

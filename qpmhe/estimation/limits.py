@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ..observers.base import SAME_COVARIANCE
+from ..observers.innovation import GROWTH, LONGEST, MOST_GROWTH
 
 #: Step lengths, tried in turn after the full step: the first for a step that leaves a set by
 #: the solver's tolerance, the last short enough for any useful direction of descent.
@@ -65,12 +66,14 @@ def c_definitions(prefix: str, real: str) -> str:
         "ROUNDING": ROUNDING, "NEARLY": NEARLY, "STALLED": STALLED, "BEYOND": BEYOND,
         "FEASIBLE": FEASIBLE, "LARGEST": LARGEST, "FAR": FAR, "NEARER": NEARER,
         "NO_VARIANCE": NO_VARIANCE, "KNOWN": KNOWN, "SAME_COVARIANCE": SAME_COVARIANCE,
-        "IN_RANGE": IN_RANGE,
+        "IN_RANGE": IN_RANGE, "GROWTH": GROWTH,
     }
     if real == "float":
         values |= _SINGLE
     lines = [f"#define {prefix}_{name} (({real}){value!r})" for name, value in values.items()]
     lines.append(f"#define {prefix}_CORRECTIONS {CORRECTIONS}")
+    lines.append(f"#define {prefix}_MOST_GROWTH {MOST_GROWTH}")
+    lines.append(f"#define {prefix}_LONGEST {LONGEST}")
     lines.append(f"#define {prefix}_NEAREST_POINTS {NEAREST_POINTS}")
     for name, lengths in (("LENGTHS", LENGTHS), ("ALONG", ALONG)):
         listed = ", ".join(f"({real}){length!r}" for length in lengths)

@@ -94,7 +94,7 @@ class Stages:
         self._stage_costs = np.zeros(room)
         self.terms = StageTerms(room, n, p)
         self._covariances = None if covariance is None else np.zeros((room + 1, n, n))  # of z
-        # How often in a row the observer has rejected each of its sensors, before each stage.
+        # How often in a row each of the observer's sensors has failed, before each stage.
         self._rejections = np.zeros((room + 1, sensors), np.int64) if sensors else None
         # For observers and losses: a user's code cannot write into the window.
         self._read_only_covariances = (
@@ -174,14 +174,6 @@ class Stages:
     def prior_covariance(self) -> Array | None:
         """The observer's covariance at z(t-N), if it has one."""
         return None if self._covariances is None else self._covariances[self.start]
-
-    @property
-    def rejected(self) -> NDArray[np.bool_] | None:
-        """Which sensors the observer rejected at the newest stage; None without a gate."""
-        if self._rejections is None:
-            return None
-        grown: NDArray[np.bool_] = self._rejections[self.end] > self._rejections[self.end - 1]
-        return grown
 
     @property
     def initial_state(self) -> Array:
@@ -322,7 +314,7 @@ class Stages:
             saved, shape = state["earlier_covariance"], self._covariances.shape[1:]
             self._earlier_covariance = checked_array("earlier_covariance", saved, shape)
         if self._rejections is not None and (self._rejections[: length + 1] < 0).any():
-            raise ValueError("a sensor's rejections are fewer than none")
+            raise ValueError("a sensor's failures are fewer than none")
         if not (self._stage_costs[:length] >= 0.0).all():
             raise ValueError("a stage's cost is not a number >= 0")
         steps, irregular = self._u[:length, -1], self._irregular[:length]

@@ -74,6 +74,7 @@ class Window(Stages):
         self._held = list(system.held)
         self.trust_start()
         self._sample = Sample(system, np.zeros(m))
+        self._rejects = observer.rejects
         self._usual = usual
         self._filled: Conditions | None = None  # those that are in the sample now
         self._evaluating = ""  # for messages: the function that is being evaluated
@@ -327,14 +328,23 @@ class Window(Stages):
             self.events |= _MISSING
         if model_failed or jacobian_failed:
             self.events |= _MODEL_FAILED
-        if self._rejections is not None and not model_failed:
+        if self._rejects:
             self._report_rejected(k)
+
+    @property
+    def rejected(self) -> NDArray[np.bool_] | None:
+        """Which sensors the observer rejected at the newest stage; None without a gate."""
+        return self._rejected_at(self.end - 1) if self._rejects else None
+
+    def _rejected_at(self, k: int) -> NDArray[np.bool_]:
+        rejections = self._rejections
+        assert rejections is not None
+        grown: NDArray[np.bool_] = rejections[k + 1] > rejections[k]
+        return grown
 
     def _report_rejected(self, k: int) -> None:
         """Add the flags of sensors that were rejected at stage k."""
-        rejections = self._rejections
-        assert rejections is not None
-        rejected, observed = rejections[k + 1] > rejections[k], self._observed[k]
+        rejected, observed = self._rejected_at(k), self._observed[k]
         if rejected.any():
             self.events |= _SENSORS_REJECTED
             sensors = zip(self._observer.sensors, rejected, strict=True)

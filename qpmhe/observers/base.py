@@ -18,7 +18,7 @@ from ..errors import OptionError, ShapeError
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..model.tracing import Traced
-from .innovation import Counts, Innovation, Mask, Verdict
+from .innovation import Counts, Innovation, Mask, Prediction, Verdict
 
 #: Two inversions of a covariance change its correlations by no more.
 SAME_COVARIANCE = 1e-9
@@ -44,8 +44,8 @@ class Sample:
     states : ConvexSet or None
         The X that this sample came with; None for the system's.
     rejections, next_rejections : (s,) int array or None
-        How often in a row the observer has rejected each of its `Observer.sensors`, before this
-        sample, and where `Observer.correct` writes the counts behind it.
+        How often in a row each of the `Observer.sensors` has failed the observer's test, before
+        this sample, and where `Observer.correct` writes the counts behind it.
     """
 
     system: System
@@ -139,8 +139,13 @@ class Observer(ABC):
 
     @property
     def sensors(self) -> tuple[tuple[int, ...], ...]:
-        """The outputs of each sensor whose rejections in a row it counts; empty without a gate."""
+        """The outputs of each sensor of which it counts how often in a row it has failed."""
         return ()
+
+    @property
+    def rejects(self) -> bool:
+        """Whether sensors that fail are rejected."""
+        return False
 
     @abstractmethod
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array | None]:
@@ -231,6 +236,11 @@ class KalmanType(Observer):
         """The outputs of each sensor of its gate; see `Observer.sensors`."""
         return self._sensors
 
+    @property
+    def rejects(self) -> bool:
+        """Whether it has a gate."""
+        return self._innovation is not None and self._innovation.rejects
+
     def _form(self, kind: str) -> ObserverForm:
         """The observer's C form, with its covariances."""
         return ObserverForm(
@@ -238,17 +248,17 @@ class KalmanType(Observer):
             innovation=self._innovation,
         )
 
-    def _judge(self, spread: Array, noise: Array, v: Array, sample: Sample) -> Verdict:
+    def _judge(self, prediction: Prediction, noise: Array, v: Array, sample: Sample) -> Verdict:
         """How much the outputs that are there count; see `Innovation.judge`."""
         if self._innovation is None:
-            return Verdict(1.0, None, noise, None)
+            return Verdict(None, None, noise, None)
         observed: Mask | None = sample.observed
         if observed is None:
             observed = np.ones(v.size, np.bool_)
         rejections = sample.rejections
         if rejections is None:
             rejections = np.zeros(len(self._sensors), np.int64)
-        return self._innovation.judge(spread, noise, v, observed, rejections)
+        return self._innovation.judge(prediction, noise, v, observed, rejections)
 
     def _remember(self, verdict: Verdict, sample: Sample) -> None:
         """Write the counts behind this sample."""

@@ -7,7 +7,7 @@ import numpy as np
 from .._checks import Array
 from .._linalg import solve
 from .base import KalmanType, ObserverForm, Sample
-from .innovation import Verdict
+from .innovation import Prediction, Verdict
 
 
 class ExtendedKalman(KalmanType):
@@ -52,15 +52,14 @@ class ExtendedKalman(KalmanType):
     @property
     def c_form(self) -> ObserverForm | None:
         """The covariances, unless a derived class may compute otherwise."""
-        own = type(self) is ExtendedKalman and self._innovation is None
-        return self._form("extended") if own else None
+        return self._form("extended") if type(self) is ExtendedKalman else None
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""
         a, c, covariance = _given(sample)
         c, r, v, verdict = self._seen(c, v, covariance, sample)
-        if verdict.growth > 1.0:
-            covariance = verdict.growth * covariance
+        if verdict.covariance is not None:
+            covariance = verdict.covariance
         self._remember(verdict, sample)
         cross = a @ covariance @ c.T
         gain = solve(c @ covariance @ c.T + r, cross.T).T if v.size else cross
@@ -74,8 +73,8 @@ class ExtendedKalman(KalmanType):
         """The filter's measurement update; see `Observer.filter`."""
         _, c, covariance = _given(sample)
         c, r, v, verdict = self._seen(c, v, covariance, sample)
-        if verdict.growth > 1.0:
-            covariance = verdict.growth * covariance
+        if verdict.covariance is not None:
+            covariance = verdict.covariance
         if not v.size:
             return z, covariance
         cross = covariance @ c.T
@@ -90,11 +89,13 @@ class ExtendedKalman(KalmanType):
         r, there = self._noise_of(sample), sample.observed
         if there is not None:
             c, r, v = c[there], r[np.ix_(there, there)], v[there]
-        verdict = self._judge(c @ covariance @ c.T, r, v, sample)
+        cross = covariance @ c.T
+        prediction = Prediction(covariance, cross, c @ cross, lambda larger: c @ larger @ c.T)
+        verdict = self._judge(prediction, r, v, sample)
         kept, r = verdict.kept, verdict.noise
-        if kept is not None:
-            c, r, v = c[kept], r[np.ix_(kept, kept)], v[kept]
-        return c, r, v, verdict
+        if kept is None:
+            return c, r, v, verdict
+        return c[kept], r[np.ix_(kept, kept)], v[kept], verdict
 
 
 def _given(sample: Sample) -> tuple[Array, Array, Array]:

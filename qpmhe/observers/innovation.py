@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,15 +14,51 @@ from numpy.typing import NDArray
 from qpmhe_solvers.values import finite, integer, shown
 
 from .._checks import Array, count, positive
-from .._linalg import unit_diagonal
+from .._linalg import solve, unit_diagonal
 from ..errors import OptionError
 
 Mask = NDArray[np.bool_]
 Counts = NDArray[np.int64]
 
-#: The covariance grows by a power of this factor, and by at most the one with this exponent: beyond
-#: it, the covariance of the noise would be lost in rounding.
+#: Variances grow by a power of this factor, and by at most the one with this exponent: beyond it,
+#: the covariance of the noise would be lost in rounding.
 GROWTH, MOST_GROWTH = 4.0, 20
+
+#: After so many times the usual number of failures, no sensor that passes keeps another one shut.
+LONGEST = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """The observer's covariance, and what it says of the q outputs that are there.
+
+    Parameters
+    ----------
+    covariance, cross, spread : (n, n), (n, q) and (q, q) array
+        P, :math:`P C'` and :math:`C P C'`.
+    spread_of : callable
+        The latter, from another P.
+    """
+
+    covariance: Array
+    cross: Array
+    spread: Array
+    spread_of: Callable[[Array], Array]
+
+    def shares(self, places: list[int], noise: Array) -> Array:
+        """By which share these outputs would reduce each variance, over the largest share."""
+        cross = self.cross[:, places]
+        reduced = cross.T * solve((self.spread + noise)[np.ix_(places, places)], cross.T)
+        variances = self.covariance.diagonal()
+        found: Array = reduced.sum(axis=0) / np.where(variances > 0.0, variances, np.inf)
+        most = found.max()
+        return found / most if most > 0.0 else np.zeros_like(found)
+
+    def grown(self, shares: Array, factor: float) -> Array:
+        """P with variances that have grown by a factor, as far as each has a share."""
+        scale = np.sqrt(1.0 + (factor - 1.0) * shares)
+        larger: Array = scale[:, None] * self.covariance * scale
+        return larger
 
 
 class Verdict(NamedTuple):
@@ -30,46 +66,116 @@ class Verdict(NamedTuple):
 
     Parameters
     ----------
-    growth : float
-        Factor of the covariance P.
+    covariance : (n, n) array or None
+        A larger P; None for the one that it has.
     kept : (q,) bool array or None
         Which of the outputs that are there correct; None for all.
     noise : (q, q) array
         Covariance of the noise of all outputs that are there.
     rejections : (s,) int array or None
-        Rejections in a row of each sensor, this sample included; None without a gate.
+        For each sensor how often in a row it has failed, this sample included.
     """
 
-    growth: float
+    covariance: Array | None
     kept: Mask | None
     noise: Array
     rejections: Counts | None
 
 
 class Innovation(ABC):
-    """A rule by which a Kalman-type observer judges its innovations."""
+    """A rule by which a Kalman-type observer judges the innovations of its sensors."""
+
+    #: Samples in a row after which a sensor that fails is due.
+    reopen: int
+
+    #: Whether sensors that fail are rejected.
+    rejects: bool
 
     @abstractmethod
     def sensors(self, outputs: int) -> tuple[tuple[int, ...], ...]:
-        """The outputs of each sensor whose rejections are counted, of so many outputs."""
+        """The outputs of each sensor, of so many outputs."""
+
+    @abstractmethod
+    def limits(self, outputs: int) -> Array:
+        """The largest squared innovations of sensors with 1, 2, ... outputs that are there."""
 
     @abstractmethod
     def judge(
-        self, spread: Array, noise: Array, v: Array, observed: Mask, rejections: Counts
+        self, prediction: Prediction, noise: Array, v: Array, observed: Mask, rejections: Counts
     ) -> Verdict:
         """Judge a sample.
 
         Parameters
         ----------
-        spread, noise : (q, q) array
-            :math:`C P C'` and R of the outputs that are there.
-        v : (q,) array
-            Their innovations.
+        prediction : Prediction
+            Of the outputs that are there.
+        noise, v : (q, q) and (q,) array
+            Covariance of their noise, and their innovations.
         observed : (p,) bool array
             Which outputs are there.
         rejections : (s,) int array
-            Rejections in a row of each sensor before this sample.
+            For each sensor how often in a row it has failed before this sample.
         """
+
+    def _judged(
+        self, prediction: Prediction, noise: Array, v: Array, observed: Mask, rejections: Counts
+    ) -> _Judged:
+        """Test each sensor, and find those that are due and how P explains them."""
+        parts, limits = self._parts(observed)
+        passes = np.array([
+            not part or _distance(prediction.spread + noise, v, [], part) <= limit
+            for part, limit in zip(parts, limits, strict=True)
+        ])
+        counts = np.where(passes, 0, rejections + 1)
+        for k, part in enumerate(parts):
+            if not part:
+                counts[k] = rejections[k]
+        late = np.flatnonzero((rejections >= self.reopen) & ~passes).tolist()
+        shares = np.zeros(0)
+        if late:
+            known = [place for k in np.flatnonzero(passes) for place in parts[k]]
+            doubted = [place for k in late for place in parts[k]]
+            shares = prediction.shares(doubted, noise)
+            given = [
+                [] if len(doubted) > len(known) or failures >= LONGEST * self.reopen else known
+                for failures in rejections.tolist()
+            ]
+
+            def passing(factor: float) -> list[int]:
+                larger = prediction.spread_of(prediction.grown(shares, factor)) + noise
+                return [k for k in late if _distance(larger, v, given[k], parts[k]) <= limits[k]]
+
+            late = passing(GROWTH**MOST_GROWTH)
+            return _Judged(parts, passes, counts, late, shares, passing)
+        return _Judged(parts, passes, counts, late, shares, lambda _: [])
+
+    def _parts(self, observed: Mask) -> tuple[list[list[int]], Array]:
+        """For each sensor its places among the outputs that are there, and its limit."""
+        key = observed.tobytes()
+        known: dict[bytes, Any] = self.__dict__.setdefault("_known", {})
+        if key not in known:
+            if len(known) > 256:
+                known.clear()
+            places = (np.cumsum(observed) - 1).tolist()
+            parts = [
+                [places[output] for output in sensor if observed[output]]
+                for sensor in self.sensors(observed.size)
+            ]
+            table = np.append(self.limits(observed.size), 0.0)
+            known[key] = parts, np.array([table[len(part) - 1] for part in parts])
+        found: tuple[list[list[int]], Array] = known[key]
+        return found
+
+
+class _Judged(NamedTuple):
+    """The places and the results of all sensors, and those that are due, by growths of P."""
+
+    parts: list[list[int]]
+    passes: Mask
+    counts: Counts
+    due: list[int]
+    shares: Array
+    passing: Callable[[float], list[int]]
 
 
 @dataclass(frozen=True)
@@ -87,17 +193,26 @@ class Gate(Innovation):
     corrects, and its covariance proceeds, as if its outputs were missing.
 
     A gate can shut on the truth, where P is too small for the observer's error. A sensor that has
-    been rejected ``reopen`` times in a row and fails once more is therefore due to open: P is
-    multiplied by the least power of 4 with which its innovation passes, given those of the sensors
-    that passed; with several due, the least that opens all of them. The observer corrects with this
-    P, by the sensors that passed and those that opened, and counts their rejections anew. So the
-    covariance explains what the observer corrects by, and the gain is near one along it; all of P
-    grows, as a covariance that is false in one direction is not to be trusted in the others.
+    been rejected ``reopen`` times in a row and fails once more is therefore due, and opens: P
+    becomes :math:`T P T` with
 
-    A sensor stays rejected, and due, while no power up to :math:`4^{20}` makes it pass: the
-    sensors that pass contradict it, however wrong P is, or P spans nothing of what it sees. So a
-    sensor with a lasting fault stays shut where others show the same, and is followed where it
-    alone does. Samples in which a sensor is missing do not count.
+    .. math::
+        T_{ii}^2 = 1 + (4^k - 1) \frac{r_i}{\max_j r_j}, \qquad
+        r_i = \frac{(P C_s^\top S_{ss}^{-1} C_s P)_{ii}}{P_{ii}}
+
+    and the least k with which its innovation passes, given those of the sensors that passed; with
+    several sensors due, s is all of them, and k the least that opens all. :math:`r_i` is the share
+    by which the sensor would reduce the variance of :math:`x_i`: the states that it shows grow, and
+    correlations stay. The observer corrects with this P by the sensors that passed or opened, whose
+    counts start anew. So the covariance explains what the observer corrects by, and the gain is
+    near one along it.
+
+    A sensor stays rejected, and due, while no k up to 20 makes it pass: P spans nothing of what it
+    sees, or the sensors that pass contradict it, however wrong P is. So a sensor with a lasting
+    fault stays shut where others show the same, and is followed where it alone does. As it may be
+    the others that are wrong, they are no longer given where they have fewer outputs than the
+    sensors that are due, or for a sensor that was rejected ten times ``reopen`` times in a row: at
+    the latest then it opens. Samples in which a sensor is missing do not count.
 
     Parameters
     ----------
@@ -118,12 +233,14 @@ class Gate(Innovation):
     References
     ----------
     Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001,
-    section 3.7 (gating) and 5.4 (normalised innovation squared).
+    sections 3.7 (gating) and 5.4 (normalised innovation squared).
     """
 
     probability: float = 0.997
     reopen: int = 10
     groups: Sequence[Sequence[int]] | None = None
+
+    rejects = True
 
     def __post_init__(self) -> None:
         probability = finite(self.probability)
@@ -133,7 +250,7 @@ class Gate(Innovation):
                 "as 0.997."
             )
         object.__setattr__(self, "probability", probability)
-        object.__setattr__(self, "reopen", count("reopen", self.reopen, 1, most=2**31 - 2))
+        object.__setattr__(self, "reopen", _checked_reopen(self.reopen))
         object.__setattr__(self, "groups", _checked_groups(self.groups))
 
     def sensors(self, outputs: int) -> tuple[tuple[int, ...], ...]:
@@ -147,64 +264,29 @@ class Gate(Innovation):
         alone = ((output,) for output in range(outputs) if output not in taken)
         return tuple(sorted((*groups, *alone), key=min))
 
-    def thresholds(self, outputs: int) -> Array:
-        """The thresholds of sensors with 1, 2, ... outputs, up to the largest sensor's."""
+    def limits(self, outputs: int) -> Array:
+        """Quantiles of the chi-square distributions; see `Innovation.limits`."""
         from scipy.special import gammaincinv  # late: most programs do without
 
         most = max(map(len, self.sensors(outputs)))
         return np.asarray(2.0 * gammaincinv(0.5 * np.arange(1, most + 1), self.probability))
 
     def judge(
-        self, spread: Array, noise: Array, v: Array, observed: Mask, rejections: Counts
+        self, prediction: Prediction, noise: Array, v: Array, observed: Mask, rejections: Counts
     ) -> Verdict:
-        """Test each sensor, and open those that were rejected too often; see `Innovation.judge`."""
-        parts, thresholds = self._parts(observed)
-        innovation = spread + noise
-        passes = np.array([
-            not part or _distance(innovation, v, [], part) <= most  # False for NaN, too
-            for part, most in zip(parts, thresholds, strict=True)
-        ])
-        growth, opening = 1.0, self._due(parts, passes, rejections)
-        if opening:
-            known = [place for k in np.flatnonzero(passes) for place in parts[k]]
-
-            def opens(k: int, factor: float) -> bool:
-                distance = _distance(factor * spread + noise, v, known, parts[k])
-                return distance <= float(thresholds[k])
-
-            opening = [k for k in opening if opens(k, GROWTH**MOST_GROWTH)]
-            while not all(opens(k, growth) for k in opening):
-                growth *= GROWTH
-            passes[opening] = True
-        following = np.where(passes, 0, rejections + 1)
+        """Test each sensor, and open those that are due; see `Innovation.judge`."""
+        found = self._judged(prediction, noise, v, observed, rejections)
+        passes, counts, larger = found.passes, found.counts, None
+        if found.due:
+            factor = GROWTH
+            while len(found.passing(factor)) < len(found.due) and factor < GROWTH**MOST_GROWTH:
+                factor *= GROWTH
+            larger = prediction.grown(found.shares, factor)
+            passes[found.due], counts[found.due] = True, 0
         kept = np.ones(v.size, np.bool_)
-        for k, part in enumerate(parts):
-            kept[part] = passes[k]
-            if not part:
-                following[k] = rejections[k]
-        return Verdict(growth, None if kept.all() else kept, noise, following)
-
-    def _due(self, parts: list[list[int]], passes: Mask, rejections: Counts) -> list[int]:
-        """The sensors that are to open."""
-        late = (rejections >= self.reopen) & ~passes
-        return [k for k in np.flatnonzero(late).tolist() if parts[k]]
-
-    def _parts(self, observed: Mask) -> tuple[list[list[int]], Array]:
-        """For each sensor its places among the outputs that are there, and its threshold."""
-        key = observed.tobytes()
-        known: dict[bytes, Any] = self.__dict__.setdefault("_known", {})
-        if key not in known:
-            if len(known) > 256:
-                known.clear()
-            places = (np.cumsum(observed) - 1).tolist()
-            parts = [
-                [places[output] for output in sensor if observed[output]]
-                for sensor in self.sensors(observed.size)
-            ]
-            table = np.append(self.thresholds(observed.size), 0.0)
-            known[key] = parts, np.array([table[len(part) - 1] for part in parts])
-        found: tuple[list[list[int]], Array] = known[key]
-        return found
+        for part, passed in zip(found.parts, passes, strict=True):
+            kept[part] = passed
+        return Verdict(larger, None if kept.all() else kept, noise, counts)
 
 
 @dataclass(frozen=True)
@@ -222,19 +304,26 @@ class HuberInnovation(Innovation):
     an innovation is :math:`S_{jj} / \omega_j`. With one output this is the correction
     :math:`K \omega v` and the covariance :math:`P - \omega P C^\top S^{-1} C P` behind it: an
     outlier corrects by no more than one of c standard deviations does, and the covariance says how
-    little was learnt from it. Nothing is ever rejected, so there is no gate to open again; from a
-    covariance that is too small the observer recovers by at most c standard deviations a sample.
+    little was learnt from it.
+
+    Alone, this would bring an observer whose covariance is too small back by c standard deviations
+    a sample at most. Where an output has been beyond the threshold ``reopen`` times in a row, P
+    therefore grows before each further sample at which it is, as in `Gate` with k = 1: standard
+    deviations at most double in a sample, so that the model is linearised often on the way. As
+    there, P does not grow while the outputs within the threshold contradict.
 
     Parameters
     ----------
     threshold : float
         c, without unit, above 0. 1.345 has 95 % of the efficiency of least squares where the noise
         is Gaussian.
+    reopen : int
+        Samples in a row beyond the threshold after which P grows, at least 1.
 
     Raises
     ------
     OptionError
-        If the threshold is not positive.
+        If the threshold is not positive, or ``reopen`` no integer above 0.
 
     References
     ----------
@@ -243,22 +332,40 @@ class HuberInnovation(Innovation):
     """
 
     threshold: float = 1.345
+    reopen: int = 10
+
+    rejects = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "threshold", positive("threshold", self.threshold))
+        object.__setattr__(self, "reopen", _checked_reopen(self.reopen))
 
     def sensors(self, outputs: int) -> tuple[tuple[int, ...], ...]:
-        """None: nothing is rejected."""
-        return ()
+        """Each output alone."""
+        return tuple((output,) for output in range(outputs))
+
+    def limits(self, outputs: int) -> Array:
+        """The threshold's square; see `Innovation.limits`."""
+        return np.array([self.threshold**2])
 
     def judge(
-        self, spread: Array, noise: Array, v: Array, observed: Mask, rejections: Counts
+        self, prediction: Prediction, noise: Array, v: Array, observed: Mask, rejections: Counts
     ) -> Verdict:
         """Weigh each output; see `Innovation.judge`."""
+        found = self._judged(prediction, noise, v, observed, rejections)
+        larger, spread = None, prediction.spread
+        if found.due:
+            larger = prediction.grown(found.shares, GROWTH)
+            spread = prediction.spread_of(larger)
         variances = (spread + noise).diagonal()
         excess = np.abs(v) / np.sqrt(variances) / self.threshold - 1.0
-        added = variances * np.maximum(excess, 0.0)
-        return Verdict(1.0, None, noise + np.diag(added), rejections)
+        return Verdict(
+            larger, None, noise + np.diag(variances * np.maximum(excess, 0.0)), found.counts
+        )
+
+
+def _checked_reopen(reopen: Any) -> int:
+    return count("reopen", reopen, 1, most=2**31 - 2)
 
 
 def _distance(innovation: Array, v: Array, known: list[int], part: list[int]) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +14,7 @@ from .._linalg import cholesky, solve
 from ..model.residuals import difference
 from ..model.sets import ConvexSet
 from .base import KalmanType, ObserverForm, Sample
-from .innovation import Innovation, Verdict
+from .innovation import Innovation, Prediction, Verdict
 
 # A sigma point is drawn back into the state set, but not closer to z than this share.
 _CLOSEST = 1e-3
@@ -63,7 +64,7 @@ class UnscentedKalman(KalmanType):
         :math:`\sqrt 3` matches the fourth moments of a Gaussian along each direction.
     innovation : Gate or HuberInnovation, optional
         As for `ExtendedKalman`, with :math:`\sum_j H_j H_j^\top` in place of
-        :math:`C P C^\top`. Where P grows, the deviations grow by its root.
+        :math:`C P C^\top`. Where P grows, sigma points are drawn anew.
 
     Raises
     ------
@@ -88,19 +89,16 @@ class UnscentedKalman(KalmanType):
     @property
     def c_form(self) -> ObserverForm | None:
         """The covariances and the spread, unless a derived class may compute otherwise."""
-        if type(self) is not UnscentedKalman or self._innovation is not None:
+        if type(self) is not UnscentedKalman:
             return None
         return replace(self._form("unscented"), spread=self._spread)
 
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""
-        _, points, roots, inputs = self._sigma_points(z, sample)
-        f = sample.system.f.batch(points, inputs)
-        ahead: Array = difference(sample.system.state_residual, f[1:], f[0]) * roots
-        seen, r, v, verdict = self._seen(points, inputs, roots, v, sample)
-        if verdict.growth > 1.0:
-            ahead = math.sqrt(verdict.growth) * ahead
+        sigma, seen, r, v, verdict = self._seen(z, v, sample)
         self._remember(verdict, sample)
+        f = sample.system.f.batch(sigma.points, sigma.inputs)
+        ahead: Array = difference(sample.system.state_residual, f[1:], f[0]) * sigma.roots
         if v.size == 0:
             return np.zeros_like(z), ahead.T @ ahead + self._disturbance_of(sample)
         gain = solve(seen.T @ seen + r, seen.T @ ahead).T
@@ -110,22 +108,16 @@ class UnscentedKalman(KalmanType):
 
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """The filter's measurement update with the same sigma points; see `Observer.filter`."""
-        moves, points, roots, inputs = self._sigma_points(z, sample)
-        around: Array = moves * roots
-        seen, r, v, verdict = self._seen(points, inputs, roots, v, sample)
-        if verdict.growth > 1.0:
-            around = math.sqrt(verdict.growth) * around
+        sigma, seen, r, v, _ = self._seen(z, v, sample)
+        around: Array = sigma.moves * sigma.roots
         if v.size == 0:
             return z, around.T @ around
         gain = solve(seen.T @ seen + r, seen.T @ around).T
         left = around - seen @ gain.T
         return z + gain @ v, left.T @ left + gain @ r @ gain.T
 
-    def _sigma_points(self, z: Array, sample: Sample) -> tuple[Array, Array, Array, Array]:
-        """Deviations, z and the sigma points, roots of their weights, and their inputs."""
-        covariance = sample.covariance
-        if covariance is None:
-            raise ValueError("the unscented Kalman observer needs a covariance")
+    def _sigma(self, z: Array, covariance: Array, sample: Sample) -> _Sigma:
+        """The sigma points of a covariance."""
         ahead = self._spread * cholesky(covariance).T
         moves, share = np.concatenate((ahead, -ahead)), np.ones(2 * z.size)
         states = sample.system.states if sample.states is None else sample.states
@@ -135,22 +127,50 @@ class UnscentedKalman(KalmanType):
         # Roots of the weights go into the deviations, so that sums become products.
         roots = (1.0 / (math.sqrt(2.0) * self._spread * share))[:, None]
         inputs = np.broadcast_to(sample.u, (points.shape[0], sample.u.size))
-        return moves, points, roots, inputs
+        return _Sigma(moves, points, roots, inputs)
 
     def _seen(
-        self, points: Array, inputs: Array, roots: Array, v: Array, sample: Sample
-    ) -> tuple[Array, Array, Array, Verdict]:
-        """Deviations, noise covariance and fitting error of the outputs that correct."""
-        h, r, there = sample.system.h.batch(points, inputs), self._noise_of(sample), sample.observed
-        seen = difference(sample.system.output_residual, h[1:], h[0])
+        self, z: Array, v: Array, sample: Sample
+    ) -> tuple[_Sigma, Array, Array, Array, Verdict]:
+        """Sigma points, and deviations, noise covariance and fitting error of what corrects."""
+        covariance, r, there = sample.covariance, self._noise_of(sample), sample.observed
+        if covariance is None:
+            raise ValueError("the unscented Kalman observer needs a covariance")
+        sigma = self._sigma(z, covariance, sample)
+        seen = self._outputs(sigma, sample)
         if there is not None:
-            seen, r, v = seen[:, there], r[np.ix_(there, there)], v[there]
-        seen = seen * roots
-        verdict = self._judge(seen.T @ seen, r, v, sample)
+            r, v = r[np.ix_(there, there)], v[there]
+
+        def spread_of(larger: Array) -> Array:
+            outputs = self._outputs(self._sigma(z, larger, sample), sample)
+            return outputs.T @ outputs
+
+        cross = (sigma.moves * sigma.roots).T @ seen
+        prediction = Prediction(covariance, cross, seen.T @ seen, spread_of)
+        verdict = self._judge(prediction, r, v, sample)
         kept, r = verdict.kept, verdict.noise
+        if verdict.covariance is not None:
+            sigma = self._sigma(z, verdict.covariance, sample)
+            seen = self._outputs(sigma, sample)
         if kept is not None:
             seen, r, v = seen[:, kept], r[np.ix_(kept, kept)], v[kept]
-        return math.sqrt(verdict.growth) * seen, r, v, verdict
+        return sigma, seen, r, v, verdict
+
+    @staticmethod
+    def _outputs(sigma: _Sigma, sample: Sample) -> Array:
+        """Deviations of the outputs that are there, times the roots of their weights."""
+        h, there = sample.system.h.batch(sigma.points, sigma.inputs), sample.observed
+        seen: Array = difference(sample.system.output_residual, h[1:], h[0])
+        return (seen if there is None else seen[:, there]) * sigma.roots
+
+
+class _Sigma(NamedTuple):
+    """Deviations from z, z and the sigma points, roots of their weights, and their inputs."""
+
+    moves: Array
+    points: Array
+    roots: Array
+    inputs: Array
 
 
 def _inside(z: Array, moves: Array, states: ConvexSet) -> tuple[Array, Array]:

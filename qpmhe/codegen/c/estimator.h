@@ -54,6 +54,8 @@ typedef $real mhe_real;
 #define MHE_OBSERVER $observer   /* MHE_GAIN, MHE_EXTENDED, ... */
 #define MHE_COVARIANCE $covariance /* whether the observer's covariance is computed */
 #define MHE_OBSERVER_PRIOR $observer_prior /* whether it weighs the prior */
+#define MHE_INNOVATION $innovation /* 0: all innovations count; MHE_GATED or MHE_WEIGHTED */
+#define MHE_SENSORS $sensors    /* sensors whose innovations are tested */
 #define MHE_TURNS $turns  /* whether the set of states bounds angles */
 #define MHE_QUIET $quiet /* directions of x(t+1) - f without a disturbance */
 #define MHE_HELD $held    /* states that are held where the window does not see them */
@@ -68,6 +70,10 @@ $limits
 #define MHE_EXTENDED 1
 #define MHE_UNSCENTED 2
 #define MHE_FUNCTION 3
+
+/* Rules for innovations: a gate, or Huber's weights. */
+#define MHE_GATED 1
+#define MHE_WEIGHTED 2
 
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
@@ -167,6 +173,14 @@ typedef struct {
 } mhe_hold;
 #endif
 
+#if MHE_SENSORS
+typedef struct {
+    mhe_real limits[MHE_NY];   /* of squared innovations of sensors with 1, 2, ... outputs there */
+    int32_t sensor_of[MHE_NY]; /* the sensor of each output */
+    int32_t reopen;            /* failures in a row after which a sensor is due */
+} mhe_innovation;
+#endif
+
 typedef struct {
     mhe_real gain[MHE_NX * MHE_NY];
     mhe_real filter_gain[MHE_NX * MHE_NY]; /* of the observer's own measurement update */
@@ -182,6 +196,9 @@ typedef struct {
 #endif
 #if MHE_HELD
     mhe_hold hold;
+#endif
+#if MHE_SENSORS
+    mhe_innovation innovation;
 #endif
     mhe_real discount;         /* factor on a stage's cost for each step of age */
     mhe_real sample_time;      /* of the rate; 0 where f is a map */
@@ -247,6 +264,9 @@ typedef struct {
 #if MHE_COVARIANCE
     mhe_real covariance[MHE_NX * MHE_NX]; /* of the observer's error at z */
 #endif
+#if MHE_SENSORS
+    int32_t rejections[MHE_SENSORS]; /* how often in a row each has failed before */
+#endif
     mhe_terms terms;
 } mhe_stage;
 
@@ -268,6 +288,9 @@ typedef struct {
 #if MHE_COVARIANCE
     mhe_real last_good_covariance[MHE_NX * MHE_NX], covariance_end[MHE_NX * MHE_NX];
 #endif
+#if MHE_SENSORS
+    int32_t rejections_end[MHE_SENSORS];
+#endif
     mhe_real history[(MHE_HORIZON + 1) * MHE_NX]; /* ring of estimates of x(t), newest last */
     mhe_real trajectory[(MHE_HORIZON + 1) * MHE_NX];
     int8_t places[MHE_ROWS];       /* of the window's rows in the last QP's active set */
@@ -287,6 +310,9 @@ typedef struct {
     /* Sides that were dropped and are violated, by stage: components of W, its rows, those of V
      * and of X. */
     uint8_t dropped[MHE_ROWS];
+#if MHE_SENSORS
+    uint8_t rejected[MHE_SENSORS]; /* 1 for each sensor that the observer's gate rejected */
+#endif
 } mhe_estimate;
 
 typedef struct {
@@ -368,6 +394,7 @@ typedef struct {
     mhe_real *costs, *candidate_costs;
     int32_t *status, *qps, *iterations;
     mhe_real *observer_states;     /* MHE_NX each */
+    uint8_t *rejected;             /* MHE_SENSORS each */
 } mhe_log;
 
 /* Forget all samples and start at x0, or at the nearest point of X. The settings are not copied:

@@ -86,8 +86,8 @@ static void mhe_gained(const mhe_seen *seen, const real *gain, real *out)
 #if MHE_COVARIANCE && MHE_OBSERVER != MHE_UNSCENTED
 /* Joseph's form of (A - K C) P (A - K C)' + K R K', with the outputs' rows of C; A is the identity
  * where there is none. */
-static void mhe_propagate(const mhe_stage *stage, const mhe_seen *seen, const real *A,
-                          const real *C, const real *gain, real *following)
+static void mhe_propagate(const real *P, const mhe_seen *seen, const real *A, const real *C,
+                          const real *gain, real *following)
 {
     real closed[NX * NX], product[NX * NX];
     for (int j = 0; j < NX; j++)
@@ -96,7 +96,7 @@ static void mhe_propagate(const mhe_stage *stage, const mhe_seen *seen, const re
             for (int i = 0; i < seen->count; i++) sum -= gain[i * NX + j] * C[i * NX + l];
             closed[j * NX + l] = sum;
         }
-    mhe_multiply(NX, NX, NX, closed, stage->covariance, product);
+    mhe_multiply(NX, NX, NX, closed, P, product);
     mhe_multiply_transposed(NX, NX, NX, product, closed, following);
     mhe_add_noise(seen, gain, following);
 }
@@ -112,11 +112,11 @@ static void mhe_rows_of(const mhe_seen *seen, const real *C, real *rows)
 #if MHE_OBSERVER == MHE_EXTENDED
 /* The columns of K = A P C' (C P C' + R)^-1 as rows, or of the measurement update's P C' (...)^-1
  * where there is no A; NaN where there is no gain. C: rows of the outputs that are there. */
-static void mhe_kalman_gain(const mhe_stage *stage, const mhe_seen *seen, const real *A,
-                            const real *C, real *gain)
+static void mhe_kalman_gain(const real *P, const mhe_seen *seen, const real *A, const real *C,
+                            real *gain)
 {
     real cross[NY * NX], innovation[NY * NY];
-    mhe_multiply(seen->count, NX, NX, C, stage->covariance, cross);
+    mhe_multiply(seen->count, NX, NX, C, P, cross);
     mhe_multiply_transposed(seen->count, NX, seen->count, cross, C, innovation);
     for (int i = 0; i < seen->count * seen->count; i++) innovation[i] += seen->noise[i];
     if (A)
@@ -173,10 +173,11 @@ static real mhe_draw_inside(const mhe_x_set *set, const real *z, real *one, real
 }
 #endif
 
-static void mhe_sigma_points(const mhe_settings *s, const mhe_stage *stage, mhe_sigma *sigma)
+static void mhe_sigma_points(const mhe_settings *s, const mhe_stage *stage, const real *P,
+                             mhe_sigma *sigma)
 {
     real *moves = sigma->moves;
-    mhe_root(NX, stage->covariance, moves);
+    mhe_root(NX, P, moves);
     for (int i = 0; i < NX * NX; i++) {
         moves[i] *= s->covariances.spread;
         moves[NX * NX + i] = -moves[i];
@@ -227,34 +228,249 @@ static void mhe_sigma_gain(const mhe_seen *seen, const real *rows, real *ahead, 
 }
 #endif
 
-/* L(z, v) of a stage, from its residual v, and the covariance of the next step. */
+#if MHE_INNOVATION
+/* P C' as rows of C P, and C P C', of the outputs that are there. */
+static void mhe_predict_outputs(const mhe_settings *s, const mhe_stage *stage,
+                                const mhe_seen *seen, const real *P, real *cross, real *spread)
+{
+#if MHE_OBSERVER == MHE_EXTENDED
+    real rows[NY * NX];
+    mhe_rows_of(seen, stage->terms.h_jacobian, rows);
+    mhe_multiply(seen->count, NX, NX, rows, P, cross);
+    mhe_multiply_transposed(seen->count, NX, seen->count, cross, rows, spread);
+    (void)s;
+#else
+    mhe_sigma sigma;
+    real rows[POINTS * NY];
+    mhe_sigma_points(s, stage, P, &sigma);
+    mhe_sigma_outputs(s, stage, seen, &sigma, rows);
+    for (int i = 0; i < POINTS * NX; i++) sigma.moves[i] *= sigma.roots[i / NX % NX];
+    for (int i = 0; i < seen->count * NX; i++) cross[i] = 0;
+    for (int i = 0; i < seen->count * seen->count; i++) spread[i] = 0;
+    mhe_add_product(POINTS, seen->count, NX, rows, sigma.moves, cross);
+    mhe_add_product(POINTS, seen->count, seen->count, rows, rows, spread);
+#endif
+}
+
+/* Sensors by their outputs' places among those that are there, and how they passed. */
+typedef struct {
+    int size[MHE_SENSORS], at[MHE_SENSORS][NY];
+    int passes[MHE_SENSORS], due[MHE_SENSORS];
+    int known_count, known[NY]; /* places of the sensors that passed */
+    int given[MHE_SENSORS];     /* how many of these hold for each */
+    real shares[NX];            /* of the states in a growth of P */
+} mhe_sensors;
+
+/* The squared norm of a part of v in its covariance, given others; infinite if singular. */
+static real mhe_distance(const mhe_seen *seen, const real *spread, int known_count,
+                         const int *known, int count, const int *part)
+{
+    const int size = known_count + count;
+    real S[NY * NY], white[NY], sum = 0;
+    int at[NY];
+    for (int i = 0; i < size; i++) at[i] = i < known_count ? known[i] : part[i - known_count];
+    for (int i = 0; i < size; i++) {
+        white[i] = seen->v[at[i]];
+        for (int j = 0; j < size; j++) {
+            const int place = at[i] * seen->count + at[j];
+            S[i * size + j] = spread[place] + seen->noise[place];
+        }
+    }
+    if (!mhe_decompose(size, S)) return INFINITY;
+    for (int i = 0; i < size; i++) {
+        const real *row = S + i * size;
+        for (int j = i + 1; j < size; j++) white[j] -= row[j] / row[i] * white[i];
+        if (i >= known_count) sum += white[i] * white[i] / row[i];
+    }
+    return sum;
+}
+
+/* By which share the due sensors would reduce each variance, over the largest share. */
+static void mhe_find_shares(const mhe_seen *seen, const mhe_sensors *sensors, const real *P,
+                            const real *cross, const real *spread, real *shares)
+{
+    real S[NY * NY], rows[NY * NX], solved[NY * NX], most = 0;
+    int count = 0, at[NY];
+    for (int k = 0; k < MHE_SENSORS; k++)
+        for (int i = 0; sensors->due[k] && i < sensors->size[k]; i++)
+            at[count++] = sensors->at[k][i];
+    for (int i = 0; i < count; i++) {
+        for (int j = 0; j < count; j++) {
+            const int place = at[i] * seen->count + at[j];
+            S[i * count + j] = spread[place] + seen->noise[place];
+        }
+        memcpy(rows + i * NX, cross + at[i] * NX, sizeof(real) * NX);
+    }
+    memcpy(solved, rows, sizeof(real) * (size_t)(count * NX));
+    const int regular = mhe_decompose(count, S);
+    if (regular) mhe_solve_for(count, S, NX, solved);
+    for (int j = 0; j < NX; j++) {
+        real reduced = 0;
+        for (int i = 0; i < count; i++) reduced += rows[i * NX + j] * solved[i * NX + j];
+        shares[j] = regular && P[j * NX + j] > 0 ? reduced / P[j * NX + j] : 0;
+        most = mhe_max(shares[j], most);
+    }
+    for (int j = 0; j < NX; j++) shares[j] = most > 0 ? shares[j] / most : 0;
+}
+
+/* out = P with variances that have grown by a factor, as far as each has a share. */
+static void mhe_grow(const real *P, const real *shares, real factor, real *out)
+{
+    real scale[NX];
+    for (int j = 0; j < NX; j++) scale[j] = sqrt(1 + (factor - 1) * shares[j]);
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++) out[i * NX + j] = scale[i] * P[i * NX + j] * scale[j];
+}
+
+/* Which of the due sensors pass with a P that has grown by a factor; how many. */
+static int mhe_passing(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
+                       const mhe_sensors *sensors, const real *P, real factor, int *passing)
+{
+    real larger[NX * NX], cross[NY * NX], spread[NY * NY];
+    int found = 0;
+    mhe_grow(P, sensors->shares, factor, larger);
+    mhe_predict_outputs(s, stage, seen, larger, cross, spread);
+    for (int k = 0; k < MHE_SENSORS; k++) {
+        passing[k] = sensors->due[k] &&
+                     mhe_distance(seen, spread, sensors->given[k], sensors->known,
+                                  sensors->size[k], sensors->at[k]) <=
+                         s->innovation.limits[sensors->size[k] - 1];
+        found += passing[k];
+    }
+    return found;
+}
+
+/* Test each sensor against the innovation's covariance spread + R, and find those that are due;
+ * how many a larger P explains. */
+static int mhe_test(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
+                    const real *P, const real *cross, const real *spread, mhe_sensors *sensors,
+                    int32_t *next)
+{
+    int late = 0, doubted = 0;
+    memset(sensors, 0, sizeof *sensors);
+    for (int i = 0; i < seen->count; i++) {
+        const int k = s->innovation.sensor_of[seen->at[i]];
+        sensors->at[k][sensors->size[k]++] = i;
+    }
+    for (int k = 0; k < MHE_SENSORS; k++) {
+        const int size = sensors->size[k];
+        const int32_t before = stage->rejections[k];
+        sensors->passes[k] = !size || mhe_distance(seen, spread, 0, 0, size, sensors->at[k]) <=
+                                          s->innovation.limits[size - 1];
+        next[k] = !size ? before : sensors->passes[k] ? 0 : before + (before < INT32_MAX);
+        sensors->due[k] = !sensors->passes[k] && before >= s->innovation.reopen;
+        late += sensors->due[k];
+        doubted += sensors->due[k] ? size : 0;
+        for (int i = 0; sensors->passes[k] && i < size; i++)
+            sensors->known[sensors->known_count++] = sensors->at[k][i];
+    }
+    if (!late) return 0;
+    for (int k = 0; k < MHE_SENSORS; k++) {
+        const int long_shut = stage->rejections[k] / MHE_LONGEST >= s->innovation.reopen;
+        sensors->given[k] = doubted > sensors->known_count || long_shut ? 0 : sensors->known_count;
+    }
+    real most = 1;
+    for (int i = 0; i < MHE_MOST_GROWTH; i++) most *= MHE_GROWTH;
+    mhe_find_shares(seen, sensors, P, cross, spread, sensors->shares);
+    return mhe_passing(s, stage, seen, sensors, P, most, sensors->due);
+}
+
+/* Let the outputs count as the rule for innovations says, and P grow where it must; the sensors'
+ * counts behind this sample. */
+static void mhe_judge_outputs(const mhe_settings *s, const mhe_stage *stage, mhe_seen *seen, real *P,
+                      int32_t *next)
+{
+    real cross[NY * NX], spread[NY * NY];
+    mhe_sensors sensors;
+    mhe_predict_outputs(s, stage, seen, P, cross, spread);
+    const int due = mhe_test(s, stage, seen, P, cross, spread, &sensors, next);
+#if MHE_INNOVATION == MHE_GATED
+    const int count = seen->count;
+    real noise[NY * NY];
+    if (due) {
+        real factor = MHE_GROWTH, larger[NX * NX];
+        int passing[MHE_SENSORS];
+        for (int i = 1; i < MHE_MOST_GROWTH; i++, factor *= MHE_GROWTH)
+            if (mhe_passing(s, stage, seen, &sensors, P, factor, passing) == due) break;
+        mhe_grow(P, sensors.shares, factor, larger);
+        memcpy(P, larger, sizeof larger);
+    }
+    memcpy(noise, seen->noise, sizeof(real) * (size_t)(count * count));
+    int kept = 0, from[NY];
+    for (int i = 0; i < count; i++) {
+        const int k = s->innovation.sensor_of[seen->at[i]];
+        if (sensors.due[k]) next[k] = 0;
+        if (sensors.passes[k] || sensors.due[k]) from[kept++] = i;
+    }
+    seen->count = kept;
+    for (int i = 0; i < kept; i++) {
+        seen->at[i] = seen->at[from[i]];
+        seen->v[i] = seen->v[from[i]];
+        for (int j = 0; j < kept; j++) seen->noise[i * kept + j] = noise[from[i] * count + from[j]];
+    }
+#else
+    if (due) {
+        real larger[NX * NX];
+        mhe_grow(P, sensors.shares, MHE_GROWTH, larger);
+        memcpy(P, larger, sizeof larger);
+        mhe_predict_outputs(s, stage, seen, P, cross, spread);
+    }
+    for (int i = 0; i < seen->count; i++) {
+        real *own = seen->noise + i * seen->count + i;
+        const real variance = spread[i * seen->count + i] + *own;
+        const real excess =
+            fabs(seen->v[i]) / sqrt(variance) / sqrt(s->innovation.limits[0]) - 1;
+        if (!(excess <= 0)) *own += variance * excess;
+    }
+#endif
+}
+#endif
+
+/* What corrects, by the rule for innovations if there is one; P, a copy of the stage's, as it grows. */
+#if MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED
+static void mhe_see_judged(const mhe_settings *s, const mhe_stage *stage, mhe_seen *seen, real *P,
+                           int32_t *next)
+{
+    mhe_see(s, stage, seen);
+    memcpy(P, stage->covariance, sizeof stage->covariance);
+#if MHE_INNOVATION
+    int32_t unused[MHE_SENSORS];
+    mhe_judge_outputs(s, stage, seen, P, next ? next : unused);
+#else
+    (void)next;
+#endif
+}
+#endif
+
+/* L(z, v) of a stage, from its residual v, the covariance of the next step, and how often in a row
+ * each sensor has failed then. */
 static void mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *out,
-                           real *following)
+                           real *following, int32_t *next)
 {
 #if MHE_OBSERVER == MHE_EXTENDED
     const mhe_terms *t = &stage->terms;
     mhe_seen seen;
-    real gain[NY * NX], rows[NY * NX];
-    mhe_see(s, stage, &seen);
+    real gain[NY * NX], rows[NY * NX], P[NX * NX];
+    mhe_see_judged(s, stage, &seen, P, next);
     mhe_rows_of(&seen, t->h_jacobian, rows);
-    mhe_kalman_gain(stage, &seen, t->f_jacobian, rows, gain);
+    mhe_kalman_gain(P, &seen, t->f_jacobian, rows, gain);
     mhe_gained(&seen, gain, out);
-    mhe_propagate(stage, &seen, t->f_jacobian, rows, gain, following);
+    mhe_propagate(P, &seen, t->f_jacobian, rows, gain, following);
     mhe_add_disturbance(s, stage, following);
 #elif MHE_OBSERVER == MHE_UNSCENTED
     mhe_seen seen;
     mhe_sigma sigma;
     real gain[NY * NX], ahead[POINTS * NX], rows[POINTS * NY];
-    real at[NX], middle[NX], next[NX];
-    mhe_see(s, stage, &seen);
-    mhe_sigma_points(s, stage, &sigma);
+    real at[NX], middle[NX], state[NX], P[NX * NX];
+    mhe_see_judged(s, stage, &seen, P, next);
+    mhe_sigma_points(s, stage, P, &sigma);
     mhe_f(stage->z, stage->u, stage->step, middle);
     for (int k = 0; k < POINTS; k++) {
         real *change = ahead + k * NX;
         for (int j = 0; j < NX; j++) at[j] = stage->z[j] + sigma.moves[k * NX + j];
-        mhe_f(at, stage->u, stage->step, next);
-        for (int j = 0; j < NX; j++) change[j] = next[j] - middle[j];
-        mhe_wrap_state(s, next, change);
+        mhe_f(at, stage->u, stage->step, state);
+        for (int j = 0; j < NX; j++) change[j] = state[j] - middle[j];
+        mhe_wrap_state(s, state, change);
         for (int j = 0; j < NX; j++) change[j] *= sigma.roots[k % NX];
     }
     mhe_sigma_outputs(s, stage, &seen, &sigma, rows);
@@ -266,9 +482,10 @@ static void mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *
     mhe_add_disturbance(s, stage, following);
 #elif MHE_OBSERVER == MHE_FUNCTION
     mhe_call_correction(stage->z, stage->v, out);
-    (void)s; (void)following;
+    (void)s; (void)following; (void)next;
 #else
     for (int j = 0; j < NX; j++) out[j] = mhe_dot(NY, s->gain + j * NY, stage->v);
+    (void)next;
 #if MHE_COVARIANCE
     mhe_seen seen;
     real gain[NY * NX], rows[NY * NX];
@@ -276,7 +493,7 @@ static void mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *
     mhe_rows_of(&seen, s->covariances.h_jacobian, rows);
     for (int i = 0; i < seen.count; i++)
         for (int j = 0; j < NX; j++) gain[i * NX + j] = s->gain[j * NY + seen.at[i]];
-    mhe_propagate(stage, &seen, s->covariances.f_jacobian, rows, gain, following);
+    mhe_propagate(stage->covariance, &seen, s->covariances.f_jacobian, rows, gain, following);
     mhe_add_disturbance(s, stage, following);
 #else
     (void)following;
@@ -289,17 +506,17 @@ static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out,
 {
 #if MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED
     mhe_seen seen;
-    real gain[NY * NX];
-    mhe_see(s, stage, &seen);
+    real gain[NY * NX], P[NX * NX];
+    mhe_see_judged(s, stage, &seen, P, 0);
 #if MHE_OBSERVER == MHE_EXTENDED
     real rows[NY * NX];
     mhe_rows_of(&seen, stage->terms.h_jacobian, rows);
-    mhe_kalman_gain(stage, &seen, 0, rows, gain);
-    if (covariance) mhe_propagate(stage, &seen, 0, rows, gain, covariance);
+    mhe_kalman_gain(P, &seen, 0, rows, gain);
+    if (covariance) mhe_propagate(P, &seen, 0, rows, gain, covariance);
 #else
     mhe_sigma sigma;
     real rows[POINTS * NY];
-    mhe_sigma_points(s, stage, &sigma);
+    mhe_sigma_points(s, stage, P, &sigma);
     mhe_sigma_outputs(s, stage, &seen, &sigma, rows);
     for (int i = 0; i < POINTS * NX; i++) sigma.moves[i] *= sigma.roots[i / NX % NX];
     mhe_sigma_gain(&seen, rows, sigma.moves, gain);
@@ -327,7 +544,7 @@ static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out,
     mhe_rows_of(&seen, s->covariances.h_jacobian, rows);
     for (int i = 0; i < seen.count; i++)
         for (int j = 0; j < NX; j++) gain[i * NX + j] = s->filter_gain[j * NY + seen.at[i]];
-    mhe_propagate(stage, &seen, 0, rows, gain, covariance);
+    mhe_propagate(stage->covariance, &seen, 0, rows, gain, covariance);
 #else
     (void)covariance;
 #endif

@@ -92,6 +92,16 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
     mhe_remember(e, o->best->x + e->length * NX);
 }
 
+#if MHE_SENSORS
+/* Which sensors the observer rejected at the newest stage. */
+static void mhe_fill_rejected(mhe_estimator *e, uint8_t *out)
+{
+    const mhe_stage *newest = mhe_stage_at(e, e->length - 1);
+    for (int k = 0; k < MHE_SENSORS; k++)
+        out[k] = MHE_INNOVATION == MHE_GATED && e->rejections_end[k] > newest->rejections[k];
+}
+#endif
+
 static void mhe_fill(mhe_estimator *e, const mhe_workspace *k, const mhe_outcome *o,
                      mhe_estimate *out)
 {
@@ -119,6 +129,9 @@ static void mhe_fill(mhe_estimator *e, const mhe_workspace *k, const mhe_outcome
     out->nearest_points = o->nearest_points;
     memcpy(out->observer_state, e->z_end, sizeof e->z_end);
     mhe_filtered(e, o, out->filtered);
+#if MHE_SENSORS
+    mhe_fill_rejected(e, out->rejected);
+#endif
 #if CONSTRAINED
     if (o->rows_dropped)
         memcpy(out->dropped, k->left_out, sizeof out->dropped);
@@ -290,6 +303,9 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64
             if (log->status) log->status[at] = o.events;
             if (log->qps) log->qps[at] = o.qps;
             if (log->iterations) log->iterations[at] = o.iterations;
+#if MHE_SENSORS
+            if (log->rejected) mhe_fill_rejected(e, log->rejected + at * MHE_SENSORS);
+#endif
         }
     }
 }

@@ -22,10 +22,35 @@ static real *mhe_next_covariance(mhe_estimator *e, int i)
 #endif
 }
 
-/* Evaluate the stage at its z and step the observer to `next`, its covariance to `following`; the
- * cost, or infinity. `events` gets bits of the status. */
+/* How often in a row each sensor has failed behind stage i. */
+static int32_t *mhe_next_rejections(mhe_estimator *e, int i)
+{
+#if MHE_SENSORS
+    return i + 1 < e->length ? mhe_stage_at(e, i + 1)->rejections : e->rejections_end;
+#else
+    (void)e; (void)i;
+    return 0;
+#endif
+}
+
+#if MHE_INNOVATION == MHE_GATED
+/* Bits of the status: whether sensors, or all that are there, were rejected at a stage. */
+static int mhe_rejection(const mhe_settings *s, const mhe_stage *stage, const int32_t *next)
+{
+    int any = 0, all = 1;
+    for (int k = 0; k < MHE_SENSORS; k++) any |= next[k] > stage->rejections[k];
+    for (int j = 0; j < NY; j++) {
+        const int k = s->innovation.sensor_of[j];
+        if (stage->is_observed[j] && !(next[k] > stage->rejections[k])) all = 0;
+    }
+    return any ? MHE_SENSORS_REJECTED | (all ? MHE_ALL_REJECTED : 0) : 0;
+}
+#endif
+
+/* Evaluate the stage at its z and step the observer to `next`, its covariance to `following` and its
+ * sensors' counts to `rejections`; the cost, or infinity. `events` gets bits of the status. */
 static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *next,
-                        real *following, int *events)
+                        real *following, int32_t *rejections, int *events)
 {
     const mhe_settings *s = e->settings;
     real *v = stage->v, *w = stage->w, predicted[NX], output[NY];
@@ -43,7 +68,7 @@ static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *ne
     mhe_wrap_output(s, stage->y, v);
     for (int j = 0; j < NY; j++)
         if (!stage->is_observed[j]) v[j] = 0;
-    mhe_correction(s, stage, w, following);
+    mhe_correction(s, stage, w, following, rejections);
     for (int j = 0; j < NX; j++) next[j] = predicted[j] + w[j];
     mhe_wrap_state(s, next, w);
     mhe_enter_turn(s, next);
@@ -68,8 +93,9 @@ static int mhe_enter(mhe_estimator *e, int i)
     mhe_terms *t = &stage->terms;
     const int linear = s->max_qps > 0, derived = linear || MHE_OBSERVER == MHE_EXTENDED;
     real *next = mhe_next_state(e, i), *following = mhe_next_covariance(e, i);
+    int32_t *rejections = mhe_next_rejections(e, i);
     int events = 0;
-    stage->cost = mhe_advance(e, stage, derived, next, following, &events);
+    stage->cost = mhe_advance(e, stage, derived, next, following, rejections, &events);
     const int held = !isfinite(stage->cost);
     if (held) {
         /* z(i) is where the model does not work: go on where it last did. */
@@ -81,9 +107,15 @@ static int mhe_enter(mhe_estimator *e, int i)
         memcpy(following, good >= 0 ? mhe_stage_at(e, good)->covariance : e->last_good_covariance,
                sizeof e->last_good_covariance);
 #endif
+#if MHE_SENSORS
+        memcpy(rejections, stage->rejections, sizeof stage->rejections);
+#endif
         memset(stage->w, 0, sizeof stage->w);
         memset(stage->v, 0, sizeof stage->v);
     }
+#if MHE_INNOVATION == MHE_GATED
+    events |= mhe_rejection(s, stage, rejections);
+#endif
     if (!linear) return held ? events | MHE_MODEL_FAILED : events;
     const int finite = mhe_all_finite(NX * NX, t->f_jacobian) &&
                        mhe_all_finite(NY * NX, t->h_jacobian);
@@ -155,6 +187,9 @@ static int mhe_push(mhe_estimator *e, const mhe_sample *sample)
     memcpy(stage->z, e->z_end, sizeof stage->z);
 #if MHE_COVARIANCE
     memcpy(stage->covariance, e->covariance_end, sizeof stage->covariance);
+#endif
+#if MHE_SENSORS
+    memcpy(stage->rejections, e->rejections_end, sizeof stage->rejections);
 #endif
     for (int j = 0; j < NU; j++) stage->u[j] = sample->u[j];
     mhe_take_conditions(s, stage, sample);
