@@ -103,9 +103,11 @@ class Problem:
 
     def tuned(self, console: Any) -> Weights:
         """The weights by `qpmhe.tune` on the first part of the records that have one."""
-        parts = []
+        parts, seen = [], set()
         for record in self.records:
-            if record.tunes:
+            # The same measurements with other starts tune once.
+            if record.tunes and id(record.measurements) not in seen:
+                seen.add(id(record.measurements))
                 until = slice(record.tunes)
                 parts.append(TuningRecord(
                     record.measurements[until],

@@ -36,23 +36,26 @@ def cells(row: Any, whole: bool) -> list[str]:
     texts = [row["estimator"], number(row["median"]), number(row["worst"])]
     if whole:
         texts += [number(row["whole median"]), number(row["whole worst"])]
-    engine = "C" if row["engine"] == "compiled" else "Python"
-    return [*texts, f"{100 * row['lost']:.0f}", f"{1e6 * row['step']:.0f}", engine]
+    engine = "C" if row["engine"] == "compiled" else "py"
+    return [*texts, f"{100 * row['lost']:.0f}", f"{1e6 * row['step']:.0f} {engine}"]
 
 
 def number(value: float) -> str:
     """Three digits, or the power of ten of what is beyond all bounds."""
     if not np.isfinite(value):
         return "-"
-    return f"{value:.3g}" if 1e-3 <= abs(value) < 1e4 or not value else f"{value:.0e}"
+    return f"{value:#.3g}" if 1e-3 <= abs(value) < 1e3 else f"{value:.0e}"
 
 
-def headings(problem: Problem, whole: bool) -> list[str]:
+def headings(whole: bool) -> list[str]:
     """Those of `cells`."""
-    names = [f"median ({problem.unit})", "worst"]
-    if whole:
-        names += ["whole record", "worst"]
-    return ["estimator", *names, "lost %", "us", "engine"]
+    return ["estimator", "median", "worst", *(["all", "worst"] * whole), "lost %", "us/step"]
+
+
+def legend(whole: bool) -> str:
+    """What the columns mean."""
+    parts = "Of the part that tunes no weights; all: of the whole record. " if whole else ""
+    return f"{parts}us/step: median time, by the step in C or in Python (py)."
 
 
 def verdict(problem: Problem, rows: pd.DataFrame, baselines: Sequence[str]) -> str:
@@ -76,19 +79,21 @@ def write(
     out.mkdir(parents=True, exist_ok=True)
     table.to_csv(out / f"{problem.name}.csv", index=False)
     whole = any(record.tunes for record in problem.records)
-    columns, text = headings(problem, whole), [f"# {problem.title}", ""]
+    columns, text = headings(whole), [f"# {problem.title}", ""]
     for (weights, record), rows in table.groupby(["weights", "record"], sort=False):
-        title = f"{record}, weights {weights}, {rows['runs'].iloc[0]} runs"
-        shown = Table(*columns, title=f"{problem.title}: {title}", box=None, title_justify="left")
+        title = (f"{record}, weights {weights}, {rows['runs'].iloc[0]} runs; "
+                 f"root mean square error in {problem.unit}")
+        shown = Table(*columns, title=f"{problem.title}: {title}", box=None, title_justify="left",
+                      caption=legend(whole), caption_justify="left")
         lines = [cells(row, whole) for _, row in rows.iterrows()]
-        shown.columns[0].no_wrap = True
-        for column in shown.columns[1:]:
-            column.justify = "right"
+        for column in shown.columns:
+            column.no_wrap = True
+            column.justify = "left" if column is shown.columns[0] else "right"
         for line in lines:
             shown.add_row(*line)
         words = verdict(problem, rows, baselines)
         console.print(shown, f"{words}\n", highlight=False)
-        text += [f"## {title}", "", *markdown(columns, lines), "", words, ""]
+        text += [f"## {title}", "", *markdown(columns, lines), "", legend(whole), words, ""]
     if problem.note:
         console.print(problem.note, "", highlight=False)
         text += [problem.note, ""]
