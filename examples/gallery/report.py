@@ -18,6 +18,7 @@ from qpmhe.plots.style import LIGHT, REAL, STYLES
 from .problem import Array, Problem, Result
 
 BY_HAND, TUNED = "by hand", "tuned"
+ENGINES = {"compiled": "C", "python": "py"}
 
 
 def frame(results: Sequence[Result]) -> pd.DataFrame:
@@ -36,8 +37,9 @@ def cells(row: Any, whole: bool) -> list[str]:
     texts = [row["estimator"], number(row["median"]), number(row["worst"])]
     if whole:
         texts += [number(row["whole median"]), number(row["whole worst"])]
-    engine = "C" if row["engine"] == "compiled" else "py"
-    return [*texts, f"{100 * row['lost']:.0f}", f"{1e6 * row['step']:.0f} {engine}"]
+    engine, micro = ENGINES.get(row["engine"], row["engine"]), 1e6 * row["step"]
+    step = f"{micro:.1f}" if micro < 10.0 else f"{micro:.0f}"
+    return [*texts, f"{100 * row['lost']:.0f}", f"{step} {engine}"]
 
 
 def number(value: float) -> str:
