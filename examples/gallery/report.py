@@ -26,7 +26,8 @@ def frame(results: Sequence[Result]) -> pd.DataFrame:
     rows = [{
         "weights": one.weights, "record": one.record, "estimator": one.estimator,
         "runs": len(one.errors), "median": np.median(one.errors), "worst": one.errors.max(),
-        "lost": one.lost, "whole median": np.median(one.whole), "whole worst": one.whole.max(),
+        "whole median": np.median(one.whole), "whole worst": one.whole.max(),
+        "lost": one.lost, "outside": one.outside,
         "step": one.seconds, "engine": one.engine,
     } for one in results]
     return pd.DataFrame(rows)
@@ -39,7 +40,8 @@ def cells(row: Any, whole: bool) -> list[str]:
         texts += [number(row["whole median"]), number(row["whole worst"])]
     engine, micro = ENGINES.get(row["engine"], row["engine"]), 1e6 * row["step"]
     step = f"{micro:.1f}" if micro < 10.0 else f"{micro:.0f}"
-    return [*texts, f"{100 * row['lost']:.0f}", f"{step} {engine}"]
+    shares = [f"{100 * row[name]:.0f}" for name in ("lost", "outside")]
+    return [*texts, *shares, f"{step} {engine}"]
 
 
 def number(value: float) -> str:
@@ -51,12 +53,13 @@ def number(value: float) -> str:
 
 def headings(whole: bool) -> list[str]:
     """Those of `cells`."""
-    return ["estimator", "median", "worst", *(["all", "worst"] * whole), "lost %", "us/step"]
+    names = ["estimator", "median", "worst", *(["all", "worst"] * whole)]
+    return [*names, "lost %", "not in X %", "us/step"]
 
 
 def legend(whole: bool) -> str:
     """What the columns mean."""
-    parts = "Of the part that tunes no weights; all: of the whole record. " if whole else ""
+    parts = "Errors of the part that judges; all: of the whole record. " if whole else ""
     return f"{parts}us/step: median time, by the step in C or in Python (py)."
 
 
