@@ -173,9 +173,14 @@ class Result:
     estimates: list[Array] = field(repr=False)
 
     @property
-    def middle(self) -> int:
+    def which(self) -> int:
         """Which run has the median error."""
         return int(np.argsort(self.errors)[(len(self.errors) - 1) // 2])
+
+    @property
+    def middle(self) -> Array:
+        """The estimates of this run."""
+        return self.estimates[self.which]
 
 
 def judge(

@@ -142,7 +142,7 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> An
     for problem, found, axes in zip(problems, results, panels, strict=True):
         record = problem.records[0]
         shown = {
-            one.estimator: one.estimates[one.middle][:, :2] for one in found
+            one.estimator: one.middle[:, :2] for one in found
             if one.estimator in SHOWN and (one.weights, one.record) == (BY_HAND, record.name)
         }
         tracks(record.truth, shown, landmarks=np.unique(record.inputs[:, 2:4], axis=0), axes=axes)

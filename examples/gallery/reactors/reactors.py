@@ -215,7 +215,7 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Fi
             REACTORS, problems, results, grid.T, strict=True
         ):
             by_name = {one.estimator: one for one in found}
-            which = by_name["EKF"].middle
+            which = by_name["EKF"].which
             truth = problem.records[which].truth
             panels = list(axes[: len(reactor.species)])
             trajectories(
