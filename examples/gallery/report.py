@@ -64,15 +64,21 @@ def legend(whole: bool) -> str:
 
 
 def verdict(problem: Problem, rows: pd.DataFrame, baselines: Sequence[str]) -> str:
-    """Which estimator has the lowest median error, and whether it is a baseline."""
-    best = rows.loc[rows["median"].idxmin()]
-    others = rows[rows["estimator"].isin(baselines)]
-    rival = others.loc[others["median"].idxmin()]
-    least = f"{best['estimator']} ({number(best['median'])} {problem.unit})"
-    if best["estimator"] in baselines:
-        return f"Lowest median error: {least}, a baseline: it wins."
-    return (f"Lowest median error: {least}; of the baselines {rival['estimator']} "
-            f"({number(rival['median'])} {problem.unit}).")
+    """Which estimator has the lowest errors; a baseline that wins is called one."""
+    found = []
+    for figure in ("median", "worst"):
+        best = rows.loc[rows[figure].idxmin()]
+        others = rows[rows["estimator"].isin(baselines)]
+        rival = others.loc[others[figure].idxmin()]
+        if best["estimator"] in baselines:
+            words = "a baseline: it wins"
+        else:
+            words = f"of the baselines {rival['estimator']}, {number(rival[figure])}"
+        found.append(
+            f"Lowest {figure} error: {best['estimator']}, {number(best[figure])} {problem.unit} "
+            f"({words})."
+        )
+    return " ".join(found)
 
 
 def write(
@@ -97,10 +103,11 @@ def write(
         for line in lines:
             shown.add_row(*line)
         words = verdict(problem, rows, baselines)
-        console.print(shown, f"{words}\n", highlight=False)
-        text += [f"## {title}", "", *markdown(columns, lines), "", legend(whole), words, ""]
+        console.print(shown)
+        console.print(f"[bold]{words}[/]\n", highlight=False, soft_wrap=True)
+        text += [f"## {title}", "", *markdown(columns, lines), "", legend(whole), "", words, ""]
     if problem.note:
-        console.print(problem.note, "", highlight=False)
+        console.print(f"{problem.note}\n", highlight=False, soft_wrap=True)
         text += [problem.note, ""]
     (out / f"{problem.name}.md").write_text("\n".join(text), encoding="utf-8")
     return [out / f"{problem.name}.md", out / f"{problem.name}.csv"]

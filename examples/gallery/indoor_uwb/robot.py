@@ -121,7 +121,7 @@ def problem(y: Array, u: Array, truth: Array, n: int, headings: int) -> Problem:
         Weights(np.diag(PRIOR[:n]) ** 2, np.diag(DISTURBANCE[:n]) ** 2, np.array([[NOISE**2]]),
                 HORIZON),
         lambda x, real: np.hypot(*(x[:, :2] - real).T), "m", LOST,
-        tuning={"objective": "prediction", "held_out": 0.0, "structure": {
+        tuning={"objective": "likelihood", "held_out": 0.0, "structure": {
             "disturbance": dict(list(groups.items())[: n - 1]), "noise": {"range": [0]},
         }},
         own=own, note=NOTE,
