@@ -6,7 +6,7 @@ ARGS ?=
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: reproduce test test-all lint types examples benchmarks comparison choice certificates docs release-check minimal-versions clean
+.PHONY: reproduce test test-all lint types examples gallery benchmarks comparison choice certificates docs release-check minimal-versions clean
 
 # One stamp for each set of extras, renewed when the project's requirements change.
 $(VENV)/.%: pyproject.toml
@@ -36,7 +36,7 @@ examples: $(VENV)/.test
 	$(BIN)/python examples/quickstart.py
 	$(BIN)/python examples/paper_figure.py --out results
 	$(BIN)/python examples/outliers.py --seeds 4 --out results
-	$(BIN)/python examples/textbook_reactors.py --seeds 2 --out results
+	$(BIN)/python -m examples.gallery.reactors --quick --out results/gallery
 	$(BIN)/python examples/benchmarks/compare_peers.py --quick --problem reactor --out results
 	$(BIN)/python examples/benchmarks/constrained.py --steps 60 --out results
 	$(BIN)/python examples/benchmarks/batch.py --members 200 --steps 40 --out results
@@ -46,6 +46,12 @@ examples: $(VENV)/.test
 	$(BIN)/qpmhe compare --seeds 2 --steps 40 --solver-iterations 2,none --store results/quick.sqlite --out results/compare
 	if [ -d "$(DATA)" ]; then $(BIN)/python examples/battery_soc/study.py --quick --data "$(DATA)" --out results; \
 	else echo "no battery data at '$(DATA)': battery example left out"; fi
+
+# The problems of docs/gallery. DATA holds a folder for each data set; without them a problem says where to get its own.
+gallery: DATA ?= data
+gallery: $(VENV)/.test
+	$(BIN)/python -m examples.gallery.reactors --out results/gallery
+	$(BIN)/python -m examples.gallery.indoor_uwb --data "$(DATA)/indoor_uwb" --out results/gallery
 
 # All benchmarks, beside all that PyPI has: an hour, most of it compiling; QUICK=--quick for minutes.
 benchmarks: $(VENV)/.test

@@ -1,7 +1,8 @@
-"""Draw the gallery's pictures: run the examples and shrink what they draw.
+"""Draw the pictures of examples and gallery: run the examples and shrink what they draw.
 
-``python docs/img/gallery.py`` renews all of them in some minutes, ``python docs/img/gallery.py
-outliers`` one. Those of the notebooks are the ones that the notebooks hold.
+``python docs/img/gallery.py`` renews the examples' in some minutes, ``python docs/img/gallery.py
+outliers`` one. Those of the notebooks are the ones that the notebooks hold. After ``make gallery``,
+``python docs/img/gallery.py --drawn results/gallery`` shrinks what it drew.
 """
 
 import argparse
@@ -23,7 +24,6 @@ WIDTH, COLORS, MOST = 1000, 96, 150_000  # pixels, of a palette, bytes
 PROGRAMS = {
     "paper-figure": (["paper_figure.py"], "paper_figure.png"),
     "outliers": (["outliers.py"], "outliers.png"),
-    "textbook-reactors": (["textbook_reactors.py"], "textbook_reactors.png"),
     "closed-loop": (["closed_loop.py"], "closed_loop.png"),
     "do-mpc-masses": (["do_mpc_masses.py"], "do_mpc_masses.png"),
 }
@@ -100,7 +100,14 @@ def main() -> None:
     names = [*PROGRAMS, *NOTEBOOKS]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", choices=[[], *names], help="all if left out")
-    for name in parser.parse_args().names or names:
+    parser.add_argument("--drawn", type=Path, help="folder of the gallery's results")
+    given = parser.parse_args()
+    if given.drawn is not None:
+        for path in sorted(given.drawn.glob("*.png")):
+            with Image.open(path) as image:
+                write(image.convert("RGB"), HERE / f"gallery-{path.stem.replace('_', '-')}.png")
+        return
+    for name in given.names or names:
         image = drawn(*PROGRAMS[name]) if name in PROGRAMS else held(*NOTEBOOKS[name])
         write(image, HERE / f"{name}.png")
 

@@ -12,15 +12,17 @@ from qpmhe.tuning import Weights
 
 from .problem import Array, Problem, Way
 
-# Squared innovation of one sensor that 99.7 % of the good samples stay below; rejections in a row
-# after which the gate opens.
-GATE: dict[str, Any] = {"probability": 0.997, "reopen": 10}
 ITERATIONS = 10
 QPS = {"1 QP": 1, "2 QPs": 2, "5 QPs": 5, "converged": None}
 
 
-class IteratedKalman(qpmhe.ExtendedKalman):
+class IteratedKalman(qpmhe.Observer):
     """The iterated extended Kalman filter: its update is a Gauss-Newton search.
+
+    Parameters
+    ----------
+    prior, disturbance, noise : (n, n), (r, r) and (p, p) array
+        As for `qpmhe.ExtendedKalman`.
 
     References
     ----------
@@ -28,28 +30,42 @@ class IteratedKalman(qpmhe.ExtendedKalman):
     Automat. Contr. 38 (1993).
     """
 
-    def correct(self, z: Array, v: Array, sample: Any) -> tuple[Array, Array]:
+    needs_jacobians = True
+
+    def __init__(self, *, prior: Array, disturbance: Array, noise: Array) -> None:
+        self._prior, self._disturbance, self._noise = prior, disturbance, noise
+
+    def check(self, system: qpmhe.System, initial_state: Array) -> None:
+        """The covariances are those of the problem."""
+
+    def initial_covariance(self) -> Array:
+        """P(0)."""
+        return self._prior
+
+    def correct(self, z: Array, v: Array, sample: qpmhe.Sample) -> tuple[Array, Array]:
         """Predict from the updated state; L(z, 0) = 0."""
         updated, covariance = self.filter(z, v, sample)
         system, u = sample.system, sample.u
         a = system.f_jacobian(updated, u)
-        ahead = a @ covariance @ a.T + self._disturbance_of(sample)
+        ahead = a @ covariance @ a.T + system.state_covariance(self._disturbance)
         return system.f(updated, u) - system.f(z, u), 0.5 * (ahead + ahead.T)
 
-    def filter(self, z: Array, v: Array, sample: Any) -> tuple[Array, Array]:
+    def filter(self, z: Array, v: Array, sample: qpmhe.Sample) -> tuple[Array, Array]:
         """Linearise h anew at each iterate."""
         system, u, p = sample.system, sample.u, sample.covariance
-        at, expected, c = z, system.h(z, u), sample.h_jacobian
+        there = np.ones(v.size, bool) if sample.observed is None else sample.observed
+        if not there.any():
+            return z, p
+        at, c, r = z, sample.h_jacobian[there], self._noise[np.ix_(there, there)]
+        y = (v + system.h(z, u))[there]
         for _ in range(ITERATIONS):
-            rows, r, left = self._seen(c, v + expected - system.h(at, u) - c @ (z - at), sample)
-            gain = np.linalg.solve(rows @ p @ rows.T + r, rows @ p).T
-            before, at = at, z + gain @ left
-            c = system.h_jacobian(at, u)
+            gain = np.linalg.solve(c @ p @ c.T + r, c @ p).T
+            before, at = at, z + gain @ (y - system.h(at, u)[there] - c @ (z - at))
+            c = system.h_jacobian(at, u)[there]
             if np.all(np.abs(at - before) <= 1e-9 * np.sqrt(p.diagonal())):
                 break
-        rows, r, _ = self._seen(c, v, sample)
-        gain = np.linalg.solve(rows @ p @ rows.T + r, rows @ p).T
-        closed = np.eye(z.size) - gain @ rows
+        gain = np.linalg.solve(c @ p @ c.T + r, c @ p).T
+        closed = np.eye(z.size) - gain @ c
         return at, closed @ p @ closed.T + gain @ r @ gain.T
 
 
@@ -58,10 +74,11 @@ def filters(problem: Problem, weights: Weights) -> dict[str, Way]:
     kinds: dict[str, Any] = {}
     if problem.constant_gain is not None:
         kinds["constant gain"] = problem.constant_gain(weights)
-    kinds["EKF"] = qpmhe.ExtendedKalman
-    if hasattr(qpmhe, "Gate"):
-        kinds["EKF, gated"] = partial(qpmhe.ExtendedKalman, innovation=qpmhe.Gate(**GATE))
-    kinds |= {"EKF, iterated": IteratedKalman, "UKF": qpmhe.UnscentedKalman}
+    kinds |= {
+        "EKF": qpmhe.ExtendedKalman,
+        "EKF, gated": partial(qpmhe.ExtendedKalman, innovation=qpmhe.Gate()),
+        "EKF, iterated": IteratedKalman, "UKF": qpmhe.UnscentedKalman,
+    }
     cost = qpmhe.QuadraticCost.from_covariances(
         prior=weights.prior, disturbance=weights.disturbance, noise=weights.noise
     )

@@ -11,6 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
+from qpmhe.errors import QpmheError
 from qpmhe.plots import save
 
 from .baselines import estimators, filters
@@ -84,20 +85,22 @@ def main(
     if folder is not None and source and (folder / name).is_dir():
         folder = folder / name
     if folder is None or not folder.is_dir():
-        console.print(f"{name}: no data at --data {folder}. {source}", highlight=False)
+        missing = "give --data DIR" if folder is None else f"there is no folder {folder}"
+        console.print(f"{name} needs its data set: {missing}. {source}", highlight=False,
+                      soft_wrap=True)
         return 0
+    files, results = [], []
     try:
         problems = make(folder, given.quick)
-    except (DataError, OSError) as error:
+        for problem in problems:
+            found = results_of(problem, console, given.quick)
+            rivals = list(filters(problem, problem.weights))
+            files += write(problem, found, rivals, console, given.out)
+            results.append(found)
+    except (DataError, QpmheError, OSError) as error:
         print(f"error: {folder}: {error}", file=sys.stderr)
         return 2
-    files, results = [], []
-    for problem in problems:
-        found = results_of(problem, console, given.quick)
-        files += write(problem, found, list(filters(problem, problem.weights)), console,
-                       given.out)
-        results.append(found)
     if draw is not None:
         files += save(draw(problems, results), given.out / name)
-    console.print("wrote", *files, highlight=False)
+    console.print("wrote", *files, highlight=False, soft_wrap=True)
     return 0

@@ -103,9 +103,11 @@ class Problem:
 
     def tuned(self, console: Any) -> Weights:
         """The weights by `qpmhe.tune` on the first part of the records that have one."""
-        parts = []
+        parts, seen = [], set()
         for record in self.records:
-            if record.tunes:
+            # The same measurements with other starts tune once.
+            if record.tunes and id(record.measurements) not in seen:
+                seen.add(id(record.measurements))
                 until = slice(record.tunes)
                 parts.append(TuningRecord(
                     record.measurements[until],
@@ -153,8 +155,8 @@ class Result:
         Root mean square errors of each run, of the samples that judge and of all.
     seconds, engine : float and str
         Median time of a step, and what ran it.
-    lost : float
-        Share of the lost runs.
+    lost, outside : float
+        Shares of the lost runs, and of the estimates outside the system's X.
     estimates : list of (T, n) array
         Of each run.
     """
@@ -167,12 +169,18 @@ class Result:
     seconds: float
     engine: str
     lost: float
+    outside: float
     estimates: list[Array] = field(repr=False)
 
     @property
+    def which(self) -> int:
+        """Which run has the median error."""
+        return int(np.argsort(self.errors)[(len(self.errors) - 1) // 2])
+
+    @property
     def middle(self) -> Array:
-        """The estimates of the run with the median error."""
-        return self.estimates[int(np.argsort(self.errors)[(len(self.errors) - 1) // 2])]
+        """The estimates of this run."""
+        return self.estimates[self.which]
 
 
 def judge(
@@ -199,8 +207,20 @@ def judge(
     judged = np.array(errors)
     return Result(
         weights, records[0].name, name, judged, np.array(whole), float(np.median(times)),
-        getattr(mhe, "engine", "python"), float(np.mean(~(judged <= problem.lost))), found,
+        getattr(mhe, "engine", "python"), float(np.mean(~(judged <= problem.lost))),
+        outside(problem.system, np.concatenate(found)), found,
     )
+
+
+def outside(system: qpmhe.System, estimates: Array) -> float:
+    """The share of estimates outside of X, by more than rounding."""
+    if system.states is None:
+        return 0.0
+    rounding = 1e-9 * np.abs(estimates).max(axis=1, keepdims=True)
+    return float(np.mean([
+        system.states.violation(x, rounding=slack) > 0.0
+        for x, slack in zip(estimates, rounding, strict=True) if not np.isnan(x).any()
+    ]))
 
 
 def causal(run: Any, mhe: Any) -> Array:

@@ -18,6 +18,7 @@ from qpmhe.plots.style import LIGHT, REAL, STYLES
 from .problem import Array, Problem, Result
 
 BY_HAND, TUNED = "by hand", "tuned"
+ENGINES = {"compiled": "C", "python": "py"}
 
 
 def frame(results: Sequence[Result]) -> pd.DataFrame:
@@ -25,7 +26,8 @@ def frame(results: Sequence[Result]) -> pd.DataFrame:
     rows = [{
         "weights": one.weights, "record": one.record, "estimator": one.estimator,
         "runs": len(one.errors), "median": np.median(one.errors), "worst": one.errors.max(),
-        "lost": one.lost, "whole median": np.median(one.whole), "whole worst": one.whole.max(),
+        "whole median": np.median(one.whole), "whole worst": one.whole.max(),
+        "lost": one.lost, "outside": one.outside,
         "step": one.seconds, "engine": one.engine,
     } for one in results]
     return pd.DataFrame(rows)
@@ -36,35 +38,47 @@ def cells(row: Any, whole: bool) -> list[str]:
     texts = [row["estimator"], number(row["median"]), number(row["worst"])]
     if whole:
         texts += [number(row["whole median"]), number(row["whole worst"])]
-    engine = "C" if row["engine"] == "compiled" else "Python"
-    return [*texts, f"{100 * row['lost']:.0f}", f"{1e6 * row['step']:.0f}", engine]
+    engine, micro = ENGINES.get(row["engine"], row["engine"]), 1e6 * row["step"]
+    step = f"{micro:.1f}" if micro < 10.0 else f"{micro:.0f}"
+    shares = [f"{100 * row[name]:.0f}" for name in ("lost", "outside")]
+    return [*texts, *shares, f"{step} {engine}"]
 
 
 def number(value: float) -> str:
     """Three digits, or the power of ten of what is beyond all bounds."""
     if not np.isfinite(value):
         return "-"
-    return f"{value:.3g}" if 1e-3 <= abs(value) < 1e4 or not value else f"{value:.0e}"
+    return f"{value:#.3g}" if 1e-3 <= abs(value) < 1e3 else f"{value:.0e}"
 
 
-def headings(problem: Problem, whole: bool) -> list[str]:
+def headings(whole: bool) -> list[str]:
     """Those of `cells`."""
-    names = [f"median ({problem.unit})", "worst"]
-    if whole:
-        names += ["whole record", "worst"]
-    return ["estimator", *names, "lost %", "us", "engine"]
+    names = ["estimator", "median", "worst", *(["all", "worst"] * whole)]
+    return [*names, "lost %", "not in X %", "us/step"]
+
+
+def legend(whole: bool) -> str:
+    """What the columns mean."""
+    parts = "Errors of the part that judges; all: of the whole record. " if whole else ""
+    return f"{parts}us/step: median time, by the step in C or in Python (py)."
 
 
 def verdict(problem: Problem, rows: pd.DataFrame, baselines: Sequence[str]) -> str:
-    """Which estimator has the lowest median error, and whether it is a baseline."""
-    best = rows.loc[rows["median"].idxmin()]
-    others = rows[rows["estimator"].isin(baselines)]
-    rival = others.loc[others["median"].idxmin()]
-    least = f"{best['estimator']} ({number(best['median'])} {problem.unit})"
-    if best["estimator"] in baselines:
-        return f"Lowest median error: {least}, a baseline: it wins."
-    return (f"Lowest median error: {least}; of the baselines {rival['estimator']} "
-            f"({number(rival['median'])} {problem.unit}).")
+    """Which estimator has the lowest errors; a baseline that wins is called one."""
+    found = []
+    for figure in ("median", "worst"):
+        best = rows.loc[rows[figure].idxmin()]
+        others = rows[rows["estimator"].isin(baselines)]
+        rival = others.loc[others[figure].idxmin()]
+        if best["estimator"] in baselines:
+            words = "a baseline: it wins"
+        else:
+            words = f"of the baselines {rival['estimator']}, {number(rival[figure])}"
+        found.append(
+            f"Lowest {figure} error: {best['estimator']}, {number(best[figure])} {problem.unit} "
+            f"({words})."
+        )
+    return " ".join(found)
 
 
 def write(
@@ -76,21 +90,24 @@ def write(
     out.mkdir(parents=True, exist_ok=True)
     table.to_csv(out / f"{problem.name}.csv", index=False)
     whole = any(record.tunes for record in problem.records)
-    columns, text = headings(problem, whole), [f"# {problem.title}", ""]
+    columns, text = headings(whole), [f"# {problem.title}", ""]
     for (weights, record), rows in table.groupby(["weights", "record"], sort=False):
-        title = f"{record}, weights {weights}, {rows['runs'].iloc[0]} runs"
-        shown = Table(*columns, title=f"{problem.title}: {title}", box=None, title_justify="left")
+        title = (f"{record}, weights {weights}, {rows['runs'].iloc[0]} runs; "
+                 f"root mean square error in {problem.unit}")
+        shown = Table(*columns, title=f"{problem.title}: {title}", box=None, title_justify="left",
+                      caption=legend(whole), caption_justify="left")
         lines = [cells(row, whole) for _, row in rows.iterrows()]
-        shown.columns[0].no_wrap = True
-        for column in shown.columns[1:]:
-            column.justify = "right"
+        for column in shown.columns:
+            column.no_wrap = True
+            column.justify = "left" if column is shown.columns[0] else "right"
         for line in lines:
             shown.add_row(*line)
         words = verdict(problem, rows, baselines)
-        console.print(shown, f"{words}\n", highlight=False)
-        text += [f"## {title}", "", *markdown(columns, lines), "", words, ""]
+        console.print(shown)
+        console.print(f"[bold]{words}[/]\n", highlight=False, soft_wrap=True)
+        text += [f"## {title}", "", *markdown(columns, lines), "", legend(whole), "", words, ""]
     if problem.note:
-        console.print(problem.note, "", highlight=False)
+        console.print(f"{problem.note}\n", highlight=False, soft_wrap=True)
         text += [problem.note, ""]
     (out / f"{problem.name}.md").write_text("\n".join(text), encoding="utf-8")
     return [out / f"{problem.name}.md", out / f"{problem.name}.csv"]

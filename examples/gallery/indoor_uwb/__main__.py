@@ -6,4 +6,4 @@ from ..command import main
 from .robot import SOURCE, draw, problems
 
 if __name__ == "__main__":
-    sys.exit(main("indoor_uwb", __doc__, problems, draw, SOURCE))
+    sys.exit(main("indoor_uwb", "A robot finds its way by distances.", problems, draw, SOURCE))

@@ -1,0 +1,1 @@
+"""Two textbook reactors on which an extended Kalman filter settles at negative pressures."""

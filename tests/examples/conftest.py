@@ -1,0 +1,22 @@
+"""The folder of examples on the path: `examples` itself is the name of this package."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = str(Path(__file__).parents[2] / "examples")
+
+
+@pytest.fixture(scope="session")
+def gallery():
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("pandas")
+    pytest.importorskip("rich")
+    sys.path.insert(0, EXAMPLES)
+    try:
+        import gallery
+
+        yield gallery
+    finally:
+        sys.path.remove(EXAMPLES)

@@ -1,0 +1,55 @@
+"""The textbook reactors are estimated as the gallery says."""
+
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+SEEDS = 4
+
+
+@pytest.fixture(scope="module")
+def reactors(gallery):
+    return import_module("gallery.reactors.reactors")
+
+
+@pytest.fixture(scope="module")
+def judged(gallery, reactors):
+    """The result of one estimator on some records of a reactor."""
+    judge = import_module("gallery.problem").judge
+    estimators = import_module("gallery.baselines").estimators
+    problems = [reactors.problem(reactor, SEEDS) for reactor in reactors.REACTORS]
+
+    def result(which, name):
+        problem = problems[which]
+        way = estimators(problem, problem.weights)[name]
+        return judge(problem, "by hand", name, way, problem.records, False)
+
+    return result
+
+
+@pytest.mark.parametrize(("which", "most"), [(0, 0.04), (1, 0.005)])
+@pytest.mark.parametrize(
+    "name", ["EKF, projected", "MHE, 1 QP", "MHE, 2 QPs", "MHE, 5 QPs", "MHE, converged"]
+)
+def test_a_projected_filter_and_mhe_on_it_settle_on_the_truth(judged, which, most, name):
+    found = judged(which, name)
+    assert np.median(found.errors) < most
+    assert found.outside == 0.0
+    assert found.lost == 0.0
+
+
+def test_a_plain_filter_settles_outside_of_x(judged):
+    found = judged(1, "EKF")
+    assert np.median(found.errors) > 0.1
+    assert found.outside > 0.5
+
+
+@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("gain", ["0.001", "0.01"])
+def test_two_qps_improve_on_a_projected_constant_gain(judged, which, gain):
+    alone, two = (
+        np.median(judged(which, name).errors)
+        for name in (f"gain {gain}, projected", f"MHE, gain {gain}, 2 QPs")
+    )
+    assert two < alone / 1.5
