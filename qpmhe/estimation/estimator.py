@@ -686,9 +686,8 @@ class MovingHorizonEstimator:
         """
         memory = read(state)
         pinned = memory.get("engine")
-        is_other = isinstance(pinned, str) and pinned != self.engine
         # Whole or, if interrupted, not at all.
-        if is_other and self.settings.engine == "auto":
+        if isinstance(pinned, str) and self.engine != pinned and self.settings.engine == "auto":
             engine = engine_of_snapshot(
                 pinned, self._own_system, self.observer, self.cost, self.settings,
                 self._initial_state,
