@@ -140,7 +140,13 @@ def check_prior_size(prior: Array, least: int) -> Array:
 
 def _symmetric(name: str, value: ArrayLike, size: int | None) -> tuple[Array, float]:
     """A symmetric copy, and the smallest eigenvalue of its correlations."""
-    matrix = np.atleast_2d(numbers(name, value))
+    given = numbers(name, value)
+    if given.ndim == 1 and given.size > 1:
+        raise ShapeError(
+            f"{name} has shape {given.shape}; expected a square matrix. For a diagonal one, give "
+            "np.diag of the vector."
+        )
+    matrix = np.atleast_2d(given)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise ShapeError(f"{name} has shape {matrix.shape}; expected a square matrix.")
     if size is not None and matrix.shape != (size, size):

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from .._checks import make_folder
+from .._checks import count, make_folder
 from ..errors import OptionError
 from ..studies import Store, Study, StudyError, run
 from ..studies.grid import WORDS, Measure
@@ -144,11 +144,13 @@ def _numbers(name: str, text: str) -> list[int | None]:
     found: list[int | None] = []
     for item in text.split(","):
         word = item.strip()
+        least = 0 if name == "qps" else 1
         try:
-            found.append(None if word == WORDS[name] else int(word))
+            found.append(None if word == WORDS[name] else count(name, int(word), least))
         except ValueError as error:
             option = name.replace("_", "-")
             raise OptionError(
-                f"--{option} has {word!r}; expected integers between commas, or {WORDS[name]!r}."
+                f"--{option} has {word!r}; expected integers >= {least} between commas, or "
+                f"{WORDS[name]!r}."
             ) from error
     return found

@@ -9,7 +9,7 @@ import typer
 Model = Annotated[
     str, typer.Argument(help="Model of the zoo, package.module:function or file.py:function.")
 ]
-Horizon = Annotated[int | None, typer.Option(help="N; default is the model's.")]
+Horizon = Annotated[int | None, typer.Option(min=1, help="N; default is the model's.")]
 InitialState = Annotated[
     str | None, typer.Option(help="Numbers between commas; default is the model's.")
 ]

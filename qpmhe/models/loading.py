@@ -95,6 +95,11 @@ def find(text: Any, folder: Path | None = None) -> ModelSource:
     arguments = ", ".join(f"{key}={value!r}" for key, value in given.items())
     name = f"{written}({arguments})" if arguments else written
     if ":" not in written:
+        if written.endswith(".py"):
+            raise ModelError(
+                f"the model is {text!r}, which names no function; "
+                f"{_proposal((folder or Path()) / written, written)}."
+            )
         if written not in catalogue():
             raise ModelError(
                 f"model {written!r} is not known; expected one of {', '.join(catalogue())}, or "
@@ -117,6 +122,22 @@ def find(text: Any, folder: Path | None = None) -> ModelSource:
             f"model {name!r}: cannot read {error.filename} ({error.strerror})."
         ) from error
     return ModelSource(name, f"{place}:{function}", arguments, digest)
+
+
+def _proposal(file: Path, written: str) -> str:
+    """What to write for the model of a file, by the functions that it defines."""
+    try:
+        body = ast.parse(file.read_bytes()).body
+    except (OSError, SyntaxError, ValueError):
+        return f"expected {written}:function"
+    names = [
+        one.name for one in body
+        if isinstance(one, ast.FunctionDef) and not one.name.startswith("_")
+        and len(one.args.posonlyargs + one.args.args) == len(one.args.defaults)
+    ]
+    if not names:
+        return f"expected {written}:function, and the file has no function without arguments"
+    return "expected " + " or ".join(f"{written}:{name}" for name in names[:5])
 
 
 def build(source: ModelSource) -> Any:

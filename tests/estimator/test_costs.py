@@ -366,3 +366,17 @@ def test_the_remedy_for_a_singular_weight_is_one_for_this_weight(name, remedy):
     weights = {"prior": 1.0, "disturbance": 1.0, "noise": 1.0, name: 0.0}
     with pytest.raises(qpmhe.errors.WeightError, match=f"{name} has the eigenvalue 0.*{remedy}"):
         qpmhe.QuadraticCost(**weights)
+
+
+@pytest.mark.parametrize("name", ["prior", "disturbance", "noise"])
+@pytest.mark.parametrize(
+    "make",
+    [
+        qpmhe.QuadraticCost, qpmhe.QuadraticCost.from_covariances, qpmhe.ExtendedKalman,
+        qpmhe.UnscentedKalman,
+    ],
+)
+def test_a_vector_in_place_of_a_matrix_suggests_a_diagonal(make, name):
+    matrices = dict.fromkeys(("prior", "disturbance", "noise"), np.eye(2)) | {name: [1.0, 2.0]}
+    with pytest.raises(qpmhe.errors.ShapeError, match=rf"{name}.* has shape \(2,\).*np\.diag"):
+        make(**matrices)

@@ -51,10 +51,11 @@ def test_compare_runs_the_study_of_its_options(tmp_path, shown):
 @pytest.mark.parametrize(
     ("option", "value", "words"),
     [
-        ("--qps", "0,two", "--qps has 'two'; expected integers between commas, or 'none'"),
+        ("--qps", "0,two", "--qps has 'two'; expected integers >= 0 between commas, or 'none'"),
         ("--qps", "converged", "--qps has 'converged'"),
         ("--solver-iterations", "", "--solver-iterations has ''"),
         ("--horizons", "converged", "--horizons has 'converged'"),
+            ("--horizons", "0", "--horizons has '0'; expected integers >= 1"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(tmp_path, option, value, words):

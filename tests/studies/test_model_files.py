@@ -126,3 +126,25 @@ def test_modules_without_a_file_of_their_own(here):
         load(find("sys.no:make"))
     with pytest.raises(QpmheError, match="changing"):
         find("changing.py/x.py:make")
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (OWN.format(""), r"names no function; expected tanks\.py:make\."),
+        ("def _helper(): pass\ndef needy(a): pass\n", "has no function without arguments"),
+        ("def open(:", r"expected tanks\.py:function\."),
+    ],
+)
+def test_a_file_without_a_function_is_answered_by_its_functions(here, code, words):
+    (here / "tanks.py").write_text(code)
+    with pytest.raises(ModelError, match=words):
+        find("tanks.py")
+
+
+@pytest.mark.parametrize("name", ["changing.py:make", "changing:make"])
+def test_what_a_function_raises_has_file_and_line(here, name):
+    (here / "changing.py").write_text('def make():\n    raise RuntimeError("boom")\n')
+    words = r"changing\.py, line 2: model '.*' cannot be made: RuntimeError: boom\."
+    with pytest.raises(ModelError, match=words):
+        load(find(name))
