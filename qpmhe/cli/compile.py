@@ -19,7 +19,9 @@ def compile(  # noqa: A001 - the name of the command
         list[str],
         typer.Argument(help="Models of the zoo, package.module:function or file.py:function."),
     ],
-    horizon: Annotated[int | None, typer.Option(min=1, help="N; default is each model's own.")] = None,
+    horizon: Annotated[
+        int | None, typer.Option(min=1, help="N; default is each model's own.")
+    ] = None,
     initial_state: Annotated[
         str | None, typer.Option(help="Numbers between commas; default is each model's own.")
     ] = None,
