@@ -74,6 +74,16 @@ def _compiled_engine(
 register_engine("compiled", _compiled_engine)
 
 
+def _page(run: Run) -> str:
+    from .plots.page import run_page  # late: it needs Matplotlib
+
+    return run_page(run)
+
+
+Run.page = staticmethod(_page)
+load_run = Run.load
+
+
 # What most programs do without is imported when it is first named.
 _LATE_MODULES = ("certificates", "plots", "records", "studies", "tuning")
 _LATE_FUNCTIONS = {"diagnose": "tuning", "tune": "tuning"}
@@ -148,6 +158,7 @@ __all__ = [
     "from_control",
     "from_jax",
     "from_sympy",
+    "load_run",
     "models",
     "noisy_inputs",
     "plots",

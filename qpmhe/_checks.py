@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -248,3 +249,42 @@ def make_folder(path: str | Path) -> Path:
     except OSError as error:
         raise InvalidInputError(f"cannot make the folder {path}: {error.strerror}.") from error
     return Path(path)
+
+
+# Arrays of more entries are shown by their shape.
+_SHOWN = 9
+
+
+def representation(thing: Any, **others: Any) -> str:
+    """What ``repr`` says of an object: its type, and the arguments that are not the defaults.
+
+    Parameters
+    ----------
+    thing : object
+        One that keeps each argument of its constructor under its name, or with an underscore.
+    **others
+        What to show in place of an attribute, or beside the arguments.
+    """
+    found: dict[str, Any] = {}
+    for name, parameter in inspect.signature(type(thing)).parameters.items():
+        value = getattr(thing, name, getattr(thing, f"_{name}", None))
+        if value is not None and not (isinstance(value, float | str | bool | int) and (
+            value == parameter.default
+        )):
+            found[name] = value
+    parts = ", ".join(
+        f"{name}={_brief(value)}" for name, value in (found | others).items() if value is not None
+    )
+    return f"{type(thing).__name__}({parts})"
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        if value.size > _SHOWN:
+            return f"<{' x '.join(map(str, value.shape))}>"
+        return " ".join(np.array2string(value, precision=4, separator=", ").split())
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if callable(value) and hasattr(value, "__qualname__"):
+        return f"<{value.__qualname__}>"
+    return repr(value)

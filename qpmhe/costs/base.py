@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.values import finite, shown
 
-from .._checks import SINGULAR, Array
+from .._checks import SINGULAR, Array, representation
 from .._linalg import inverse, solve
 from ..errors import InvalidInputError, OptionError
 from .subspace import Subspace
@@ -214,6 +214,9 @@ class Cost(ABC):
         # each of its methods is atomic, and a matrix that two of them compute is the same.
         self._partial: OrderedDict[bytes, Array] = OrderedDict()
         self._kept = max(_KEPT_LEAST, _KEPT_BYTES // self.stage_weight.nbytes)
+
+    def __repr__(self) -> str:
+        return representation(self)
 
     @property
     def r(self) -> int:

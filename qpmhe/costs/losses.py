@@ -9,7 +9,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array, flag, positive, positive_definite
+from .._checks import Array, flag, positive, positive_definite, representation
 from ..errors import InvalidInputError, OptionError, WeightError
 from .base import LossForm, quadratic_form
 
@@ -39,6 +39,9 @@ class Loss(ABC):
         self.dimension = self.weight.shape[0]
         self.per_component = flag("per_component", per_component)
         self.check_weight(self.weight)
+
+    def __repr__(self) -> str:
+        return representation(self)
 
     def check_weight(self, weight: Array) -> None:
         """Raise a `WeightError` unless the weight is diagonal, where the loss is per component."""

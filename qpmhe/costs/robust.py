@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from qpmhe_solvers.errors import report_unknown_options
 
-from .._checks import Array, check_prior_size, positive_definite
+from .._checks import Array, check_prior_size, positive_definite, representation
 from ..errors import InvalidInputError
 from .base import Cost, CostConstants, CostForm, ObserverPrior
 from .losses import Loss, Quadratic
@@ -58,6 +58,12 @@ class RobustCost(Cost):
             weight = check_prior_size(positive_definite("prior", self.prior_loss.weight), r)
         self.graduation = max(self.disturbance_loss.graduation, self.noise_loss.graduation)
         super().__init__(weight, self.disturbance_loss.weight, self.noise_loss.weight, discount)
+
+    def __repr__(self) -> str:
+        prior = self.prior if self.observer_prior is not None else self.prior_loss
+        return representation(
+            self, prior=prior, disturbance=self.disturbance_loss, noise=self.noise_loss
+        )
 
     @property
     def c_form(self) -> CostForm | None:

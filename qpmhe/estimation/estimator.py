@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import warnings
 from collections.abc import Mapping
+from dataclasses import fields
 from time import perf_counter
 from typing import Any
 
@@ -696,6 +697,18 @@ class MovingHorizonEstimator:
             self._engine = engine
         else:
             self._engine.load_state_dict(memory)
+
+    def __repr__(self) -> str:
+        parts = {"system": self.system, "observer": self.observer, "cost": self.cost}
+        chosen = {
+            field.name: value for field in fields(self.settings)
+            if (value := getattr(self.settings, field.name)) != field.default
+            and field.name != "engine"
+        }
+        words = [f"{name}={value!r}" for name, value in (
+            parts | chosen | {"engine": self.engine, "time": self.time}
+        ).items()]
+        return "MovingHorizonEstimator(\n    " + ",\n    ".join(words) + "\n)"
 
     def __getstate__(self) -> dict[str, Any]:
         solver = self.settings.backend

@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from os import PathLike
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import numbers
+from .._checks import need, numbers
 from ..costs import Cost
+from ..errors import InvalidInputError, ShapeError
 from ..model.system import System
 from ..observers import Observer
 from .estimate import Estimate, Status
 from .settings import Settings
 
+if TYPE_CHECKING:
+    import pandas
+
 Array = NDArray[np.float64]
 Integers = NDArray[np.intp]
+
+
+_PER_STEP = (
+    "filtered", "costs", "candidate_costs", "times", "solve_times", "qps", "solver_iterations",
+    "delayed", "rejected_sensors",
+)
 
 
 class RunSource(NamedTuple):
@@ -88,6 +100,9 @@ class Run:
     """
 
     source: RunSource | None = None
+
+    #: Draws a run for a notebook; whoever can draw sets it.
+    page: ClassVar[Callable[[Run], str] | None] = None
 
     def __init__(
         self,
@@ -173,6 +188,103 @@ class Run:
 
     def __len__(self) -> int:
         return self.flags.size
+
+    def facts(self) -> dict[str, str]:
+        """What the run holds, in words: steps, outcomes, costs and times."""
+        kept = int(((self.flags & Status.CANDIDATE.value) != 0).sum())
+        improved = int(((self.flags & Status.IMPROVED.value) != 0).sum())
+        found = {
+            "steps": f"{len(self)}", "states": f"{self.states.shape[1]}", "engine": self.engine,
+            "improved": f"{improved}", "candidate kept": f"{kept}",
+        }
+        if len(self):
+            found["mean J"] = f"{self.costs.mean():.6g}"
+            found["mean J of the candidate"] = f"{self.candidate_costs.mean():.6g}"
+            found["median step"] = f"{1e6 * np.median(self.times):.3g} us"
+        return found
+
+    def __repr__(self) -> str:
+        return f"Run({', '.join(f'{name}: {fact}' for name, fact in self.facts().items())})"
+
+    def _repr_html_(self) -> str | None:
+        return None if Run.page is None else Run.page(self)
+
+    def to_frame(self) -> pandas.DataFrame:
+        """The run as a table of pandas, a row for each update.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Indexed by t. ``x1``, ``x2``, ... is the estimate of x(t+1), ``filtered1``, ... that of
+            x(t), ``std1``, ... are the standard deviations of the first, where covariances were
+            requested; then ``J``, ``J_candidate``, ``status``, ``qps``, ``solver_iterations``,
+            ``seconds``, ``solver_seconds``.
+
+        Raises
+        ------
+        InvalidInputError
+            If pandas is not installed.
+        """
+        pandas = need("pandas", "Run.to_frame")
+        blocks = {"x": self.states[1:], "filtered": self.filtered}
+        if self.covariances is not None:
+            with np.errstate(invalid="ignore"):
+                blocks["std"] = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+        columns: dict[str, Any] = {
+            f"{name}{i + 1}": values[:, i]
+            for name, values in blocks.items() for i in range(values.shape[1])
+        }
+        columns |= {
+            "J": self.costs, "J_candidate": self.candidate_costs,
+            "status": [str(one).removeprefix("Status.") for one in self.statuses],
+            "qps": self.qps, "solver_iterations": self.solver_iterations,
+            "seconds": self.times, "solver_seconds": self.solve_times,
+        }
+        return pandas.DataFrame(columns, index=pandas.RangeIndex(len(self), name="t"))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write all arrays to a NumPy archive, which `qpmhe.load_run` reads; without pickle.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file, usually in ``.npz``; one that exists is replaced.
+        """
+        arrays: dict[str, Any] = {
+            name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)
+        }
+        with open(path, "wb") as file:
+            np.savez_compressed(file, engine=np.array(self.engine), **arrays)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Run:
+        """Read what `save` wrote, without its ``source``.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file.
+
+        Raises
+        ------
+        InvalidInputError
+            If it cannot be read, or is no run.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = dict(file)
+            run = cls(**arrays | {"engine": str(arrays["engine"])})
+            lengths = {len(arrays[name]) for name in _PER_STEP}
+            if lengths != {len(run)} or len(run.states) != len(run) + 1:
+                raise ShapeError("its arrays are not of the same steps")
+        except (
+            OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile
+        ) as error:
+            raise InvalidInputError(
+                f"{path} cannot be read as a run ({type(error).__name__}: {error}); expected a "
+                "file that Run.save wrote."
+            ) from error
+        return run
 
     def share(self, flag: Status) -> float:
         """The share of steps whose status has this flag."""

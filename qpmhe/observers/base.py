@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers.values import shown
 
-from .._checks import Array, positive_definite, positive_semidefinite
+from .._checks import Array, positive_definite, positive_semidefinite, representation
 from .._linalg import inverse
 from ..errors import OptionError, ShapeError
 from ..model.sets import ConvexSet
@@ -107,6 +107,9 @@ class Observer(ABC):
     needs_jacobians: bool = False
 
     _metric: Array | None = None
+
+    def __repr__(self) -> str:
+        return representation(self)
 
     @abstractmethod
     def check(self, system: System, initial_state: Array) -> None:

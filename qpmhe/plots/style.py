@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,8 +55,11 @@ def panels(count: int, axes: Any, height: float = 2.1) -> list[Any]:
     from matplotlib.figure import Figure
 
     if axes is None:
+        # Pyplot shows the figures that it knows: at the end of a notebook's cell, or in windows.
+        pyplot = sys.modules.get("matplotlib.pyplot") or _notebooks_pyplot()
+        make = Figure if pyplot is None else pyplot.figure
         with rc_context(LIGHT):
-            figure = Figure(figsize=(6.4, 0.9 + height * count), layout="constrained")
+            figure = make(figsize=(6.4, 0.9 + height * count), layout="constrained")
             return list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
     given = list(np.ravel(np.asarray(axes, dtype=object)))
     for one in given:
@@ -67,6 +71,15 @@ def panels(count: int, axes: Any, height: float = 2.1) -> list[Any]:
     if len(given) != count:
         raise ShapeError(f"axes are {len(given)}; expected {count}, one for each panel.")
     return given
+
+
+def _notebooks_pyplot() -> Any:
+    """Pyplot where a notebook's kernel runs, None elsewhere."""
+    if "ipykernel" not in sys.modules:
+        return None
+    from matplotlib import pyplot
+
+    return pyplot
 
 
 def save(figure: Figure, stem: str | PathLike[str]) -> list[Path]:

@@ -1,0 +1,48 @@
+"""What a notebook shows of a run: its facts, and small plots of states and costs."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+from io import BytesIO
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .steps import costs
+from .style import LIGHT
+from .trajectories import trajectories
+
+if TYPE_CHECKING:
+    from ..estimation.run import Run
+
+# The first states alone are drawn of a run with many.
+_MOST = 6
+
+
+def run_page(run: Run) -> str:
+    """A run as HTML, as notebooks show it: a table, and an image within the text."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    rows = "".join(
+        f"<tr><td style='text-align:left'>{escape(name)}</td>"
+        f"<td style='text-align:left'>{escape(fact)}</td></tr>"
+        for name, fact in run.facts().items()
+    )
+    table = f"<table><caption>qpmhe.Run</caption>{rows}</table>"
+    if not len(run):
+        return table
+    with rc_context(LIGHT):
+        count = min(run.states.shape[1], _MOST)
+        figure = Figure(figsize=(5.6, 0.5 + 1.1 * (count + 1)), layout="constrained")
+        panels = list(figure.subplots(count + 1, 1, sharex=True))
+        trajectories(
+            np.arange(len(run) + 1.0), None, {"estimate": run.states[:, :count]},
+            [f"x{i + 1}" for i in range(count)], "", panels[:-1],
+        )
+        costs(run, axes=panels[-1])
+        data = BytesIO()
+        figure.savefig(data, format="png", dpi=110)
+    image = base64.b64encode(data.getvalue()).decode()
+    return f"{table}<img alt='states and costs over time' src='data:image/png;base64,{image}'>"
