@@ -220,17 +220,16 @@ def attack(row: Row) -> None:
             worst = max(worst, check(mhe, run, signals, errors))
         return worst
 
-    def with_bound(mhe: Any, run: Any, signals: Signals, errors: Array) -> float:
+    def with_bound(_: Any, run: Any, signals: Signals, errors: Array) -> float:
         for w, v in ((signals.w, signals.v), (case.sizes.disturbance, case.sizes.noise)):
-            known = certificate.bound(run, w, v, initial_error=np.zeros(system.n), source=mhe)
+            known = certificate.bound(run, w, v, initial_error=np.zeros(system.n))
             compare(errors, known[: len(errors)])
             row.compared += len(errors)
         if errors.max() > row.estimated:
             row.estimated, row.around = float(errors.max()), float(known[int(errors.argmax())])
-        if certificate.bounds:
+        if certificate.constants:
             paper = certificate.bound(
-                run, signals.w, signals.v, initial_error=np.zeros(system.n), source=mhe,
-                kind="paper",
+                run, signals.w, signals.v, initial_error=np.zeros(system.n), kind="paper"
             )
             compare(errors, paper[: len(errors)])
         return float(errors.max())
@@ -305,10 +304,8 @@ def second_line(row: Row) -> str:
             short(each) for each in (float(plan.length(plan.limit())), row.designed)
         )]
     paper = ["-", "-"]
-    if certificate.bounds:
-        limit = certificate.limit(
-            row.case.sizes.disturbance, row.case.sizes.noise, kind="paper"
-        )
+    if certificate.constants:
+        limit = certificate.limit(kind="paper")
         paper = [str(row.case.horizon), short(limit)]
     return f"| {row.case.name} | {' | '.join((*cells, *paper))} | {certificate.diameter:.3g} |"
 

@@ -1,4 +1,4 @@
-"""The theorem's assumptions, each examined alone."""
+"""The theorem's assumptions about cost, output and corrections, each examined alone."""
 
 from __future__ import annotations
 
@@ -10,26 +10,38 @@ import numpy as np
 
 from ..costs import Cost, CostConstants
 from ..errors import InvalidInputError, ShapeError
-from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
 from ..observers import Observer, Sample
-from .branch_and_bound import output_lipschitz
+from .branch_and_bound import Cells, output_lipschitz
 from .contraction import gain_if_constant
-from .deadline import PART_SECONDS, Deadline
-from .enclosures import evaluated
+from .deadline import Deadline
+from .enclosures import SmoothModel, evaluated
 from .evidence import CertificateError, Evidence, json_ready
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
-from .regions import Region, bounded_region
+from .regions import Region
 
-_SAMPLES = 2000
-_SEED = 20210829
-_SETS = "candidate in the sets"
+_SAMPLES, _SEED = 500, 20210829
+_MOST_CELLS, _CHUNK, _ROOM = 4000, 256, 1.01  # for L_f, and how far it may be above what was seen
 _SCALES = (1e-3, 1e-1, 1.0, 10.0)  # of fitting errors that are tried, in sizes of the output
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
-    """Whether one assumption holds, and what that rests on."""
+class Assumption:
+    """Whether an assumption of the theorem holds, and what that rests on.
+
+    Parameters
+    ----------
+    name, label : str
+        What it is called, and its label in the paper.
+    holds : bool or None
+        None where it is not examined in advance.
+    evidence : Evidence or None
+        What the answer rests on.
+    text : str
+        What was found, in words.
+    value : float or None
+        The constant: L_h or kappa in units of the system, or the cost's exponent.
+    """
 
     name: str
     label: str
@@ -38,23 +50,57 @@ class Finding:
     text: str
     value: float | None = None
 
-    @property
-    def needed(self) -> bool:
-        """Whether the bounds rest on it: they rest on no set, but hold for any w and v."""
-        return self.name != _SETS
-
     def to_dict(self) -> dict[str, Any]:
         """The finding in types that JSON knows; numbers that are not finite become None."""
-        content: dict[str, Any] = json_ready(vars(self) | {"needed": self.needed})
+        content: dict[str, Any] = json_ready(vars(self))
         return content
 
 
-def _correction_findings(
+def about_output(system: System, region: Region, deadline: Deadline) -> Assumption:
+    """L_h, Assumption ass:lipschitz."""
+    slope = output_lipschitz(system, region, seconds=deadline)
+    return Assumption(
+        "output Lipschitz", "ass:lipschitz", True, slope.evidence,
+        f"L_h = {slope.value:.6g} ({slope.note}); the gradient has the norm "
+        f"{slope.attained:.6g} at {np.round(slope.at, 4).tolist()}", slope.value,
+    )
+
+
+def about_model(system: System, region: Region, deadline: Deadline) -> Assumption:
+    """L_f, which takes the place of kappa where the observer is projected."""
+    model, n = SmoothModel(system, region), system.n
+    points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
+    slopes = evaluated("the Jacobian of f", system.f_jacobian, points[:, :n], points[:, n:])
+    seen = float(np.linalg.norm(slopes, 2, axis=(1, 2)).max())
+    found = partial(Assumption, "model Lipschitz", "in place of eq:kappa", True)
+    cells, proved = Cells(region), 0.0 if not model.reason else np.inf
+    while len(cells.lower) and not model.reason:
+        if cells.taken and (deadline.passed or cells.taken > _MOST_CELLS):
+            proved = max(proved, float(cells.inherited.max()))
+            break
+        low, high = cells.take(_CHUNK)
+        corners, error = model.enclose(low, high).corners()
+        with np.errstate(all="ignore"):
+            each = norm_bound(Matrices(
+                corners[:, :, :n].reshape(-1, n, n), np.repeat(error[:, :n], corners.shape[1], 0)
+            )).reshape(len(low), -1).max(axis=1)
+        each = np.where(np.isnan(each), np.inf, each)
+        left = ~(each <= _ROOM * seen)
+        proved = max(proved, float(each[~left].max(initial=0.0)))
+        cells.halve(low[left], high[left], np.zeros_like(low[left]), each[left])
+    if np.isfinite(proved):
+        text = f"L_f = {proved:.6g}, bounded on {cells.taken} cells, for the projected observer"
+        return found(Evidence.PROVED, text, proved)
+    return found(Evidence.SAMPLED, f"L_f = {seen:.6g}, the largest of {len(points)} Jacobians; "
+                 f"{model.reason or 'no bound was found in time'}", seen)
+
+
+def about_corrections(
     system: System, observer: Observer, region: Region
-) -> tuple[Finding, Finding]:
+) -> tuple[Assumption, Assumption]:
     """Whether the observer corrects where the output fits, and how much elsewhere."""
-    none = partial(Finding, "no correction without error", "ass:observer_0")
-    bound = partial(Finding, "correction bound", "eq:kappa")
+    none = partial(Assumption, "no correction without error", "ass:observer_0")
+    bound = partial(Assumption, "correction bound", "eq:kappa")
     gain, kind = gain_if_constant(observer, system), type(observer).__name__
     if gain is not None:
         kappa = float(norm_bound(Matrices.exact(gain[None]))[0])
@@ -64,15 +110,15 @@ def _correction_findings(
     if observer.initial_covariance() is not None or observer.needs_jacobians:
         varying = f"{kind} multiplies v by its gain of the moment"
         return none(True, Evidence.ASSUMED, varying), bound(
-            None, None, f"{kind} has a gain that follows from what was measured: state its bound, "
-            "ObserverStability.assumed(kappa=...)",
+            None, None, f"{kind} has a gain that follows from what was measured: its bound is "
+            "stated, ObserverStability.assumed(kappa=...)",
         )
     generator, sample = np.random.default_rng(_SEED), Sample(system, np.zeros(system.m))
     points = region.sample(_SAMPLES, generator)
     states = points[:, : system.n]
     size = np.ptp(evaluated("h", system.h, states, points[:, system.n :]), axis=0)
-    scales = generator.choice(_SCALES, (len(states), 1)) * np.where(size > 0.0, size, 1.0)
-    errors = scales * generator.uniform(-1.0, 1.0, (len(states), system.p))
+    errors = generator.choice(_SCALES, (len(states), 1)) * np.where(size > 0.0, size, 1.0)
+    errors = errors * generator.uniform(-1.0, 1.0, (len(states), system.p))
     with np.errstate(all="ignore"):
         still, moved = (
             np.stack([
@@ -88,16 +134,16 @@ def _correction_findings(
         text = f"L(z, 0) = {still[k].tolist()} at z = {states[k].tolist()}"
         unmoved = none(False, Evidence.PROVED, text)
     k = int(np.where(np.isfinite(ratios), ratios, np.inf).argmax())
-    kappa, where = float(ratios[k]), f"z = {states[k].tolist()}, v = {errors[k].tolist()}"
-    how = f"the largest |L(z, v)| / |v| tried, at {where}"
-    if not np.isfinite(kappa):
-        return unmoved, bound(False, Evidence.SAMPLED, f"kappa is infinite: {how}")
-    return unmoved, bound(True, Evidence.SAMPLED, f"kappa = {kappa:.6g}, {how}", kappa)
+    kappa = float(ratios[k]) if np.isfinite(ratios[k]) else np.inf
+    return unmoved, bound(
+        bool(np.isfinite(kappa)), Evidence.SAMPLED, f"kappa = {kappa:.6g}, the largest "
+        f"|L(z, v)| / |v| tried, at z = {states[k].tolist()}, v = {errors[k].tolist()}", kappa,
+    )
 
 
-def _cost_finding(cost: Cost) -> tuple[CostConstants | None, Finding]:
-    """The cost's constants, rounded outward where they could be."""
-    found = partial(Finding, "cost bounds", "ass:stagecosts")
+def about_cost(cost: Cost) -> tuple[CostConstants | None, Assumption]:
+    """The cost's constants, rounded outward where they could be, Assumption ass:stagecosts."""
+    found = partial(Assumption, "cost bounds", "ass:stagecosts")
     constants = cost.constants
     if constants is None:
         why = (
@@ -107,10 +153,10 @@ def _cost_finding(cost: Cost) -> tuple[CostConstants | None, Finding]:
             if cost.observer_prior is not None and cost.observer_prior.bounds is None
             else "its terms are not bounded by powers with one exponent, above and below"
         )
-        return None, found(False, Evidence.PROVED, f"the cost has no constants: {why}", None)
-    evidence = Evidence.ASSUMED
+        return None, found(False, Evidence.PROVED, f"the cost has no constants: {why}")
+    evidence, stated = Evidence.ASSUMED, ", as the cost states them"
     if cost.quadratic:
-        evidence, (low, high) = Evidence.PROVED, constants.prior
+        evidence, stated, (low, high) = Evidence.PROVED, "", constants.prior
         prior = (
             eigenvalue_bounds(cost.least_prior) if cost.observer_prior is None
             else (low * (1.0 - 1e-12), high * (1.0 + 1e-12))
@@ -120,86 +166,13 @@ def _cost_finding(cost: Cost) -> tuple[CostConstants | None, Finding]:
             eigenvalue_bounds(cost.noise),
         )
     terms = ", ".join(
-        f"{letter} in [{low:.6g}, {high:.6g}]"
+        f"c_{letter} in [{low:.6g}, {high:.6g}]"
         for letter, (low, high) in zip(
-            ("c_p", "c_w", "c_v"),
-            (constants.prior, constants.disturbance, constants.noise), strict=True,
+            "pwv", (constants.prior, constants.disturbance, constants.noise), strict=True,
         )
     )
-    text = f"a = {constants.exponent:.6g}, {terms}"
-    if evidence is Evidence.ASSUMED:
-        text += ", as the cost states them"
+    text = f"a = {constants.exponent:.6g}, {terms}{stated}"
     return constants, found(True, evidence, text, constants.exponent)
-
-
-@dataclass(frozen=True, eq=False)
-class Audit:
-    """All assumptions but detectability and the observer's stability, one a finding.
-
-    The cost's constants are rounded outward where possible, and None where there are none.
-    """
-
-    findings: tuple[Finding, ...]
-    constants: CostConstants | None
-    region: Region
-
-    def __getitem__(self, name: str) -> Finding:
-        """A finding by its name."""
-        for finding in self.findings:
-            if finding.name == name:
-                return finding
-        known = ", ".join(repr(finding.name) for finding in self.findings)
-        raise InvalidInputError(f"there is no finding {name!r}; expected one of {known}.")
-
-    @property
-    def lipschitz(self) -> float:
-        """L_h."""
-        value = self["output Lipschitz"].value
-        assert value is not None
-        return value
-
-    @property
-    def violated(self) -> tuple[Finding, ...]:
-        """The findings with a counterexample, or without constants."""
-        return tuple(finding for finding in self.findings if finding.holds is False)
-
-    def to_dict(self) -> list[dict[str, Any]]:
-        """The findings in types that JSON knows."""
-        return [finding.to_dict() for finding in self.findings]
-
-
-def audit(
-    system: System, observer: Observer, cost: Cost, region: ConvexSet | Region | None = None, *,
-    inputs: Box | None = None, seconds: float | Deadline = PART_SECONDS,
-) -> Audit:
-    """Check each assumption of the theorem, and show where it fails.
-
-    Arguments and errors are as for `certify`; ``seconds`` bounds the time for the output's
-    Lipschitz constant. An assumption that does not hold raises nothing.
-    """
-    checked_ingredients(system, observer, cost)
-    where = bounded_region(system, region, inputs)
-    points = where.sample(_SAMPLES, np.random.default_rng(_SEED))
-    evaluated("f", system.f, points[:, : system.n], points[:, system.n :])  # an error if it raises
-    slope = output_lipschitz(system, where, seconds=Deadline.of(seconds))
-    constants, about_cost = _cost_finding(cost)
-    candidate: tuple[bool | None, Evidence | None, str] = (
-        True, Evidence.PROVED, "X, W and V are the whole space"
-    )
-    if any(one is not None for one in (system.states, system.disturbances, system.noises)):
-        candidate = None, None, "the monitor checks it at each step of a run"
-    findings = (
-        Finding(
-            "output Lipschitz", "ass:lipschitz", True, slope.evidence,
-            f"L_h = {slope.value:.6g} ({slope.note}); the gradient has the norm "
-            f"{slope.attained:.6g} at {np.round(slope.at, 4).tolist()}",
-            slope.value,
-        ),
-        *_correction_findings(system, observer, where),
-        about_cost,
-        Finding(_SETS, "ass:observer", *candidate),
-    )
-    return Audit(findings, constants, where)
 
 
 def checked_ingredients(system: Any, observer: Any, cost: Any) -> None:

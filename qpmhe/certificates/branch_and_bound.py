@@ -219,18 +219,6 @@ def output_lipschitz(
     return LipschitzConstant(bound, Evidence.PROVED, attained, at, how)
 
 
-def constant_output(system: System, region: Region) -> Matrices | None:
-    """An enclosure of the Jacobian of h where that is shown to be constant, (1, p, n)."""
-    model = SmoothModel(system, region)
-    if not model.affine_output:
-        return None
-    found = model.enclose(region.lower[None], region.upper[None], output_only=True)
-    corners, error = found.corners()
-    if corners.shape[1] != 1 or not np.isfinite(error).all():
-        return None
-    return Matrices(corners[:, 0], error)
-
-
 def _largest(jacobians: Array, points: Array, unknown: float) -> tuple[float, Array]:
     """The largest norm of some Jacobians, and where; those that are not finite count as given."""
     usable = np.isfinite(jacobians).all(axis=(-2, -1))

@@ -3,31 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from qpmhe_solvers.values import shown
-
-from .._checks import Array, choice, count, numbers
+from .._checks import Array, choice, count
 from ..costs import Cost, CostConstants
-from ..errors import InvalidInputError, OptionError, QpmheError, ShapeError
-from ..estimation.estimate import Status
+from ..errors import InvalidInputError, OptionError, QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
-from .audit import Audit, audit, checked_ingredients
-from .branch_and_bound import constant_output
-from .contraction import (
-    certify_detectability,
-    constant_gain,
-    gain_if_constant,
+from .audit import (
+    Assumption,
+    about_corrections,
+    about_cost,
+    about_model,
+    about_output,
+    checked_ingredients,
 )
+from .contraction import certify_detectability, constant_gain, gain_if_constant
 from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import (
     CertificateError,
@@ -42,24 +40,20 @@ from .observer_bound import ObserverBound, bound_observer, with_invariance
 from .properties import Detectability, ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
-from .signal_bounds import SignalBounds, Size
-from .theorem import Sizes, checked_length
-from .window_bounds import HorizonBounds, bounds_for
-from .window_bounds import Kind as TheoremKind
+from .sizes import Size, Sizes, initial_length, lengths_of, read_size
+from .theorem import TheoremConstants
 
-Kind = TheoremKind | Literal["observer"]
-_KINDS = ("observer", "paper", "summed", "weighted", "measured")
+Kind = Literal["observer", "paper"]
+KINDS: tuple[Kind, ...] = ("observer", "paper")
 
-#: The constants are upper bounds, what is computed from them is not: this covers its rounding.
-OUTWARD = 1.0 + 1e-9
+# The constants are upper bounds, what is computed from them is not: this covers its rounding.
+_OUTWARD = 1.0 + 1e-9
 
 #: What no check can see.
 ASSUMED = (
     "the true state stays in the region (and in X), and follows the model",
     "the bounds on disturbances, noises and the initial error are true",
 )
-#: A window without all its measurements has another cost.
-BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,31 +68,33 @@ class Certificate:
         What the estimator is made of.
     region : Region
         Where it holds.
-    sizes : SignalBounds
+    sizes : Sizes
         For which disturbances and noises the bounds are stated.
     observer_bound : ObserverBound or None
         The observer's own bound, and with it the set around the observer that holds the truth.
-    audit, detectability, stability : optional
-        The theorem's assumptions; None for what could not be examined.
-    bounds : mapping of int to HorizonBounds
-        The theorem's bounds for each horizon; empty where it does not apply.
+    assumptions : tuple of Assumption
+        What was found of the theorem's assumptions about cost, output and corrections.
+    detectability, stability : optional
+        Detectability and the observer's stability; None for what could not be shown.
+    constants : mapping of int to TheoremConstants
+        The theorem's for each horizon; empty where it does not apply.
     errors : mapping of str to QpmheError
         What could not be certified, and why.
     evidence : Evidence
-        What the theorem's bounds rest on, the weakest evidence among their ingredients'; where
-        there are none, what the observer's rests on.
+        What the theorem's constants rest on, the weakest evidence among their ingredients'; where
+        there are none, what the observer's bound rests on.
     """
 
     system: System
     observer: Observer
     cost: Cost
     region: Region
-    sizes: SignalBounds
+    sizes: Sizes
     observer_bound: ObserverBound | None = None
-    audit: Audit | None = None
+    assumptions: tuple[Assumption, ...] = ()
     detectability: Detectability | None = None
     stability: ObserverStability | None = None
-    bounds: Mapping[int, HorizonBounds] = field(default_factory=dict)
+    constants: Mapping[int, TheoremConstants] = field(default_factory=dict)
     errors: Mapping[str, QpmheError] = field(default_factory=dict)
     evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
 
@@ -108,24 +104,14 @@ class Certificate:
         return gain_if_constant(self.observer, self.system)
 
     @property
-    def horizons(self) -> tuple[int, ...]:
-        """The horizons with bounds of the theorem."""
-        return tuple(self.bounds)
-
-    @cached_property
     def diameter(self) -> float:
         """The largest distance of two states of the region, or a little more."""
         return self.region.diameter
 
     @property
-    def kinds(self) -> tuple[TheoremKind, ...]:
-        """The kinds of the theorem's bounds, the sharpest last; none without the theorem."""
-        return next((bounds.kinds for bounds in self.bounds.values()), ())
-
-    @property
     def holds(self) -> bool:
         """Whether anything bounds the error."""
-        return self.observer_bound is not None or bool(self.bounds)
+        return self.observer_bound is not None or bool(self.constants)
 
     @property
     def failures(self) -> list[str]:
@@ -133,297 +119,139 @@ class Certificate:
         return [f"{what}: {each}" for what, each in self.errors.items()]
 
     def bound(
-        self, run: Run | None, disturbances: Size | None = None, noises: Size | None = None, *,
+        self, run: Run, disturbances: Size | None = None, noises: Size | None = None, *,
         initial_error: Size, horizon: int | None = None, kind: Kind = "observer",
-        source: MovingHorizonEstimator | None = None,
     ) -> Array:
         """The bound of the error |x(t) - x_hat(t)| along a run at t = 0, ..., T, (T + 1,).
 
         Parameters
         ----------
-        run : Run or None
-            The run. Without one, ``kind="observer"`` bounds the observer's error, and
-            disturbances or noises give the number of samples.
+        run : Run
+            The run; one that knows its estimator is compared with the certificate.
         disturbances, noises : array_like or set, optional
-            w(t) and v(t) as (T, n) and (T, p), their Euclidean lengths (T,), a number that bounds
-            the length at all times or, for ``kind="observer"``, a set; `sizes` if left out.
+            w(t) and v(t) as (T, n) and (T, p), their Euclidean lengths (T,), or what bounds them
+            at all times, a length or a set; `sizes` if left out.
         initial_error : (n,) array_like, float or set
-            x_0 - z_0, a bound on its length or, for ``kind="observer"``, a set that holds it.
+            x_0 - z_0, a bound on its length, or a set that holds it.
         horizon : int, optional
-            N; the source's, or the only one, if left out. Not for ``kind="observer"``.
-        kind : {"observer", "paper", "summed", "weighted", "measured"}
+            N, for ``kind="paper"``; the run's, or the only one, if left out.
+        kind : {"observer", "paper"}
             ``observer``: the distance to the farthest point of the set around the observer that
             holds the true state, NaN from where the run shows that it no longer does, see
-            `ObserverBound.along`. The others follow from the theorem: the right-hand side of
-            (eq:RGES_result) with the paper's constants, or beyond the paper with the proof's
-            norms kept (for other costs than quadratic ones its sums), and with the estimates'
-            own costs in place of their bound.
-        source : MovingHorizonEstimator, optional
-            The estimator that made the run, as the run left it; it is compared with the
-            certificate. Needed for ``kind="measured"``.
+            `ObserverBound.along`. ``paper``: the right-hand side of (eq:RGES_result).
 
         Raises
         ------
         ShapeError, OptionError, InvalidInputError
             If an argument does not fit, or there is no such bound.
         MismatchError
-            If the source is of another system, observer, cost or horizon, or did not make
-            the run.
+            If the run is of another system, observer, cost or horizon.
         """
-        choice("kind", kind, _KINDS)
-        if kind == "observer":
-            return self._of_observer(run, disturbances, noises, initial_error, source)
-        if source is not None and horizon is None:
-            horizon = getattr(source, "horizon", None)
-        chosen, lengths = self.of(horizon), self.sizes.lengths
-        start, w, v = self._signals(
-            run, initial_error, lengths.disturbance if disturbances is None else disturbances,
-            lengths.noise if noises is None else noises,
-        )
-        costs = None
-        if source is not None:
-            costs = self._costs(source, run, chosen.paper.horizon)
-        elif kind == "measured":
+        choice("kind", kind, KINDS)
+        if not isinstance(run, Run):
             raise InvalidInputError(
-                "the measured bound has no source, and a run does not say its horizon and "
-                "cost; pass the estimator that made it (source=estimator)."
+                f"run is of type {type(run).__name__}; expected a qpmhe.Run, as "
+                "MovingHorizonEstimator.run returns it."
             )
-        if kind != "paper":
-            measured = costs if kind == "measured" else None
-            return OUTWARD * chosen.beyond(kind).bound(start, w, v, measured)
-        sizes = [x if x.ndim == 1 else np.linalg.norm(x, axis=1) for x in (w, v)]
-        return OUTWARD * chosen.paper.result.bound(float(np.linalg.norm(start)), *sizes)
-
-    def _of_observer(
-        self, run: Run | None, disturbances: Size | None, noises: Size | None,
-        initial_error: Size, source: MovingHorizonEstimator | None,
-    ) -> Array:
-        proved = self._observer()
-        if source is not None:
-            self.check_estimator(source)
-            if source.settings.candidate != "observer":
-                raise MismatchError(
-                    "the source's candidate comes from a reinitialized observer, whose states "
-                    "this bound is not about; make it with candidate='observer'."
-                )
-            proved = proved.of_observer(source.observer)
-        if run is not None:
-            return proved.along(run, disturbances, noises, initial_error=initial_error).error
-        entering = proved.entering(disturbances, noises)
-        if entering.samples is None:
-            raise ShapeError(
-                "disturbances and noises are not of single samples, and there is no run; expected "
-                "a sequence for one of them, to say how many samples there are."
-            )
-        radius = proved.radii(entering.samples, initial_error, entering)
-        return proved.farthest(radius, np.zeros((len(radius), self.system.n)))
-
-    def _observer(self) -> ObserverBound:
-        """The observer's bound, or an error that says why there is none."""
-        if self.observer_bound is None:
-            reason = self.errors.get("the observer")
-            why = (
-                f"{reason}" if reason is not None else
-                "its constants were stated, not certified: leave stability out."
-            )
-            others = f" Of the theorem's there are {list(self.kinds)}." if self.bounds else ""
-            raise OptionError(
-                f"kind is 'observer', but there is no bound of the observer: {why}{others}"
-            )
-        return self.observer_bound
-
-    def _signals(
-        self, run: Run | None, initial_error: Size, disturbances: Size, noises: Size
-    ) -> tuple[Array, Array, Array]:
-        """Initial error, disturbances and noises: vectors or lengths, at each sample."""
-        n, p = self.system.n, self.system.p
-        start, w, v = (
-            numbers(name, self._number(name, given)) for name, given in (
-                ("initial_error", initial_error), ("disturbances", disturbances),
-                ("noises", noises),
-            )
-        )
-        steps = len(run) if run is not None else next((len(x) for x in (w, v) if x.ndim), None)
-        if steps is None:
-            raise ShapeError(
-                "disturbances and noises are numbers and there is no run; expected a sequence "
-                "for one of them, to say how many steps there are."
-            )
-        known = ("initial_error", start, (), (n,)), ("disturbances", w, (steps,), (steps, n)), (
-            "noises", v, (steps,), (steps, p)
-        )
-        found = []
-        for name, x, lengths, vectors in known:
-            if x.ndim and x.shape not in (lengths, vectors):
-                raise ShapeError(
-                    f"{name} has shape {x.shape}; expected {vectors}, lengths {lengths}, or a "
-                    "number."
-                )
-            if x.shape != vectors and (x < 0.0).any():
-                raise OptionError(f"{name} is {shown(x)}; expected Euclidean lengths, all >= 0.")
-            found.append(x if x.ndim else np.full(lengths, x))
-        return found[0], found[1], found[2]
-
-    @staticmethod
-    def _number(name: str, given: Size) -> ArrayLike:
-        """What is no set; the theorem's bounds take lengths and vectors."""
-        if isinstance(given, ConvexSet):
-            raise OptionError(
-                f"{name} is a set, which kind='observer' takes; expected lengths or vectors."
-            )
-        return given
-
-    def _costs(self, source: MovingHorizonEstimator, run: Run | None, horizon: int) -> Array:
-        """The costs of a run's estimates; NaN where a window is not what the bound is of."""
-        if run is None or not isinstance(source, MovingHorizonEstimator):
-            raise InvalidInputError(
-                f"source is {source!r} and run {run!r}; expected an estimator and its run."
-            )
-        self.check_estimator(source)
-        if source.horizon != horizon:
+        if kind == "observer":
+            return self._proved().along(
+                run, disturbances, noises, initial_error=initial_error
+            ).error
+        if run.source is not None:
+            self._check("observer", run.source.observer)
+            self._check("cost", run.source.cost)
+        made_with = None if run.source is None else run.source.settings.horizon
+        if None not in (horizon, made_with) and horizon != made_with:
             raise MismatchError(
-                f"horizon is {horizon}, but the run's estimator has {source.horizon}; take the "
-                "bound for its horizon, and certify again if there is none."
+                f"horizon is {horizon}, but the run's estimator has {made_with}; take the bound "
+                "for its horizon, and certify again if there is none."
             )
-        if source.time != len(run) or not np.array_equal(
-            source.state, run.states[-1], equal_nan=True
-        ):
-            raise MismatchError(
-                "the source is not at the end of this run: it has seen another one, or more or "
-                "less of it. Pass the estimator right after its run from the start."
-            )
-        costs = np.array(run.costs, np.float64)
-        for t in np.flatnonzero(run.flags & BROKEN.value):
-            costs[t : t + horizon] = np.nan
-        return costs
-
-    def funnel(
-        self, w_max: float | None = None, v_max: float | None = None, *, initial_error: Size,
-        steps: int, horizon: int | None = None, kind: Kind = "observer",
-    ) -> Array:
-        """The bound before anything is measured, (T + 1,).
-
-        Parameters
-        ----------
-        w_max, v_max : float, optional
-            Bounds on the lengths of w(t) and v(t); `sizes` if left out.
-        initial_error, horizon, kind
-            As for `bound`; not "measured". For "observer", the bound is of |x(t) - z(t)|.
-        steps : int
-            T.
-
-        Raises
-        ------
-        OptionError
-            If a length is negative or not finite, the steps are no integer, or there is no
-            such bound.
-        """
-        self._check_unmeasured(kind)
-        length = count("steps", steps, 1)
-        w, v = self._always(w_max, v_max, kind)
-        if kind == "observer":
-            proved = self._observer()
-            radius = proved.radii(length, initial_error, proved.entering(w, v))
-            return proved.farthest(radius, np.zeros((length + 1, self.system.n)))
-        return self.bound(
-            None, np.full(length, w), np.full(length, v), horizon=horizon, kind=kind,
-            initial_error=checked_length("initial_error", initial_error),
-        )
-
-    def limit(
-        self, w_max: float | None = None, v_max: float | None = None, *,
-        horizon: int | None = None, kind: Kind = "observer",
-    ) -> float:
-        """What the funnel tends to as t grows; arguments and errors as for `funnel`."""
-        self._check_unmeasured(kind)
-        w, v = self._always(w_max, v_max, kind)
-        if kind == "observer":
-            proved = self._observer()
-            return float(proved.farthest(proved.limit(w, v), np.zeros(self.system.n)))
-        chosen = self.of(horizon)
-        bound = chosen.paper.result if kind == "paper" else chosen.beyond(kind)
-        return OUTWARD * bound.limit(w, v)
-
-    def _always(
-        self, w_max: float | None, v_max: float | None, kind: Kind
-    ) -> tuple[Any, Any]:
-        """What bounds w and v at all times: sets only for the observer's bound."""
-        if kind == "observer":
-            usual: tuple[Any, Any] = self.sizes.disturbances, self.sizes.noises
-        else:
-            lengths = self.sizes.lengths
-            usual = lengths.disturbance, lengths.noise
+        constants, n, p = self.of(horizon or made_with), self.system.n, self.system.p
+        start = initial_length(initial_error, np.eye(n))
         w, v = (
-            each if given is None else checked_length(name, given)
-            for each, given, name in zip(usual, (w_max, v_max), ("w_max", "v_max"), strict=True)
-        )
-        return w, v
-
-    def _check_unmeasured(self, kind: Kind) -> None:
-        choice("kind", kind, _KINDS)
-        if kind == "measured":
-            kinds = ["observer", *(each for each in self.kinds if each != "measured")]
-            raise OptionError(
-                f"kind is 'measured', but nothing is measured yet; expected one of {kinds}."
+            np.broadcast_to(
+                lengths_of(name, read_size(name, usual if given is None else given), size,
+                           np.eye(size)), len(run)
             )
+            for name, given, usual, size in (
+                ("disturbances", disturbances, self.sizes.disturbance, n),
+                ("noises", noises, self.sizes.noise, p),
+            )
+        )
+        return _OUTWARD * constants.result.bound(start, w, v)
 
-    def vacuous(
-        self, w_max: float | None = None, v_max: float | None = None, *,
-        horizon: int | None = None, kind: Kind = "observer",
-    ) -> bool:
+    def limit(self, *, horizon: int | None = None, kind: Kind = "observer") -> float:
+        """What the bound tends to as t grows, for disturbances and noises of these `sizes`.
+
+        Arguments and errors as for `bound`; of the observer, it is the bound of |x(t) - z(t)|.
+        """
+        if choice("kind", kind, KINDS) == "paper":
+            return _OUTWARD * self.of(horizon).result.limit(*self.sizes.largest)
+        proved = self._proved()
+        return float(proved.farthest(proved.limit(), np.zeros(self.system.n)))
+
+    def vacuous(self, *, horizon: int | None = None, kind: Kind = "observer") -> bool:
         """Whether the bound says nothing: its limit is no less than the region's size.
 
         State and estimate are both in the region, so that their distance is never more than its
         diameter. Of the observer's bound each component must be less than the region is wide.
-        Arguments and errors are those of `funnel`.
+        Arguments and errors are those of `limit`.
         """
-        if kind == "observer":
-            w, v = self._always(w_max, v_max, kind)
-            proved = self._observer()
-            return not (proved.components(proved.limit(w, v)) < proved.widths).all()
-        return not self.limit(w_max, v_max, horizon=horizon, kind=kind) < self.diameter
+        if choice("kind", kind, KINDS) == "paper":
+            return not self.limit(horizon=horizon, kind=kind) < self.diameter
+        proved = self._proved()
+        return not (proved.components(proved.limit()) < proved.widths).all()
 
-    def of(self, horizon: int | None = None) -> HorizonBounds:
-        """The constants for a horizon N, which may be left out if there is only one.
+    def _proved(self) -> ObserverBound:
+        """The observer's bound, or an error that says why there is none."""
+        if self.observer_bound is None:
+            reason = self.errors.get(
+                "the observer", "its constants were stated, not certified: leave stability out."
+            )
+            raise OptionError(
+                f"kind is 'observer', but there is no bound of the observer: {reason}"
+            )
+        return self.observer_bound
+
+    def of(self, horizon: int | None = None) -> TheoremConstants:
+        """The theorem's constants for a horizon N, which may be left out if there is only one.
 
         An `OptionError` says which there are if there are none for this one, or why there are
         none at all.
         """
-        if horizon is None and len(self.bounds) == 1:
-            return next(iter(self.bounds.values()))
-        if not self.bounds:
+        if horizon is None and len(self.constants) == 1:
+            return next(iter(self.constants.values()))
+        if not self.constants:
             raise OptionError(
-                "the theorem's bounds could not be certified, so that only kind='observer' is "
+                "the theorem's constants could not be certified, so that only kind='observer' is "
                 f"there: {'; '.join(self.failures)}"
             )
-        if horizon is None or horizon not in self.bounds:
+        if horizon is None or horizon not in self.constants:
             raise OptionError(
-                f"horizon is {horizon!r}; expected one of {list(self.bounds)}, for which there "
+                f"horizon is {horizon!r}; expected one of {list(self.constants)}, for which there "
                 "are constants. Certify again with this horizon."
             )
-        return self.bounds[horizon]
+        return self.constants[horizon]
 
     def check_estimator(self, estimator: MovingHorizonEstimator) -> None:
-        """Raise a `MismatchError` unless the estimator has this very system, observer and cost.
+        """Raise a `MismatchError` unless an estimator has this system, observer and cost.
 
         An observer with the same constant gain is the same one, whatever its metric. The cost
-        matters only to the theorem's bounds.
+        matters only to the theorem's constants.
         """
         for name in ("system", "observer", "cost"):
-            mine, theirs = getattr(self, name), getattr(estimator, name)
-            same = mine is theirs or (
-                self._has_same_gain(theirs) if name == "observer"
-                else name == "cost" and not self.bounds
-            )
-            if not same:
-                raise MismatchError(
-                    f"the certificate is of another {name} than the estimator's; certify the "
-                    "very objects that the estimator is made of."
-                )
+            self._check(name, getattr(estimator, name))
 
-    def _has_same_gain(self, observer: Observer) -> bool:
-        gain = gain_if_constant(observer, self.system)
-        return gain is not None and self.gain is not None and np.array_equal(gain, self.gain)
+    def _check(self, name: str, theirs: Any) -> None:
+        same = getattr(self, name) is theirs or (name == "cost" and not self.constants)
+        if name == "observer" and not same:
+            gain, own = gain_if_constant(theirs, self.system), self.gain
+            same = gain is not None and own is not None and np.array_equal(gain, own)
+        if not same:
+            raise MismatchError(
+                f"the certificate is of another {name} than the estimator's; certify the very "
+                "objects that the estimator is made of."
+            )
 
     @property
     def headline(self) -> str:
@@ -436,17 +264,15 @@ class Certificate:
         """The headline, for what it holds, what it rests on, and what could not be certified."""
         lines = [self.headline]
         if self.observer_bound is not None:
-            lines.append(f"for {self.observer_bound.sizes}")
-            lines.append(self.observer_bound.condition)
-        lines += [f"Not certified: {each}" for each in self.failures]
-        return "\n".join(lines)
+            lines += [f"for {self.observer_bound.sizes}", self.observer_bound.condition]
+        return "\n".join([*lines, *(f"Not certified: {each}" for each in self.failures)])
 
     def __str__(self) -> str:
         return self.summary()
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows; infinite numbers become None."""
-        system, bounds = self.system, self.bounds
+        system = self.system
         content: dict[str, Any] = json_ready({
             "system": {"n": system.n, "p": system.p, "m": system.m},
             "region": self.region.to_dict(),
@@ -455,15 +281,15 @@ class Certificate:
             "assumed": list(ASSUMED),
             "failures": self.failures,
             "observer_bound": self.observer_bound and self.observer_bound.to_dict(),
-            "assumptions": self.audit and self.audit.to_dict(),
+            "assumptions": [each.to_dict() for each in self.assumptions],
             "detectability": self.detectability and self.detectability.to_dict(),
             "observer": self.stability and self.stability.to_dict(),
             "sizes": self.sizes.to_dict(),
-            "horizons": [each.to_dict(self.sizes.lengths) for each in bounds.values()],
-            "vacuous": {
-                kind: {N: self.vacuous(horizon=N, kind=kind) for N in bounds}
-                for kind in self.kinds if kind != "measured"
-            },
+            "paper": [
+                each.to_dict(self.sizes.largest)
+                | {"vacuous": self.vacuous(horizon=N, kind="paper")}
+                for N, each in self.constants.items()
+            ],
         })
         return content
 
@@ -471,13 +297,13 @@ class Certificate:
 Result = TypeVar("Result")
 
 # How much of the time left each part takes.
-_OBSERVER, _AUDIT, _DETECTABILITY, _INVARIANCE = 0.6, 0.4, 0.9, 0.2
+_OBSERVER, _OUTPUT, _DETECTABILITY, _INVARIANCE = 0.6, 0.4, 0.9, 0.2
 
 
 def certify(
     system: System, observer: Observer, cost: Cost, *, horizon: int | Sequence[int],
     region: ConvexSet | Region | None = None, inputs: Box | None = None,
-    sizes: SignalBounds | Sizes | None = None, detectability: Detectability | None = None,
+    sizes: Sizes | None = None, detectability: Detectability | None = None,
     stability: ObserverStability | None = None, seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Certificate:
     """Bound the observer's error on a set of states, then the estimator's by the theorem.
@@ -495,15 +321,15 @@ def certify(
         A bounded set of states; the system's own if left out.
     inputs : Box, optional
         Bounds on the inputs, for a system with inputs.
-    sizes : SignalBounds or Sizes, optional
+    sizes : Sizes, optional
         Which disturbances and noises the bounds are for; left out, the system's W and V, and
         three standard deviations by the cost's weights where it has none.
     detectability, stability : optional
         Constants to take instead of looking for them, such as assumed ones, or those that
         were certified of this system and gain on a set that contains the region.
     seconds : float or Deadline
-        How long the audit and the search for constants may take, about, from when the solvers
-        are loaded. What is not proved when its share is over rests on samples, and says so.
+        How long the search for constants may take, about, from when the solvers are loaded. What
+        is not proved when its share is over rests on samples, and says so.
 
     Raises
     ------
@@ -533,8 +359,8 @@ def certify(
 
 def examined(
     system: System, observer: Observer, cost: Cost, region: Region, horizons: Sequence[int],
-    sizes: SignalBounds | Sizes | None, deadline: Deadline,
-    detectability: Detectability | None = None, stability: ObserverStability | None = None,
+    sizes: Sizes | None, deadline: Deadline, detectability: Detectability | None = None,
+    stability: ObserverStability | None = None,
 ) -> Certificate:
     """The certificate of `certify`, also where nothing holds: its errors say why."""
     errors: dict[str, QpmheError] = {}
@@ -546,73 +372,83 @@ def examined(
             errors[what] = error
             return None
 
-    try:
-        checked_ingredients(system, observer, cost)
-    except CertificateError as error:
-        errors["the theorem"] = error
-    bounds_of_signals = SignalBounds.of(sizes, system, cost)
-    gain = gain_if_constant(observer, system)
+    attempt("the theorem", lambda: checked_ingredients(system, observer, cost))
+    chosen, gain = Sizes.of(sizes, system, cost), gain_if_constant(observer, system)
     if detectability is not None:
         detectability = fitting(detectability, system, region, gain)
-    if stability is not None:
-        stability = fitting(stability, system, region, gain)
     proved = None
     if stability is None:
         proved = attempt("the observer", lambda: bound_observer(
-            system, observer, cost, region, sizes=bounds_of_signals,
-            seconds=deadline.part(_OBSERVER),
+            system, observer, cost, region, sizes=chosen, seconds=deadline.part(_OBSERVER)
         ))
         stability = None if proved is None else proved.stability
-    elif stability.P is not None and stability.gain is not None:
-        proved = with_invariance(
-            ObserverBound(stability, region, bounds_of_signals, observer.metric), system,
-            deadline.part(_INVARIANCE),
-        )
-    findings: Audit | None = None
-    constants: CostConstants | None = None
-    if "the theorem" not in errors:
-        findings = attempt("the theorem", lambda: audit(
-            system, observer, cost, region, seconds=deadline.part(_AUDIT)
-        ))
-        if findings is not None:
-            constants = attempt("the theorem", lambda: _needed(findings))
-        weights = (1.0, 1.0) if constants is None else _cheapest(constants)
-        detectability = detectability or attempt("detectability", lambda: certify_detectability(
-            system, region, weights=weights, seconds=deadline.part(_DETECTABILITY)
-        ))
-    bounds: dict[int, HorizonBounds] = {}
-    used = []
-    if findings and constants and detectability is not None and stability is not None:
-        output = constant_output(system, region)
-        bounds = {
-            N: bounds_for(
-                N, detectability, stability, cost, constants, lipschitz=findings.lipschitz,
-                output=output,
+    else:
+        stability = fitting(stability, system, region, gain)
+        if stability.P is not None and stability.gain is not None:
+            proved = with_invariance(
+                ObserverBound(stability, region, chosen, observer.metric), system,
+                deadline.part(_INVARIANCE),
             )
-            for N in horizons
-        }
-        used = [detectability.evidence] + [
-            each.evidence for each in findings.findings
-            if each.needed and each.evidence is not None
-        ]
     certificate = Certificate(
-        system, observer, cost, region, bounds_of_signals, proved, findings, detectability,
-        stability, bounds, errors,
+        system, observer, cost, region, chosen, proved, stability=stability, errors=errors
     )
-    if stability is not None and (bounds or proved is not None):
-        object.__setattr__(certificate, "evidence", weakest([stability.evidence, *used]))
+    if "the theorem" not in errors:
+        certificate = _with_theorem(certificate, horizons, detectability, deadline, attempt)
+    if certificate.holds and stability is not None:
+        parts = [stability.evidence]
+        if certificate.constants and certificate.detectability is not None:
+            parts += [certificate.detectability.evidence] + [
+                each.evidence for each in certificate.assumptions if each.evidence is not None
+            ]
+        object.__setattr__(certificate, "evidence", weakest(parts))
     return certificate
 
 
-def _needed(findings: Audit) -> CostConstants:
-    """The cost's constants; a `CertificateError` where there are none."""
-    if findings.constants is None:
-        raise CertificateError(f"{findings['cost bounds'].text}; the theorem needs them.")
-    return findings.constants
+def _with_theorem(
+    bare: Certificate, horizons: Sequence[int], detectability: Detectability | None,
+    deadline: Deadline, attempt: Callable[..., Any],
+) -> Certificate:
+    """The certificate with the theorem's assumptions and, where they hold, its constants."""
+    system, cost, region, stability = bare.system, bare.cost, bare.region, bare.stability
+    weights, about = about_cost(cost)
+    if weights is None:
+        attempt("the theorem", lambda: _refused(about))
+    output = about_output(system, region, deadline.part(_OUTPUT))
+    found = [output, *about_corrections(system, bare.observer, region), about]
+    if detectability is None:
+        detectability = attempt("detectability", lambda: certify_detectability(
+            system, region, weights=_cheapest(weights), seconds=deadline.part(_DETECTABILITY)
+        ))
+    constants: dict[int, TheoremConstants] = {}
+    if weights is not None and detectability is not None and stability is not None:
+        slope, proved, bent = output.value, bare.observer_bound, None
+        assert slope is not None
+        if system.states is not None and proved is not None and proved.projects:
+            found.append(about_model(system, region, deadline))
+            bent = found[-1].value
+        observer = stability.sums
+        if slope > 0.0:  # a larger C_v holds as well, and from 1 / L_h on L_bar is L_h
+            observer = replace(observer, noise=max(observer.noise, 1.0 / slope))
+        constants = {
+            N: TheoremConstants(
+                detectability.sums, observer, weights, kappa=stability.kappa, lipschitz=slope,
+                horizon=N, model_lipschitz=bent,
+            )
+            for N in horizons
+        }
+    return replace(
+        bare, assumptions=tuple(found), detectability=detectability, constants=constants
+    )
 
 
-def _cheapest(constants: CostConstants) -> tuple[float, float]:
+def _refused(about: Assumption) -> None:
+    raise CertificateError(f"{about.text}; the theorem needs them.")
+
+
+def _cheapest(constants: CostConstants | None) -> tuple[float, float]:
     """Sizes of disturbance and noise of which each alone costs 1, in its cheapest direction."""
+    if constants is None:
+        return 1.0, 1.0
     root = -1.0 / constants.exponent
     return constants.disturbance[0] ** root, constants.noise[0] ** root
 

@@ -19,7 +19,7 @@ from .inequalities import Form, Matrices, OutputInjection, OutputWeight, norms
 from .regions import Region
 from .sdp import Answer, Kind, Program, Scales, _columns
 from .search import Found, Search
-from .signal_bounds import SignalBounds, lengths_of, read_size, sides_of
+from .sizes import Sizes, lengths_of, read_size, sides_of
 
 _MOST_CONDITION = 1e8
 _FLOOR = 1e-6  # of the noise's weight: a cost needs a positive one
@@ -97,7 +97,7 @@ class DesignProgram(Program):
     """
 
     def __init__(
-        self, kind: Kind, jacobians: Array, scales: Scales, G: Array, sizes: SignalBounds,
+        self, kind: Kind, jacobians: Array, scales: Scales, G: Array, sizes: Sizes,
         horizon: int | None,
     ) -> None:
         widths, groups, largest = _columns(G, scales, largest_sizes(sizes))
@@ -143,7 +143,7 @@ class DesignProgram(Program):
         supply = sum(
             float(lengths_of(name, read_size(name, given), len(weight), weight)) ** 2
             for name, given, weight in (
-                ("disturbances", sizes.disturbances, Q), ("noises", sizes.noises, R)
+                ("disturbances", sizes.disturbance, Q), ("noises", sizes.noise, R)
             )
         )
         scale = 1.0 / (supply or 1.0)
@@ -162,7 +162,7 @@ class DesignSearch(Search):
     """`Search` with the program of the design."""
 
     def __init__(
-        self, system: System, region: Region, sizes: SignalBounds, horizon: int | None,
+        self, system: System, region: Region, sizes: Sizes, horizon: int | None,
         seconds: float | Deadline,
     ) -> None:
         super().__init__(system, region, None, (1.0, 1.0), seconds=seconds)
@@ -215,11 +215,11 @@ class DesignSearch(Search):
         return super()._verified(form)
 
 
-def largest_sizes(sizes: SignalBounds) -> tuple[float | Array, float | Array]:
+def largest_sizes(sizes: Sizes) -> tuple[float | Array, float | Array]:
     """The largest disturbances and noises: lengths, or half-widths by component."""
     w, v = (
         np.abs(sides_of(name, given)).max(axis=0) if isinstance(given, ConvexSet) else given
-        for name, given in (("disturbances", sizes.disturbances), ("noises", sizes.noises))
+        for name, given in (("disturbances", sizes.disturbance), ("noises", sizes.noise))
     )
     return w, v
 

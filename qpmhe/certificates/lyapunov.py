@@ -26,13 +26,11 @@ from .contraction import _undetectable
 from .deadline import DEFAULT_SECONDS, Deadline
 from .dissipation import DesignSearch, Dissipation, growth
 from .evidence import Evidence, MismatchError, json_ready
-from .inequalities import norms
 from .invariance import supports
 from .observer_bound import largest_ratio
 from .regions import Region, bounded_region
 from .sdp import started
-from .signal_bounds import OUTWARD, SignalBounds, Size, lengths_of, read_size
-from .theorem import Sizes
+from .sizes import OUTWARD, Size, Sizes, initial_length, lengths_of, read_size
 
 Kind = Literal["minimiser", "measured"]
 KINDS: tuple[Kind, ...] = ("minimiser", "measured")
@@ -73,7 +71,7 @@ class Design:
         The inequality that was verified.
     discount : float
         gamma.
-    sizes : SignalBounds
+    sizes : Sizes
         The largest disturbances and noises.
     horizon : int
         The horizon given, or the least one whose limit for a minimiser is at most a tenth above
@@ -88,7 +86,7 @@ class Design:
     region: Region
     form: Dissipation
     discount: float
-    sizes: SignalBounds
+    sizes: Sizes
     horizon: int
     evidence: Evidence
     notes: tuple[str, ...] = ()
@@ -191,7 +189,7 @@ class Design:
         width = (self.region.upper - self.region.lower)[: self.system.n]
         widest = float(lengths_of("the region", Box(-width, width), len(width), self.prior))
         bound = np.full(steps + 1, math.nan)
-        bound[0] = self._initial(initial_error)
+        bound[0] = initial_length(initial_error, self.prior)
         for t in (np.flatnonzero(~spoilt) + 1).tolist():
             first: int = max(t - N, 0)
             own = float(np.fmin(bound[first], widest)) if first else float(bound[0])
@@ -200,16 +198,6 @@ class Design:
             estimate = truth if kind == "minimiser" else math.sqrt(run.costs[t - 1])
             bound[t] = (truth + estimate) * _SUMS
         return bound
-
-    def _initial(self, error: Size) -> float:
-        given, n = read_size("initial_error", error), self.system.n
-        if isinstance(given, ConvexSet):
-            return float(lengths_of("initial_error", given, n, self.prior))
-        if given.shape not in ((), (n,)):
-            raise ShapeError(
-                f"initial_error has shape {given.shape}; expected ({n},), a length, or a set."
-            )
-        return float(norms(given[None], self.prior)[0]) * _SUMS
 
     def _unusual(self, run: Run) -> NDArray[np.bool_]:
         """The samples with another cost, an input outside of the region, or an unusual step."""
@@ -223,8 +211,8 @@ class Design:
 
     def _supply(self, w: Size | None, v: Size | None, steps: int) -> Array:
         """What the truth costs at each sample, (T,)."""
-        w = read_size("disturbances", self.sizes.disturbances if w is None else w)
-        v = read_size("noises", self.sizes.noises if v is None else v)
+        w = read_size("disturbances", self.sizes.disturbance if w is None else w)
+        v = read_size("noises", self.sizes.noise if v is None else v)
         r, p = len(self.disturbance), self.system.p
         parts = (
             lengths_of("disturbances", w, r, self.disturbance),
@@ -297,7 +285,7 @@ def _first(wanted: Callable[[int], bool]) -> int | None:
 
 def design(
     system: System, region: ConvexSet | Region | None = None, *, inputs: Box | None = None,
-    sizes: SignalBounds | Sizes | None = None, horizon: int | None = None,
+    sizes: Sizes | None = None, horizon: int | None = None,
     discount: float | None = None, seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Design:
     """Find weights, discount and horizon for which the discounted cost bounds the error.
@@ -306,7 +294,7 @@ def design(
     ----------
     system, region, inputs
         As for `certify`.
-    sizes : SignalBounds or Sizes, optional
+    sizes : Sizes, optional
         Largest disturbances and noises, for which the limit is to be small; W and V of the
         system if left out.
     horizon : int, optional
@@ -344,16 +332,16 @@ def design(
     )
 
 
-def _sizes(system: System, sizes: SignalBounds | Sizes | None) -> SignalBounds:
+def _sizes(system: System, sizes: Sizes | None) -> Sizes:
     """What is stated, or else the system's W and V."""
     if sizes is not None:
-        return SignalBounds.stated(sizes)
+        return Sizes.stated(sizes)
     if system.disturbances is None or system.noises is None:
         raise SetError(
             "it is not known how large disturbances and noises may be: the system has no sets of "
             "them. Pass sizes=Sizes(disturbance=..., noise=...), or boxes in their place."
         )
-    return SignalBounds(system.disturbances, system.noises, "the system's W and V")
+    return Sizes(system.disturbances, system.noises, "the system's W and V")
 
 
 def _short(gamma: float) -> float:

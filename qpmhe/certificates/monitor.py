@@ -1,4 +1,4 @@
-"""At run time: the observer's bound, and which of the theorem's hypotheses hold at each step."""
+"""At run time: what bounds the error beside each estimate, and the sample at which that ends."""
 
 from __future__ import annotations
 
@@ -9,29 +9,37 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from .._checks import Array, count, record
+from .._checks import Array, record
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.constraints import Constraints
-from ..estimation.estimate import Estimate
+from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.limits import FEASIBLE
 from ..estimation.run import Run
 from ..model.system import System
-from .certificate import BROKEN, OUTWARD, Certificate
+from .certificate import Certificate
 from .evidence import MismatchError
-from .observer_monitor import ObserverMonitor, Reading, sharper
-from .signal_bounds import SignalBounds, Size
+from .measured_cost import MeasuredCost
+from .observer_bound import CONTRADICTION, REINITIALIZED, ObserverBound, largest_ratio
+from .sizes import Size, Sizes
 
 _RELATIVE = 1e-6
-_ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
-
+_UNITS = 8.0 * float(np.finfo(np.float64).eps)
+# What rounding may make of one step of the observer, as a share of what it sums up.
+_ROUNDING = 1e-9
+#: A window without all its measurements has another cost.
+_BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE
+_MOVED = (
+    "the observer's state before was changed, by a late measurement (amend), by set or by a "
+    "sample's own bounds"
+)
 
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Which hypotheses held at one step; each is checked anew from the estimate's numbers.
+    """Which hypotheses of the theorem held at one sample, checked anew from its numbers.
 
     Parameters
     ----------
@@ -41,18 +49,16 @@ class Hypotheses:
     complete : bool
         All measurements of the window are there, and the model could be evaluated.
     observer_candidate : bool
-        (eq:warmstart): the candidate is the observer's trajectory, not a projection of it,
-        and corrects by the certificate's gain, where that is constant.
+        (eq:warmstart): the candidate is the observer's trajectory and corrects by the certified
+        gain, where that is constant; or was projected onto X in the certified metric.
     kappa : bool
-        (eq:kappa): |L| <= kappa |v_z| all along the candidate.
+        (eq:kappa): |L| <= kappa |v_z| all along the candidate, but where it was so projected.
     candidate_in_region, estimate_in_region : bool
         All states of the window but the newest, from which nothing is concluded yet, lie in
         the certified set, and so do the inputs.
-    candidate_in_sets : bool
-        Assumption ass:observer: the candidate's states, corrections and fitting errors are in
-        X, W and V.
-    feasible : bool
-        (eq:constraints): the estimate's states, disturbances and noises are in X, W and V.
+    candidate_in_sets, feasible : bool
+        Assumption ass:observer and (eq:constraints): the candidate and the estimate are in X, W
+        and V. Only reported: what is certified holds for any w and v.
     """
 
     cost_decrease: bool
@@ -65,16 +71,8 @@ class Hypotheses:
     feasible: bool
 
     @property
-    def held(self) -> bool:
-        """Whether the certificate's bound follows at this step, if it did at those before.
-
-        The last two are no part of that: what is certified holds for any w and v.
-        """
-        return not self.failed
-
-    @property
     def failed(self) -> tuple[str, ...]:
-        """Names of those that the bound needs and that did not hold."""
+        """Names of those that the theorem's bound needs and that did not hold."""
         return tuple(name for name in NEEDED if not getattr(self, name))
 
 
@@ -83,249 +81,362 @@ UNNEEDED = ("candidate_in_sets", "feasible")
 NEEDED = tuple(each.name for each in fields(Hypotheses) if each.name not in UNNEEDED)
 
 
-@dataclass(frozen=True)
-class MonitorSummary:
-    """For how many steps of a run the certificate applied.
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What is known of the true state x(t+1) after a sample; NaN where nothing is.
 
-    Parameters
+    Attributes
     ----------
-    steps : int
-        Steps of the run.
-    applied : int
-        Steps from the first on, until the first at which a needed hypothesis did not hold:
-        the observer's bound goes back to the start, and is lost with it.
-    held : int
-        Steps at which all needed hypotheses held, whatever had happened before.
-    missed : dict of str to int
-        At how many steps each hypothesis did not hold.
-    first_failure, failed : int or None, and tuple of str
-        The first step at which hypotheses failed, and which.
-    observer : str
-        How long the observer's bound held, and what ended it; empty if it was not followed.
-    barred : str
-        Why the theorem does not apply at all; empty if it may.
+    time : int
+        t, the index of the newest measurement.
+    radius : float
+        b(t+1), which bounds |x(t+1) - z(t+1)|_P.
+    lower, upper : (n,) array
+        Sides of a box that holds x(t+1): the set around the observer, within the region.
+    error : float
+        What |x(t+1) - x_hat(t+1)| is at most.
+    kind : str
+        What gives the last: ``observer``, or ``measured`` where the measured cost gives less.
+    lost : int or None
+        The sample after which the bound no longer holds.
+    reason : str
+        Why; empty while it holds.
+    hypotheses : Hypotheses or None
+        Those of the theorem, where a certificate is monitored.
     """
 
-    steps: int
-    applied: int
-    held: int
-    missed: dict[str, int]
-    first_failure: int | None
-    failed: tuple[str, ...]
-    observer: str = ""
-    barred: str = ""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything in types that JSON knows."""
-        content = vars(self) | {"failed": list(self.failed), "hypotheses": {
-            name: {"needed": name in NEEDED, "failed": count, "held": self.steps - count}
-            for name, count in self.missed.items()
-        }}
-        del content["missed"]
-        return content
-
-    def __str__(self) -> str:
-        before = f"{self.observer} " if self.observer else ""
-        if self.barred:
-            return f"{before}The theorem does not apply: {self.barred}".strip()
-        text = f"{before}The certificate applied at {self.applied} of {self.steps} steps"
-        either = ""
-        if self.first_failure is not None:
-            reasons = ", ".join(self.failed).replace("_", " ")
-            text += (
-                f": at step {self.first_failure} it was lost ({reasons} did not hold). All "
-                f"hypotheses that the bound needs held at {self.held} steps"
-            )
-            either = " either"
-        return (
-            f"{text}.{self._missed('Not held', NEEDED)}"
-            f"{self._missed(f'Not held{either}, but the bound needs no sets', UNNEEDED)}"
-        )
-
-    def _missed(self, what: str, names: tuple[str, ...]) -> str:
-        """A sentence about the hypotheses that did not hold at all steps; empty without any."""
-        text = ", ".join(
-            f"{name.replace('_', ' ')} at {count} step{'s' if count > 1 else ''}"
-            for name in names if (count := self.missed[name])
-        )
-        return f" {what}: {text}." if text else ""
+    time: int
+    radius: float
+    lower: Array
+    upper: Array
+    error: float
+    kind: str = "observer"
+    lost: int | None = None
+    reason: str = ""
+    hypotheses: Hypotheses | None = None
 
 
 class Monitor:
-    """Checks a run's estimates, one after another from the first.
+    """Follows an estimator from sample to sample, with what is proved of it.
+
+    It takes one evaluation of f and two of h a sample; with the theorem's hypotheses, which it
+    checks for a `Certificate`, some for each sample of the window.
 
     Parameters
     ----------
-    certificate : Certificate
-        Of the estimator's system, observer and cost.
-    horizon : int
-        The estimator's; an `OptionError` is raised if the certificate has bounds, but not for it.
-    observer : ObserverMonitor, optional
-        Follows the observer's bound, for `bound`.
+    certified : Certificate or ObserverBound
+        Of the estimator's system, observer and cost; the bound of its observer is enough.
+    estimator : MovingHorizonEstimator
+        Where the bound begins: before its first measurement, or later for an `ObserverBound`.
+    initial_error : float, (n,) array_like or set
+        What bounds x - z there; see `ObserverBound.along`. Only for a certificate without a bound
+        of the observer it may be left out.
+    sizes : Sizes, optional
+        What bounds w and v at all times; the bound's own if left out.
+
+    Raises
+    ------
+    ShapeError, OptionError, SetError, InvalidInputError
+        If an argument does not fit, or the certificate is not for this horizon.
+    MismatchError
+        If what is certified is of another system, gain or cost than the estimator's.
+
+    Attributes
+    ----------
+    lost, reason : int or None, and str
+        The sample after which the observer's bound no longer holds, and why.
     barred : str
-        Why the theorem does not apply to the estimator, if it does not.
+        Why the theorem does not apply at all; empty if it may.
+    steps, applied : int
+        Samples seen, and those up to the first at which a needed hypothesis did not hold.
+    missed : dict of str to int
+        At how many samples each hypothesis did not hold.
+
+    Examples
+    --------
+    >>> import qpmhe
+    >>> from qpmhe.certificates import Monitor, certify
+    >>> system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1,
+    ...                       states=qpmhe.Box([-9.0], [9.0]))
+    >>> observer = qpmhe.Luenberger([0.3])
+    >>> cost = qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0)
+    >>> certificate = certify(system, observer, cost, horizon=5)
+    >>> mhe = qpmhe.MovingHorizonEstimator(
+    ...     system, observer, cost, horizon=5, initial_state=[0.0])
+    >>> watch = Monitor(certificate, mhe, initial_error=1.0)
+    >>> reading = watch.check(mhe.update([1.0]))
+    >>> bool(reading.lower[0] < reading.upper[0]), reading.lost
+    (True, None)
     """
 
     def __init__(
-        self, certificate: Certificate, horizon: int, observer: ObserverMonitor | None = None,
-        barred: str = "",
+        self, certified: Certificate | ObserverBound, estimator: MovingHorizonEstimator, *,
+        initial_error: Size | None = None, sizes: Sizes | None = None,
     ) -> None:
-        self.horizon = count("horizon", horizon, 1)
-        if certificate.bounds and not barred:
-            certificate.of(self.horizon)
-        elif not barred:
-            barred = "; ".join(certificate.failures)
-        self.certificate, self.observer = certificate, observer
-        self._barred = barred
-        self._inputs: deque[Array] = deque(maxlen=horizon)
-        self._checks: list[Hypotheses] = []
-        self._radii: deque[float] = deque(maxlen=horizon + 1)
-        self._reading: Reading | None = None
-        if observer is not None:
-            self._radii.append(observer.radius)
+        certificate: Certificate | None = None
+        if isinstance(certified, Certificate):
+            certificate, bound = certified, certified.observer_bound
+        elif isinstance(certified, ObserverBound):
+            bound = certified
+        else:
+            raise InvalidInputError(
+                f"certified is of type {type(certified).__name__}; expected a Certificate or an "
+                "ObserverBound, such as certificate.observer_bound."
+            )
+        self._system: System = estimator.system
+        self._horizon, self._certificate = estimator.horizon, certificate
+        self._time, self._z = estimator.time, estimator.observer_state
+        self.lost: int | None = None
+        self.reason = ""
+        self._ends = REINITIALIZED if estimator.settings.candidate != "observer" else ""
+        self.bound: ObserverBound | None = None
+        self._radius = math.nan
+        if bound is not None:
+            if initial_error is None:
+                raise OptionError("initial_error is missing; expected what bounds x_0 - z_0.")
+            own = bound.stability.system
+            if own is not None and own is not estimator.system:
+                raise MismatchError(
+                    "the bound is of another System object than the estimator's; certify the very "
+                    "objects that the estimator is made of."
+                )
+            self.bound = bound.of_observer(estimator.observer, estimator.system)
+            self.sizes = chosen = bound.sizes if sizes is None else sizes
+            self._entering = bound.entering(chosen.disturbance, chosen.noise)
+            self._radius = bound.initial(initial_error)
+        else:
+            self.lost, self.reason = self._time, "there is no bound of the observer"
+        self._radii = deque([self._radius], maxlen=estimator.horizon + 1)
+        self.barred = ""
+        self._measured: MeasuredCost | None = None
+        self.steps, self.applied = 0, 0
+        self.missed = dict.fromkeys((*NEEDED, *UNNEEDED), 0)
+        self._first: tuple[int, tuple[str, ...]] | None = None
+        self._inputs: deque[Array] = deque(maxlen=estimator.horizon)
+        self._projected: deque[bool] = deque(maxlen=estimator.horizon)
+        if certificate is not None:
+            self._begin(certificate, estimator)
 
-    @classmethod
-    def of(
-        cls, certificate: Certificate, estimator: MovingHorizonEstimator, *,
-        initial_error: Size | None = None, sizes: SignalBounds | None = None,
-    ) -> Monitor:
-        """A monitor for this estimator, before its first measurement.
-
-        Parameters
-        ----------
-        certificate, estimator
-            What is monitored.
-        initial_error, sizes : optional
-            What bounds x_0 - z_0, with which the monitor follows the observer's bound, and what
-            bounds w and v, see `ObserverMonitor`.
-
-        Raises
-        ------
-        MismatchError
-            If the certificate is not of its system, observer and cost.
-        InvalidInputError
-            If the estimator has taken measurements already.
-        OptionError
-            If it has no bounds for its horizon, or there is no bound of the observer and the
-            theorem does not cover the estimator's options.
-        """
+    def _begin(self, certificate: Certificate, estimator: MovingHorizonEstimator) -> None:
+        """What the theorem needs of the estimator."""
         certificate.check_estimator(estimator)
         if estimator.time:
             raise InvalidInputError(
                 f"the estimator has taken {estimator.time} measurements; reset it first: the "
                 "certificate's bound starts with the first one."
             )
-        barred = _barred(estimator)
-        proved, observer = certificate.observer_bound, None
-        if barred and proved is None:
-            raise OptionError(barred)
-        if initial_error is not None and proved is not None:
-            observer = ObserverMonitor(
-                proved, estimator, initial_error=initial_error, sizes=sizes
-            )
-        return cls(certificate, estimator.horizon, observer, barred)
-
-    @property
-    def bound(self) -> Reading | None:
-        """What is known of the true state after the last check; None if nothing is followed.
-
-        The observer's bound or, where that is less, the one with the measured cost.
-        """
-        return self._reading
+        self.barred = _barred(estimator) or (
+            "" if certificate.constants else "; ".join(certificate.failures)
+        )
+        if not self.barred:
+            certificate.of(estimator.horizon)
+        if self.barred and self.bound is None:
+            raise OptionError(self.barred)
+        detected, cost = certificate.detectability, certificate.cost
+        if not self.barred and self.bound is not None and MeasuredCost.applies(detected, cost):
+            assert detected is not None
+            self._measured = MeasuredCost(detected, cost, self.bound, self.sizes)
 
     def check(
         self, estimate: Estimate, u: ArrayLike | None = None, *, dt: float | None = None
-    ) -> Hypotheses:
-        """Check the estimate that `MovingHorizonEstimator.update` returned for the next input u.
+    ) -> Reading:
+        """What is known after the estimate that an update, `amend` or `set` returned.
 
-        With ``dt``, if the step had a length of its own. A monitor that follows the observer's
-        bound also takes the estimates of `amend` and `set`, and says what became of the bound.
+        Parameters
+        ----------
+        estimate : Estimate
+            The next one.
+        u : (m,) array_like, optional
+            The system's input of the sample, parameters included.
+        dt : float, optional
+            Length of its step, if it had one of its own.
 
         Raises
         ------
+        InvalidInputError, ShapeError
+            If it is no estimate, or the input does not fit.
         MismatchError
-            If it is not the next estimate, or its window does not fit the horizon.
-        ShapeError
-            If the input does not fit.
+            If its window does not fit the horizon.
         """
-        t, m = len(self._checks), self.certificate.system.m
-        given = np.zeros(0) if u is None else np.atleast_1d(np.asarray(u, np.float64))
-        if given.shape != (m,):
-            raise ShapeError(f"u has shape {given.shape}; expected ({m},).")
-        again = self.observer is not None and estimate.time == t - 1
-        if estimate.time != t and not again:
-            text = (
-                f"the estimate is of the time {estimate.time}; expected {t}: a monitor sees all "
-                "estimates of a run, from the first one on."
+        if not isinstance(estimate, Estimate):
+            raise InvalidInputError(
+                f"estimate is of type {type(estimate).__name__}; expected what "
+                "MovingHorizonEstimator.update returns."
             )
-            if self.observer is None:
-                raise MismatchError(text)
-            self._barred = text
-        stages, expected = estimate.trajectory.shape[0] - 1, min(estimate.time + 1, self.horizon)
-        if stages != expected:
+        given = np.zeros(0) if u is None else np.ravel(np.asarray(u, np.float64))
+        again = estimate.time == self._time - 1
+        if given.shape != (self._system.m,) and not again:
+            raise ShapeError(f"u has shape {given.shape}; expected ({self._system.m},).")
+        stages = estimate.trajectory.shape[0] - 1
+        if self._certificate is not None and stages != min(estimate.time + 1, self._horizon):
             raise MismatchError(
-                f"the estimate's window has {stages} stages at time {t}; expected {expected}, for "
-                f"the horizon {self.horizon}. Make the monitor for the estimator's horizon."
+                f"the estimate's window has {stages} stages at time {estimate.time}; expected "
+                f"{min(estimate.time + 1, self._horizon)}, for the horizon {self._horizon}. Make "
+                "the monitor for the estimator's horizon."
             )
-        if again:
-            self._checks.pop()
-            self._barred = self._barred or "a sample was estimated again (amend or set)"
-        else:
+        order = self._order(estimate.time)
+        if self.lost is None:
+            reason = self._ends or order or (
+                self._again(estimate) if again else self._advance(estimate, given, dt)
+            )
+            if reason:
+                self.lost, self.reason, self._radius = estimate.time, reason, math.nan
+        if order or again:
+            self.barred = self.barred or order or "a sample was estimated again (amend or set)"
+        held = None
+        if not again:
             self._inputs.append(given)
-        inputs = np.array(self._inputs)[-stages:] if len(self._inputs) >= stages else None
-        self._checks.append(monitor(self.certificate, estimate, inputs))
-        if self.observer is not None:
-            reading = self.observer.check(estimate, None if again else given, dt=dt)
-            if not again:
-                self._radii.append(reading.radius)
-            self._reading = sharper(reading, self._measured(estimate, stages))
-        return self._checks[-1]
+            self._radii.append(self._radius)
+            self._projected.append(
+                self.bound is not None and self.bound.projects
+                and Status.OBSERVER_PROJECTED in estimate.status
+            )
+        if self._certificate is not None and not order:
+            held = self._hypotheses(estimate, stages)
+        self._time, self._z = estimate.time + 1, estimate.observer_state.copy()
+        return self._reading(estimate, stages, held)
 
-    def _measured(self, estimate: Estimate, stages: int) -> float:
-        """The bound with the estimate's own cost, from the observer's bound N samples ago."""
-        if not self.applies or self.certificate.kinds[-2:] != ("weighted", "measured"):
-            return math.inf
-        assert self.observer is not None
-        from scipy.linalg import eigh
+    def _reading(self, estimate: Estimate, stages: int, held: Hypotheses | None) -> Reading:
+        """The smaller one of the observer's bound and the one with the measured cost."""
+        nothing = np.full(self._system.n, np.nan)
+        lower, upper, error, kind = nothing, nothing, math.nan, "observer"
+        if self.bound is not None:
+            lower, upper = self.bound.around(self._radius, self._z)
+            error = float(
+                self.bound.farthest(self._radius, estimate.state - self._z, self._z)
+            )
+        if self._measured is not None and self.applies and self.lost is None:
+            least = self._measured.error(self._radii[-1 - stages], stages, estimate.cost)
+            if least < error:
+                error, kind = least, "measured"
+        return Reading(
+            estimate.time, self._radius, lower, upper, error, kind, self.lost, self.reason, held
+        )
 
-        window = self.certificate.of(self.horizon).beyond("measured")
-        weights = window.norms
-        # The initial error that counts most in detectability's norm.
-        start = eigh(weights.window, weights.observer)[1][:, -1] * self._radii[-1 - stages]
-        w, v = (np.full(stages, size) for size in self.observer.sizes.largest)
-        costs = np.append(np.full(stages - 1, np.inf), estimate.cost)
-        return OUTWARD * float(window.bound(start, w, v, costs)[-1])
+    def _order(self, time: int) -> str:
+        """Why an estimate is not the next one; empty if it is, or is the same again."""
+        if time in (self._time, self._time - 1):
+            return ""
+        if time < self._time:
+            return "the estimator began again (reset, or a snapshot)"
+        return f"the samples from {self._time} to {time - 1} were not shown to the monitor"
+
+    def _again(self, estimate: Estimate) -> str:
+        return "" if np.array_equal(estimate.observer_state, self._z) else _MOVED
+
+    def _advance(self, estimate: Estimate, u: Array, dt: float | None) -> str:
+        """Take b(t) to b(t+1); why it cannot be, or empty."""
+        bound, system, before, z = self.bound, self._system, self._z, estimate.observer_state
+        assert bound is not None
+        events = bound.events(
+            np.array([estimate.status.value]), before[None], u[None],
+            None if dt is None else [dt], system.dt,
+        )
+        if events:
+            return events[0][1]
+        if np.isnan(estimate.noises[-1]).any():
+            return "not all outputs were sampled"
+        if not np.array_equal(estimate.candidate[-2], before):
+            return _MOVED
+        if Status.OBSERVER_PROJECTED not in estimate.status:
+            try:
+                output = system.h(before, u)
+                error = estimate.noises[-1] + system.h(estimate.trajectory[-2], u) - output
+                predicted, correction = system.f(before, u), bound.gain @ error
+            except Exception:  # a model that is not defined here
+                return "the model could not be evaluated"
+            size = np.abs(predicted) + np.abs(correction) + np.abs(bound.gain) @ (
+                np.abs(error) + np.abs(output)
+            )
+            if not (np.abs(z - predicted - correction) <= _ROUNDING * size).all():
+                return (
+                    "the observer's step was not f(z) + L v: it had another length (dt), other "
+                    "parameters or another gain"
+                )
+        self._radius = bound.advanced(self._radius, self._entering)
+        return CONTRADICTION if bound.is_empty(np.array(self._radius), z) else ""
+
+    def _hypotheses(self, estimate: Estimate, stages: int) -> Hypotheses:
+        """Those that held, counted."""
+        assert self._certificate is not None
+        found = hypotheses(
+            self._certificate, estimate, np.array(self._inputs)[-stages:],
+            np.array(self._projected)[-stages:],
+        )
+        if estimate.time >= self.steps:
+            self.steps = estimate.time + 1
+            for name in self.missed:
+                self.missed[name] += not getattr(found, name)
+        if found.failed and self._first is None:
+            self._first = estimate.time, found.failed
+        self.applied = self.steps if self._first is None else self._first[0]
+        return found
 
     @property
     def applies(self) -> bool:
-        """Whether the bound follows at the last step: all needed hypotheses held so far."""
-        return not self._barred and all(check.held for check in self._checks)
+        """Whether the theorem's bound follows at the last sample: it goes back to the first one."""
+        return not self.barred and self._first is None
 
-    def summary(self) -> MonitorSummary:
-        """For how many of the steps so far the certificate applied."""
-        checks = self._checks
-        held = [check.held for check in checks]
-        first = held.index(False) if False in held else None
-        return MonitorSummary(
-            len(held), len(held) if first is None else first, sum(held),
-            {
-                name: sum(not getattr(check, name) for check in checks)
-                for name in (*NEEDED, *UNNEEDED)
+    def summary(self) -> str:
+        """How long the observer's bound held, and at how many samples the theorem's followed."""
+        text = ""
+        if self.bound is not None:
+            text = f"The observer's bound held at all {self.steps} samples. "
+            if self.lost is not None:
+                text = f"The observer's bound held up to sample {self.lost}: there {self.reason}. "
+        if self.barred:
+            return f"{text}The theorem does not apply: {self.barred}".strip()
+        text += f"The certificate applied at {self.applied} of {self.steps} samples"
+        if self._first is not None:
+            reasons = ", ".join(self._first[1]).replace("_", " ")
+            text += f": at sample {self._first[0]} it was lost ({reasons} did not hold)"
+        missed = ", ".join(
+            f"{name.replace('_', ' ')} at {times}{'' if name in NEEDED else ' (not needed)'}"
+            for name, times in self.missed.items() if times
+        )
+        return f"{text}.{f' Not held: {missed}.' if missed else ''}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """What the summary says, in types that JSON knows."""
+        return {
+            "steps": self.steps, "applied": self.applied, "barred": self.barred,
+            "failed": [] if self._first is None else list(self._first[1]),
+            "lost": self.lost, "reason": self.reason, "hypotheses": {
+                name: {"needed": name in NEEDED, "failed": times, "held": self.steps - times}
+                for name, times in self.missed.items()
             },
-            first, () if first is None else checks[first].failed, self._of_observer(),
-            self._barred,
-        )
+        }
 
-    def _of_observer(self) -> str:
-        """How long the observer's bound held."""
-        if self.observer is None:
-            return ""
-        if self.observer.lost is None:
-            return f"The observer's bound held at all {len(self._checks)} samples."
-        return (
-            f"The observer's bound held up to sample {self.observer.lost}: there "
-            f"{self.observer.reason}."
-        )
+    def state_dict(self) -> dict[str, Any]:
+        """What `load_state_dict` restores of the observer's bound, as plain numbers and arrays."""
+        if self.bound is None or self._certificate is not None:
+            raise InvalidInputError(
+                "only a monitor of an ObserverBound has a state; pass certificate.observer_bound."
+            )
+        return {
+            "time": self._time, "observer": self._z.copy(), "radius": self._radius,
+            "lost": self.lost, "reason": self.reason, "metric": self.bound.metric.copy(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue where another monitor of this observer stopped.
+
+        It may have another P. An `InvalidInputError` is raised if it is not such a state.
+        """
+        mine = self.state_dict()["metric"]
+        try:
+            z = np.array(state["observer"], np.float64).reshape(self._z.shape)
+            time, radius = int(state["time"]), float(state["radius"])
+            lost = None if state["lost"] is None else int(state["lost"])
+            reason = str(state["reason"])
+            metric = np.array(state["metric"], np.float64).reshape(mine.shape)
+            if not np.array_equal(metric, mine):  # another search found another P
+                radius *= largest_ratio(mine, metric)
+        except (KeyError, TypeError, ValueError) as error:
+            raise InvalidInputError(
+                f"the state is of no monitor of this observer: {error}."
+            ) from error
+        self._time, self._z, self._radius, self.lost, self.reason = time, z, radius, lost, reason
 
 
 def _barred(estimator: MovingHorizonEstimator) -> str:
@@ -353,20 +464,23 @@ def _barred(estimator: MovingHorizonEstimator) -> str:
     return ""
 
 
-def monitor(
-    certificate: Certificate, estimate: Estimate, inputs: ArrayLike | None = None
+def hypotheses(
+    certificate: Certificate, estimate: Estimate, inputs: ArrayLike | None = None,
+    projected: ArrayLike | None = None,
 ) -> Hypotheses:
-    """Which hypotheses held at one step.
+    """Which hypotheses of the theorem held at one sample.
 
     Parameters
     ----------
     certificate : Certificate
         Of the estimator's system, observer and cost.
     estimate : Estimate
-        What the step returned.
+        What the update returned.
     inputs : (K, m) array_like, optional
         The inputs of the window's K samples, for a system with inputs; a `ShapeError` is raised
         if they do not fit.
+    projected : (K,) array_like, optional
+        At which samples the observer was projected onto X in the certified metric.
     """
     system, region = certificate.system, certificate.region
     stages = estimate.trajectory.shape[0] - 1
@@ -375,12 +489,15 @@ def monitor(
         raise ShapeError(
             f"inputs has shape {u.shape}; expected ({stages}, {system.m}), those of the window."
         )
+    moved: NDArray[np.bool_] = np.zeros(stages, np.bool_)
+    if projected is not None:
+        moved = np.asarray(projected, np.bool_)
     with np.errstate(all="ignore"):
         w, outputs = _along(system, estimate.trajectory, u)
         y = outputs + estimate.noises
         corrections, candidate_outputs = _along(system, estimate.candidate, u)
         fit = y - candidate_outputs
-        complete = not estimate.status & BROKEN and bool(
+        complete = not estimate.status & _BROKEN and bool(
             np.isfinite(w).all() and np.isfinite(y).all() and np.isfinite(fit).all()
         )
         # What is missing is reported as that alone: the observer takes it for a fit.
@@ -388,26 +505,23 @@ def monitor(
         kappa = math.inf if certificate.stability is None else certificate.stability.kappa
         allowed = kappa * np.linalg.norm(known, axis=1) * (1.0 + _RELATIVE)
         rounding = 1e-12 * np.abs(estimate.candidate).max(axis=0)
-        bounded = bool(
-            (np.linalg.norm(corrections, axis=1) <= allowed + np.linalg.norm(rounding)).all()
-        )
-        gain = certificate.gain
-        observed = gain is None or not complete or bool(
-            (np.abs(corrections - known @ gain.T)
-             <= rounding + _RELATIVE * (np.abs(known) @ np.abs(gain).T)).all()
-        )
-        cheaper = estimate.cost <= estimate.candidate_cost and (
-            not complete
-            or (_costs(certificate, estimate.trajectory, estimate, w, estimate.noises, y,
-                       estimate.cost)
-            and _costs(certificate, estimate.candidate, estimate, corrections, fit, y,
-                       estimate.candidate_cost))
-        )
+        sizes = np.linalg.norm(corrections, axis=1)
+        gain, observed = certificate.gain, True
+        if gain is not None and complete:
+            missed = np.abs(corrections - known @ gain.T)
+            right = missed <= rounding + _RELATIVE * (np.abs(known) @ np.abs(gain).T)
+            observed = bool((right.all(axis=1) | moved).all())
+        cheaper = estimate.cost <= estimate.candidate_cost and (not complete or all(
+            _has_cost(certificate, estimate, x, w_, v, y, stated) for x, w_, v, stated in (
+                (estimate.trajectory, w, estimate.noises, estimate.cost),
+                (estimate.candidate, corrections, fit, estimate.candidate_cost),
+            )
+        ))
     low, high = region.lower[region.n :], region.upper[region.n :]
     usual = bool(((u >= low) & (u <= high)).all())
     return Hypotheses(
-        cost_decrease=cheaper, complete=complete,
-        observer_candidate=observed, kappa=bounded,
+        cost_decrease=cheaper, complete=complete, observer_candidate=observed,
+        kappa=bool((moved | (sizes <= allowed + np.linalg.norm(rounding))).all()),
         candidate_in_region=usual and bool(region.contains(estimate.candidate[:-1]).all()),
         estimate_in_region=usual and bool(region.contains(estimate.trajectory[:-1]).all()),
         candidate_in_sets=_in_sets(certificate, estimate.candidate, corrections, fit, y),
@@ -418,32 +532,19 @@ def monitor(
 def monitored_run(
     certificate: Certificate, estimator: MovingHorizonEstimator, measurements: ArrayLike,
     inputs: ArrayLike | None = None, *, initial_error: Size | None = None,
-) -> tuple[Run, MonitorSummary]:
-    """Run an estimator over a record, and count for how many steps the certificate applied.
-
-    Parameters
-    ----------
-    certificate : Certificate
-        Of the estimator's system, observer and cost.
-    estimator : MovingHorizonEstimator
-        Before its first measurement.
-    measurements, inputs
-        As for `MovingHorizonEstimator.run`, which returns the same run.
-    initial_error : optional
-        What bounds x_0 - z_0, to follow the observer's bound as well.
-    """
-    watch = Monitor.of(certificate, estimator, initial_error=initial_error)
+) -> tuple[Run, Monitor]:
+    """Run an estimator over a record beside a monitor; arguments as of both."""
+    watch = Monitor(certificate, estimator, initial_error=initial_error)
     ys = record("measurements", measurements, estimator.system.p)
-    us = None if inputs is None else record("inputs", inputs, estimator.system.m)
-    if us is not None and len(us) != len(ys):
+    us = [None] * len(ys) if inputs is None else record("inputs", inputs, estimator.system.m)
+    if len(us) != len(ys):
         raise ShapeError(f"inputs has {len(us)} samples; expected {len(ys)}.")
     start, estimates = estimator.state.copy(), []
     observer_start = estimator.observer_state
-    for t, y in enumerate(ys):
-        u = None if us is None else us[t]
+    for y, u in zip(ys, us, strict=True):
         estimates.append(estimator.update(y, u))
         watch.check(estimates[-1], u)
-    return Run.of(start, estimates, observer_start=observer_start), watch.summary()
+    return Run.of(start, estimates, observer_start=observer_start), watch
 
 
 def _along(system: System, states: Array, u: Array) -> tuple[Array, Array]:
@@ -457,8 +558,8 @@ def _along(system: System, states: Array, u: Array) -> tuple[Array, Array]:
     return w, h
 
 
-def _costs(
-    certificate: Certificate, states: Array, estimate: Estimate, w: Array, v: Array, y: Array,
+def _has_cost(
+    certificate: Certificate, estimate: Estimate, states: Array, w: Array, v: Array, y: Array,
     stated: float,
 ) -> bool:
     """Whether a trajectory has the stated cost, or no less where the prior's weight varies."""
@@ -468,7 +569,7 @@ def _costs(
     # Residuals are differences of numbers of these sizes.
     sizes = np.hstack((np.abs(states[1:]) + np.abs(w), np.abs(y) + np.abs(v)))
     each = np.diag(cost.stage_weight.diagonal())
-    rounding = float(np.sum(cost.stage_costs(_ROUNDING * sizes, each)))
+    rounding = float(np.sum(cost.stage_costs(_UNITS * sizes, each)))
     missed = abs(total - stated) if cost.observer_prior is None else total - stated
     return bool(missed <= _RELATIVE * abs(stated) + rounding / _RELATIVE)
 

@@ -14,6 +14,7 @@ No cost, horizon or detectability enters.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import itemgetter
@@ -25,11 +26,11 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import Array, numbers
 from ..costs import Cost
 from ..errors import InvalidInputError, OptionError, ShapeError
+from ..estimation.estimate import Status
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
-from .bound_events import CONTRADICTION, events_of
 from .contraction import certify_observer, gain_if_constant
 from .deadline import PART_SECONDS, Deadline
 from .evidence import Evidence, MismatchError, json_ready
@@ -37,49 +38,55 @@ from .inequalities import Matrices, definite
 from .invariance import Invariance, certify_invariance, inner_region, supports
 from .properties import ObserverStability
 from .regions import Region, bounded_region
-from .signal_bounds import (
+from .sizes import (
     MOST_CORNERS,
     OUTWARD,
-    SignalBounds,
+    UNIT,
     Size,
+    Sizes,
     corners_of,
-    largest_length,
+    initial_length,
     lengths_of,
     read_size,
-    root_of,
     sides_of,
     weighted_lengths,
 )
-from .theorem import Sizes, checked_length
 
-_UNIT = float(np.finfo(np.float64).eps)
-# How close to its limit the bound is when it is called settled.
-_SETTLED = 0.1
+# How close to its limit the bound is when it is called settled, and in how many samples at most.
+_SETTLED, _MOST_SAMPLES = 0.1, 10**6
 # How much of the time is for the contraction, and of the rest for the region itself.
 _CONTRACTION, _INVARIANCE = 0.8, 0.6
-_MOST_SAMPLES = 10**6  # that are counted until then
 # Halvings of the bracket of a multiplier, each value of which gives a bound.
 _HALVINGS = 20
 _SLACKS = (1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
 
+#: Of an estimator whose observer does not run on.
+REINITIALIZED = (
+    "the candidate comes from an observer that starts again at each sample, whose states this "
+    "bound is not about"
+)
+#: Where the data contradict what is assumed.
+CONTRADICTION = (
+    "no state of the region fits the bound: the disturbances, the noises or the initial error were "
+    "larger than stated, or the model is another one"
+)
+_EVENTS = (
+    (Status.MISSING, "a measurement was missing"),
+    (Status.MODEL_FAILED, "the model failed, and the observer started again"),
+    (Status.METRIC_SINGULAR, "the observer was projected in a metric of the projection's own"),
+)
+_PROJECTED = (
+    Status.OBSERVER_PROJECTED,
+    "the observer was projected onto X in another metric than the certified one, "
+    "metric=observer_bound.metric",
+)
+
 
 class Entering(NamedTuple):
-    """What disturbances and noises add to the bound: at each sample (T,), or always ().
-
-    Attributes
-    ----------
-    length, square : array
-        |w - L v|_P and |w|_Q^2 + |v|_R^2 at most, rounded up; the latter is infinite where the sum
-        of squares is not certified.
-    """
+    """What w and v add at each sample (T,), or always (): |w - L v|_P and |w|_Q^2 + |v|_R^2."""
 
     length: Array
-    square: Array
-
-    @property
-    def samples(self) -> int | None:
-        """How many samples these are; None for bounds that hold at all times."""
-        return max((len(each) for each in self if each.ndim), default=None)
+    square: Array  # infinite where the sum of squares is not certified
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +130,7 @@ class ObserverBound:
         The certified contraction, with its P and gain.
     region : Region
         The set in which state and observer must stay.
-    sizes : SignalBounds
+    sizes : Sizes
         What bounds w and v unless something else is passed.
     projection : ndarray or None
         The metric in which the observer is projected onto X, if it has one of its own.
@@ -136,7 +143,7 @@ class ObserverBound:
 
     stability: ObserverStability
     region: Region
-    sizes: SignalBounds
+    sizes: Sizes
     projection: Array | None = None
     invariance: Invariance | None = None
     inner: Invariance | None = None
@@ -168,12 +175,11 @@ class ObserverBound:
         """Whether a projection of the observer onto X keeps the bound: in P, it does."""
         return self.projection is not None and np.array_equal(self.projection, self.metric)
 
-    def of_observer(self, observer: Observer) -> ObserverBound:
-        """The same of an observer with this gain, which may be projected in another metric."""
-        return replace(self, projection=observer.metric)
+    def of_observer(self, observer: Observer, system: System) -> ObserverBound:
+        """The same of an observer with this gain, which may be projected in another metric.
 
-    def check_gain(self, observer: Observer, system: System) -> None:
-        """Raise a `MismatchError` unless the observer has this very gain."""
+        A `MismatchError` is raised if it has another gain.
+        """
         gain = gain_if_constant(observer, system)
         if gain is None or not np.array_equal(gain, self.gain):
             theirs = "not constant" if gain is None else str(gain.tolist())
@@ -181,6 +187,7 @@ class ObserverBound:
                 f"the bound is of an observer with the gain {self.gain.tolist()}; the estimator's "
                 f"is {theirs}. Certify the estimator's observer."
             )
+        return replace(self, projection=observer.metric)
 
     @cached_property
     def slopes(self) -> Array:
@@ -202,10 +209,10 @@ class ObserverBound:
         for slack in _SLACKS:
             axes = (sizes + slack * sizes[0]) * (1.0 + slack)
             least = np.diag(1.0 / axes**2)
-            rest = turned - Matrices(least, 4.0 * _UNIT * least)
+            rest = turned - Matrices(least, 4.0 * UNIT * least)
             if definite(Matrices(rest.middle[None], rest.radius[None]))[0].all():
                 # The directions are orthonormal up to rounding.
-                return axes * (1.0 + 16.0 * n * _UNIT), left
+                return axes * (1.0 + 16.0 * n * UNIT), left
         return ball
 
     def length(self, errors: ArrayLike) -> Array:
@@ -214,39 +221,23 @@ class ObserverBound:
 
     def initial(self, error: Size) -> float:
         """b(0) from x(0) - z(0): a vector (n,), a bound on its length, or a set that holds it."""
-        given, n = read_size("initial_error", error), len(self.metric)
-        if isinstance(given, ConvexSet):
-            return largest_length("initial_error", given, n, self.metric)
-        if given.shape not in ((), (n,)):
-            raise ShapeError(
-                f"initial_error has shape {given.shape}; expected ({n},), a length, or a qpmhe.Box."
-            )
-        if given.shape == (n,):
-            return float(self.length(given))
-        return checked_length("initial_error", given) * root_of(self.metric)
+        return initial_length(error, self.metric)
 
-    def entering(
-        self, disturbances: Size | None = None, noises: Size | None = None
-    ) -> Entering:
-        """What disturbances and noises add to the bound at each sample, or always.
-
-        Parameters
-        ----------
-        disturbances, noises : optional
-            Vectors (T, n) and (T, p), lengths (T,), a length or a set; `sizes` if left out.
-        """
-        usual = self.sizes
-        w = read_size("disturbances", usual.disturbances if disturbances is None else disturbances)
-        v = read_size("noises", usual.noises if noises is None else noises)
+    def entering(self, disturbances: Size | None = None, noises: Size | None = None) -> Entering:
+        """What disturbances and noises add to the bound; arguments as of `radii`."""
+        usual, V = self.sizes, self.stability.V  # V is no less than L^T P L
+        w = read_size("disturbances", usual.disturbance if disturbances is None else disturbances)
+        v = read_size("noises", usual.noise if noises is None else noises)
         n, p = self.gain.shape
+        assert V is not None
         if isinstance(w, ConvexSet) and isinstance(v, ConvexSet):
             ws, vs = corners_of("disturbances", w, n), corners_of("noises", v, p)
             if len(ws) * len(vs) in range(1, MOST_CORNERS + 1):
                 joint = self._joint(np.repeat(ws, len(vs), 0), np.tile(vs, (len(ws), 1))).max()
                 return Entering(np.array(joint), self._square(w, v))
-        first = lengths_of("disturbances", w, n, self.metric)
-        assert self.stability.V is not None
-        second = lengths_of("noises", v, p, self.stability.V)  # no less than L^T P L
+        first, second = (
+            lengths_of("disturbances", w, n, self.metric), lengths_of("noises", v, p, V)
+        )
         if first.ndim and second.ndim and len(first) != len(second):
             raise ShapeError(
                 f"disturbances has {len(first)} samples, and noises {len(second)}; expected the "
@@ -257,7 +248,6 @@ class ObserverBound:
         return Entering((first + second) * OUTWARD, self._square(w, v))
 
     def _square(self, w: Array | ConvexSet, v: Array | ConvexSet) -> Array:
-        """|w|_Q^2 + |v|_R^2 at most; infinite where the sum of squares is not certified."""
         Q, R = self.stability.Q, self.stability.R
         if Q is None or R is None or len(Q) != len(self.metric):
             return np.array(math.inf)
@@ -265,17 +255,32 @@ class ObserverBound:
         return (first * first + second * second) * OUTWARD
 
     def _joint(self, w: Array, v: Array) -> Array:
+        """|w - L v|_P, rounded up."""
         sizes = np.abs(w) + np.abs(v) @ np.abs(self.gain.T)
-        error = (self.gain.shape[1] + 2) * _UNIT * sizes
+        error = (self.gain.shape[1] + 2) * UNIT * sizes
         rounding = weighted_lengths(error, np.abs(self.metric))
         return (weighted_lengths(w - v @ self.gain.T, self.metric) + rounding) * OUTWARD
 
-    def radii(self, steps: int, initial_error: Size, entering: Entering) -> Array:
-        """b(0), ..., b(T), from what enters at each sample or always."""
-        samples = entering.samples
-        if samples is not None and samples != steps:
+    def radii(
+        self, steps: int, initial_error: Size, disturbances: Size | None = None,
+        noises: Size | None = None,
+    ) -> Array:
+        """b(0), ..., b(T), (T + 1,).
+
+        Parameters
+        ----------
+        steps : int
+            T.
+        initial_error : float, (n,) array_like or set
+            x(0) - z(0), a bound on its length, or a set that holds it.
+        disturbances, noises : optional
+            Vectors (T, n) and (T, p), lengths (T,), a length or a set; `sizes` if left out.
+        """
+        entering = self.entering(disturbances, noises)
+        samples = {len(each) for each in entering if each.ndim} - {steps}
+        if samples:
             raise ShapeError(
-                f"disturbances and noises have {samples} samples; expected {steps}."
+                f"disturbances and noises have {samples.pop()} samples; expected {steps}."
             )
         found = np.empty(steps + 1)
         lengths, squares = (np.broadcast_to(each, steps) for each in entering)
@@ -290,17 +295,10 @@ class ObserverBound:
         linear = reached + float(entering.length)
         return min(linear, math.hypot(reached, math.sqrt(entering.square))) * OUTWARD
 
-    def at(
-        self, time: int, initial_error: Size, disturbances: Size | None = None,
-        noises: Size | None = None,
-    ) -> float:
-        """b(t) for bounds on w and v that hold at all times; arguments as of `along`."""
-        return float(self.radii(time, initial_error, self.entering(disturbances, noises))[-1])
-
     def limit(self, disturbances: Size | None = None, noises: Size | None = None) -> float:
         """What b(t) tends to as t grows, for bounds on w and v that hold at all times."""
         entering = self.entering(disturbances, noises)
-        if entering.samples is not None:
+        if any(each.ndim for each in entering):
             raise OptionError(
                 "disturbances and noises are of single samples; expected bounds for all times."
             )
@@ -316,7 +314,7 @@ class ObserverBound:
         """Sides (..., n) of a box that holds the true state: around z, and within the region."""
         half = self.components(radius)
         n = self.region.n
-        margin = _UNIT * (np.abs(observer) + half)
+        margin = UNIT * (np.abs(observer) + half)
         return (
             np.maximum(observer - half - margin, self.region.lower[:n]),
             np.minimum(observer + half + margin, self.region.upper[:n]),
@@ -367,7 +365,7 @@ class ObserverBound:
             found = np.where(ball > 0.0, np.where(length > 0.0, found, ball), length)
             # Of a bound without end, the region's sides are left.
             found = np.where(np.isnan(b), np.nan, np.where(np.isfinite(found), found, np.inf))
-        found = found * (1.0 + 64.0 * len(axes) * _UNIT)
+        found = found * (1.0 + 64.0 * len(axes) * UNIT)
         if observer is not None:
             z = np.asarray(observer, np.float64)
             lower, upper = self.around(b, z)
@@ -404,25 +402,58 @@ class ObserverBound:
                 f"run is of type {type(run).__name__}; expected a qpmhe.Run, as "
                 "MovingHorizonEstimator.run returns it."
             )
-        if run.source is not None:
-            self.check_gain(run.source.observer, run.source.system)
-            if run.source.observer.metric is not self.projection:
-                other = self.of_observer(run.source.observer)
-                if other.projects != self.projects:
-                    return other.along(run, disturbances, noises, initial_error=initial_error)
-        radius = self.radii(len(run), initial_error, self.entering(disturbances, noises))
-        z = run.observer_states
-        events = events_of(run, self.region, self.projects)
+        z, source, of_run = run.observer_states, run.source, self
+        inputs, steps, usual = None, None, None
+        if source is not None:
+            of_run = self.of_observer(source.observer, source.system)
+            inputs, steps, usual = source.inputs, source.steps, source.system.dt
+        radius = self.radii(len(run), initial_error, disturbances, noises)
+        events = of_run.events(run.flags, z[:-1], inputs, steps, usual)
+        if source is not None and source.settings.candidate != "observer":
+            events.insert(0, (0, REINITIALIZED))
         empty = self.is_empty(radius[1:], z[1:])
         if empty.any():
             events.append((int(empty.argmax()), CONTRADICTION))
         lost, reason = min(events, key=itemgetter(0), default=(None, ""))
         if lost is not None:
             radius[lost + 1 :] = np.nan
-        lower, upper = self.around(radius, z)
-        return Band(
-            radius, lower, upper, self.farthest(radius, run.states - z, z), lost, reason
-        )
+        error = self.farthest(radius, run.states - z, z)
+        return Band(radius, *self.around(radius, z), error, lost, reason)
+
+    def events(
+        self, flags: NDArray[np.integer[Any]], observer: Array, inputs: Array | None = None,
+        steps: ArrayLike | None = None, usual: float | None = None,
+    ) -> list[tuple[int, str]]:
+        """Samples after which the bound does not follow, and why: the first of each kind.
+
+        Parameters
+        ----------
+        flags : (T,) array
+            Values of the statuses.
+        observer : (T, n) array
+            z(0), ..., z(T-1).
+        inputs, steps, usual : optional
+            u (T, m), lengths of the steps (T,), and the one that is certified.
+        """
+        low, high = self.region.lower[self.region.n :], self.region.upper[self.region.n :]
+        where: list[tuple[Any, Callable[[int], str]]] = [
+            ((flags & flag.value) != 0, lambda _, text=text: text)  # type: ignore[misc]
+            for flag, text in (_EVENTS if self.projects else (*_EVENTS, _PROJECTED))
+        ]
+        where.append((~self.region.contains(observer), lambda t: (
+            f"the observer was outside of the region, at {np.round(observer[t], 6).tolist()}"
+        )))
+        if inputs is not None:
+            where.append((~((low <= inputs) & (inputs <= high)).all(axis=1), lambda t: (
+                f"the input {inputs[t].tolist()} is outside of what was certified"
+            )))
+        if steps is not None:
+            lengths = np.asarray(steps)
+            where.append((lengths != usual, lambda t: (
+                f"the step had the length {lengths[t]:.6g}, and {usual or 0.0:.6g} is certified"
+            )))
+        first = [(int(there.argmax()), text) for there, text in where if there.any()]
+        return [(t, text(t)) for t, text in first]
 
     def is_empty(self, radius: Array, observer: Array) -> NDArray[np.bool_]:
         """Whether no state of the region is in the set around z."""
@@ -474,41 +505,35 @@ class ObserverBound:
                 f"x and z stay in the region: proved from {start} on, for an initial error of at "
                 "most the limit"
             )
+        found = "not proved" if self.invariance is None else f"not proved: {self.invariance}"
         if self.invariance is not None and self.invariance.holds:
-            return "x stays in the region: proved; that z does is checked at each sample"
-        why = "" if self.invariance is None else f": {self.invariance}"
-        return f"x stays in the region: not proved{why}; that z does is checked at each sample"
+            found = "proved"
+        return f"x stays in the region: {found}; that z does is checked at each sample"
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows."""
         limit = self.limit()
-        length = self.farthest(limit, np.zeros(len(self.gain)))
         content: dict[str, Any] = json_ready({
             "evidence": self.evidence.value, "rate": self.rate, "metric": self.metric,
             "gain": self.gain, "sizes": self.sizes.to_dict(), "limit": limit,
             "condition": self.condition,
             "invariance": self.invariance and self.invariance.to_dict(),
-            "components": self.components(limit), "length": length,
+            "components": self.components(limit),
+            "length": self.farthest(limit, np.zeros(len(self.gain))),
         })
         return content
 
 
 def bound_observer(
     system: System, observer: Observer, cost: Cost, region: ConvexSet | Region | None = None, *,
-    inputs: Box | None = None, sizes: SignalBounds | Sizes | None = None,
+    inputs: Box | None = None, sizes: Sizes | None = None,
     seconds: float | Deadline = PART_SECONDS,
 ) -> ObserverBound:
-    """Certify the observer alone: the first part of `certify`, with the same arguments.
+    """Certify the observer alone: the first part of `certify`, with the same arguments and errors.
 
-    Raises
-    ------
-    CertificateError, NotCertifiedError
-        If the observer has no constant gain, or is not shown to contract; the text says what may
-        help.
-    SetError, ShapeError, OptionError, ModelError
-        If an argument does not fit.
+    A `CertificateError` or `NotCertifiedError` says why it has no bound.
     """
-    place, given = bounded_region(system, region, inputs), SignalBounds.of(sizes, system, cost)
+    place, given = bounded_region(system, region, inputs), Sizes.of(sizes, system, cost)
     deadline = Deadline.of(seconds)
     stability = certify_observer(
         system, observer, place, sizes=given.typical(system), seconds=deadline.part(_CONTRACTION)
@@ -524,15 +549,15 @@ def with_invariance(
     """The bound with what is found of whether state and observer stay in the region."""
     if system.disturbance_matrix is not None:
         return bound
-    deadline, w = Deadline.of(seconds), bound.sizes.disturbances
-    sizes: Any = np.abs(sides_of("disturbances", w)).max(axis=0) if isinstance(w, ConvexSet) else w
+    deadline, w = Deadline.of(seconds), bound.sizes.disturbance
+    size: Any = np.abs(sides_of("disturbances", w)).max(axis=0) if isinstance(w, ConvexSet) else w
     found = certify_invariance(
-        system, bound.region, disturbance=sizes, seconds=deadline.part(_INVARIANCE)
+        system, bound.region, disturbance=size, seconds=deadline.part(_INVARIANCE)
     )
     kept: Invariance | None = None
     region = inner_region(bound.region, bound.metric, bound.limit())
     if region is not None:
-        kept = certify_invariance(system, region, disturbance=sizes, seconds=deadline)
+        kept = certify_invariance(system, region, disturbance=size, seconds=deadline)
     return replace(bound, invariance=found, inner=kept if kept is not None and kept.holds else None)
 
 
@@ -540,11 +565,15 @@ def largest_ratio(metric: Array, other: Array) -> float:
     """A number c with |e|_P <= c |e|_M for all e, P the first and M the other metric."""
     from scipy.linalg import eigh
 
+    units = 1.0 / np.sqrt(other.diagonal())
+    metric, other = np.outer(units, units) * metric, np.outer(units, units) * other
     top = float(eigh(metric, other, eigvals_only=True)[-1])
     for slack in _SLACKS:
         found = top * (1.0 + slack)
         scaled = metric[None] / found
-        rest = Matrices.exact(other[None]) - Matrices(scaled, 2.0 * _UNIT * np.abs(scaled))
+        rest = Matrices(other[None], 4.0 * UNIT * np.abs(other[None])) - Matrices(
+            scaled, 6.0 * UNIT * np.abs(scaled)
+        )
         if found > 0.0 and definite(rest)[0].all():
             return math.sqrt(found) * OUTWARD
     return math.inf

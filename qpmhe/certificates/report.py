@@ -15,31 +15,24 @@ from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
-from ..models.example import Example
 from ..models.scenario import Record, Scenario
 from ..observers import Observer
 from ..plots.bounds import error_and_bounds
 from ..plots.style import save
-from .certificate import Certificate, Kind, examined, horizons_of
+from .certificate import KINDS, Certificate, examined, horizons_of
 from .contraction import certify_observer, synthesise_gain
 from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import CertificateError, NotCertifiedError
 from .lyapunov import Design
-from .monitor import MonitorSummary, monitored_run
+from .monitor import Monitor, monitored_run
 from .observer_bound import Band, ObserverBound
 from .properties import ObserverStability
 from .regions import Region, bounded_region
 from .sdp import started
-from .signal_bounds import SignalBounds
+from .sizes import Sizes
 
 #: Names of the kinds of bounds in figures and tables.
-LABELS = {
-    "observer": "set around the observer",
-    "paper": "theorem, paper's constants",
-    "summed": "beyond: sums kept",
-    "weighted": "beyond: norms kept",
-    "measured": "beyond: measured costs",
-}
+LABELS = {"observer": "set around the observer", "paper": "theorem, paper's constants"}
 
 # Without a region: the simulated states, with this share of their extent on each side.
 _ROOM = 0.75
@@ -56,14 +49,15 @@ class Report:
 
     Parameters
     ----------
-    name, example, record
-        The model's name, the model, and its simulated record.
+    name : str
+        The model's.
+    scenario, record : Scenario and Record, or None
+        How the model is simulated, if that is known, and a simulated record.
     certificate : Certificate
         What could be certified, with the reasons where something could not; perhaps nothing.
-    run, band, summary, estimator : Run, Band, MonitorSummary and MovingHorizonEstimator, or None
+    run, band, monitor : Run, Band and Monitor, or None
         Where something bounds the error: the estimator's run on the record, with the largest
-        horizon and two QPs a sample, the observer's bound along it, what the monitor saw, and the
-        estimator after it.
+        horizon and two QPs a sample, the observer's bound along it, and what the monitor saw.
     replaced : str
         Which observer took the place of the model's own, and why; empty if none did.
     design : Design or None
@@ -71,20 +65,14 @@ class Report:
     """
 
     name: str
-    example: Example
-    record: Record
+    scenario: Scenario | None
+    record: Record | None
     certificate: Certificate
     run: Run | None = None
     band: Band | None = None
-    summary: MonitorSummary | None = None
-    estimator: MovingHorizonEstimator | None = None
-    design: Design | None = None
+    monitor: Monitor | None = None
     replaced: str = ""
-
-    @property
-    def region(self) -> Region:
-        """Where all of it holds."""
-        return self.certificate.region
+    design: Design | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows; rates that are not known are None."""
@@ -95,8 +83,8 @@ class Report:
         ]
         return certificate.to_dict() | {
             "model": self.name, "certified": certificate.holds, "replaced": self.replaced,
-            "monitor": self.summary and str(self.summary),
-            "monitored": self.summary and self.summary.to_dict(),
+            "monitor": self.monitor and self.monitor.summary(),
+            "monitored": self.monitor and self.monitor.to_dict(),
             "design": self.design and self.design.to_dict(),
             "suggestions": list(dict.fromkeys(suggestions)),
             "smallest_rates": {
@@ -108,31 +96,33 @@ class Report:
     def draw(self, axes: Any = None) -> Any:
         """Draw the error of the run and its bounds into axes; see `error_and_bounds`.
 
-        Without a certificate there is no run: an `InvalidInputError` is raised.
+        Without a run there is nothing to draw: an `InvalidInputError` is raised.
         """
-        certificate, run = self.certificate, self.run
-        if run is None or self.estimator is None:
-            raise InvalidInputError("there is no certificate, hence no bound to draw.")
-        system, scenario, record = self.example.system, self.example.scenario, self.record
-        steps = len(record.measurements)
+        certificate, run, record, scenario = self.certificate, self.run, self.record, self.scenario
+        if run is None or record is None or scenario is None:
+            raise InvalidInputError(
+                "there is no certificate or no scenario to simulate, hence no run and no bound to "
+                "draw."
+            )
+        system, steps = certificate.system, len(record.measurements)
         u = np.zeros((steps, 0)) if record.inputs is None else record.inputs
         w = record.states[1:] - system.f.batch(record.states[:-1], u)
         v = record.measurements - system.h.batch(record.states[:-1], u)
-        kinds: list[Kind] = list(certificate.kinds)
-        if certificate.observer_bound is not None:
-            kinds.insert(0, "observer")
         start = record.states[0] - run.observer_states[0]
+        has = {"observer": certificate.observer_bound, "paper": certificate.constants}
+        horizon = max(certificate.constants, default=None)
         bounds = {
             LABELS[kind]: certificate.bound(
-                run, w, v, initial_error=start, kind=kind, source=self.estimator
+                run, w, v, initial_error=start, kind=kind,
+                horizon=horizon if kind == "paper" else None,
             )
-            for kind in kinds
+            for kind in KINDS if has[kind]
         }
         return error_and_bounds(
             scenario.dt * np.arange(steps + 1.0),
             np.linalg.norm(record.states - run.states, axis=1), bounds,
             diameter=certificate.diameter, time_label=f"time t ({scenario.time_unit})",
-            error_label=f"error, N = {self.estimator.horizon}, {_QPS} QPs a sample", axes=axes,
+            error_label=f"error, {_QPS} QPs a sample", axes=axes,
         )
 
     def save(self, path: str | Path) -> list[Path]:
@@ -154,9 +144,10 @@ class Report:
 
 
 def certify_model(
-    example: Example, *, horizon: int | list[int] | None = None,
-    region: ConvexSet | Region | None = None, inputs: Box | None = None, seed: int = 0,
-    seconds: float | Deadline = DEFAULT_SECONDS, name: str = "",
+    system: System, observer: Observer, cost: Cost, scenario: Scenario | None = None, *,
+    horizon: int | list[int] | None = None, region: ConvexSet | Region | None = None,
+    inputs: Box | None = None, seed: int = 0, seconds: float | Deadline = DEFAULT_SECONDS,
+    name: str = "",
 ) -> Report:
     """Certify a model as far as possible, and monitor its estimator on a simulated record.
 
@@ -165,9 +156,12 @@ def certify_model(
 
     Parameters
     ----------
-    example : Example
-        System, observer, cost and scenario, as `qpmhe.models` returns them. Bounds are judged
-        for three standard deviations of the scenario's noises.
+    system, observer, cost
+        What the estimator is made of.
+    scenario : Scenario, optional
+        How it is simulated, as `qpmhe.models` return it: ``certify_model(*batch_reactor())``.
+        Bounds are judged for three standard deviations of its noises; without it, of the cost's
+        inverse weights, and no record is simulated.
     horizon : int or list of int, optional
         N, or several of them; the scenario's if left out.
     region : Box, Polytope or Region, optional
@@ -184,65 +178,65 @@ def certify_model(
 
     Raises
     ------
-    SetError, ModelError
-        If an argument does not fit, or the model raises in the region.
+    SetError, OptionError, ModelError
+        If an argument does not fit or is missing, or the model raises in the region.
     """
     deadline = started(seconds)
-    system, observer, cost, scenario = example
-    record = scenario.simulate(seed)
+    record = None if scenario is None else scenario.simulate(seed)
+    if horizon is None:
+        if scenario is None:
+            raise OptionError("horizon is missing, and there is no scenario that has one; give N.")
+        horizon = scenario.horizon
     place = region_of(system, scenario, region, inputs, record=record)
-    horizons = horizons_of(scenario.horizon if horizon is None else horizon)
-    sizes = sizes_of(system, cost, scenario)
+    horizons, sizes = horizons_of(horizon), sizes_of(system, cost, scenario)
     observer, stability, replaced = _proved_observer(
         system, observer, place, sizes, deadline.part(_OBSERVER)
     )
     certificate = examined(
         system, observer, cost, place, horizons, sizes, deadline, stability=stability
     )
-    report = Report(
-        name or scenario.title, example._replace(observer=observer), record, certificate,
-        replaced=replaced,
-    )
-    if certificate.holds:
-        report.estimator = MovingHorizonEstimator(
+    title = "" if scenario is None else scenario.title
+    report = Report(name or title, scenario, record, certificate, replaced=replaced)
+    if certificate.holds and scenario is not None and record is not None:
+        mhe = MovingHorizonEstimator(
             system, observer, cost, horizon=horizons[-1],
             initial_state=scenario.initial_estimate, max_qps=_QPS, engine="python",
         )
-        report.run, report.summary = monitored_run(
-            certificate, report.estimator, record.measurements, record.inputs,
-            initial_error=initial_error(scenario),
+        start = initial_error(scenario)
+        report.run, report.monitor = monitored_run(
+            certificate, mhe, record.measurements, record.inputs, initial_error=start
         )
         if certificate.observer_bound is not None:
-            report.band = certificate.observer_bound.along(
-                report.run, initial_error=initial_error(scenario)
-            )
+            report.band = certificate.observer_bound.along(report.run, initial_error=start)
     return report
 
 
 def _proved_observer(
-    system: System, observer: Observer, region: Region, sizes: SignalBounds, deadline: Deadline
+    system: System, observer: Observer, region: Region, sizes: Sizes, deadline: Deadline
 ) -> tuple[Observer, ObserverStability | None, str]:
     """The observer or, where its bound says nothing, one with a gain made for the region; why."""
     widths, own = (region.upper - region.lower)[: system.n], None
+
+    def limits(stability: ObserverStability) -> tuple[Any, bool]:
+        proved = ObserverBound(stability, region, sizes)
+        limit = proved.components(proved.limit())
+        return limit, bool((limit < widths)[widths > 0.0].all())
+
     try:
         own = certify_observer(
             system, observer, region, sizes=sizes.typical(system), seconds=deadline.part(0.5)
         )
-        proved = ObserverBound(own, region, sizes)
-        limit = proved.components(proved.limit())
-        if (limit < widths)[widths > 0.0].all():
+        limit, says = limits(own)
+        if says:
             return observer, own, ""
         why = f"its bound, {np.round(limit, 3).tolist()}, says nothing of every state"
     except (NotCertifiedError, CertificateError) as error:
         why = str(error.args[0]).split(". ")[0].split(" What may help")[0]
     try:
-        made = synthesise_gain(
-            system, region, sizes=sizes.typical(system), seconds=deadline
-        )
+        made = synthesise_gain(system, region, sizes=sizes.typical(system), seconds=deadline)
     except (NotCertifiedError, CertificateError):
         return observer, own, ""
-    proved = ObserverBound(made.stability, region, sizes)
-    if not (proved.components(proved.limit()) < widths)[widths > 0.0].all() and own is not None:
+    if own is not None and not limits(made.stability)[1]:
         return observer, own, ""
     return made.observer, made.stability, (
         f"Luenberger({made.observer.gain.tolist()}), made for the region in place of the model's "
@@ -290,9 +284,10 @@ def region_of(
             f"{option} is missing, and the model has neither a bounded set of states nor a "
             "scenario to simulate; give the set in which the states stay."
         )
-    low, high = record.states.min(axis=0), record.states.max(axis=0)
     start = scenario.initial_estimate
-    low, high = np.minimum(low, start), np.maximum(high, start)
+    low, high = np.minimum(record.states.min(axis=0), start), np.maximum(
+        record.states.max(axis=0), start
+    )
     width = np.where(high > low, high - low, np.abs(high))
     room = _ROOM * np.where(width > 0.0, width, 1.0)
     around = Box(low - room, high + room)
@@ -301,11 +296,11 @@ def region_of(
     )
 
 
-def sizes_of(system: System, cost: Cost, scenario: Scenario | None) -> SignalBounds:
+def sizes_of(system: System, cost: Cost, scenario: Scenario | None) -> Sizes:
     """The system's W and V, or three standard deviations of the scenario's noises."""
     if scenario is None:
-        return SignalBounds.of(None, system, cost)
-    return SignalBounds.usual(
+        return Sizes.of(None, system, cost)
+    return Sizes.usual(
         system, scenario.disturbance_covariance, scenario.noise_covariance, "the model's scenario"
     )
 

@@ -17,22 +17,6 @@ from ..errors import OptionError, ShapeError
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Largest |w| and |v| for which bounds are made tight, and called vacuous or not.
-
-    An `OptionError` is raised if one is negative or not finite, or both are zero.
-    """
-
-    disturbance: float = 1.0
-    noise: float = 1.0
-
-    def __post_init__(self) -> None:
-        w = checked_length("disturbance", self.disturbance)
-        if not (checked_length("noise", self.noise) or w):
-            raise OptionError("disturbance and noise are both 0; expected one of them above 0.")
-
-
-@dataclass(frozen=True)
 class DecayingSums:
     r"""The four constants of a bound with decaying sums.
 
@@ -141,7 +125,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class TheoremConstants:
-    """All constants of the theorem for one horizon, with the paper's symbols.
+    r"""All constants of the theorem for one horizon, with the paper's symbols.
 
     Triples are in the order initial error, disturbance, noise: p, w, v and 1, 2, 3 in the paper.
 
@@ -159,11 +143,16 @@ class TheoremConstants:
         L_h, in units of the output per unit of the state.
     horizon : int
         N >= 1.
+    model_lipschitz : float, optional
+        L_f, for an observer that is projected onto X in the metric in which it contracts. Its
+        corrections have no kappa; :math:`(\rho + L_f + 1 / C_w) / \bar L` takes its place.
 
     Attributes
     ----------
-    L_bar, c_bar : float
-        max(L_h, 1 / C_v), before (eq:proof_2), and (3 L_bar)^a (c_w kappa^a + c_v), (eq:proof_rho).
+    L_bar, kappa_bar : float
+        max(L_h, 1 / C_v), before (eq:proof_2), and kappa or what takes its place.
+    c_bar : float
+        (3 L_bar)^a (c_w kappa_bar^a + c_v), (eq:proof_rho).
     rho_bar_1, rho_bar_2 : float
         The sums of rho^(-a k) over k = 1, ..., N, (eq:proof_rho4), and from 0 on, (eq:proof_rho5).
     C_bar : (float, float, float)
@@ -197,7 +186,9 @@ class TheoremConstants:
     kappa: float = field(kw_only=True)
     lipschitz: float = field(kw_only=True)
     horizon: int = field(kw_only=True)
+    model_lipschitz: float | None = field(default=None, kw_only=True)
     L_bar: float = field(init=False)
+    kappa_bar: float = field(init=False)
     c_bar: float = field(init=False)
     rho_bar_1: float = field(init=False)
     rho_bar_2: float = field(init=False)
@@ -215,8 +206,11 @@ class TheoremConstants:
         eta, (c_p, c_w, c_v) = self.detectability.rate, self.detectability.constants
         rho, (C_p, C_w, C_v) = self.observer.rate, self.observer.constants
         L_bar = max(self.lipschitz, 1.0 / C_v)
+        kappa_bar = self.kappa
+        if self.model_lipschitz is not None:
+            kappa_bar = (rho + self.model_lipschitz + 1.0 / C_w) / L_bar
         c_bar = _power(3.0 * L_bar, a) * (
-            cost.disturbance[1] * _power(self.kappa, a) + cost.noise[1]
+            cost.disturbance[1] * _power(kappa_bar, a) + cost.noise[1]
         )
         rho_bar_2 = _geometric(-a * math.log(rho), N)
         rho_bar_1 = rho_bar_2 * _power(rho, -a)
@@ -242,9 +236,9 @@ class TheoremConstants:
         )
         C = tuple(map(max, C_prime, C_double_prime))
         vars(self).update(
-            L_bar=L_bar, c_bar=c_bar, rho_bar_1=rho_bar_1, rho_bar_2=rho_bar_2, C_bar=C_bar,
-            eta_bar=eta_bar, lam=lam, C_prime=C_prime, C_double_prime=C_double_prime, C=C,
-            result=DecayingSums(lam, *C),
+            L_bar=L_bar, kappa_bar=kappa_bar, c_bar=c_bar, rho_bar_1=rho_bar_1,
+            rho_bar_2=rho_bar_2, C_bar=C_bar, eta_bar=eta_bar, lam=lam, C_prime=C_prime,
+            C_double_prime=C_double_prime, C=C, result=DecayingSums(lam, *C),
         )
 
     def _check(self) -> None:
@@ -264,6 +258,19 @@ class TheoremConstants:
                 "the observer's C_v is 0, which makes L_bar = max(L_h, 1/C_v) infinite; pass a "
                 "larger one, which holds as well, such as 1 / L_h."
             )
+        if self.model_lipschitz is not None:
+            checked_length("model_lipschitz", self.model_lipschitz)
+            positive("the observer's C_w", self.observer.disturbance)
+
+    def to_dict(self, sizes: tuple[float, float]) -> dict[str, Any]:
+        """The constants, and the limit for the largest |w| and |v|, in types that JSON knows."""
+        names = (
+            "horizon", "L_bar", "kappa_bar", "c_bar", "eta_bar", "rho_bar_1", "rho_bar_2", "C_bar",
+            "C_prime", "C_double_prime", "C",
+        )
+        return {name: getattr(self, name) for name in names} | {
+            "lambda": self.lam, "limit": self.result.limit(*sizes),
+        }
 
 
 def _geometric(slope: float, count: int) -> float:

@@ -132,7 +132,7 @@ def certify(
 
     certified = run(
         Console(), model, box, horizon, report, input_box=input_box, seed=seed, seconds=seconds,
-        details=details, design=design,
+        details=details, with_design=design,
     )
     if not certified:
         raise typer.Exit(1)

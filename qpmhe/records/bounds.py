@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array
+from ..certificates.monitor import Monitor
 from ..certificates.observer_bound import ObserverBound, bound_observer
-from ..certificates.observer_monitor import ObserverMonitor
 from ..certificates.report import initial_error, region_of, sizes_of
-from ..certificates.signal_bounds import SignalBounds, Size
+from ..certificates.sizes import Size, Sizes
 from ..errors import OptionError
 from ..estimation.estimate import Estimate
 from ..model.sets import Box
@@ -68,9 +68,9 @@ class RowBounds:
             system, scenario, options.box, options.input_box, option="--bound-box"
         )
         usual = sizes_of(system, mhe.cost, scenario)
-        sizes = SignalBounds(
-            _size("--max-disturbance", options.max_disturbance, n, usual.disturbances),
-            _size("--max-noise", options.max_noise, p, usual.noises),
+        sizes = Sizes(
+            _size("--max-disturbance", options.max_disturbance, n, usual.disturbance),
+            _size("--max-noise", options.max_noise, p, usual.noise),
             usual.source if options.max_disturbance is None and options.max_noise is None
             else "as stated",
         )
@@ -85,7 +85,7 @@ class RowBounds:
         self.proved: ObserverBound = bound_observer(
             system, mhe.observer, mhe.cost, region, sizes=sizes, seconds=_SECONDS
         )
-        self._watch = ObserverMonitor(self.proved, mhe, initial_error=start, sizes=sizes)
+        self._watch = Monitor(self.proved, mhe, initial_error=start, sizes=sizes)
         self._report, self._estimator = report, mhe
         self._fields = np.empty(2 * n + 1)
 

@@ -41,7 +41,7 @@ def load_record_model(text: str, engine_at_work: str | None = None, **options: A
     """
     source = find(text)
     name = source.name
-    parts, given = _parts(name, build(source))
+    parts, given = model_parts(name, build(source))
     scenario = given.pop("scenario", None)
     signals = {kind: given.pop(kind, None) for kind in _SIZES}
     dt, unit = given.pop("dt", None), str(given.pop("time_unit", "s"))
@@ -83,11 +83,11 @@ def load_record_model(text: str, engine_at_work: str | None = None, **options: A
 
 def load_system(source: ModelSource) -> System:
     """The system of a model alone."""
-    system: System = _parts(source.name, build(source))[0][0]
+    system: System = model_parts(source.name, build(source))[0][0]
     return system
 
 
-def _parts(name: str, made: Any) -> tuple[tuple[Any, ...], dict[str, Any]]:
+def model_parts(name: str, made: Any) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """System, observer and cost, and the model's own options."""
     if isinstance(made, MovingHorizonEstimator):
         options = {**vars(made.settings), "initial_state": made.initial_state}

@@ -6,7 +6,7 @@ import pytest
 import qpmhe
 from qpmhe.certificates.certificate import certify
 from qpmhe.certificates.contraction import certify_detectability, certify_observer
-from qpmhe.certificates.theorem import Sizes
+from qpmhe.certificates.sizes import Sizes
 
 REACTOR_BOX = ([0.1, -1.0], [9.0, 9.0])
 

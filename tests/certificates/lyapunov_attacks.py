@@ -57,7 +57,7 @@ def attack(plan, gain, *, trials, steps=25, seed=0):
         )
         w, v = (
             bounded(rng, NOISES[rng.choice(kinds)](rng, steps, width), size)
-            for width, size in ((system.n, plan.sizes.disturbances), (system.p, plan.sizes.noises))
+            for width, size in ((system.n, plan.sizes.disturbance), (system.p, plan.sizes.noise))
         )
         mhe = qpmhe.MovingHorizonEstimator(
             system, qpmhe.Luenberger(gain), plan.cost(), horizon=N, initial_state=guess,
@@ -68,7 +68,7 @@ def attack(plan, gain, *, trials, steps=25, seed=0):
         for t in range(steps):
             if pushing:
                 gap = mhe.state - x[-1]
-                w[t] = -plan.sizes.disturbances * gap / max(float(np.linalg.norm(gap)), 1e-300)
+                w[t] = -plan.sizes.disturbance * gap / max(float(np.linalg.norm(gap)), 1e-300)
             ahead = np.asarray(system.f(x[-1], nothing))
             estimates.append(mhe.update(system.h(x[-1], nothing) + v[t]))
             x.append(ahead + w[t])

@@ -14,7 +14,6 @@ from qpmhe.certificates import (
     MismatchError,
     NotCertifiedError,
     OutOfTimeError,
-    SignalBounds,
     Sizes,
     design,
 )
@@ -170,7 +169,7 @@ def test_sizes_of_components_and_of_the_system():
     w = np.array([[0.1, 0.01], [0.1, -0.01]])
     costs = np.einsum("ti,ij,tj->t", w, plan.disturbance, w) + 0.01 * plan.noise[0, 0]
     assert costs.max() == pytest.approx(1.0)
-    boxes = SignalBounds(system.disturbances, system.noises)
+    boxes = Sizes(system.disturbances, system.noises)
     assert np.array_equal(design(system, sizes=boxes).prior, plan.prior)
 
 
@@ -265,7 +264,7 @@ def test_the_command_prints_the_code_and_reports_it(tmp_path):
     # At 70 columns: what is to be pasted must not be broken.
     console = Console(file=io.StringIO(), width=70)
     report = tmp_path / "certificate.json"
-    certify(console, "batch_reactor", "0.1:9,-1:9", "20", report, design=True)
+    certify(console, "batch_reactor", "0.1:9,-1:9", "20", report, with_design=True)
     printed = console.file.getvalue()
     system, observer, _, scenario = qpmhe.models.batch_reactor()
     names = {

@@ -9,10 +9,9 @@ import pytest
 import qpmhe
 from qpmhe.certificates import (
     ObserverBound,
-    SignalBounds,
+    Sizes,
     certify,
     certify_observer,
-    design,
     observer_bound,
 )
 from qpmhe.certificates import certificate as certification
@@ -28,7 +27,7 @@ def bound_of(system, gain, region, disturbances, noises, metric=None):
     """The certified bound of a Luenberger observer, its gain found where none is given."""
     place = bounded_region(system, region)
     stability = certify_observer(system, qpmhe.Luenberger(gain, metric), place)
-    return ObserverBound(stability, place, SignalBounds(disturbances, noises), metric)
+    return ObserverBound(stability, place, Sizes(disturbances, noises), metric)
 
 
 @cache
@@ -92,7 +91,7 @@ def test_no_adversary_exceeds_the_bound(made, runs, capsys):
     x, z = (rng.choice([0.0, 0.1, 0.5, 0.9, 1.0], (runs, n)) * (high - low) + low for _ in "xz")
     x[::7] = z[::7]  # some begin without an error: the noise alone
     pairs = list(itertools.product(
-        candidates(bound.sizes.disturbances, n, rng), candidates(bound.sizes.noises, p, rng)
+        candidates(bound.sizes.disturbance, n, rng), candidates(bound.sizes.noise, p, rng)
     ))
     u, alive = np.zeros((runs, 0)), np.ones(runs, bool)
     b = np.array([bound.initial(e) for e in x - z])
@@ -144,9 +143,9 @@ def test_no_adversary_exceeds_the_bound(made, runs, capsys):
 # Sizes
 
 
-def scalar(disturbances=0.1, noises=0.2):
+def scalar(disturbance=0.1, noise=0.2, side=9.0):
     system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1)
-    return bound_of(system, [[0.3]], qpmhe.Box([-9.0], [9.0]), disturbances, noises)
+    return bound_of(system, [[0.3]], qpmhe.Box([-side], [side]), disturbance, noise)
 
 
 def test_a_scalar_system_has_the_bound_that_one_computes_by_hand():
@@ -155,8 +154,9 @@ def test_a_scalar_system_has_the_bound_that_one_computes_by_hand():
     assert float(bound.entering().length) == pytest.approx(scale * (0.1 + 0.3 * 0.2))
     # The worst that w and v can do is 0.16 / (1 - 0.5).
     assert 0.32 <= bound.components(bound.limit())[0] <= 1.1 * 0.32
-    assert 2.0 * 0.5 + 0.16 <= bound.components(bound.at(1, 2.0))[0] <= 2.0 * bound.rate + 0.1601
-    assert bound.components(bound.at(0, [-2.0]))[0] == pytest.approx(2.0)
+    reached = bound.components(bound.radii(1, 2.0)[1])[0]
+    assert 2.0 * 0.5 + 0.16 <= reached <= 2.0 * bound.rate + 0.1601
+    assert bound.components(bound.radii(0, [-2.0])[0])[0] == pytest.approx(2.0)
     # With one sign of each, the worst of both is no sum of the worst.
     box = scalar(qpmhe.Box([0.0], [0.1]), qpmhe.Box([0.0], [0.2]))
     scale = float(np.sqrt(box.metric[0, 0]))
@@ -208,9 +208,9 @@ def test_boxes_with_too_many_corners_are_bounded_by_their_sides():
 def test_the_systems_own_sets_come_first_and_are_named():
     sets = {"disturbances": qpmhe.Box([-0.1], [0.2]), "noises": qpmhe.Box([-np.inf], [np.inf])}
     system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1, **sets)
-    found = SignalBounds.usual(system, np.eye(1), 4.0 * np.eye(1), "the data")
-    assert found.disturbances is sets["disturbances"]
-    assert found.noises.upper == pytest.approx([6.0])
+    found = Sizes.usual(system, np.eye(1), 4.0 * np.eye(1), "the data")
+    assert found.disturbance is sets["disturbances"]
+    assert found.noise.upper == pytest.approx([6.0])
     assert str(found) == (
         "w in [-0.1, 0.2], |v| <= 6 (the system's W and three standard deviations of the data)"
     )
@@ -254,7 +254,7 @@ def random_bound(rng, n, units=1.0):
     Stability.P = P
     whole = qpmhe.Box(-1e9 * np.ones(n), 1e9 * np.ones(n))
     system = qpmhe.System(lambda x: x, lambda x: x[..., :1], n=n, p=1)
-    return ObserverBound(Stability(), bounded_region(system, whole), SignalBounds(1.0, 1.0))
+    return ObserverBound(Stability(), bounded_region(system, whole), Sizes(1.0, 1.0))
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
@@ -322,7 +322,7 @@ def test_a_cost_without_constants_leaves_the_observers_bound():
     cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0, discount=0.9)
     certificate = certify(system, qpmhe.Luenberger([[0.3]]), cost, horizon=3)
     assert certificate.holds
-    assert certificate.horizons == ()
+    assert not certificate.constants
     assert list(certificate.errors) == ["the theorem"]
     assert not certificate.vacuous()
     assert 7.8 <= certificate.limit() <= 1.05 * 7.8
@@ -342,29 +342,26 @@ def test_an_undetectable_part_leaves_nothing_to_bound():
         certify(system, qpmhe.Luenberger([[0.1], [0.0]]), cost, horizon=3)
 
 
-def test_without_a_run_it_is_the_bound_of_the_observers_error():
-    system = qpmhe.System(
-        lambda x: 0.8 * x, lambda x: x, n=1, p=1, states=qpmhe.Box([-90.0], [90.0])
-    )
-    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
-    certificate = certify(system, qpmhe.Luenberger([[0.3]]), cost, horizon=3)
+def test_a_record_of_the_worst_comes_near_the_bound():
+    bound = scalar(0.1, 0.2, 90.0)
     w, v = np.full((40, 1), 0.1), np.full((40, 1), -0.2)
-    found = certificate.bound(None, w, v, initial_error=[2.0])
+    found = bound.components(bound.radii(40, [2.0], w, v))[:, 0]
     true = 2.0 * 0.5 ** np.arange(41) + 0.16 * np.array(
         [sum(0.5**k for k in range(t)) for t in range(41)]
     )
     assert (true <= found).all()
     assert found[0] == pytest.approx(2.0)
     assert found[-1] <= 1.5 * true[-1]
-    funnel = certificate.funnel(0.1, 0.2, initial_error=2.0, steps=400)
-    assert (found <= funnel[:41] * (1.0 + 1e-9)).all()
-    assert certificate.limit(0.1, 0.2) == pytest.approx(funnel[-1])
-    with pytest.raises(ShapeError, match="no run"):
-        certificate.bound(None, initial_error=1.0)
-    proved = certificate.observer_bound
-    wide = proved.settling_samples
-    whole = proved.radii(wide, qpmhe.Box([-180.0], [180.0]), proved.entering())
-    assert whole[wide] <= 1.1 * proved.limit() < whole[wide - 1]
+    always = bound.components(bound.radii(400, 2.0))[:, 0]
+    assert (found <= always[:41] * (1.0 + 1e-9)).all()
+    assert bound.components(bound.limit())[0] == pytest.approx(always[-1])
+    wide = bound.settling_samples
+    whole = bound.radii(wide, qpmhe.Box([-180.0], [180.0]))
+    assert whole[wide] <= 1.1 * bound.limit() < whole[wide - 1]
+    with pytest.raises(ShapeError, match="40 samples; expected 39"):
+        bound.radii(39, 2.0, w, v)
+    with pytest.raises(OptionError, match="of single samples"):
+        bound.limit(w, v)
 
 
 # What the headline rests on
@@ -375,7 +372,7 @@ def scalar_certificate(slope, region=1.0, w=0.01):
     cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
     return certify(
         system, qpmhe.Luenberger([[max(slope - 0.5, 0.1)]]), cost, horizon=3,
-        region=qpmhe.Box([-region], [region]), sizes=SignalBounds(qpmhe.Box([-w], [w]), 0.01),
+        region=qpmhe.Box([-region], [region]), sizes=Sizes(qpmhe.Box([-w], [w]), 0.01),
     )
 
 
@@ -416,7 +413,7 @@ def test_time_up_leaves_what_was_reached(monkeypatch):
     certificate = scalar_certificate(0.8)
     assert certificate.observer_bound.evidence is Evidence.PROVED
     assert isinstance(certificate.errors["detectability"], OutOfTimeError)
-    assert certificate.horizons == ()
+    assert not certificate.constants
     assert "Not certified: detectability: the time for this search" in certificate.summary()
     monkeypatch.setattr(observer_bound, "certify_observer", late)
     with pytest.raises(OutOfTimeError, match="more seconds"):
@@ -431,25 +428,6 @@ def test_time_up_names_no_time_that_nobody_gave():
             system, qpmhe.Luenberger([[0.1]]), ONES, horizon=4,
             region=region, seconds=1e-9,
         )
-
-
-def test_sizes_and_kinds_that_are_none_are_named():
-    system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1)
-    region = qpmhe.Box([-1.0], [1.0])
-    cost, observer = ONES, qpmhe.Luenberger([[0.1]])
-    with pytest.raises(OptionError, match=r"sizes is \(0.1, 0.1\); expected Sizes\("):
-        certify(system, observer, cost, horizon=4, region=region, sizes=(0.1, 0.1))
-    with pytest.raises(OptionError, match=r"sizes is \(0.1, 0.1\); expected Sizes\("):
-        design(system, region, sizes=(0.1, 0.1))
-    certificate = scalar_certificate(0.8)
-    for asked in (
-        lambda: certificate.bound(None, [0.1], [0.1], initial_error=0.1, kind="own"),
-        lambda: certificate.limit(kind="own"),
-    ):
-        with pytest.raises(OptionError, match="kind is 'own'; expected one of 'observer', 'paper'"):
-            asked()
-    with pytest.raises(OptionError, match=r"initial_error is -0\.1;"):
-        certificate.observer_bound.initial(-0.1)
 
 
 def test_what_may_help_is_a_sentence_of_its_own():

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from qpmhe.certificates.theorem import DecayingSums, Sizes, TheoremConstants, decaying_sums
+from qpmhe.certificates.theorem import DecayingSums, TheoremConstants, decaying_sums
 from qpmhe.costs import CostConstants
 from qpmhe.errors import OptionError, ShapeError
 
@@ -14,10 +14,9 @@ OBSERVER = DecayingSums(0.8, 1.5, 1.7, 0.3)
 COST = CostConstants(2.0, (1.0, 2.0), (50.0, 100.0), (20.0, 25.0))
 
 
-def made(detectability=DETECTABILITY, observer=OBSERVER, cost=COST, kappa=0.2, lipschitz=1.4,
-         horizon=10):
+def made(detectability=DETECTABILITY, observer=OBSERVER, cost=COST, **options):
     return TheoremConstants(
-        detectability, observer, cost, kappa=kappa, lipschitz=lipschitz, horizon=horizon
+        detectability, observer, cost, **{"kappa": 0.2, "lipschitz": 1.4, "horizon": 10} | options
     )
 
 
@@ -109,6 +108,10 @@ def test_special_cases():
     still = made(kappa=0.0, lipschitz=0.0)
     assert still.c_bar == pytest.approx(9.0 / 0.09 * 25.0)
     assert np.isfinite(still.C).all()
+    # A projected observer: (rho + L_f + 1 / C_w) / L_bar in place of kappa.
+    bent = made(model_lipschitz=1.1)
+    assert bent.kappa_bar == pytest.approx((0.8 + 1.1 + 1.0 / 1.7) / (1.0 / 0.3))
+    assert pytest.approx(bent.C) == made(kappa=bent.kappa_bar).C
     # A horizon beyond the numbers.
     far = made(observer=DecayingSums(0.1, 1.0, 1.0, 1.0), horizon=2000)
     assert (math.inf,) * 3 == far.C
@@ -133,9 +136,8 @@ def test_special_cases():
         (half, {"initial": "1"}, "initial"),
         (half, {"disturbance": -1.0}, "disturbance"),
         (half, {"noise": math.nan}, "noise"),
-        (Sizes, {"disturbance": 0.0, "noise": 0.0}, "disturbance and noise are both 0"),
-        (Sizes, {"disturbance": -1.0}, "disturbance"),
-        (Sizes, {"noise": math.inf}, "noise"),
+        (made, {"model_lipschitz": -1.0}, "model_lipschitz"),
+        (made, {"model_lipschitz": 1.0, "observer": DecayingSums(0.5, 1.0, 0.0, 1.0)}, "C_w"),
     ],
 )
 def test_bad_constants_are_named(make, arguments, words):

@@ -6,7 +6,8 @@ from scipy.optimize import minimize
 
 import qpmhe
 from qpmhe import Status
-from qpmhe.certificates import CertificateError, audit
+from qpmhe.certificates import CertificateError
+from qpmhe.certificates.audit import checked_ingredients
 from qpmhe.errors import (
     InvalidInputError,
     ModelError,
@@ -401,7 +402,7 @@ def test_what_cannot_take_it_refuses_it_by_name():
         )
         observer = qpmhe.Luenberger(0.5 * np.eye(2))
         with pytest.raises(CertificateError, match="disturbance_matrix"):
-            audit(one, observer, price, qpmhe.Box([-1.0, -1.0], [1.0, 1.0]))
+            checked_ingredients(one, observer, price)
 
 
 # Bad input

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import qpmhe
-import qpmhe.certificates
 from qpmhe import Status
+from qpmhe.certificates.audit import checked_ingredients
 from qpmhe.errors import ModelError, SetError, ShapeError
 from qpmhe.estimation.subproblem import Subproblem
 
@@ -428,9 +428,8 @@ def test_what_does_not_have_them_says_so_by_name(options, words):
     system = qpmhe.System(f, h, n=2, p=2, **options)
     system.symbolic = object()  # as if it had a CasADi form
     assert words in uncovered(system, observer, COST, Settings(N, "auto", 1))
-    region = qpmhe.Box([-1.0, -1.0], [1.0, 1.0])
     with pytest.raises(qpmhe.errors.InvalidInputError, match=words):
-        qpmhe.certificates.audit(system, observer, COST, region)
+        checked_ingredients(system, observer, COST)
     pytest.importorskip("casadi")
     with pytest.raises(qpmhe.errors.InvalidInputError, match=words):
         IpoptEstimator(

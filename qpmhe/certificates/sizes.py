@@ -18,14 +18,14 @@ from ..errors import OptionError, SetError, ShapeError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from .regions import bounds
-from .theorem import Sizes, checked_length
+from .theorem import checked_length
 
 #: What bounds w or v: a length, a set, or lengths (T,) or vectors (T, n) at each sample.
 Size = ArrayLike | ConvexSet
 
-_UNIT = float(np.finfo(np.float64).eps)
+UNIT = float(np.finfo(np.float64).eps)
 #: More than the rounding of a sum, a product and a root, each.
-OUTWARD = 1.0 + 16.0 * _UNIT
+OUTWARD = 1.0 + 16.0 * UNIT
 _SIGMAS = 3.0
 # Of the larger size, what the other one counts at least where a matrix is sought.
 _LEAST = 1e-3
@@ -34,29 +34,33 @@ MOST_CORNERS = 4096
 
 
 @dataclass(frozen=True)
-class SignalBounds:
-    """What bounds disturbances and noises at all times, and where that comes from.
+class Sizes:
+    """What bounds disturbances and noises at all times.
 
     Parameters
     ----------
-    disturbances, noises : float or ConvexSet
-        The largest |w| and |v|, or sets that hold w and v; of a set, the box around it is used.
+    disturbance, noise : float or ConvexSet
+        The largest |w| and |v|, or sets that hold w and v, such as ``qpmhe.Box``; of another set,
+        the box around it is used. An error names one that is negative or not bounded.
     source : str
-        In words, for reports.
+        Where this comes from, for reports.
     """
 
-    disturbances: float | ConvexSet
-    noises: float | ConvexSet
+    disturbance: float | ConvexSet = 1.0
+    noise: float | ConvexSet = 1.0
     source: str = "as stated"
 
     def __post_init__(self) -> None:
-        for name in ("disturbances", "noises"):
-            read_size(name, getattr(self, name))
+        for name in ("disturbance", "noise"):
+            given = getattr(self, name)
+            if not isinstance(given, ConvexSet):
+                checked_length(name, given)
+            read_size(name, given)
 
     @classmethod
     def usual(
         cls, system: System, w_covariance: Array, v_covariance: Array, origin: str
-    ) -> SignalBounds:
+    ) -> Sizes:
         """The system's W and V, and three standard deviations where these are not bounded."""
         found: list[ConvexSet] = []
         sources: list[str] = []
@@ -75,19 +79,7 @@ class SignalBounds:
         return cls(found[0], found[1], " and ".join(dict.fromkeys(sources)))
 
     @classmethod
-    def stated(cls, sizes: Any) -> SignalBounds:
-        """Those that the user states, or an `OptionError`."""
-        if isinstance(sizes, Sizes):
-            return cls(sizes.disturbance, sizes.noise)
-        if isinstance(sizes, SignalBounds):
-            return sizes
-        raise OptionError(
-            f"sizes is {shown(sizes)}; expected Sizes(disturbance=..., noise=...), the largest "
-            "lengths, or SignalBounds(disturbances, noises) with boxes."
-        )
-
-    @classmethod
-    def of(cls, sizes: SignalBounds | Sizes | None, system: System, cost: Cost) -> SignalBounds:
+    def of(cls, sizes: Any, system: System, cost: Cost) -> Sizes:
         """Those that are stated, or the usual ones with the weights as inverse covariances."""
         if sizes is not None:
             return cls.stated(sizes)
@@ -96,20 +88,25 @@ class SignalBounds:
             covariance = factor @ covariance @ factor.T
         return cls.usual(system, covariance, inverse(cost.noise), "the cost's inverse weights")
 
+    @classmethod
+    def stated(cls, sizes: Any) -> Sizes:
+        """Those that the user states, or an `OptionError`."""
+        if not isinstance(sizes, Sizes):
+            raise OptionError(
+                f"sizes is {shown(sizes)}; expected Sizes(disturbance=..., noise=...), the largest "
+                "lengths or boxes."
+            )
+        return sizes
+
     @property
     def largest(self) -> tuple[float, float]:
         """The largest |w| and |v|."""
         w, v = (
             float(given) if not isinstance(given, ConvexSet)
             else float(np.linalg.norm(np.abs(sides_of(name, given)).max(axis=0))) * OUTWARD
-            for name, given in (("disturbances", self.disturbances), ("noises", self.noises))
+            for name, given in (("disturbance", self.disturbance), ("noise", self.noise))
         )
         return w, v
-
-    @property
-    def lengths(self) -> Sizes:
-        """The largest |w| and |v|; 1 each where there are neither disturbances nor noises."""
-        return Sizes(*self.largest) if max(self.largest) > 0.0 else Sizes()
 
     def typical(self, system: System) -> tuple[float | Array, float | Array]:
         """Sizes of w and v to choose a certificate for: of each component, or lengths.
@@ -117,32 +114,31 @@ class SignalBounds:
         Where there is nothing of one kind, a thousandth of the other keeps the choice bounded.
         """
         found: list[float | Array] = []
-        least = _LEAST * max(self.lengths.disturbance, self.lengths.noise)
-        for name, given, size in (
-            ("disturbances", self.disturbances, system.r), ("noises", self.noises, system.p),
+        lengths = self.largest if max(self.largest) > 0.0 else (1.0, 1.0)
+        least = _LEAST * max(lengths)
+        for name, given, length, size in (
+            ("disturbance", self.disturbance, lengths[0], system.r),
+            ("noise", self.noise, lengths[1], system.p),
         ):
+            sides = np.empty(0)
             if isinstance(given, ConvexSet):
-                largest = np.abs(sides_of(name, given)).max(axis=0)
-                if largest.size == size:
-                    found.append(np.maximum(largest, least))
-                    continue
-            length = self.lengths.disturbance if name == "disturbances" else self.lengths.noise
-            found.append(max(length, least))
+                sides = np.abs(sides_of(name, given)).max(axis=0)
+            found.append(np.maximum(sides, least) if sides.size == size else max(length, least))
         return found[0], found[1]
 
     def __str__(self) -> str:
-        return f"{_words('w', self.disturbances)}, {_words('v', self.noises)} ({self.source})"
+        return f"{_words('w', self.disturbance)}, {_words('v', self.noise)} ({self.source})"
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows."""
         return {"source": self.source} | {
             name: sides_of(name, given).tolist() if isinstance(given, ConvexSet) else float(given)
-            for name, given in (("disturbances", self.disturbances), ("noises", self.noises))
+            for name, given in (("disturbance", self.disturbance), ("noise", self.noise))
         }
 
 
 def read_size(name: str, value: Any) -> Array | ConvexSet:
-    """A set, or numbers."""
+    """A bounded set, or numbers."""
     if isinstance(value, ConvexSet):
         sides_of(name, value)
         return value
@@ -177,19 +173,14 @@ def corners_of(name: str, given: ConvexSet, size: int) -> Array:
     return found
 
 
-def largest_length(name: str, given: ConvexSet, size: int, weight: Array) -> float:
-    """The largest |s|_W in the box around a set, or a little more."""
-    corners = corners_of(name, given, size)
-    if len(corners):
-        return float(weighted_lengths(corners, weight).max())
-    largest = np.abs(sides_of(name, given)).max(axis=0)
-    return float(weighted_lengths(largest, np.abs(weight)))
-
-
 def lengths_of(name: str, given: Array | ConvexSet, size: int, weight: Array) -> Array:
-    """|s|_W at most, always () or at each sample (T,)."""
+    """|s|_W at most, always () or at each sample (T,); of a set, that of the box around it."""
     if isinstance(given, ConvexSet):
-        return np.array(largest_length(name, given, size, weight))
+        corners = corners_of(name, given, size)
+        if len(corners):
+            return np.array(weighted_lengths(corners, weight).max())
+        largest = np.abs(sides_of(name, given)).max(axis=0)
+        return np.array(weighted_lengths(largest, np.abs(weight)))
     if given.ndim > 2 or (given.ndim == 2 and given.shape[1] != size):
         raise ShapeError(
             f"{name} has shape {given.shape}; expected vectors (T, {size}), lengths (T,), a "
@@ -202,12 +193,26 @@ def lengths_of(name: str, given: Array | ConvexSet, size: int, weight: Array) ->
     return given * root_of(weight)
 
 
+def initial_length(error: Size, weight: Array) -> float:
+    """|e|_W from an initial error: a vector (n,), a bound on its length, or a set that holds it."""
+    given, n = read_size("initial_error", error), len(weight)
+    if isinstance(given, ConvexSet):
+        return float(lengths_of("initial_error", given, n, weight))
+    if given.shape not in ((), (n,)):
+        raise ShapeError(
+            f"initial_error has shape {given.shape}; expected ({n},), a length, or a qpmhe.Box."
+        )
+    if given.shape == (n,):
+        return float(weighted_lengths(given, weight))
+    return float(given) * root_of(weight)
+
+
 def weighted_lengths(vectors: Array, weight: Array) -> Array:
     """|s|_W of vectors (..., n), rounded up."""
     sizes = np.abs(vectors)
     squares = np.einsum("...i,ij,...j->...", vectors, weight, vectors)
     slack = np.einsum("...i,ij,...j->...", sizes, np.abs(weight), sizes)
-    squares = np.maximum(squares, 0.0) + (2 * len(weight) + 4) * _UNIT * slack
+    squares = np.maximum(squares, 0.0) + (2 * len(weight) + 4) * UNIT * slack
     found: Array = np.sqrt(squares) * OUTWARD
     return found
 
@@ -216,7 +221,7 @@ def root_of(weight: Array) -> float:
     """The largest |s|_W of |s| = 1, rounded up."""
     n = len(weight)
     top = float(np.linalg.eigvalsh(weight)[-1])
-    slack = 16.0 * n * n * _UNIT * float(np.linalg.norm(weight))
+    slack = 16.0 * n * n * UNIT * float(np.linalg.norm(weight))
     return math.sqrt(max(top, 0.0) + slack) * OUTWARD
 
 

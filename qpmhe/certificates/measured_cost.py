@@ -1,0 +1,74 @@
+"""A bound of the estimate's error from the cost that came back."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..costs import Cost
+from .observer_bound import ObserverBound, largest_ratio
+from .properties import Detectability
+from .sizes import OUTWARD, Sizes, lengths_of, read_size
+
+_SUMS = 1.0 + 1e-9  # covers the rounding of a sum over a window, and of roots
+
+
+class MeasuredCost:
+    r"""What detectability makes of an estimate's cost and of a bound of its prior's error.
+
+    With detectability's norms P and V, a trajectory of k stages with the cost B is at most
+    :math:`\alpha_k \sqrt B` from one without disturbances and noises that starts at its prior's
+    mean z: with the cost's weights :math:`\Pi, Q, R`,
+
+    .. math::
+        \alpha_0^2 = \lambda(P \Pi^{-1}), \qquad
+        \alpha_{k+1}^2 = \max\{\eta^2 \alpha_k^2, \lambda(V R^{-1})\} + \lambda(P Q^{-1}) .
+
+    The true one is at most :math:`d_k` from it, :math:`d_{j+1} = \sqrt{\eta^2 d_j^2 + |v|_V^2} +
+    |w|_P` from :math:`d_0 \ge |x - z|_P` on. `docs/explanation/guarantees.md` derives both.
+
+    Parameters
+    ----------
+    detectability : Detectability
+        With its norms P and V.
+    cost : Cost
+        A quadratic one without discount.
+    bound : ObserverBound
+        Of the observer whose state is the prior's mean.
+    sizes : Sizes
+        What bounds w and v.
+    """
+
+    def __init__(
+        self, detectability: Detectability, cost: Cost, bound: ObserverBound, sizes: Sizes
+    ) -> None:
+        P, V = detectability.P, detectability.V
+        assert P is not None
+        assert V is not None
+        self._eta = detectability.eta
+        self._start, self._noise, self._disturbance = (
+            largest_ratio(mine, theirs) ** 2
+            for mine, theirs in ((P, cost.least_prior), (V, cost.noise), (P, cost.disturbance))
+        )
+        self._entry = largest_ratio(P, bound.metric)
+        self._length = largest_ratio(np.eye(len(P)), P)
+        self._w = float(lengths_of("disturbance", read_size("w", sizes.disturbance), len(P), P))
+        self._v = float(lengths_of("noise", read_size("v", sizes.noise), len(V), V))
+
+    @staticmethod
+    def applies(detectability: Detectability | None, cost: Cost) -> bool:
+        """Whether there is such a bound."""
+        return (
+            detectability is not None and detectability.P is not None
+            and detectability.V is not None and cost.quadratic and cost.discount == 1.0
+        )
+
+    def error(self, radius: float, stages: int, cost: float) -> float:
+        """A bound of |x - x_hat| from the observer's bound at the window's start, and from J."""
+        alpha, own = self._start, self._entry * radius
+        for _ in range(stages):
+            alpha = max(self._eta**2 * alpha, self._noise) + self._disturbance
+            own = math.hypot(self._eta * own, self._v) + self._w
+        root = math.sqrt(alpha * max(cost, 0.0))
+        return self._length * (root + own) * _SUMS * OUTWARD
