@@ -414,13 +414,13 @@ static const real *mhe_metric(const mhe_estimator *e, const real *covariance)
     return MHE_COVARIANCE ? covariance : e->metric;
 }
 
-/* Keep the observer's next state in X; bits of the status. The stage's Jacobians are there as long
+/* Keep the observer's next state in X, or in another set; bits of the status. The stage's Jacobians are there as long
  * as the metric has not settled. */
-static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const real *predicted, real *next,
-                           const real *covariance)
+static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const mhe_x_set *onto,
+                           const real *predicted, real *next, const real *covariance)
 {
     const mhe_settings *s = e->settings;
-    const mhe_x_set *set = mhe_x_set_behind(e, stage);
+    const mhe_x_set *set = onto ? onto : mhe_x_set_behind(e, stage);
     if (!e->metric_settled) {
         real slope[NX * NY];
         mhe_correction_slope(s, stage, slope);

@@ -323,7 +323,7 @@ void mhe_recompute(mhe_estimator *e, real *reached, real *covariances)
         real *following = mhe_next_covariance(e, i), kept_covariance[NX * NX];
         memcpy(kept_covariance, following, sizeof kept_covariance);
 #endif
-        mhe_enter(e, i);
+        mhe_enter(e, i, 0);
         memcpy(reached + i * NX, next, sizeof kept);
         memcpy(next, kept, sizeof kept);
 #if MHE_COVARIANCE

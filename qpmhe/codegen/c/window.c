@@ -48,9 +48,10 @@ static int mhe_rejection(const mhe_settings *s, const mhe_stage *stage, const in
 #endif
 
 /* Evaluate the stage at its z and step the observer to `next`, its covariance to `following` and its
- * sensors' counts to `rejections`; the cost, or infinity. `events` gets bits of the status. */
+ * sensors' counts to `rejections`, in X or, if there is one, `onto`; the cost, or infinity. `events`
+ * gets bits of the status. */
 static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *next,
-                        real *following, int32_t *rejections, int *events)
+                        real *following, int32_t *rejections, const mhe_x_set *onto, int *events)
 {
     const mhe_settings *s = e->settings;
     real *v = stage->v, *w = stage->w, predicted[NX], output[NY];
@@ -76,17 +77,18 @@ static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *ne
     if (!mhe_all_finite(NX, next)) return INFINITY;
     if (MHE_COVARIANCE && !mhe_all_finite(NX * NX, following)) return INFINITY;
 #if MHE_X_SET
-    if (s->project) *events = mhe_stay_inside(e, stage, predicted, next, following);
+    if (s->project) *events = mhe_stay_inside(e, stage, onto, predicted, next, following);
 #else
-    (void)events;
+    (void)events; (void)onto;
 #endif
     const real cost = mhe_stage_cost(s, 0, stage, w, v);
     return isfinite(cost) ? cost : INFINITY;
 }
 
 /* Compute stage i of the window from z(i) and its sample; bits of the status: MODEL_FAILED where the
- * model has no finite values (held) or only no finite Jacobians. */
-static int mhe_enter(mhe_estimator *e, int i)
+ * model has no finite values (held) or only no finite Jacobians. The observer goes on in X, or in
+ * `onto` if there is one. */
+static int mhe_enter(mhe_estimator *e, int i, const mhe_x_set *onto)
 {
     const mhe_settings *s = e->settings;
     mhe_stage *stage = mhe_stage_at(e, i);
@@ -95,7 +97,7 @@ static int mhe_enter(mhe_estimator *e, int i)
     real *next = mhe_next_state(e, i), *following = mhe_next_covariance(e, i);
     int32_t *rejections = mhe_next_rejections(e, i);
     int events = 0;
-    stage->cost = mhe_advance(e, stage, derived, next, following, rejections, &events);
+    stage->cost = mhe_advance(e, stage, derived, next, following, rejections, onto, &events);
     const int held = !isfinite(stage->cost);
     if (held) {
         /* z(i) is where the model does not work: go on where it last did. */
@@ -132,7 +134,7 @@ static int mhe_enter(mhe_estimator *e, int i)
 static int mhe_replay(mhe_estimator *e, int i)
 {
     int outcome = 0;
-    for (; i < e->length; i++) outcome = mhe_enter(e, i);
+    for (; i < e->length; i++) outcome = mhe_enter(e, i, 0);
     return outcome;
 }
 
@@ -152,13 +154,7 @@ static int mhe_move_state(mhe_estimator *e, const mhe_sample *sample)
         mhe_put_inside(e, &set, mhe_next_covariance(e, e->length - 1), e->z_end);
         return 0;
     }
-    const mhe_x_set own = newest->own_x;
-    const int32_t has_own = newest->has_own_x;
-    newest->own_x = set;
-    newest->has_own_x = 1;
-    const int events = mhe_enter(e, e->length - 1);
-    newest->own_x = own;
-    newest->has_own_x = has_own;
+    const int events = mhe_enter(e, e->length - 1, &set);
     return events & (MHE_OBSERVER_PROJECTED | MHE_PREDICTION_OUTSIDE | MHE_METRIC_SINGULAR);
 }
 #endif
@@ -194,7 +190,7 @@ static int mhe_push(mhe_estimator *e, const mhe_sample *sample)
     for (int j = 0; j < NU; j++) stage->u[j] = sample->u[j];
     mhe_take_conditions(s, stage, sample);
     mhe_set_noise_weight(s, stage);
-    events |= mhe_enter(e, e->length - 1);
+    events |= mhe_enter(e, e->length - 1, 0);
     e->time++;
     return events;
 }
