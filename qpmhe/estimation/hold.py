@@ -91,15 +91,16 @@ class WindowHold:
     the prior is, with
 
     .. math::
-        H = L^{-\top} \Psi L^{-1}, \qquad \Psi = D^{-1} \Phi D^{-1}, \qquad
+        H = L^{-\top} D^{-1} \Phi^2 D^{-1} L^{-1}, \qquad
         \Phi = V \operatorname{diag}(\min(1, 1/s_i)) V^\top
 
     What the data see no better than the first prior is held fully, and what they see well is free.
-    There, the trusted value follows the estimate, the less the more it was held:
+    There, the trusted value follows the estimate, with more caution: while excitation fades, the
+    last windows know less and less.
 
     .. math::
-        \bar\theta^+ = \bar\theta
-        + L (I + \Psi)^{-1} (I - \Phi) L^{-1} (\hat\theta - \bar\theta)
+        \bar\theta^+ = \bar\theta + L (I + D^{-1} \Phi D^{-1})^{-1} (I - \Phi) L^{-1}
+        (\hat\theta - \bar\theta)
 
     Attributes
     ----------
@@ -119,12 +120,12 @@ class WindowHold:
     def __init__(self, hold: Hold, values: Array, vectors: Array, target: Array) -> None:
         self.components, self.target, self.values = hold.components, target, values
         # Whatever is not a number above 1 is not seen.
-        held = np.where(values > 1.0, 1.0 / np.where(values > 1.0, values, 1.0), 1.0)
-        inner = (vectors * held) @ vectors.T
-        self.shares: Array = inner.diagonal().copy()
-        eye, stiff = np.eye(held.size), inner * np.multiply.outer(hold.stiffness, hold.stiffness)
-        self.weight: Array = hold.inverse_units.T @ stiff @ hold.inverse_units
-        self._follow = hold.units @ solve(eye + stiff, eye - inner) @ hold.inverse_units
+        unseen = 1.0 / np.where(values > 1.0, values, 1.0)
+        inner, held = ((vectors * one) @ vectors.T for one in (unseen, unseen * unseen))
+        self.shares: Array = held.diagonal().copy()
+        eye, stiff = np.eye(unseen.size), np.multiply.outer(hold.stiffness, hold.stiffness)
+        self.weight: Array = hold.inverse_units.T @ (stiff * held) @ hold.inverse_units
+        self._follow = hold.units @ solve(eye + stiff * inner, eye - inner) @ hold.inverse_units
         n = hold.deviations.size
         #: H among the weights of all states (n, n).
         self.whole: Array = np.zeros((n, n))

@@ -129,7 +129,7 @@ def augment_parameters(
     by the singular values of its Gauss-Newton matrix in deviations of the first prior, as in
     `Diagnosis`, with the other states eliminated. A direction with a singular value up to 1, of
     which the data say no more than that prior, is held fully; above, its weight falls as the
-    inverse of the singular value, and the trusted value follows the estimate. See `WindowHold`.
+    inverse square, and the trusted value follows the estimate. See `WindowHold`.
 
     The observer is not held: it stays the one that the theorem is about, but the theorem does not
     cover this term. Kalman-type observers need no more than a disturbance of the parameter that

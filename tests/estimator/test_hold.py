@@ -212,9 +212,9 @@ def dense_hold(mhe, candidate, u, y, prior):
     low = np.minimum(values, 0.5)
     shares = (vectors * (low / (1.0 - low))) @ vectors.T
     stiffness = np.diag([1.0 / system.held[int(j)] for j in held])
-    stiff = stiffness @ shares @ stiffness
-    follow = root @ np.linalg.inv(np.eye(held.size) + stiff) @ (np.eye(held.size) - shares)
-    return inverse.T @ stiff @ inverse, follow @ inverse
+    weight, eye = stiffness @ shares @ shares @ stiffness, np.eye(held.size)
+    follow = root @ np.linalg.inv(eye + stiffness @ shares @ stiffness) @ (eye - shares)
+    return inverse.T @ weight @ inverse, follow @ inverse
 
 
 @pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
@@ -354,8 +354,8 @@ def test_sensitivity_has_the_hold():
     """By the newest measurement, on which neither target nor weight rests here."""
     y, u, _ = record(6)
     mhe = estimator(0.1, max_qps=None, tolerance=1e-15)
-    mhe.run(y[: UNSEEN + 6], u[: UNSEEN + 6])
-    state, k = mhe.state_dict(), UNSEEN + 6
+    mhe.run(y[: UNSEEN + 8], u[: UNSEEN + 8])
+    state, k = mhe.state_dict(), UNSEEN + 8
     mhe.update(y[k], u[k])
     assert mhe.hold.shares[0] > 0.05
     found = mhe.sensitivity().measurements[-1, :, -1, 0]

@@ -30,14 +30,14 @@ HOLD = 0.1
 HORIZON = 20
 # Samples: until it runs steadily, with another inertia from CHANGE on, until it accelerates again.
 STEADY, CHANGE, AGAIN, END = 8 * HORIZON, 18 * HORIZON, 21 * HORIZON, 26 * HORIZON
-INERTIAS = (1.5, 2.6)  # g m^2
+INERTIAS = 1.5, 2.6  # g m^2
 SEEDS, FEW = 12, 2
 LOST = 100.0  # per cent
 HELD, STIFFER = "MHE, 2 QPs, held", "MHE, 2 QPs, stiff"
 SHOWN = ("EKF", "MHE, 2 QPs", STIFFER, HELD)
 NOTE = (
     "Unseen: while the speed is steady, up to the change. Again: from two horizons after the first "
-    "acceleration on."
+    "acceleration on; what is before tunes."
 )
 
 
@@ -75,33 +75,31 @@ def simulate(seed: int) -> tuple[Array, Array, Array]:
 
 def problems(_: Path, quick: bool) -> list[Problem]:
     """The same runs, judged while the inertia is unseen and where it is seen again."""
-    time, records = np.arange(END), []
-    for name, judged in (
-        ("unseen", (time >= STEADY + HORIZON) & (time < CHANGE)),
-        ("again", time >= AGAIN + 2 * HORIZON),
-    ):
-        for seed in range(FEW if quick else SEEDS):
-            y, u, truth = simulate(seed)
-            truth = np.where(judged[:, None], truth, np.nan)
-            records.append(Record(name, y, u, truth, [np.array([0.0, NOMINAL])]))
-    return [Problem(
-        "weak_excitation", "Inertia of a motor", system(), records, weights(QUICK),
-        lambda x, real: 100.0 * np.abs(x[:, 1:] / real - 1.0)[:, 0], "per cent", LOST,
-        own=own, note=NOTE,
-    )]
-
-
-def weights(drift: float) -> Weights:
-    """Covariances for an inertia that changes by so much in one sample."""
-    return Weights(
-        np.diag(PRIOR) ** 2, np.diag([DISTURBANCE, drift]) ** 2, np.array([[NOISE**2]]), HORIZON
+    time, start = np.arange(END)[:, None], np.array([0.0, NOMINAL])
+    runs = [simulate(seed) for seed in range(FEW if quick else SEEDS)]
+    records = [
+        Record(name, y, u, np.where(judged, truth, np.nan), [start], tunes)
+        for name, judged, tunes in (
+            ("unseen", (time >= STEADY + HORIZON) & (time < CHANGE), 0),
+            ("again", time >= AGAIN + 2 * HORIZON, AGAIN + HORIZON),
+        )
+        for y, u, truth in runs
+    ]
+    weights = Weights(
+        np.diag(PRIOR) ** 2, np.diag([DISTURBANCE, QUICK]) ** 2, np.array([[NOISE**2]]), HORIZON
     )
+    groups = {"disturbance": {"speed": [0], "inertia": [1]}, "noise": {"encoder": [0]}}
+    return [Problem(
+        "weak_excitation", "Inertia of a motor", system(), records, weights,
+        lambda x, real: 100.0 * np.abs(x[:, 1:] / real - 1.0)[:, 0], "per cent", LOST,
+        tuning=None if quick else {"held_out": 0.0, "structure": groups}, own=own, note=NOTE,
+    )]
 
 
 def own(problem: Problem, given: Weights) -> dict[str, Way]:
     """Stiff ones, and the same weights with the inertia held."""
     held = replace(problem, system=system(HOLD))
-    stiff = weights(STIFF)
+    stiff = replace(given, disturbance=np.diag([given.disturbance[0, 0], STIFF**2]))
     return {
         "EKF, stiff": partial(problem.estimator, weights=stiff, max_qps=0),
         STIFFER: partial(problem.estimator, weights=stiff, max_qps=2),
@@ -110,16 +108,16 @@ def own(problem: Problem, given: Weights) -> dict[str, Way]:
     }
 
 
-def draw(_: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Any:
+def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Any:
     """Speed, and the inertia with its estimates in the first run."""
-    found, time = results[0], DT * np.arange(END)
-    y, _, truth = simulate(0)
+    found, record, time = results[0], problems[0].records[0], DT * np.arange(END)
+    inertias = np.where(np.arange(END) < CHANGE, *INERTIAS)
     with rc_context(LIGHT):
         figure = Figure(figsize=(9.6, 6.0), layout="constrained")
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1, 2))
-    above.plot(time, y[:, 0], ".", color="0.4", markersize=2.0)
+    above.plot(time, record.measurements[:, 0], ".", color="0.4", markersize=2.0)
     above.set_ylabel("speed (rad/s)")
-    below.plot(time, truth[:, 0], **REAL)
+    below.plot(time, inertias, **REAL)
     first = {one.estimator: one.estimates[0] for one in found if one.record == "unseen"}
     for style, name in zip(STYLES, SHOWN, strict=False):
         below.plot(time, first[name][:, 1], linewidth=1.2, label=name, **style)

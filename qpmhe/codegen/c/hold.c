@@ -72,7 +72,7 @@ static void mhe_set_hold(mhe_estimator *e, mhe_workspace *k)
     const mhe_hold *hold = &e->settings->hold;
     mhe_prior *prior = &k->prior;
     enum { COUNT = MHE_HELD * MHE_HELD };
-    real share[COUNT], V[COUNT], values[COUNT], held[COUNT], stiff[COUNT], free_part[COUNT];
+    real share[COUNT], V[COUNT], values[COUNT], unseen[COUNT], held[COUNT], free_part[COUNT];
     memset(prior->held, 0, sizeof prior->held);
     memset(prior->follow, 0, sizeof prior->follow);
     if (e->settings->max_qps == 0) return; /* no Jacobians, and no other trajectory to choose */
@@ -86,17 +86,19 @@ static void mhe_set_hold(mhe_estimator *e, mhe_workspace *k)
         if (!isfinite(left))
             for (int i = 0; i < MHE_HELD; i++) V[j * MHE_HELD + i] = i == j;
     }
-    mhe_held_form(V, values, held);
+    mhe_held_form(V, values, unseen);
+    mhe_multiply(MHE_HELD, MHE_HELD, MHE_HELD, unseen, unseen, held);
     for (int i = 0; i < MHE_HELD; i++)
         for (int j = 0; j < MHE_HELD; j++) {
             const int at = i * MHE_HELD + j;
-            stiff[at] = hold->stiffness[i] * hold->stiffness[j] * held[at];
-            free_part[at] = (i == j) - held[at];
+            const real stiff = hold->stiffness[i] * hold->stiffness[j];
+            free_part[at] = (i == j) - unseen[at];
+            held[at] *= stiff;
+            unseen[at] = stiff * unseen[at] + (i == j);
         }
-    mhe_held_form(hold->inverse_units, stiff, prior->held);
-    for (int j = 0; j < MHE_HELD; j++) stiff[j * MHE_HELD + j] += 1;
-    if (!mhe_decompose(MHE_HELD, stiff)) return;
-    mhe_solve_for(MHE_HELD, stiff, MHE_HELD, free_part);
+    mhe_held_form(hold->inverse_units, held, prior->held);
+    if (!mhe_decompose(MHE_HELD, unseen)) return;
+    mhe_solve_for(MHE_HELD, unseen, MHE_HELD, free_part);
     mhe_multiply(MHE_HELD, MHE_HELD, MHE_HELD, free_part, hold->inverse_units, held);
     mhe_multiply(MHE_HELD, MHE_HELD, MHE_HELD, hold->units, held, prior->follow);
 }
