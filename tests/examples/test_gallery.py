@@ -3,10 +3,11 @@
 from importlib import import_module
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import qpmhe
+
+pd = pytest.importorskip("pandas")
 
 A = np.array([[1.0, 0.1], [0.0, 0.9]])
 WEIGHTS = {"prior": np.eye(2), "disturbance": 0.01 * np.eye(2), "noise": np.array([[0.1]])}

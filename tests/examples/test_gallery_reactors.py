@@ -1,9 +1,14 @@
 """The textbook reactors are estimated as the gallery says."""
 
+import subprocess
+import sys
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
+
+ROOT = Path(__file__).parents[2]
 
 SEEDS = 4
 
@@ -30,7 +35,8 @@ def judged(gallery, reactors):
 
 @pytest.mark.parametrize(("which", "most"), [(0, 0.04), (1, 0.005)])
 @pytest.mark.parametrize(
-    "name", ["EKF, projected", "MHE, 1 QP", "MHE, 2 QPs", "MHE, 5 QPs", "MHE, converged"]
+    "name", ["EKF, projected", "MHE, 1 QP", "MHE, 2 QPs", "MHE, 5 QPs", "MHE, converged",
+     "MHE, UKF, 2 QPs"],
 )
 def test_a_projected_filter_and_mhe_on_it_settle_on_the_truth(judged, which, most, name):
     found = judged(which, name)
@@ -53,3 +59,16 @@ def test_two_qps_improve_on_a_projected_constant_gain(judged, which, gain):
         for name in (f"gain {gain}, projected", f"MHE, gain {gain}, 2 QPs")
     )
     assert two < alone / 1.5
+
+
+def test_the_command_writes_both_reactors(gallery, tmp_path):
+    pd = pytest.importorskip("pandas")
+    subprocess.run(
+        [sys.executable, "-m", "examples.gallery.reactors", "--quick", "--out", tmp_path],
+        cwd=ROOT, check=True, capture_output=True,
+    )
+    for name in ("reactors_dimer", "reactors_batch"):
+        table = pd.read_csv(tmp_path / f"{name}.csv").set_index("estimator")
+        assert table["median"]["MHE, UKF, 2 QPs"] < table["median"]["gain 0.01, projected"]
+        assert (tmp_path / f"{name}.md").is_file()
+    assert (tmp_path / "reactors.png").read_bytes().startswith(b"\x89PNG")

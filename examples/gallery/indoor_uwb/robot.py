@@ -135,17 +135,27 @@ def own(problem: Problem, weights: Weights) -> dict[str, Way]:
 
 
 def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Any:
-    """The room, with the runs of median error; without and with the offset."""
+    """The room, with each estimator's runs of median and of largest error."""
+    record = problems[0].records[0]
+    found = [
+        one for one in results[0]
+        if one.estimator in SHOWN and (one.weights, one.record) == (BY_HAND, record.name)
+    ]
     with rc_context(LIGHT):
-        figure = Figure(figsize=(9.6, 5.2), layout="constrained")
+        figure = Figure(figsize=(8.6, 5.0), layout="compressed")
         panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    for problem, found, axes in zip(problems, results, panels, strict=True):
-        record = problem.records[0]
-        shown = {
-            one.estimator: one.middle[:, :2] for one in found
-            if one.estimator in SHOWN and (one.weights, one.record) == (BY_HAND, record.name)
-        }
-        tracks(record.truth, shown, landmarks=np.unique(record.inputs[:, 2:4], axis=0), axes=axes)
-        axes.set_title("distances with an offset" if problem.system.n > 3 else "without an offset")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=5)
+        anchors = np.unique(record.inputs[:, 2:4], axis=0)
+        for axes, which in zip(panels, ("median", "worst"), strict=True):
+            paths = {}
+            for one in found:
+                path = one.middle if which == "median" else one.estimates[np.argmax(one.errors)]
+                paths[one.estimator] = path[:, :2]
+            tracks(record.truth, paths, landmarks=anchors, axes=axes)
+            axes.set_title(f"{which} run of {record.name}")
+        # A filter that is lost may be far away.
+        low, high = anchors.min(axis=0), anchors.max(axis=0)
+        axes.set(xlim=(low[0] - 0.5, high[0] + 0.7), ylim=(low[1] - 0.5, high[1] + 0.5))
+        figure.legend(
+            *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5
+        )
     return figure

@@ -192,6 +192,7 @@ def own(reactor: Reactor, problem: Problem, weights: Weights) -> dict[str, Way]:
         "EKF, clipped": partial(plain, observer=Clipped, max_qps=0),
         "EKF, projected": partial(way, max_qps=0),
         "MHE, plain EKF, 2 QPs": partial(plain, max_qps=2),
+        "MHE, UKF, 2 QPs": partial(way, observer=qpmhe.UnscentedKalman, max_qps=2),
     }
     for gain in GAINS:
         constant = {
