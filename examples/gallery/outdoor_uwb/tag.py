@@ -19,7 +19,6 @@ import qpmhe
 from qpmhe.plots.style import LIGHT, STYLES
 from qpmhe.tuning import Weights
 
-from ..baselines import GATE
 from ..problem import Array, Problem, Record, Result, Way
 from ..report import tracks
 from .ranges import SOURCE, Walk, folders, read
@@ -77,7 +76,7 @@ def problem_of(walk: Walk, quick: bool) -> Problem:
         walk.name, walk.ranges, walk.steps[:, None], walk.path,
         starts(walk, FEW if quick else STARTS), len(walk.path) // 2, known,
     )
-    gated = partial(qpmhe.ExtendedKalman, innovation=qpmhe.Gate(**GATE))
+    gated = partial(qpmhe.ExtendedKalman, innovation=qpmhe.Gate())
     return Problem(
         f"outdoor_uwb_{walk.name}", f"Outdoor positions by ultra-wideband, {walk.name}",
         model(walk.anchors), [record], by_hand,
@@ -98,7 +97,7 @@ def problems(folder: Path, quick: bool) -> list[Problem]:
 
 def own(problem: Problem, weights: Weights) -> dict[str, Way]:
     """A gated observer, losses for outliers, and a prior that no filter has made certain."""
-    gated = partial(qpmhe.ExtendedKalman, innovation=qpmhe.Gate(**GATE))
+    gated = partial(qpmhe.ExtendedKalman, innovation=qpmhe.Gate())
     prior, disturbance, noise = (
         np.linalg.inv(one) for one in (weights.prior, weights.disturbance, weights.noise)
     )
