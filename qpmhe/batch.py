@@ -264,6 +264,9 @@ class BatchEstimator:
             delayed=np.full((*shape, n), np.nan), costs=np.empty(shape),
             candidate_costs=np.empty(shape), statuses=np.empty(shape, np.int64),
             qps=np.empty(shape, np.intp),
+            rejected_sensors=np.empty(
+                (*shape, len(self.observer.sensors) * self.observer.rejects), np.bool_
+            ),
         )
         found.states[:, 0] = self.states
         found.observer_states[:, 0] = self._engine.observer_states
@@ -273,6 +276,7 @@ class BatchEstimator:
             found.observer_states[:, t + 1] = one.observer_states
             if one.delayed is not None:
                 found.delayed[:, t] = one.delayed
+            found.rejected_sensors[:, t] = one.rejected_sensors
             found.costs[:, t], found.candidate_costs[:, t] = one.costs, one.candidate_costs
             found.statuses[:, t], found.qps[:, t] = one.flags, one.qps
         return found
@@ -355,6 +359,7 @@ class _Looped:
                 np.array([one.qps for one in found], np.intp),
                 np.array([one.filtered for one in found]),
                 np.array([one.observer_state for one in found]),
+                np.array([one.rejected for one in found]),
                 self._delay,
             )
         except BaseException:
@@ -382,6 +387,8 @@ class BatchEstimate:
         Estimates of x(t).
     observer_states : (K, n) array
         The states from which the observers go on.
+    rejected_sensors : (K, s) bool array
+        Whether the gates of the observers rejected each of their s sensors; s is 0 without a gate.
     delayed : (K, n) array or None
         Estimates of x(t+1-k) for the estimator's delay k.
     engine : str
@@ -397,6 +404,7 @@ class BatchEstimate:
     qps: Index
     filtered: Array
     observer_states: Array
+    rejected_sensors: NDArray[np.bool_]
     delay: InitVar[int] = 0
     engine: str = "python"
 
@@ -445,6 +453,8 @@ class BatchRun:
         True cost J of estimates and candidates.
     statuses, qps : (K, T) int array
         Values of the statuses (``Status(value)`` makes a flag), and QPs solved.
+    rejected_sensors : (K, T, s) bool array
+        Whether the gates of the observers rejected each of their s sensors.
     engine : str
         What ran the steps: ``python`` or ``compiled``.
     """
@@ -457,6 +467,7 @@ class BatchRun:
     candidate_costs: Array
     statuses: Flags
     qps: Index
+    rejected_sensors: NDArray[np.bool_]
     engine: str = "python"
 
     def __len__(self) -> int:

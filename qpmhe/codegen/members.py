@@ -128,6 +128,9 @@ class CompiledMembers:
             "candidates": found["candidate"][:, states],
             "candidate_costs": found["candidate_cost"],
             "flags": found["status"].astype(np.int64), "qps": found["qps"].astype(np.intp),
+            "rejected_sensors": self._rejecting(
+                found["rejected"] if self._library.layout.sensors else np.zeros((len(ys), 0))
+            ),
         }
 
     def run(self, y: Array, u: Array) -> dict[str, Any]:
@@ -161,7 +164,13 @@ class CompiledMembers:
             "observer_states": np.concatenate((observers[:, None], log.observer_states), axis=1),
             "costs": log.costs, "candidate_costs": log.candidate_costs,
             "statuses": log.flags.astype(np.int64), "qps": log.qps.astype(np.intp),
+            "rejected_sensors": self._rejecting(log.rejected),
         }
+
+    def _rejecting(self, rejected: NDArray[Any]) -> NDArray[np.bool_]:
+        """Which sensors of a gate were rejected; none without a gate."""
+        found = rejected.astype(np.bool_)
+        return found if self._library.observer.rejects else found[..., :0]
 
     def _share(self, work: Callable[[slice, NDArray[np.uint8]], None]) -> None:
         """Do the work on all members, a part a thread; C runs without the interpreter's lock."""

@@ -131,6 +131,8 @@ class Innovation(ABC):
             if not part:
                 counts[k] = rejections[k]
         late = np.flatnonzero((rejections >= self.reopen) & ~passes).tolist()
+        if self.rejects and not any(rejections[k] % self.reopen == 0 for k in late):
+            late = []  # they were contradicted, and wait
         shares = np.zeros(0)
         if late:
             known = [place for k in np.flatnonzero(passes) for place in parts[k]]
@@ -207,12 +209,13 @@ class Gate(Innovation):
     counts start anew. So the covariance explains what the observer corrects by, and the gain is
     near one along it.
 
-    A sensor stays rejected, and due, while no k up to 20 makes it pass: P spans nothing of what it
-    sees, or the sensors that pass contradict it, however wrong P is. So a sensor with a lasting
-    fault stays shut where others show the same, and is followed where it alone does. As it may be
-    the others that are wrong, they are no longer given where they have fewer outputs than the
-    sensors that are due, or for a sensor that was rejected ten times ``reopen`` times in a row: at
-    the latest then it opens. Samples in which a sensor is missing do not count.
+    A sensor stays rejected for another ``reopen`` samples where no k up to 20 makes it pass: P
+    spans nothing of what it sees, or the sensors that pass contradict it, however wrong P is. So a
+    sensor with a lasting fault stays shut where others show the same, and is followed where it
+    alone does. As it may be the others that are wrong, they are no longer given where they have
+    fewer outputs than the sensors that were rejected so often, or for a sensor that was rejected
+    ten times ``reopen`` times in a row: at the latest then it opens. When one is due, so are all
+    that were rejected ``reopen`` times. Samples in which a sensor is missing do not count.
 
     Parameters
     ----------

@@ -408,6 +408,26 @@ def _observed(make: Callable[..., qpmhe.Observer], weight: Any = None, **options
     return replace(base, observer=make(**covariances), cost=cost)
 
 
+def _doubtful(
+    base: Case, innovation: Any, make: Any = qpmhe.ExtendedKalman, **options: Any
+) -> Case:
+    """The case with outliers, a fault that lasts, and an observer that judges innovations."""
+    generator, samples = np.random.default_rng(17), []
+    n, p = base.system.n, base.system.p
+    scale = np.std([np.array(sample["y"], float) for sample in base.samples], axis=0)
+    for t, sample in enumerate(base.samples):
+        y = np.array(sample["y"], float)
+        y += (generator.random(p) < 0.15) * generator.choice([-1.0, 1.0], p) * 10.0 * scale
+        y[0] += 8.0 * scale[0] * (9 <= t < 16)
+        samples.append(sample | {"y": y})
+    covariances = {
+        "prior": 0.01 * spd(4, n), "disturbance": 0.002 * spd(5, base.system.r),
+        "noise": 0.01 * spd(6, p),
+    } | options
+    observer = make(innovation=innovation, **covariances)
+    return replace(base, observer=observer, samples=tuple(samples))
+
+
 def _reactor_extended() -> Case:
     base = _reactor()
     observer = qpmhe.ExtendedKalman(
@@ -923,6 +943,42 @@ CASES: dict[str, Callable[[], Case]] = {
     "unscented angles": lambda: _filtered(
         qpmhe.UnscentedKalman, _rover(True, True, True).with_gaps()
     ).with_options(arrival="smoothed"),
+    "gated": lambda: _doubtful(_with_inputs(), qpmhe.Gate(reopen=3)),
+    "gated prior": lambda: _doubtful(
+        _observed(qpmhe.ExtendedKalman), qpmhe.Gate(0.95, reopen=2)
+    ).with_gaps(),
+    "gated group": lambda: with_changes(with_conditions(_doubtful(
+        _observed(qpmhe.ExtendedKalman), qpmhe.Gate(reopen=2, groups=[[1, 0]])
+    ).with_gaps())),
+    "gated reinitialized": lambda: with_changes(with_conditions(_doubtful(
+        _observed(qpmhe.ExtendedKalman), qpmhe.Gate(reopen=1)
+    ).with_gaps())).with_options(candidate="reinitialized", warm_start=True),
+    "gated observer": lambda: case("gated prior").with_options(max_qps=0, horizon=1),
+    "gated in states": lambda: _doubtful(
+        case("inputs and states"), qpmhe.Gate(reopen=2)
+    ).with_gaps(),
+    "gated angles": lambda: _doubtful(_rover(True, True), qpmhe.Gate(reopen=2)).with_gaps(),
+    "gated failing": lambda: _doubtful(_failing(), qpmhe.Gate(reopen=2)),
+    "gated singular": lambda: replace(_doubtful(
+        _with_inputs(), qpmhe.Gate(reopen=2), prior=np.diag([1e-4, 0.0, 1e-4]),
+        disturbance=np.diag([0.002, 0.0, 0.0]),
+    ), tolerance=1e-7),
+    "weighted": lambda: _doubtful(_with_inputs(), qpmhe.HuberInnovation(reopen=2)),
+    "weighted prior": lambda: with_changes(with_conditions(_doubtful(
+        _observed(qpmhe.ExtendedKalman), qpmhe.HuberInnovation(0.7, reopen=1)
+    ).with_gaps())),
+    "weighted smoothed": lambda: _doubtful(
+        _observed(qpmhe.ExtendedKalman), qpmhe.HuberInnovation()
+    ).with_options(arrival="smoothed", delay=1),
+    "unscented gated": lambda: _doubtful(
+        _observed(qpmhe.UnscentedKalman), qpmhe.Gate(reopen=2), qpmhe.UnscentedKalman
+    ).with_gaps(),
+    "unscented gated in states": lambda: with_changes(with_conditions(_doubtful(
+        case("inputs and states"), qpmhe.Gate(reopen=2, groups=[[0, 1]]), qpmhe.UnscentedKalman
+    ).with_gaps())),
+    "unscented weighted": lambda: with_changes(with_conditions(_doubtful(
+        _observed(qpmhe.UnscentedKalman), qpmhe.HuberInnovation(reopen=2), qpmhe.UnscentedKalman
+    ).with_gaps())),
     "injection": lambda: replace(
         case("inputs"), observer=qpmhe.OutputInjection(_saturated)
     ).with_gaps(),

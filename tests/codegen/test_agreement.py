@@ -7,13 +7,18 @@ from qpmhe.codegen.compiler import find_compiler
 
 from .cases import CASES, case
 
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+pytestmark = [
+    pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler"),
+    pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning"),
+]
 
 ARRAYS = (
     "state", "filtered", "trajectory", "candidate", "observer_state", "disturbances", "noises",
     "delayed",
 )
-EVENTS = ("status", "qps", "dropped", "time", "corrections", "nearest_points")
+EVENTS = (
+    "status", "qps", "dropped", "time", "corrections", "nearest_points", "rejected_sensors",
+)
 
 
 def agree(expected, found, tolerance):
@@ -68,6 +73,7 @@ def test_the_same_runs(name):
     U = np.array([sample["u"] for sample in one.samples]) if one.system.m else None
     expected, found = (one.estimator(engine).run(Y, U) for engine in ("python", "compiled"))
     np.testing.assert_array_equal(found.flags, expected.flags)
+    np.testing.assert_array_equal(found.rejected_sensors, expected.rejected_sensors)
     for array in ("states", "filtered", "observer_states", "costs", "candidate_costs"):
         a, b = getattr(expected, array), getattr(found, array)
         largest = np.abs(a[np.isfinite(a)]).max(initial=0.0)

@@ -359,12 +359,16 @@ static int mhe_test(const mhe_settings *s, const mhe_stage *stage, const mhe_see
                                           s->innovation.limits[size - 1];
         next[k] = !size ? before : sensors->passes[k] ? 0 : before + (before < INT32_MAX);
         sensors->due[k] = !sensors->passes[k] && before >= s->innovation.reopen;
-        late += sensors->due[k];
+        late += sensors->due[k] &&
+                (MHE_INNOVATION != MHE_GATED || before % s->innovation.reopen == 0);
         doubted += sensors->due[k] ? size : 0;
         for (int i = 0; sensors->passes[k] && i < size; i++)
             sensors->known[sensors->known_count++] = sensors->at[k][i];
     }
-    if (!late) return 0;
+    if (!late) { /* those that were contradicted wait */
+        memset(sensors->due, 0, sizeof sensors->due);
+        return 0;
+    }
     for (int k = 0; k < MHE_SENSORS; k++) {
         const int long_shut = stage->rejections[k] / MHE_LONGEST >= s->innovation.reopen;
         sensors->given[k] = doubted > sensors->known_count || long_shut ? 0 : sensors->known_count;
@@ -377,8 +381,8 @@ static int mhe_test(const mhe_settings *s, const mhe_stage *stage, const mhe_see
 
 /* Let the outputs count as the rule for innovations says, and P grow where it must; the sensors'
  * counts behind this sample. */
-static void mhe_judge_outputs(const mhe_settings *s, const mhe_stage *stage, mhe_seen *seen, real *P,
-                      int32_t *next)
+static void mhe_judge_outputs(const mhe_settings *s, const mhe_stage *stage, mhe_seen *seen,
+                              real *P, int32_t *next)
 {
     real cross[NY * NX], spread[NY * NY];
     mhe_sensors sensors;
@@ -426,7 +430,7 @@ static void mhe_judge_outputs(const mhe_settings *s, const mhe_stage *stage, mhe
 }
 #endif
 
-/* What corrects, by the rule for innovations if there is one; P, a copy of the stage's, as it grows. */
+/* What corrects, by the rule for innovations if there is one; P is the stage's, or larger. */
 #if MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED
 static void mhe_see_judged(const mhe_settings *s, const mhe_stage *stage, mhe_seen *seen, real *P,
                            int32_t *next)
