@@ -12,16 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
+from ..command import DataError
+
 Array = NDArray[np.float64]
 
 DOI = "10.17632/9xyvy2njj3"
 C20, HPPC = "c20_25degC.mat", "hppc_25degC.mat"
-_SOURCE = f"get the data at https://doi.org/{DOI}"
+SOURCE = (
+    "P. Kollmeyer, M. Skells, Samsung INR21700 30T 3Ah Li-ion Battery Data, McMaster University, is "
+    f"at https://doi.org/{DOI}: put the .mat files of the drive cycles into one folder."
+)
 _FIELDS = "Time", "Voltage", "Current", "Ah", "Battery_Temp_degC"
-
-
-class DataError(Exception):
-    """Measured data that are not there or not what they should be."""
 
 
 class Raw(NamedTuple):
@@ -63,21 +64,21 @@ def load(folder: Path, name: str) -> Raw:
     """
     path = folder / name
     if not path.is_file():
-        raise DataError(f"{path} is not there; {_SOURCE}.")
+        raise DataError(f"{path} is not there. {SOURCE}")
     try:
         meas = loadmat(path, squeeze_me=True)["meas"][()]
         data = np.array([meas[field] for field in _FIELDS], dtype=float)
     except Exception as error:  # whatever the reader makes of a file that is something else
-        raise DataError(f"{path} cannot be read ({error}); {_SOURCE}.") from error
+        raise DataError(f"{path} cannot be read ({error}). {SOURCE}") from error
     # The tester logs an instant twice where it goes on to the next step of its programme.
     new = np.concatenate([[True], np.diff(np.maximum.accumulate(data[0])) > 0])
     raw = Raw(*data[:, new])
     if not np.isfinite(data).all() or raw.time.size < 2:
-        raise DataError(f"{path} has missing values; {_SOURCE}.")
+        raise DataError(f"{path} has missing values. {SOURCE}")
     empty = int(np.argmin(raw.charge))  # the counter may begin anew behind that
     found, counted = passed(raw)[empty] / 3600, raw.charge[empty] - raw.charge[0]
     if not abs(found - counted) < 0.01 * np.ptp(raw.charge):
-        raise DataError(f"{path}: {found:.3f} Ah by current, {counted:.3f} by counter; {_SOURCE}.")
+        raise DataError(f"{path}: {found:.3f} Ah by current, {counted:.3f} by counter. {SOURCE}")
     return raw
 
 
@@ -122,7 +123,7 @@ def drive_cycles(folder: Path) -> dict[str, Path]:
         for path in sorted(folder.glob("*.mat")) if path.name not in (C20, HPPC)
     }
     if not files:
-        raise DataError(f"{folder} holds no drive cycle (*.mat); {_SOURCE}.")
+        raise DataError(f"{folder} holds no drive cycle (*.mat). {SOURCE}")
     return files
 
 

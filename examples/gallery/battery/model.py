@@ -1,4 +1,4 @@
-"""The cell as a system, its observers and its costs, all from the parameter file.
+"""The cell as a system, its observers and its weights, all from the parameter file.
 
 States x = (SOC, v1, v2, rho), input the current I (A, < 0 on discharge), output the mean terminal
 voltage over the step, disturbances on all four states:
@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import qpmhe
+from qpmhe.tuning import Weights
 
 Array = NDArray[np.float64]
 
 PARAMETERS = Path(__file__).with_name("samsung_30t.json")
-START = np.array([0.6, 0.0, 0.0, 1.0])
 
 # The circuit is wrong by some 15 mV, for about a minute at a time: hysteresis, current that it
 # is not linear in, diffusion that is not an exponential. White noise that tells as little about
@@ -53,7 +53,7 @@ HORIZON = 120.0  # s
 
 
 class Cell:
-    """Tables of the parameter file, on a uniform grid of SOC; straight lines go on beyond it.
+    """Tables of the parameter file as functions of SOC, which go on as straight lines beyond them.
 
     Parameters
     ----------
@@ -72,45 +72,37 @@ class Cell:
         self.capacity = float(parameters["capacity_Ah"])
         circuit, voltage = parameters["circuit"], np.array(parameters["ocv"]["V"])
         self.tau: Array = np.array(circuit["tau_s"])
-        self.steps = voltage.size - 1
-        soc = np.linspace(0.0, 1.0, voltage.size)
-        # The slope is interpolated and the voltage is its integral: exact derivatives.
-        self._slopes = np.maximum(np.gradient(voltage, soc), 0.05)
-        self._voltage = np.concatenate(
-            [[0.0], np.cumsum(0.5 * (self._slopes[1:] + self._slopes[:-1])) / self.steps]
-        )
-        self._voltage += np.mean(voltage - self._voltage)
-        resistances = np.array([
-            np.interp(soc, circuit["soc"], circuit[name]) for name in ("R0_Ohm", "R1_Ohm", "R2_Ohm")
-        ])
-        rise = np.diff(resistances, axis=1, append=resistances[:, -1:]) * self.steps
-        # (points, 3), so that one index picks a row.
-        self._resistances, self._rises = resistances.T.copy(), rise.T.copy()
+        # The slope is interpolated and the voltage is its integral: a continuous derivative.
+        self._soc = np.linspace(0.0, 1.0, voltage.size)
+        slopes = np.maximum(np.gradient(voltage, self._soc), 0.05)
+        self._slope, self._bends = slopes[0], _kinks(self._soc, slopes)
+        rise = 0.5 * np.diff(self._soc) * (slopes[1:] + slopes[:-1])
+        self._empty = float(np.mean(voltage - np.append(0.0, np.cumsum(rise))))
+        self._knots = np.array(circuit["soc"])
+        tables = np.array([circuit[name] for name in ("R0_Ohm", "R1_Ohm", "R2_Ohm")])
+        self._first, self._kinks = tables[:, 0], _kinks(self._knots, tables)
 
     @classmethod
     def read(cls, path: Path = PARAMETERS) -> "Cell":
         """The cell of a parameter file."""
         return cls(json.loads(path.read_text(encoding="utf-8")))
 
-    def ocv(self, soc: Array) -> tuple[Array, Array]:
-        """The open-circuit voltage and its slope (V), each of the shape of soc."""
-        k, part = self._below(soc)
-        last = np.minimum(k + 1, self.steps)
-        slope = self._slopes[k] + np.clip(part, 0.0, 1.0) * (self._slopes[last] - self._slopes[k])
-        return self._voltage[k] + 0.5 * (self._slopes[k] + slope) * part / self.steps, slope
+    def ocv(self, soc: Array) -> Array:
+        """The open-circuit voltage (V), of the shape of soc (..., 1)."""
+        beyond = np.maximum(soc - self._soc, 0.0)
+        bent = (self._bends * beyond * beyond).sum(axis=-1, keepdims=True)
+        return self._empty + self._slope * soc + 0.5 * bent
 
-    def resistances(self, soc: Array) -> tuple[Array, Array]:
-        """R0, R1, R2 (..., 3) in Ohm and their slopes; constant beyond the grid."""
-        k, part = self._below(soc)
-        rise = self._rises[k] * ((part >= 0.0) & (part <= 1.0))[..., None]
-        return self._resistances[k] + rise * (part / self.steps)[..., None], rise
+    def resistance(self, soc: Array, which: int) -> Array:
+        """R0, R1 or R2 in Ohm, of the shape of soc (..., 1); constant beyond the table."""
+        kinked = self._kinks[which] * np.maximum(soc - self._knots, 0.0)
+        return self._first[which] + kinked.sum(axis=-1, keepdims=True)
 
-    def _below(self, soc: Array) -> tuple[NDArray[np.intp], Array]:
-        """Index of the grid point at or below, and how far above it, in grid steps."""
-        place = soc * self.steps
-        # Where the model is tried out at infinity, any index will do.
-        k = np.clip(np.nan_to_num(place), 0, self.steps).astype(np.intp)
-        return k, place - k
+
+def _kinks(knots: Array, values: Array) -> Array:
+    """How the slope of an interpolated table (..., K) changes at each knot; zero beyond them."""
+    slopes = np.diff(values) / np.diff(knots)
+    return np.diff(slopes, prepend=0.0, append=0.0)
 
 
 def system_of(cell: Cell, dt: float) -> qpmhe.System:
@@ -126,39 +118,27 @@ def system_of(cell: Cell, dt: float) -> qpmhe.System:
     decay = np.exp(-dt / cell.tau)
     held = cell.tau * (1.0 - decay) / dt
     per_ampere = dt / (3600.0 * cell.capacity)
-    into, through = 1.0 - decay, np.concatenate([[1.0], 1.0 - held])
 
     def f(x: Array, u: Array) -> Array:
-        drop = x[..., 3:] * cell.resistances(x[..., 0])[0][..., 1:] * u
-        return np.concatenate(
-            [x[..., :1] + per_ampere * u, decay * x[..., 1:3] + into * drop, x[..., 3:]], axis=-1
+        soc, rho = x[..., :1], x[..., 3:]
+        v1, v2 = (
+            decay[j] * x[..., j + 1 : j + 2]
+            + (1.0 - decay[j]) * rho * cell.resistance(soc, j + 1) * u
+            for j in range(2)
         )
+        return np.concatenate((soc + per_ampere * u, v1, v2, rho), axis=-1)
 
     def h(x: Array, u: Array) -> Array:
-        resistance = cell.resistances(x[..., 0])[0] @ through
-        y: Array = cell.ocv(x[..., 0])[0] + x[..., 1:3] @ held + x[..., 3] * resistance * u[..., 0]
-        return y[..., None]
-
-    def f_jacobian(x: Array, u: Array) -> Array:
-        values, slopes = cell.resistances(x[..., 0])
-        A = np.zeros((*x.shape, 4))
-        A[..., 0, 0] = A[..., 3, 3] = 1.0
-        A[..., 1, 1], A[..., 2, 2] = decay
-        A[..., 1:3, 0] = x[..., 3:] * into * slopes[..., 1:] * u
-        A[..., 1:3, 3] = into * values[..., 1:] * u
-        return A
-
-    def h_jacobian(x: Array, u: Array) -> Array:
-        values, slopes = cell.resistances(x[..., 0])
-        C = np.empty((*x.shape[:-1], 1, 4))
-        C[..., 0, 0] = cell.ocv(x[..., 0])[1] + x[..., 3] * (slopes @ through) * u[..., 0]
-        C[..., 0, 1:3] = held
-        C[..., 0, 3] = (values @ through) * u[..., 0]
-        return C
+        soc, rho = x[..., :1], x[..., 3:]
+        y = cell.ocv(soc) + rho * cell.resistance(soc, 0) * u
+        for j in range(2):
+            dropped = (1.0 - held[j]) * rho * cell.resistance(soc, j + 1) * u
+            y = y + held[j] * x[..., j + 1 : j + 2] + dropped
+        return y
 
     free = np.inf
     return qpmhe.System(
-        f, h, n=4, p=1, m=1, f_jacobian=f_jacobian, h_jacobian=h_jacobian,
+        f, h, n=4, p=1, m=1,
         states=qpmhe.Box([0.0, -free, -free, 0.3], [1.0, free, free, 3.0]),
     )
 
@@ -199,59 +179,35 @@ def constant_gain(dt: float) -> qpmhe.Luenberger:
     return qpmhe.Luenberger(dt * _GAIN_PER_SECOND)
 
 
-def cost_of(cell: Cell, dt: float, prior: Array | qpmhe.ObserverPrior) -> qpmhe.RobustCost:
-    """Inverse covariances, and Huber's loss of the noise beyond what the model's error reaches.
+def weights_of(cell: Cell, dt: float, prior: Array = PRIOR) -> Weights:
+    """The covariances by hand, for a quadratic loss.
 
     Parameters
     ----------
     cell, dt
         As for `system_of`.
+    prior : (4, 4) array
+        Covariance of the initial error, as somebody states it.
+    """
+    return Weights(prior, disturbance(cell, dt), noise(dt), horizon=round(HORIZON / dt))
+
+
+def robust_cost(weights: Weights, prior: Array | qpmhe.ObserverPrior) -> qpmhe.RobustCost:
+    """Huber's loss of the noise beyond what the model's error reaches.
+
+    Parameters
+    ----------
+    weights : Weights
+        Covariances of disturbance and noise.
     prior : (4, 4) array or ObserverPrior
         Weight of the prior.
     """
     return qpmhe.RobustCost(
-        prior=prior, disturbance=np.linalg.inv(disturbance(cell, dt)),
-        noise=qpmhe.Huber(np.linalg.inv(noise(dt)), threshold=_threshold(noise(dt))),
+        prior=prior, disturbance=np.linalg.inv(weights.disturbance),
+        noise=qpmhe.Huber(np.linalg.inv(weights.noise), threshold=_threshold(weights.noise)),
     )
 
 
 def _threshold(noise: Array) -> float:
     """Huber's threshold, in standard deviations of the white noise."""
     return _GROSS / float(np.sqrt(noise[0, 0]))
-
-
-def estimator(
-    cell: Cell,
-    dt: float,
-    *,
-    max_qps: int | None,
-    start: Array = START,
-    prior: Array = PRIOR,
-    observer: qpmhe.Observer | None = None,
-) -> qpmhe.MovingHorizonEstimator:
-    """The estimator of the study.
-
-    Parameters
-    ----------
-    cell, dt
-        As for `system_of`.
-    max_qps : int or None
-        As for `qpmhe.MovingHorizonEstimator`.
-    start : (4,) array
-        The initial estimate.
-    prior : (4, 4) array
-        Covariance of its error, as somebody states it.
-    observer : Observer, optional
-        Another one than `robust_kalman`; without a covariance, the prior's weight is constant.
-    """
-    weight: Array | qpmhe.ObserverPrior = qpmhe.ObserverPrior()
-    if observer is None:
-        observer = robust_kalman(
-            prior=prior, disturbance=disturbance(cell, dt), noise=noise(dt)
-        )
-    if observer.initial_covariance() is None:
-        weight = np.asarray(np.linalg.inv(prior), np.float64)
-    return qpmhe.MovingHorizonEstimator(
-        system_of(cell, dt), observer, cost_of(cell, dt, weight), horizon=round(HORIZON / dt),
-        initial_state=start, max_qps=max_qps, engine="python",
-    )

@@ -1,6 +1,6 @@
 """Identify the cell's open-circuit voltage and its two-RC equivalent circuit.
 
-Run ``python examples/battery_soc/identify.py --data DIR``. It reads the C/20 test and the HPPC test
+Run ``python -m examples.gallery.battery.identify --data DIR``. It reads the C/20 test and the HPPC test
 and writes ``samsung_30t.json``; it never sees a drive cycle.
 
 1. OCV(SOC) is the C/20 discharge, plus what the current of 0.15 A takes from it, by the resistances
@@ -27,10 +27,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from measurements import C20, DOI, HPPC, Array, DataError, load, resample
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import lsq_linear, minimize_scalar
 from scipy.signal import lfilter
+
+from ..command import DataError
+from .measurements import C20, DOI, HPPC, Array, load, resample
 
 KNOTS = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 GRID = np.linspace(0.0, 1.0, 1001)
@@ -158,7 +160,7 @@ def identify(folder: Path) -> dict[str, Any]:
                     "McMaster University, Mendeley Data",
             "doi": DOI,
             "files": [C20, HPPC],
-            "script": "examples/battery_soc/identify.py",
+            "script": "examples/gallery/battery/identify.py",
             "date": datetime.date.today().isoformat(),
         },
         "capacity_Ah": round(capacity, 4),

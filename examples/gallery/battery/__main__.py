@@ -1,0 +1,11 @@
+"""``python -m examples.gallery.battery --data DIR --out results``."""
+
+import sys
+
+from ..command import main
+from . import __doc__ as question
+from .cell import draw, problems
+from .measurements import SOURCE
+
+if __name__ == "__main__":
+    sys.exit(main("battery", question, problems, draw, SOURCE))

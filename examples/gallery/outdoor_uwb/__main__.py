@@ -1,0 +1,9 @@
+"""``python -m examples.gallery.outdoor_uwb --data DIR --out results``."""
+
+import sys
+
+from ..command import main
+from .tag import SOURCE, draw, problems
+
+if __name__ == "__main__":
+    sys.exit(main("outdoor_uwb", __doc__, problems, draw, SOURCE))
