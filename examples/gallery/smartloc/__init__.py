@@ -1,0 +1,1 @@
+"""A car finds its way between houses, which reflect the signals of its satellites."""
