@@ -9,8 +9,11 @@ depend on that state.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -20,15 +23,21 @@ from qpmhe.tuning import Weights
 
 from ..problem import Array, Problem, Record, Result, Way
 from ..report import tracks
+from .bank import Bank
 from .record import Drive, folders, read
 
 # Seconds: of the windows, of the delay, and before an error counts.
 SHORT, LONG, DELAY, SETTLING = 10.0, 80.0, 40.0, 10.0
+# Metres from the truth, and runs from each: of the starts.
+STARTS, FEW = {5.0: 4, 100.0: 4}, {5.0: 1, 100.0: 1}
+HUBER = 1.345
+#: dBHz: weaker signals are reflected ones more often than not.
+STRONG = 35.0
 # Random walks a root of a second: of position, height, heading, clock, its drift, the offsets of
 # other systems' clocks and the zero of the gyroscope. In m and rad.
 WALKS = {"position": 0.1, "height": 0.05, "heading": 0.002, "clock": 0.7, "drift": 0.25,
          "gyroscope": 2e-6, "offset": 0.05}
-INITIAL = {"position": 50.0, "height": 20.0, "heading": 0.5, "clock": 100.0, "drift": 100.0,
+INITIAL = {"position": 50.0, "height": 20.0, "heading": 1.8, "clock": 100.0, "drift": 100.0,
            "gyroscope": 0.003, "offset": 20.0}
 #: m, of a pseudorange that may be reflected.
 NOISE = 10.0
@@ -85,6 +94,107 @@ def start(drive: Drive, where: Array, heading: float) -> Array:
     found = np.zeros(len(names(drive)))
     found[:3], found[3] = where, heading
     left = drive.ranges - np.linalg.norm(drive.satellites - where, axis=2)
-    first = left[np.isfinite(left).any(axis=1)][0]
-    found[4] = np.nanmedian(first)
+    found[4] = np.nanmedian(left[np.isfinite(left).any(axis=1)][0])
     return found
+
+
+def starts(drive: Drive, away: float, count: int) -> list[Array]:
+    """States that far from the true first place, in directions and with headings all around."""
+    angles = 2.0 * np.pi * np.arange(count) / count
+    truth = drive.positions[np.isfinite(drive.positions[:, 0])][0]
+    return [
+        start(drive, truth + away * np.array([np.cos(one), np.sin(one), 0.0]), 2.0 * one)
+        for one in angles
+    ]
+
+
+def problems(folder: Path, quick: bool) -> list[Problem]:
+    """Each record of the folder, with all signals and with the strong ones only."""
+    found = []
+    for one in folders(folder):
+        drive = read(one)
+        found.append(problem(one.name, "", drive, quick))
+        if not quick:
+            found.append(problem(
+                f"{one.name}_strong", f", signals of {STRONG:.0f} dBHz and more",
+                drive.strong(STRONG), quick,
+            ))
+    return found
+
+
+def problem(name: str, which: str, drive: Drive, quick: bool) -> Problem:
+    """A record from starts near and far."""
+    made, by_hand, u = system(drive), weights(drive), inputs(drive)
+    half = len(drive.times) // 2
+    truth = np.where(
+        (drive.times - drive.times[0] >= SETTLING)[:, None], drive.positions[:, :2], np.nan
+    )
+    known = np.full((len(truth), made.n), np.nan)
+    known[:, :3] = drive.positions
+    groups = {kind: [] for kind in names(drive)}
+    for state, kind in enumerate(names(drive)):
+        groups[kind].append(state)
+    return Problem(
+        name, f"A car between houses{which}", made,
+        [
+            Record(f"start {away:.0f} m off", drive.ranges, u, truth, [begin], half, known)
+            for away, count in (FEW if quick else STARTS).items()
+            for begin in starts(drive, away, count)
+        ],
+        by_hand, lambda x, real: np.hypot(*(x[:, :2] - real).T), "m", 100.0,
+        tuning=None if quick else {
+            "structure": {"disturbance": groups, "noise": {"pseudorange": range(made.p)}},
+        },
+        own=partial(own, drive, quick),
+    )
+
+
+def own(
+    drive: Drive, quick: bool, problem: Problem, weights: Weights
+) -> dict[str, Way]:
+    """Over windows in which the car drives round some corners, and against reflections."""
+    step = float(np.median(drive.lengths))
+    horizon = min(round(LONG / step), len(drive.times))
+    options: dict[str, Any] = {"horizon": horizon, "max_qps": 5, "warm_start": True}
+    prior, walk, noise = (
+        np.linalg.inv(one) for one in (weights.prior, weights.disturbance, weights.noise)
+    )
+    huber = qpmhe.RobustCost(
+        prior=prior, disturbance=walk, noise=qpmhe.Huber(noise, HUBER, per_component=True)
+    )
+    redescending = qpmhe.RobustCost(
+        prior=prior, disturbance=walk, noise=qpmhe.GemanMcClure(
+            noise, drive.deviation * np.sqrt(noise[0, 0]), per_component=True, graduation=1.0
+        )
+    )
+    bank = Bank(
+        partial(problem.estimator, weights=weights, cost=redescending, delay=round(DELAY / step),
+                **options),
+        np.sqrt(weights.prior.diagonal()[:2]), compiled=not quick,
+    )
+    return {
+        "EKF, Huber innovation": partial(
+            problem.estimator, weights=weights, max_qps=0, horizon=1, project_observer=False,
+            observer=partial(qpmhe.ExtendedKalman, innovation=qpmhe.HuberInnovation(HUBER)),
+        ),
+        f"MHE, Huber, {LONG:.0f} s": partial(
+            problem.estimator, weights=weights, cost=huber, **options
+        ),
+        f"MHE, Geman-McClure, {LONG:.0f} s": bank.causal,
+        f"the same, {DELAY:.0f} s late": bank.late,
+    }
+
+
+def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Any:
+    """The map of the first record, and the errors in time."""
+    problem, found = problems[0], results[0]
+    record = [one for one in problem.records if one.name == found[-1].record][0]
+    wanted = ["EKF", *own_names()]
+    shown = {
+        one.estimator: one.middle for one in found
+        if one.weights == BY_HAND and one.record == record.name and one.estimator in wanted
+    }
+    with rc_context(LIGHT):
+        figure = Figure(figsize=(11.0, 5.6), layout="constrained")
+        places, errors = figure.subplots(1, 2, width_ratios=(1, 1.2))
+    return figure

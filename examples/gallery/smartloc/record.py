@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gzip
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +40,8 @@ class Drive:
         Speed in m/s and turn rate in rad/s.
     positions : (T, 3) array
         The true ones, east, north and up in m; NaN where there is none.
+    strengths : (T, P) array
+        Carrier to noise density of the pseudoranges, in dBHz.
     deviation : float
         Standard deviation that the receiver reports for the best twentieth of its pseudoranges, in m.
     """
@@ -50,6 +52,7 @@ class Drive:
     offset: Array
     odometry: Array
     positions: Array
+    strengths: Array
     deviation: float
 
     @property
@@ -57,6 +60,10 @@ class Drive:
         """Those of the steps, in s; the last one is taken to be usual."""
         found = np.diff(self.times)
         return np.append(found, np.median(found))
+
+    def strong(self, least: float) -> Drive:
+        """The record without pseudoranges of weaker signals, in dBHz."""
+        return replace(self, ranges=np.where(self.strengths >= least, self.ranges, np.nan))
 
 
 def folders(folder: Path) -> list[Path]:
@@ -75,7 +82,7 @@ def read(folder: Path) -> Drive:
     """The record in a folder."""
     lines = _lines(folder, "input")
     odometry = _numbers(lines, "odom3", 8)
-    ranges = _numbers(lines, "pseudorange3", 9)
+    ranges = _numbers(lines, "pseudorange3", 10)
     truth = _numbers(_lines(folder, "ground", "gt"), "point3", 4)
     odometry, truth = (one[np.argsort(one[:, 0], kind="stable")] for one in (odometry, truth))
     times = odometry[:, 0]
@@ -87,16 +94,17 @@ def read(folder: Path) -> Drive:
     names, columns = np.unique(ranges[:, [7, 6]], axis=0, return_inverse=True)
     step = _nearest(times, ranges[:, 0])
     near = np.abs(times[step] - ranges[:, 0]) <= 0.5 * np.median(np.diff(times))
-    y = np.full((len(times), len(names)), np.nan)
+    y, strengths = np.full((2, len(times), len(names)), np.nan)
     satellites = np.full((len(times), len(names), 3), np.nan)
     y[step[near], columns[near]] = ranges[near, 1]
+    strengths[step[near], columns[near]] = ranges[near, 9]
     satellites[step[near], columns[near]] = local(_rotated(ranges[near, 3:6], origin), origin)
     at = np.column_stack([
         np.interp(times, truth[:, 0], one, left=np.nan, right=np.nan)
         for one in local(truth[:, 1:], origin).T
     ])
     return Drive(
-        times, y, _filled(satellites), _offsets(ranges[:, 7], columns), odometry[:, [1, 6]], at,
+        times, y, _filled(satellites), _offsets(ranges[:, 7], columns), odometry[:, [1, 6]], at, strengths,
         float(np.sqrt(np.quantile(ranges[:, 2], 0.05))),
     )
 
