@@ -13,7 +13,7 @@ from ..model.system import System
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel, check_values, evaluated
 from .evidence import Evidence
-from .inequalities import Form, Matrices, definite, norm_bound, quickly_definite
+from .inequalities import Form, Matrices, definite, norm_bound
 from .regions import Region
 
 _CHUNK = 256
@@ -24,8 +24,6 @@ _WORK = 4e7
 # Cells are split by what their width adds to the error; what it adds to the corners counts
 # a little, for cells that reach out of a polytope.
 _CORNER_SHARE = 1e-3
-# Rows of matrices from which on their smallest eigenvalues cost too much; the margin is NaN then.
-_LARGE = 20
 _MOST_OUTPUT_CELLS = 20_000
 _TOLERANCE = 1e-3
 _SAMPLES = 2000
@@ -37,7 +35,6 @@ class Cover:
 
     proved: bool
     cells: int
-    margin: float  # smallest eigenvalue on the proved cells, of the matrix with unit diagonal
     violations: Array  # (V, n + m): states and inputs at which the inequality does not hold
     jacobians: Array  # (V, n + p, n): the Jacobians there
     late: bool = False  # whether it ended because the time was over
@@ -92,9 +89,6 @@ def _scores(enclosure: Enclosure, left: NDArray[Any]) -> Array:
 class Enclosing(Protocol):
     """Whatever encloses Jacobians over cells."""
 
-    n: int
-    p: int
-
     def enclose(self, lower: Array, upper: Array) -> Enclosure:
         """As `SmoothModel.enclose`."""
 
@@ -104,43 +98,31 @@ def cover(
     seconds: float | Deadline = PART_SECONDS,
 ) -> Cover:
     """Show an inequality on a region by dividing it until each cell is shown."""
-    deadline, cells, margin = Deadline.of(seconds), Cells(region), np.inf
+    deadline, cells = Deadline.of(seconds), Cells(region)
     corners = 2 ** min(region.lower.size, MOST_ACTIVE)
-    chunk = int(np.clip(_WORK / (corners * (2 * model.n + model.p) ** 3), 1, _CHUNK))
-    order = form.P.shape[0]
-    nowhere = np.empty((0, region.lower.size)), np.empty((0, order + model.p, order))
+    order = len(form.P)
+    chunk = int(np.clip(_WORK / (corners * (2 * order + len(form.R)) ** 3), 1, _CHUNK))
+    nowhere = np.empty((0, region.lower.size)), np.empty((0, 0, 0))
     while len(cells.lower):
         if cells.taken and deadline.passed:
-            return Cover(False, cells.taken, margin, *nowhere, late=True)
+            return Cover(False, cells.taken, *nowhere, late=True)
         low, high = cells.take(chunk)
         enclosure = model.enclose(low, high)
-        shown, least = _shown(form, enclosure)
-        margin = min(margin, float(least[shown].min(initial=np.inf)))
+        matrices, count = _at_corners(enclosure)
+        with np.errstate(all="ignore"):
+            shown = definite(form.matrices(matrices)).reshape(count, -1).all(axis=1)
         if shown.all():
             continue
         left = np.flatnonzero(~shown)
         low, high, centres = low[left], high[left], enclosure.jacobian[left]
         middle = 0.5 * (low + high)
-        broken = _broken(form, centres) & region.contains(middle[:, : model.n])
+        broken = _broken(form, centres) & region.contains(middle[:, : region.n])
         if broken.any():
-            return Cover(False, cells.taken, margin, middle[broken], centres[broken])
+            return Cover(False, cells.taken, middle[broken], centres[broken])
         if cells.taken > most_cells:
-            return Cover(False, cells.taken, margin, *nowhere)
+            return Cover(False, cells.taken, *nowhere)
         cells.halve(low, high, _scores(enclosure, left), np.full(len(left), np.inf))
-    return Cover(True, cells.taken, margin, *nowhere)
-
-
-def _shown(form: Form, enclosure: Enclosure) -> tuple[NDArray[np.bool_], Array]:
-    matrices, cells = _at_corners(enclosure)
-    with np.errstate(all="ignore"):
-        found = form.matrices(matrices)
-        if found.middle.shape[-1] < _LARGE:
-            proved, least = definite(found)
-        else:
-            proved, least = quickly_definite(found), np.full(len(found.middle), np.nan)
-    every: NDArray[np.bool_] = np.all(proved.reshape(cells, -1), axis=1)
-    smallest: Array = least.reshape(cells, -1).min(axis=1)
-    return every, smallest
+    return Cover(True, cells.taken, *nowhere)
 
 
 def _at_corners(enclosure: Enclosure) -> tuple[Matrices, int]:

@@ -6,21 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._checks import Array
+from .._checks import Array, positive, vector
 from ..errors import InvalidInputError, ShapeError
 from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
 from ..observers import Luenberger, Observer
 from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
 from .evidence import CertificateError, NotCertifiedError
-from .inequalities import (
-    ErrorContraction,
-    Matrices,
-    OutputInjection,
-    OutputWeight,
-    euclidean_constants,
-    norm_bound,
-)
+from .inequalities import Matrices, euclidean_constants, norm_bound
 from .properties import Detectability, ObserverStability, sealed
 from .regions import Region, bounded_region
 from .sdp import NoiseSizes, started
@@ -74,14 +67,15 @@ def certify_detectability(
         If there are no such constants, or none were found; the text gives the smallest feasible
         rate and what is not detected. An `OutOfTimeError` says that it is not known which.
     """
+    first, second = vector("weights", np.asarray(weights), 2).tolist()
     search = Search(
-        system, bounded_region(system, region, inputs), None, weights, seconds=started(seconds)
+        system, bounded_region(system, region, inputs), None,
+        (positive("weights[0]", first), positive("weights[1]", second)), seconds=started(seconds),
     )
     found = search.answer("eta", eta, (), _undetectable)
     form = found.form
-    assert isinstance(form, (OutputWeight, OutputInjection))
     notes = (*found.notes, *_left_out(search), _PAIR_STAYS)
-    if isinstance(form, OutputInjection):
+    if form.injection is not None:
         notes = (
             *notes,
             "h is not affine on the region, where the inequality with an output weight does not "
@@ -91,8 +85,7 @@ def certify_detectability(
         Detectability(
             form.rate, *euclidean_constants(form.P, form.R, form.rate), form=search.kind,
             region=search.region, notes=notes,
-            P=search.embedded(form.P, search.free, system.n), V=form.R, margin=found.margin,
-            cells=found.cells,
+            P=search.embedded(form.P, search.free, system.n), V=form.R, cells=found.cells,
         ),
         system, found.evidence,
     )
@@ -237,7 +230,7 @@ def _stability(search: Search, rho: float | None) -> ObserverStability:
     others = () if search.gain is None else ("another gain, such as synthesise_gain finds",)
     found = search.answer("rho", rho, others, _unstable)
     form = found.form
-    assert isinstance(form, ErrorContraction)
+    assert form.gain is not None
     gain = Matrices.exact(form.gain)
     product = gain.T @ Matrices.exact(form.P) @ gain
     # V is L^T P L, with what rounding may have made of it on the diagonal.
@@ -253,8 +246,8 @@ def _stability(search: Search, rho: float | None) -> ObserverStability:
             region=search.region,
             notes=(*found.notes, *search.notes, *_left_out(search), _RUN_STAYS),
             P=search.embedded(form.P, free, system.n), V=V,
-            Q=None if form.Q is None else search.embedded(form.Q, search.acting, system.r),
-            R=form.R, margin=found.margin, cells=found.cells,
+            Q=search.embedded(form.Q, search.acting, system.r) if form.Q.size else None,
+            R=form.R if form.R.size else None, cells=found.cells,
         ),
         system, found.evidence,
     )

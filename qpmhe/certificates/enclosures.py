@@ -301,9 +301,9 @@ class _Plan:
         nodes = [one[-1] for one in first]
         self._conditions = graph.open_conditions(nodes)
         decisions = [pair[0] for pair in self._conditions]
+        above = [set(graph.ancestors([node])) for node in nodes]
         self._depends = np.array([
-            [one in above for one in decisions]
-            for above in [set(graph.ancestors([node])) for node in nodes]
+            [one in each for one in decisions] for each in above
         ], np.bool_).reshape(len(nodes), len(decisions))
         self._point = Program(graph, roots + nodes + decisions)
         self._cell = Program(graph, roots + nodes + [one[-1] for one in second] + decisions)

@@ -11,16 +11,16 @@ Jacobians along the segment between them, so that
 
 with one pair (A, C) in the closed convex hull of the joint Jacobians J over the set. A
 condition of the pair that describes a convex set of pairs holds on this hull once it holds
-at the Jacobian of every single state. Each form below is such a condition: a matrix affine
-in (A, C) that is positive definite.
+at the Jacobian of every single state. `Form` is such a condition: a matrix affine in (A, C) that
+is positive definite.
 """
 
 from __future__ import annotations
 
 import math
 import operator
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,27 +33,6 @@ _TINY = 1e-290  # covers what underflows
 _ROUNDING = 1e-6  # more than rounding makes of differences of f and h
 
 
-class Form(Protocol):
-    """A matrix inequality with its unknowns filled in."""
-
-    @property
-    def P(self) -> Array:  # noqa: N802 - the paper's symbol
-        """The norm's matrix, (n, n)."""
-
-    @property
-    def rate(self) -> float:
-        """The contraction per step."""
-
-    def matrices(self, jacobian: Matrices) -> Matrices:
-        """The matrices that must be positive definite."""
-
-    def constants(self) -> tuple[Matrices, ...]:
-        """Matrices that must be, too, whatever the Jacobian: each a stack of one."""
-
-    def excess(self, dx: Array, df: Array, dh: Array) -> Array:
-        """By how much differences violate the conclusion; positive beyond rounding."""
-
-
 def norms(values: Array, weight: Array) -> Array:
     """|s|_W of each row, or what it is at most for vectors of these lengths."""
     if values.ndim == 1:
@@ -63,10 +42,8 @@ def norms(values: Array, weight: Array) -> Array:
     return np.sqrt(np.maximum(squares, 0.0))
 
 
-def _square(P: Array, rate: float) -> Matrices:
-    """rate^2 P, with more than the error of two products."""
-    middle = rate * rate * P
-    return Matrices(middle, 4.0 * _UNIT * np.abs(middle) + _TINY)
+def _empty() -> Array:
+    return np.empty((0, 0))
 
 
 def _assemble(rows: list[list[Matrices]]) -> Matrices:
@@ -82,154 +59,115 @@ def _assemble(rows: list[list[Matrices]]) -> Matrices:
     return Matrices(middle, radius)
 
 
-def _parts(jacobian: Matrices, n: int) -> tuple[Matrices, Matrices]:
-    return (
-        Matrices(jacobian.middle[:, :n], jacobian.radius[:, :n]),
-        Matrices(jacobian.middle[:, n:], jacobian.radius[:, n:]),
-    )
-
-
 @dataclass(frozen=True, eq=False)
-class OutputWeight:
-    r"""Detectability where h is affine, C constant.
+class Form:
+    r"""A quadratic Lyapunov function of differences, with its unknowns filled in.
+
+    For two states x_1, x_2 with their disturbances, of detectability,
 
     .. math::
-        A^\top P A \preceq \eta^2 P + C^\top R C \quad\Leftrightarrow\quad
-        \begin{pmatrix} P & P A \\ \cdot & \eta^2 P + C^\top R C \end{pmatrix} \succeq 0
+        |x_1^+ - x_2^+|_P^2 \le \rho^2 |x_1 - x_2|_P^2 + |w_1 - w_2|_Q^2 + |h(x_1) - h(x_2)|_R^2,
 
-    is affine in A. It gives :math:`|A \delta x|_P^2 \le \eta^2 |\delta x|_P^2 +
-    |C \delta x|_R^2`, hence, by :math:`\sqrt{a^2 + b^2} \le a + b` and the triangle inequality,
+    and for the error e = x - z of an observer with the constant gain L,
 
-    .. math::
-        |x_1^+ - x_2^+|_P \le \eta |\delta x|_P + |\delta w|_P + |\delta h|_R .
+    .. math:: |e^+|_P^2 \le \rho^2 |e|_P^2 + |w|_Q^2 + |v|_R^2 .
 
-    Where C varies, :math:`-C^\top R C` is concave in C: the inequality at every single state
-    says nothing of averages of their Jacobians, and `OutputInjection` must be used.
-    """
-
-    P: Array
-    R: Array
-    rate: float
-
-    def matrices(self, jacobian: Matrices) -> Matrices:
-        """The matrix above; see `Form.matrices`."""
-        A, C = _parts(jacobian, self.P.shape[0])
-        P = Matrices.exact(self.P)
-        lower = _square(self.P, self.rate) + C.T @ (Matrices.exact(self.R) @ C)
-        return _assemble([[P, P @ A], [(P @ A).T, lower]])
-
-    def constants(self) -> tuple[Matrices, ...]:
-        """P; see `Form.constants`."""
-        return (Matrices.exact(self.P[None]),)
-
-    def excess(self, dx: Array, df: Array, dh: Array) -> Array:
-        """The first inequality's left-hand side less its right-hand one; see `Form.excess`."""
-        left = norms(df, self.P) * (1.0 - _ROUNDING)
-        return left - np.hypot(self.rate * norms(dx, self.P), norms(dh, self.R))
-
-
-@dataclass(frozen=True, eq=False)
-class OutputInjection:
-    r"""Detectability where h is nonlinear, by output injection and multipliers.
-
-    As :math:`\delta h = C \delta x`, neither of the terms with :math:`\delta h - C \delta x`
-    changes anything in
+    Either follows from two inequalities, of which the second has no state in it:
 
     .. math::
-        |A \delta x - K (\delta h - C \delta x)|_P^2 \le \eta^2 |\delta x|_P^2
+        \begin{pmatrix} X & P A_L \\ \cdot & \rho^2 P + C^\top R C \end{pmatrix} \succ 0, \qquad
+        \begin{pmatrix} P - X & P B \\ \cdot & D \end{pmatrix} \succ 0,
+
+    for detectability with :math:`A_L = A`, B = G and D = Q, for an observer with
+    :math:`A_L = A - L C`, B = (G, -L), D = diag(Q, R) and without :math:`C^\top R C`. Their sum
+    is :math:`|a|_P^2 \le \rho^2 |e|_P^2 + |d|_D^2 + |C e|_R^2` for :math:`a = A_L e + B d`. With
+    X = P there is no room for the second; then, by the triangle inequality,
+
+    .. math:: |x_1^+ - x_2^+|_P \le \rho |x_1 - x_2|_P + |w_1 - w_2|_P + |h(x_1) - h(x_2)|_R .
+
+    Where C varies, :math:`-C^\top R C` is concave in C: the first inequality at every single state
+    says nothing of averages of their Jacobians. As :math:`\delta h = C \delta x`, neither of the
+    terms with :math:`\delta h - C \delta x` changes anything in
+
+    .. math::
+        |A \delta x - K (\delta h - C \delta x)|_S^2 \le \rho^2 |\delta x|_P^2
         + |\delta h|_R^2 - 2 (\delta h - C \delta x)^\top (M \delta x + N \delta h),
 
-    but asked of all :math:`\delta x, \delta h`, with Y = P K, it is the inequality
+    but asked of all :math:`\delta x, \delta h`, with Y = P K and :math:`S = P X^{-1} P`, it is
 
     .. math::
-        \begin{pmatrix} P & P A + Y C & -Y \\
-        \cdot & \eta^2 P + C^\top M + M^\top C & C^\top N - M^\top \\
-        \cdot & \cdot & R - N - N^\top \end{pmatrix} \succeq 0,
+        \begin{pmatrix} X & P A + Y C & -Y \\
+        \cdot & \rho^2 P + C^\top M + M^\top C & C^\top N - M^\top \\
+        \cdot & \cdot & R - N - N^\top \end{pmatrix} \succ 0,
 
-    which is affine in (A, C) jointly, and from which the conclusion of `OutputWeight`
-    follows. It takes one K, M and N for the whole set.
+    which is affine in (A, C) jointly. It takes one K, M and N for the whole set.
+
+    Parameters
+    ----------
+    P : (n, n) array
+    rate : float
+        rho.
+    R : (p, p) array
+        The weight of the output's difference, or of an observer's noise; empty if there is none.
+    gain : (n, p) array, optional
+        L, of an observer.
+    injection : (Y, M, N), optional
+        For outputs that are not affine.
+    X, B, Q : (n, n), (n, r) or (n, r + p), and (r, r) array
+        Empty where X is P.
     """
 
     P: Array
-    R: Array
-    Y: Array
-    M: Array
-    N: Array
     rate: float
+    R: Array = field(default_factory=_empty)
+    gain: Array | None = None
+    injection: tuple[Array, Array, Array] | None = None
+    X: Array = field(default_factory=_empty)
+    B: Array = field(default_factory=_empty)
+    Q: Array = field(default_factory=_empty)
 
     def matrices(self, jacobian: Matrices) -> Matrices:
-        """The matrix above; see `Form.matrices`."""
-        A, C = _parts(jacobian, self.P.shape[0])
-        P, Y, M, N = (Matrices.exact(one) for one in (self.P, self.Y, self.M, self.N))
+        """The matrix of the first inequality, which must be positive definite."""
+        n, P = len(self.P), Matrices.exact(self.P)
+        A, C = jacobian[:, :n], jacobian[:, n:]
+        X = Matrices.exact(self.X) if self.X.size else P
+        square = self.rate * self.rate * self.P
+        low = Matrices(square, 4.0 * _UNIT * np.abs(square) + _TINY)
+        if self.gain is not None:
+            side = P @ (A - Matrices.exact(self.gain) @ C)
+            return _assemble([[X, side], [side.T, low]])
+        R = Matrices.exact(self.R)
+        if self.injection is None:
+            side = P @ A
+            return _assemble([[X, side], [side.T, low + C.T @ (R @ C)]])
+        Y, M, N = map(Matrices.exact, self.injection)
         side, crossed, mixed = P @ A + Y @ C, C.T @ M, C.T @ N - M.T
-        lower = _square(self.P, self.rate) + crossed + crossed.T
-        noise = Matrices.exact(self.R) - N - N.T
-        return _assemble([[P, side, -Y], [side.T, lower, mixed], [-Y.T, mixed.T, noise]])
+        return _assemble([
+            [X, side, -Y], [side.T, low + crossed + crossed.T, mixed], [-Y.T, mixed.T, R - N - N.T],
+        ])
 
-    constants = OutputWeight.constants
-    excess = OutputWeight.excess
-
-
-@dataclass(frozen=True, eq=False)
-class ErrorContraction:
-    r"""The error of an observer with the constant gain L.
-
-    With e = x - z, of the system (eq:system) and the observer (eq:observer),
-
-    .. math::
-        e^+ = (A - L C)\, e + G w - L v, \qquad
-        \begin{pmatrix} S & S (A - L C) \\ \cdot & \rho^2 P \end{pmatrix} \succeq 0,
-        \quad S \succeq P,
-
-    is affine in (A, C) jointly, for linear and for nonlinear h. It is
-    :math:`|(A - L C) e|_S \le \rho |e|_P`, and gives, as :math:`|\cdot|_P \le |\cdot|_S`,
-
-    .. math:: |e^+|_P \le \rho |e|_P + |G w|_P + |L v|_P .
-
-    With S above P, there is room for a sum of squares, whose limit is smaller where disturbance
-    and error do not point in one direction: with :math:`B = (G, -L)`,
-
-    .. math::
-        \begin{pmatrix} S - P & -P B \\ \cdot & \operatorname{diag}(Q, R) - B^\top P B
-        \end{pmatrix} \succ 0 \quad \Rightarrow \quad
-        |e^+|_P^2 \le \rho^2 |e|_P^2 + |w|_Q^2 + |v|_R^2,
-
-    as the matrix is of the form :math:`|a|_S^2 + |d|_{Q, R}^2 - |a + B d|_P^2`, at
-    :math:`a = (A - L C) e`, d = (w, v).
-    """
-
-    P: Array
-    gain: Array
-    rate: float
-    S: Array | None = None  # P where left out, and then there are no Q and R
-    G: Array | None = None
-    Q: Array | None = None
-    R: Array | None = None
-
-    def matrices(self, jacobian: Matrices) -> Matrices:
-        """The first matrix above; see `Form.matrices`."""
-        A, C = _parts(jacobian, self.P.shape[0])
-        S = Matrices.exact(self.P if self.S is None else self.S)
-        closed = S @ (A - Matrices.exact(self.gain) @ C)
-        return _assemble([[S, closed], [closed.T, _square(self.P, self.rate)]])
-
-    def constants(self) -> tuple[Matrices, ...]:
-        """P and the second matrix above; see `Form.constants`."""
-        only = (Matrices.exact(self.P[None]),)
-        if self.S is None or self.G is None or self.Q is None or self.R is None:
-            return only
-        P, S = Matrices.exact(self.P[None]), Matrices.exact(self.S[None])
-        B = Matrices.exact(np.hstack((self.G, -self.gain))[None])
-        r = self.Q.shape[0]
-        D = np.zeros((1, r + self.R.shape[0], r + self.R.shape[0]))
-        D[:, :r, :r], D[:, r:, r:] = self.Q, self.R
-        side = -(P @ B)
-        return *only, _assemble([[S - P, side], [side.T, Matrices.exact(D) - B.T @ P @ B]])
+    def holds_always(self) -> bool:
+        """Whether P and the second inequality's matrix are shown to be positive definite."""
+        P = Matrices.exact(self.P[None])
+        if not self.X.size:
+            return bool(definite(P).all())
+        D, r = np.zeros((1, *2 * self.B.shape[1:])), len(self.Q)
+        D[:, :r, :r] = self.Q
+        if self.gain is not None:
+            D[:, r:, r:] = self.R
+        rest, side = P - Matrices.exact(self.X[None]), P @ Matrices.exact(self.B[None])
+        both = _assemble([[rest, side], [side.T, Matrices.exact(D)]])
+        return bool(definite(P).all() and definite(both).all())
 
     def excess(self, dx: Array, df: Array, dh: Array) -> Array:
-        """What the error grows to less what it may; see `Form.excess`."""
-        left = norms(df - dh @ self.gain.T, self.P) * (1.0 - _ROUNDING)
-        return left - self.rate * norms(dx, self.P)
+        """By how much differences violate the first inequality; positive beyond rounding."""
+        S = self.P @ np.linalg.solve(self.X, self.P) if self.X.size else self.P
+        right = self.rate * norms(dx, self.P)
+        if self.gain is not None:
+            df = df - dh @ self.gain.T
+        else:
+            right = np.hypot(right, norms(dh, self.R))
+        return norms(df, 0.5 * (S + S.T)) * (1.0 - _ROUNDING) - right
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,6 +186,9 @@ class Matrices:
     def T(self) -> Matrices:  # noqa: N802 - as NumPy calls it
         """The transposes."""
         return Matrices(np.swapaxes(self.middle, -1, -2), np.swapaxes(self.radius, -1, -2))
+
+    def __getitem__(self, index: Any) -> Matrices:
+        return Matrices(self.middle[index], self.radius[index])
 
     def __neg__(self) -> Matrices:
         return Matrices(-self.middle, self.radius)
@@ -274,50 +215,13 @@ class Matrices:
         )
 
 
-def definite(matrices: Matrices) -> tuple[NDArray[np.bool_], Array]:
-    r"""Whether every symmetric matrix of a set is positive definite.
+def definite(matrices: Matrices) -> NDArray[np.bool_]:
+    r"""Whether every symmetric matrix of each set is positive definite.
 
-    With S from an eigenvalue decomposition of the middle M, :math:`G = S^\top M S` is near
-    the identity. G is enclosed with a bound on all rounding, and where Gershgorin's discs
-    lie right of zero, G is positive definite for every member. Then so is M: S cannot be
-    singular, or G would be, and congruence keeps the inertia.
-
-    References
-    ----------
-    Rump, Verification of positive definiteness, BIT 46 (2006), for a neighbouring method.
-    """
-    middle = 0.5 * (matrices.middle + np.swapaxes(matrices.middle, -1, -2))
-    diagonal = np.diagonal(middle, axis1=-2, axis2=-1)
-    least = np.full(middle.shape[0], -np.inf)
-    proved = np.zeros(middle.shape[0], dtype=np.bool_)
-    usable = np.isfinite(middle).all(axis=(-2, -1)) & (diagonal > 0.0).all(axis=-1)
-    if not usable.any():
-        return proved, least
-    scale = 1.0 / np.sqrt(diagonal[usable])
-    scaled = scale[:, :, None] * middle[usable] * scale[:, None, :]
-    values, vectors = np.linalg.eigh(scaled)
-    least[usable] = values[:, 0]
-    S = Matrices.exact(
-        scale[:, :, None] * vectors / np.sqrt(np.maximum(values, 1e-300))[:, None, :]
-    )
-    radius = np.broadcast_to(matrices.radius, matrices.middle.shape)[usable]
-    with np.errstate(all="ignore"):
-        G = S.T @ Matrices(matrices.middle[usable], radius) @ S
-        size = np.abs(G.middle) + G.radius
-        own = np.diagonal(G.middle, axis1=-2, axis2=-1) - np.diagonal(G.radius, axis1=-2, axis2=-1)
-        others = size.sum(axis=-1) - np.diagonal(size, axis1=-2, axis2=-1)
-        room = own - others - (own.shape[-1] + 4) * _UNIT * (np.abs(own) + size.sum(axis=-1))
-        proved[usable] = (room > 0.0).all(axis=-1) & (values[:, 0] > 0.0)
-    return proved, least
-
-
-def quickly_definite(matrices: Matrices) -> NDArray[np.bool_]:
-    r"""As `definite`, for many large matrices: quicker, and of no use for single small numbers.
-
-    With unit diagonals, the members lie within the largest row sum of the radii of the middle,
-    in the spectral norm. Cholesky's factorisation of the middle A less c I, where it ends, is of
-    a matrix that differs by at most :math:`\gamma_{n+1} \operatorname{tr} A` up to a factor near
-    one; c is more than both.
+    The matrices are scaled to diagonals near one. A member less the middle A, plus the sums of the
+    radius' rows on the diagonal, is diagonally dominant; so A less these sums must be definite.
+    Cholesky's factorisation, where it ends, is of a matrix that differs from it by at most
+    :math:`\gamma_{n+1} \operatorname{tr} A`, up to a factor near one.
 
     References
     ----------
@@ -332,10 +236,9 @@ def quickly_definite(matrices: Matrices) -> NDArray[np.bool_]:
         scale = np.exp2(-np.round(0.5 * np.log2(diagonal)))
         factor = scale[:, :, None] * scale[:, None, :]
         A, spread = factor * middle, factor * radius
-        widest = np.maximum(spread, np.swapaxes(spread, -1, -2)).sum(axis=-1).max(axis=-1)
+        rows = np.maximum(spread, np.swapaxes(spread, -1, -2)).sum(axis=-1)
         trace = np.diagonal(A, axis1=-2, axis2=-1).sum(axis=-1)
-        shift = (widest + 4.0 * (n + 4) * _UNIT * trace) * (1.0 + 1e-12)
-        A[:, range(n), range(n)] -= shift[:, None]
+        A[:, range(n), range(n)] -= (rows + 4.0 * (n + 4) * _UNIT * trace[:, None]) * (1.0 + 1e-12)
         proved: NDArray[np.bool_] = np.all(np.isfinite(A), axis=(-2, -1))
         for k in range(n):
             pivot = A[:, k, k]
@@ -357,7 +260,7 @@ def eigenvalue_bounds(P: Array) -> tuple[float, float]:
         pair = Matrices.exact(np.stack((P, -P))) + Matrices.exact(
             np.stack((-low * eye, high * eye))
         )
-        if definite(pair)[0].all():
+        if definite(pair).all():
             return low, high
     raise CertificateError(
         f"P has the eigenvalues {values.tolist()}; it could not be shown positive definite."
@@ -380,7 +283,7 @@ def norm_bound(matrices: Matrices) -> Array:
     guess = found * (1.0 + 1e-10) + 1e-150
     eye = np.eye(middle.shape[-1])
     square = Matrices.exact((guess * guess * (1.0 - 1e-15))[:, None, None] * eye)
-    shown, _ = definite(square - chosen.T @ chosen)
+    shown = definite(square - chosen.T @ chosen)
     bounds[usable] = (np.where(shown, guess, frobenius) + spread[usable]) * (1.0 + 1e-15)
     return bounds
 

@@ -197,7 +197,7 @@ def supports(metric: Array, rows: Array) -> Array:
         # g^T P^-1 g < c exactly where g g^T / c < P, by Schur's complement.
         less = rows[:, :, None] * rows[:, None, :] / squares[:, None, None]
         P = Matrices.exact(np.broadcast_to(metric, less.shape))
-        if (squares > 0.0).all() and definite(P - Matrices(less, 1e-15 * np.abs(less)))[0].all():
+        if (squares > 0.0).all() and definite(P - Matrices(less, 1e-15 * np.abs(less))).all():
             found: Array = np.sqrt(squares) * _OUTWARD
             return found
     return np.full(len(rows), np.inf)

@@ -1,4 +1,4 @@
-"""The semidefinite programs whose solutions are then verified."""
+"""The semidefinite program whose solutions are then verified."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import contextlib
 import importlib
 import math
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -17,24 +17,24 @@ from numpy.typing import ArrayLike
 from .._checks import Array, numbers
 from ..errors import OptionError, ShapeError
 from .deadline import Deadline
-from .inequalities import ErrorContraction, Form, Matrices, OutputInjection, OutputWeight, definite
+from .inequalities import Form, Matrices, definite
 
 Kind = Literal["output weight", "output injection", "observer", "synthesis"]
 #: The largest disturbance and noise: each a length, or half-widths by component.
 NoiseSizes = tuple[ArrayLike, ArrayLike]
 
-# c_p beyond 1e4 would be a certificate of nothing, and spoils the conditioning.
-_MOST_CONDITION = 1e8
 # Seconds for one entry of a factorisation, as measured for 10 to 30 states: a rough guide.
 _SECONDS = 5e-9
-# Bounds on the limit, as multiples of the largest noise.
-_SMALLEST_LIMIT, _LARGEST_LIMIT = 0.1, 1e3
+# Larger ones would be a certificate of nothing, and spoil the conditioning.
+_MOST_CONDITION, _MOST_SUPPLY = 1e6, 1e8
+_FLOOR = 1e-6  # of what noises count
+# What rounding needs between matrices that follow from each other; at most the margins.
+_SLACK = 1e-7
 _DIGITS = 4  # of a gain, after the first
+_PRINTED, _NOTHING = 8, 1e-6  # of weights: as they are verified, so they are printed
 _LEAST = 1e-3  # seconds for a solver, for which zero may mean no limit
 # What a noise counts as at least, of the largest one, in the sizes of states and outputs.
 _SMALLEST_NOISE = 1e-4
-# What rounding needs between matrices that follow from each other; at most the margins.
-_SLACK = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,52 +72,123 @@ def expected_seconds(n: int, p: int, kind: Kind) -> float:
     return _SECONDS * (size * (size + 1) / 2) ** 3
 
 
-class Program(ABC):
-    """A semidefinite program at some Jacobians, in numbers without units."""
+class Program:
+    r"""Minimise the limit of an error over the unknowns of a `Form`, at some Jacobians.
 
-    def __init__(self, kind: Kind, jacobians: Array, scales: Scales) -> None:
-        self._cp: Any = importlib.import_module("cvxpy")
+    .. math::
+        \min \textstyle\sum_j d_j^2 D_j \quad \text{s.t. both inequalities of the form}, \quad
+        D \text{ diagonal}, \quad \operatorname{tr} P^{-1} \le n,
+
+    in states of the region's size, for disturbances and noises d of the given sizes. A length is
+    shared by its components. In the limit, :math:`|e|_P^2` is at most the sum divided by
+    :math:`1 - \rho^2`. A rate hardly above the smallest leaves no room between X and P: then X is
+    P, and so it is where the triangle inequality is to be used. There, and for the weights of a
+    cost, P is no less than I instead, and the latter are scaled to a sum of 1. For
+    ``synthesis`` the gain is sought as well, with Y = P L.
+
+    Parameters
+    ----------
+    kind : str
+    jacobians : (K, n + p, n) array
+    scales : Scales
+    sizes : NoiseSizes
+        Of w, and of v or the output.
+    matrix : (n, r) array
+        G, by which disturbances act.
+    gain : (n, p) array, optional
+        The observer's.
+    growth : callable, optional
+        The limit's square for a supply of 1, by the rate; then weights are rounded to be printed.
+    triangle : bool
+        Whether X is P from the first, for detectability.
+    """
+
+    def __init__(
+        self, kind: Kind, jacobians: Array, scales: Scales, sizes: NoiseSizes, matrix: Array,
+        gain: Array | None = None, growth: Callable[[float], float] | None = None,
+        triangle: bool = False,
+    ) -> None:
+        self._cp = cp = importlib.import_module("cvxpy")
+        self._all, self._kind, self._gain, self._G = (jacobians, scales, sizes), kind, gain, matrix
+        self._growth = growth or (lambda rate: 1.0 / (1.0 - rate * rate))
+        self._printed = growth is not None
         count, rows, n = jacobians.shape
-        self.expected_seconds = count * expected_seconds(n, rows - n, kind)
+        p, r, observes = rows - n, matrix.shape[1], kind in ("observer", "synthesis")
+        self.expected_seconds = count * expected_seconds(n, p, kind)
         self._jacobians = Matrices.exact(jacobians)
-        self._d, self._s = d, s = scales.states, scales.outputs
-        self._A = jacobians[:, :n] * d / d[:, None]
-        self._C = jacobians[:, n:] * d / s[:, None]
+        widths, groups, largest = _columns(matrix, scales, sizes)
+        self._d, self._s = d, s = largest * scales.states, largest * scales.outputs
+        self._w, self._v = widths[:r], widths[r:]
         # The square of the rate; the margin, and what it leaves of the square.
-        self._rate2, self._margin, self._rest = (self._cp.Parameter(nonneg=True) for _ in range(3))
-        self._P = self._cp.Variable((n, n), symmetric=True)
+        self._margin, self._rest = cp.Parameter(nonneg=True), cp.Parameter(nonneg=True)
+        self._P, self._X, T = (cp.Variable((n, n), symmetric=True) for _ in range(3))
+        P, room, low = self._P, self._margin * self._P, self._rest * self._P
+        shares, self._Y = cp.Variable(groups.shape[1]), cp.Variable((n, p))
+        self._M, self._N = cp.Variable((p, n)), cp.Variable((p, p))
+        self._D = D = groups @ shares
+        R = cp.diag(cp.multiply(D[r:], (s / self._v) ** 2))
+        PB = P @ (matrix / d[:, None] * self._w)
+        injected = self._Y
+        if gain is not None:
+            injected = P @ (gain / d[:, None] * s)
+        if observes:
+            PB, supply = cp.hstack([PB, -injected @ np.diag(self._v / s)]), D
+        else:
+            supply = D[:r]
 
-    @abstractmethod
+        def problem(squares: bool) -> Any:
+            top, rest, eye = self._X if squares else P, P - self._X if squares else P, np.eye(n)
+            found = [
+                P << _MOST_CONDITION * eye, cp.trace(T) <= n, self._definite([[T, eye], [eye, P]])
+            ] if squares and growth is None else [P >> eye]
+            found += [shares >= _FLOOR, cp.sum(shares) <= _MOST_SUPPLY, self._definite([
+                [rest - _SLACK * P, PB], [PB.T, (1.0 - _SLACK) * cp.diag(supply)]
+            ])]
+            first, Y, M, N = top - room, self._Y, self._M, self._N
+            for jacobian in jacobians:
+                A, C = jacobian[:n] * d / d[:, None], jacobian[n:] * d / s[:, None]
+                if observes:
+                    side = P @ A - injected @ C
+                    rows = [[first, side], [side.T, low]]
+                elif kind == "output weight":
+                    rows = [[first, P @ A], [A.T @ P, low + C.T @ R @ C]]
+                else:
+                    side, mixed = P @ A + Y @ C, C.T @ N - M.T
+                    rows = [
+                        [first, side, -Y], [side.T, low + C.T @ M + M.T @ C, mixed],
+                        [-Y.T, mixed.T, (1.0 - self._margin) * R - N - N.T],
+                    ]
+                found.append(self._definite(rows))
+            return cp.Problem(cp.Minimize(cp.sum(shares)), found)
+
+        self._forms = (True, False) if observes else (not triangle,)
+        self._problem = lru_cache(None)(problem)
+
     def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
-        """Solve for a rate."""
+        """Solve for a rate; the measure is the length of the error's components in the limit."""
+        for squares in self._forms:
+            answer = self._answer(squares, rate, margin, seconds)
+            if answer.form is not None or answer.status == "user_limit":
+                break
+        if answer.form is None:
+            return answer
+        growth = self._growth(rate) if squares else 1.0 / (1.0 - rate) ** 2
+        square = max(float(self._problem(squares).value), 0.0) * growth
+        return replace(answer, objective=math.sqrt(square))
 
-    def _detectable(self, kind: Kind, top: Any, R: Any, Y: Any, M: Any, N: Any) -> list[Any]:
-        """The inequality of detectability at each Jacobian, with its first block ``top``."""
-        P, low, found = self._P, self._rest * self._P, []
-        for A, C in zip(self._A, self._C, strict=True):
-            if kind == "output weight":
-                rows = [[top, P @ A], [A.T @ P, low + C.T @ R @ C]]
-            else:
-                side, mixed = P @ A + Y @ C, C.T @ N - M.T
-                rows = [
-                    [top, side, -Y], [side.T, low + C.T @ M + M.T @ C, mixed],
-                    [-Y.T, mixed.T, R - N - N.T - self._margin * R],
-                ]
-            found.append(self._definite(rows))
-        return found
+    def of_gain(self, gain: Array) -> Program:
+        """The program for an observer with this gain."""
+        return Program("observer", *self._all, self._G, gain)
 
     def _definite(self, rows: list[list[Any]]) -> Any:
         """The constraint that blocks form a matrix that is positive semidefinite."""
         matrix = self._cp.bmat(rows)
         return 0.5 * (matrix + matrix.T) >> 0
 
-    def _answer(
-        self, problem: Any, form: Callable[[float], Form], rate: float, margin: float,
-        seconds: float,
-    ) -> Answer:
+    def _answer(self, squares: bool, rate: float, margin: float, seconds: float) -> Answer:
         """Solve one of the problems, and fill its form in; without its measure."""
-        self._rate2.value, self._margin.value = rate * rate, margin
-        self._rest.value = max(rate * rate - margin, 0.0)
+        problem = self._problem(squares)
+        self._margin.value, self._rest.value = margin, max(rate * rate - margin, 0.0)
         limit = {"time_limit": max(seconds, _LEAST)} if math.isfinite(seconds) else {}
         try:
             with warnings.catch_warnings():
@@ -132,211 +203,48 @@ class Program(ABC):
                for each in problem.variables()):
             return Answer(status)
         try:
-            found = form(rate)
+            form = self._form(rate, squares)
         except np.linalg.LinAlgError:
             return Answer(status)
         if status == "optimal":
-            return Answer("solved", form=found)
+            return Answer("solved", form=form)
         # A solver that stopped early may have returned anything.
-        matrices = *found.constants(), found.matrices(self._jacobians)
-        usable = all(definite(each)[0].all() for each in matrices)
-        return Answer(status, form=found if usable else None)
+        usable = form.holds_always() and definite(form.matrices(self._jacobians)).all()
+        return Answer(status, form=form if usable else None)
 
-    def _value(self, variable: Any, rows: Array, columns: Array) -> Array:
-        return np.asarray(variable.value, np.float64) / np.outer(rows, columns)
-
-    def _symmetric(self, variable: Any) -> Array:
-        value = self._value(variable, self._d, self._d)
-        return 0.5 * (value + value.T)
-
-
-class DetectabilityProgram(Program):
-    r"""Minimise :math:`d^2 \kappa + v^2 r` over :math:`I \preceq P \preceq \kappa I` and a form.
-
-    r bounds the weight of the output, :math:`R \preceq r I`. Then :math:`\sqrt\kappa / \eta` and
-    :math:`\sqrt r / \eta` are the constants of disturbance and noise; d and v say how much each
-    matters.
-    """
-
-    def __init__(
-        self, kind: Kind, jacobians: Array, scales: Scales, weights: tuple[float, float]
-    ) -> None:
-        super().__init__(kind, jacobians, scales)
-        cp, d, s, P = self._cp, self._d, self._s, self._P
-        n, p = d.size, s.size
-        self._kind = kind
-        self._Y, self._R = Y, R = cp.Variable((n, p)), cp.Variable((p, p), symmetric=True)
-        self._M, self._N = M, N = cp.Variable((p, n)), cp.Variable((p, p))
-        condition, output = cp.Variable(), cp.Variable()
-        square, output_square = np.diag(d**2), np.diag(s**2)
-        constraints: list[Any] = [
-            P - square >> 0, condition * square - P >> 0, condition <= _MOST_CONDITION,
-            R >> 0, output * output_square - R >> 0,
-        ]
-        constraints += self._detectable(kind, P - self._margin * P, R, Y, M, N)
-        first, second = weights
-        self._problem = cp.Problem(
-            cp.Minimize(first**2 * condition + second**2 * output), constraints
-        )
-
-    def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
-        """Solve for a rate; the measure is the program's, up to a factor the limit."""
-        answer = self._answer(self._problem, self._form, rate, margin, seconds)
-        if answer.form is None:
-            return answer
-        return replace(
-            answer, objective=math.sqrt(max(float(self._problem.value), 0.0)) / (1.0 - rate)
-        )
-
-    def _form(self, rate: float) -> Form:
-        d, s, P = self._d, self._s, self._symmetric(self._P)
-        R = self._value(self._R, s, s)
-        # The solver's tolerance may leave it below zero; a larger R asks for less.
-        values, vectors = np.linalg.eigh(0.5 * (R + R.T))
-        R = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        R = 0.5 * (R + R.T)
-        if self._kind == "output weight":
-            return OutputWeight(P, R, rate)
-        Y, M, N = self._value(self._Y, d, s), self._value(self._M, s, d), self._value(self._N, s, s)
-        return OutputInjection(P, R, Y, M, N, rate)
+    def _form(self, rate: float, squares: bool) -> Form:
+        """The unknowns in the units of the system."""
+        d, s = self._d, self._s
+        P = 0.5 * (self._P.value + self._P.value.T) / np.outer(d, d)
+        r, D = len(self._w), self._D.value / np.append(self._w, self._v) ** 2
+        scale = 1.0 / float(self._problem(squares).value) if self._printed else 1.0
+        if self._printed:
+            P, D = _rounded(scale * P), _rounded(np.diag(scale * D)).diagonal()
+        B, Q, R = self._G, np.diag(D[:r]), np.diag(D[r:])
+        gain, observes = self._gain, self._kind in ("observer", "synthesis")
+        if observes:
+            if gain is None:
+                gain = _printable(np.linalg.solve(P, self._Y.value / np.outer(d, s)))
+            B = np.hstack((B, -gain))
+        form = Form(P, rate, R, gain)
+        if self._kind == "output injection":
+            Y, M, N = (
+                scale * each.value / np.outer(one, other)
+                for each, one, other in ((self._Y, d, s), (self._M, s, d), (self._N, s, s))
+            )
+            form = replace(form, injection=(Y, M, N))
+        if squares:  # X as large as the second inequality allows
+            PB = P @ B
+            X = (1.0 - _SLACK) * P - (1.0 + _SLACK) * (PB / D[: B.shape[1]]) @ PB.T
+            return replace(form, X=0.5 * (X + X.T), B=B, Q=Q)
+        return form if not observes else replace(form, R=np.empty((0, 0)))
 
 
-class ObserverProgram(Program):
-    r"""Minimise the limit of the bound on an observer's error, for noises of given sizes.
-
-    Of :math:`d = (w, v)` within these sizes, and B with :math:`B d = G w - L v`, it is
-
-    .. math::
-        \min \operatorname{tr} X \quad \text{s.t.} \quad
-        \begin{pmatrix} X - B \Delta B^\top & (A - L C) X \\ \cdot & \rho^2 X \end{pmatrix}
-        \succeq 0, \quad \sum_j d_j^2 / \Delta_j \le 1 - \rho^2,
-
-    in states of the region's size. With P the inverse of X, S the inverse of the first block, and
-    diag(Q, R) the inverse of :math:`\Delta`, it is the pair of inequalities of `ErrorContraction`,
-    with :math:`|e|_P \le 1` in the limit. :math:`\Delta` is diagonal; a length d is shared by its
-    components. A rate hardly above the smallest leaves no room between S and P: then X is
-    the first block, and :math:`|B d|_P \le 1`.
-    """
-
-    def __init__(
-        self, jacobians: Array, scales: Scales, sizes: NoiseSizes, gain: Array,
-        matrix: Array | None = None,
-    ) -> None:
-        matrix = np.eye(scales.states.size) if matrix is None else matrix
-        self._widths, self._groups, largest = _columns(matrix, scales, sizes)
-        self._scales, sizes_now = scales.states, Scales(
-            largest * scales.states, largest * scales.outputs
-        )
-        super().__init__("observer", jacobians, sizes_now)
-        cp, d, n = self._cp, self._d, self._d.size
-        self._gain, self._matrix = gain, matrix
-        B = np.hstack((matrix, -gain)) / d[:, None] * self._widths
-        self._X = X = cp.Variable((n, n), symmetric=True)
-        self._weights = weights = cp.Variable(self._groups.shape[1], pos=True)
-        # X at infinity, or at zero where nothing disturbs, would be feasible for any rate.
-        limits = [
-            cp.sum(cp.inv_pos(weights)) <= 1.0, X - _SMALLEST_LIMIT**2 * np.eye(n) >> 0,
-            cp.trace(X) <= _LARGEST_LIMIT**2,
-        ]
-        noise = B @ cp.diag(self._groups @ weights) @ B.T
-        closed = self._A - (gain / d[:, None] * self._s) @ self._C
-        least, low = cp.Minimize(cp.trace(X)), self._rest * X
-        self._share = cp.Parameter(nonneg=True)  # of the noise, 1 / (1 - rate^2)
-
-        def problem(top: Any, *others: Any) -> Any:
-            first = top - self._margin * X
-            contracts = [self._definite([[first, A @ X], [X @ A.T, low]]) for A in closed]
-            return cp.Problem(least, [*limits, *others, *contracts])
-
-        self._squares = problem(X - self._share * noise)
-        self._triangle = problem(X, X - noise >> 0)
-
-    def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
-        """Solve for a rate; its measure is the length of the error's components in the limit."""
-        self._share.value = 1.0 / (1.0 - rate * rate)
-        answer, share = self._answer(self._squares, self._squared, rate, margin, seconds), 1.0
-        if answer.form is None and answer.status != "user_limit":
-            answer = self._answer(self._triangle, self._plain, rate, margin, seconds)
-            share = 1.0 / (1.0 - rate)
-        if answer.form is None:
-            return answer
-        scaled = answer.form.P * np.outer(self._scales, self._scales)
-        limit = math.sqrt(max(float(np.trace(np.linalg.inv(scaled))), 0.0))
-        return replace(answer, objective=limit * share)
-
-    def _plain(self, rate: float) -> ErrorContraction:
-        P = np.linalg.inv(self._X.value) / np.outer(self._d, self._d)
-        return ErrorContraction(0.5 * (P + P.T), self._gain, rate)
-
-    def _squared(self, rate: float) -> ErrorContraction:
-        d, r = self._d, self._matrix.shape[1]
-        weights = self._groups @ self._weights.value / (1.0 - rate * rate)
-        B = np.hstack((self._matrix, -self._gain)) / d[:, None] * self._widths
-        S = np.linalg.inv((1.0 - _SLACK) * self._X.value - (B * weights) @ B.T) / np.outer(d, d)
-        D = 1.0 / (weights * np.square(self._widths))
-        return replace(
-            self._plain(rate), S=0.5 * (S + S.T), G=self._matrix, Q=np.diag(D[:r]),
-            R=np.diag(D[r:]),
-        )
-
-
-class GainProgram(Program):
-    r"""Find a gain whose error stays small; `ObserverProgram` then takes it as given.
-
-    .. math::
-        \min \operatorname{tr} D \quad \text{s.t.} \quad P \succeq I, \quad
-        \begin{pmatrix} P & P A - Y C & P G & -Y \\ \cdot & \rho^2 P & 0 & 0 \\
-        \cdot & \cdot & D_w & 0 \\ \cdot & \cdot & \cdot & D_v \end{pmatrix} \succeq 0,
-
-    with Y = P L, in noises of the given sizes and states of the region's size: the limit is
-    :math:`|e|^2 \le \operatorname{tr} D / (1 - \rho^2)`.
-    """
-
-    def __init__(
-        self, jacobians: Array, scales: Scales, sizes: NoiseSizes, matrix: Array | None = None
-    ) -> None:
-        self._all = jacobians, scales, sizes
-        matrix = np.eye(scales.states.size) if matrix is None else matrix
-        widths, groups, largest = _columns(matrix, scales, sizes)
-        super().__init__(
-            "synthesis", jacobians, Scales(largest * scales.states, largest * scales.outputs)
-        )
-        cp, d, s, P = self._cp, self._d, self._s, self._P
-        n, r = matrix.shape
-        self._matrix = matrix
-        self._Y = Y = cp.Variable((n, s.size))
-        weights = cp.Variable(groups.shape[1], nonneg=True)
-        PB = cp.hstack([P @ (matrix / d[:, None] * widths[:r]), -Y @ np.diag(widths[r:] / s)])
-        nothing, D = np.zeros(PB.shape), cp.diag(groups @ weights)
-        closed = [P @ A - Y @ C for A, C in zip(self._A, self._C, strict=True)]
-        self._problem = cp.Problem(cp.Minimize(cp.sum(weights)), [
-            P - np.eye(n) >> 0, _LARGEST_LIMIT**2 * np.eye(n) - P >> 0,
-            cp.sum(weights) <= _LARGEST_LIMIT**2,
-            *(self._definite([
-                [P - self._margin * P, side, PB], [side.T, self._rest * P, nothing],
-                [PB.T, nothing.T, D],
-            ]) for side in closed),
-        ])
-
-    def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
-        """Solve for a rate; its measure is the bound on the error in the limit."""
-        answer = self._answer(self._problem, self._form, rate, margin, seconds)
-        if answer.form is None:
-            return answer
-        squares = max(float(self._problem.value), 0.0) / (1.0 - rate * rate)
-        return replace(answer, objective=math.sqrt(squares))
-
-    def improved(self, answer: Answer, margin: float, seconds: float) -> Answer:
-        """A better P for the gain that was found."""
-        if answer.form is None:
-            return answer
-        assert isinstance(answer.form, ErrorContraction)
-        again = ObserverProgram(*self._all, answer.form.gain, self._matrix)
-        return again.solve(answer.form.rate, margin, seconds)
-
-    def _form(self, rate: float) -> Form:
-        P, Y = self._symmetric(self._P), self._value(self._Y, self._d, self._s)
-        return ErrorContraction(P, _printable(np.asarray(np.linalg.solve(P, Y), np.float64)), rate)
+def _rounded(matrix: Array) -> Array:
+    """A symmetric matrix with as many digits as are printed, and zeros for what is close to it."""
+    sizes = np.sqrt(np.abs(matrix.diagonal()))
+    kept = np.where(np.abs(matrix) > _NOTHING * np.outer(sizes, sizes), matrix, 0.0)
+    return np.array([[float(f"{value:.{_PRINTED}g}") for value in row] for row in kept])
 
 
 def _printable(gain: Array) -> Array:

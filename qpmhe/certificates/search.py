@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import Array, positive, vector
+from .._checks import Array
 from ..model.residuals import Angles
 from ..model.system import System
 from .branch_and_bound import Cover, cover
@@ -18,45 +18,31 @@ from .enclosures import Enclosure, SmoothModel, evaluated, joint_jacobians
 from .evidence import CertificateError, Evidence, NotCertifiedError, OutOfTimeError
 from .inequalities import Form, Matrices, definite
 from .regions import Region
-from .sdp import (
-    Answer,
-    DetectabilityProgram,
-    GainProgram,
-    Kind,
-    NoiseSizes,
-    ObserverProgram,
-    Program,
-    Scales,
-    expected_seconds,
-)
+from .sdp import Answer, Kind, NoiseSizes, Program, Scales, expected_seconds
 from .theorem import checked_rate
 
-_SAMPLES = 400
+_SAMPLES, _PAIRS, _SEED = 400, 2000, 20210829
 _ROUNDS = 8
 _MARGINS = (1e-6, 1e-4, 1e-3, 1e-2)
 # Of what a rate that is not given leaves to 1: few cells suffice where there is room.
 _ROOM = (0.03, 0.06, 0.12, 0.25)
+_DESIGN_MARGIN = 1e-4  # it saves the verification most of its cells, and costs as much
 # Where one program takes longer than so many seconds, these rates are tried in turn, with more
 # room and fewer Jacobians.
 _LONG, _RATES, _WIDE_ROOM = 0.3, (0.9, 0.95, 0.98), (0.2, 0.4, 0.6)
-_FEW_POINTS = 4
-_FEW_CELLS = 100
+_FEW_POINTS, _MOST_POINTS, _MORE_POINTS = 4, 24, 6  # Jacobians at first, and of a failure
+_FEW_CELLS, _MOST_CELLS = 100, 40_000
 _TOLERANCE = 1e-3  # of the smallest rate
 _LARGEST_RATE = 0.9999
-# Above the smallest feasible rate, at which constants may grow without bound, and how often
-# to go three times as far.
-_ABOVE, _ATTEMPTS = 0.01, 4
-# Between the smallest rate, where constants grow without bound, and 1, where they last.
-_SHARES = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
-_REFINEMENTS = 3  # of the best of them, each by two more programs
-_SEED = 20210829
+# In how many steps the best rate is sought, in decades of 1 - rate; how often, and how much of
+# what a failed rate leaves to 1 the next ones leave out.
+_STEPS, _FURTHER = 12, (0.0, 0.03, 0.1, 0.3)
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 _ROUNDING = 1e-12  # of a state that f keeps
-_PAIRS = 2000
 # How much of the time the choice of a rate may take, and one verification; how many programs
 # the former solves; how far off the time that a program is expected to take may be.
 _CHOICE, _VERIFICATION = 0.5, 0.6
 _PROGRAMS, _MISJUDGED = 20, 4.0
-_MOST_POINTS = 24  # Jacobians that a program starts with
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +51,7 @@ class Found:
 
     form: Form  # filled in
     evidence: Evidence
-    margin: float  # margin and cells are those of `Cover`
-    cells: int
+    cells: int  # in which it was proved
     notes: tuple[str, ...]
 
 
@@ -74,40 +59,12 @@ class _BrokenPairError(NotCertifiedError):
     """No matrix helps where f or h jumps."""
 
 
-class FreeModel:
-    """A model's Jacobians by some of its states, where f keeps the others at their values."""
-
-    def __init__(self, model: SmoothModel, free: NDArray[np.intp]) -> None:
-        self._model, self._free = model, free
-        self.n, self.p = model.n, model.p
-        self.reason, self.affine_output = model.reason, model.affine_output
-        self._rows = np.append(free, model.n + np.arange(model.p))
-
-    @property
-    def unknown(self) -> str:
-        """As `SmoothModel.unknown`."""
-        return self._model.unknown
-
-    def enclose(self, lower: Array, upper: Array) -> Enclosure:
-        """As `SmoothModel.enclose`; nothing is known where f is not shown to keep the others."""
-        found, kept = self._model.enclose(lower, upper), np.ones(self.n, np.bool_)
-        kept[self._free] = False
-        moves = (
-            np.abs(found.centre) + np.abs(found.slopes).sum(axis=1) + found.error
-        )[:, : self.n][:, kept][:, :, self._free].any(axis=(1, 2))
-        rows, columns = self._rows[:, None], self._free
-        return Enclosure(
-            found.centre[:, rows, columns], found.slopes[:, :, rows, columns],
-            np.where(moves[:, None, None], np.nan, found.error[:, rows, columns]), found.excess,
-            found.jacobian[:, rows, columns],
-        )
-
-
 class Search:
     """Programs at some states, verification at all of them, and more states where it fails.
 
     ``kind=None`` takes the form of detectability that the output allows. The sizes are those of
-    disturbance and noise; for detectability, two numbers that say how much they matter.
+    disturbance and noise; for detectability, of disturbance and output. With ``growth``, as of
+    `Program`, detectability has the sum of squares, and disturbances act through their matrix.
 
     A state that the region fixes, such as a known parameter, has no error. It is left out where
     f keeps it at its value, whatever the others do, and the gain does not move it. Jacobians,
@@ -118,70 +75,65 @@ class Search:
     def __init__(
         self, system: System, region: Region, kind: Kind | None, sizes: NoiseSizes,
         gain: Array | None = None, seconds: float | Deadline = PART_SECONDS,
+        growth: Callable[[float], float] | None = None,
     ) -> None:
         self._deadline = Deadline.of(seconds)
         self.system, self.region, self.gain, self._sizes = system, region, gain, sizes
-        if kind is None:
-            if system.output_residual is not None or system.state_residual is not None:
-                raise CertificateError(
-                    "the system has angles, whose differences may wrap: only an observer is "
-                    "certified, within a region where they do not. Leave the residuals out for "
-                    "detectability, with outputs and states that do not wrap within the region."
-                )
-            first, second = vector("weights", np.asarray(sizes), 2).tolist()
-            self._weights = positive("weights[0]", first), positive("weights[1]", second)
+        self._growth, self._triangle = growth, kind is None and growth is None
+        if kind is None and (system.output_residual or system.state_residual) is not None:
+            raise CertificateError(
+                "the system has angles, whose differences may wrap: only an observer is "
+                "certified, within a region where they do not. Leave the residuals out for "
+                "detectability, with outputs and states that do not wrap within the region."
+            )
+        n, self.p, G = system.n, system.p, system.disturbance_matrix
+        self._matrix = np.eye(n) if G is None or self._triangle else G
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
-        jacobians, n = joint_jacobians(system, self.points), system.n
+        self.jacobians = joint_jacobians(system, self.points)
+        self.model = SmoothModel(system, region)
+        given = "given" in (system.f_jacobian.method, system.h_jacobian.method)
+        if given and not self.model.reason:  # what is given may be wrong
+            true = self.model.enclose(self.points, self.points).centre
+            self.jacobians = np.where(np.isfinite(true), true, self.jacobians)
         fixed = (region.lower == region.upper)[:n]
-        self.free = np.flatnonzero(~fixed)
-        self.model: SmoothModel | FreeModel = SmoothModel(system, region)
-        self._matrix, self.acting = system.disturbance_matrix, np.arange(system.r)
-        if fixed.any():
-            self._leave_out(fixed, jacobians)
-        rows = np.append(self.free, n + np.arange(system.p))
-        self.jacobians = jacobians[:, rows[:, None], self.free]
+        self.free, self.acting = np.flatnonzero(~fixed), np.arange(system.r)
         self.n = self.free.size
+        if fixed.any():
+            self._leave_out(fixed)
         if kind is None:
-            outputs = self.jacobians[:, self.n :]
             same = self.model.affine_output or (
-                bool(self.model.reason) and np.ptp(outputs, axis=0).max() == 0.0
+                bool(self.model.reason) and not np.ptp(self.jacobians[:, self.n :], axis=0).any()
             )
             kind = "output weight" if same else "output injection"
         self.kind: Kind = kind
-        each = expected_seconds(self.n, system.p, kind)
+        each = expected_seconds(self.n, self.p, kind)
         affordable = _CHOICE * self._deadline.left / (_PROGRAMS * each)
         self._long = each * _MOST_POINTS > _LONG
         most = _FEW_POINTS if self._long else _MOST_POINTS
         self._chosen = _far_apart(self.jacobians, int(np.clip(affordable, 1, most)))
-        if not self.model.reason and "given" in (
-            system.f_jacobian.method, system.h_jacobian.method
-        ):
-            # What is given may be wrong, and would make the program another one.
-            chosen = self.points[self._chosen]
-            true = self.model.enclose(chosen, chosen).centre
-            self.jacobians[self._chosen] = np.where(
-                np.isfinite(true), true, self.jacobians[self._chosen]
-            )
-        self.scales = _typical_scales(region, self.jacobians, self.free)
+        states = 0.5 * (region.upper - region.lower)[self.free]
+        outputs = np.abs(self.jacobians[:, self.n :] * states).sum(axis=2).max(axis=0)
+        self.scales = Scales(
+            states / states.max(), np.where(outputs > 0.0, outputs / states.max(), 1.0)
+        )
         self._program: Program | None = None
-        self._few = False  # whether few cells must do
+        self._answers: list[Answer] = []
         self.notes = self._angles()
 
     def _angles(self) -> tuple[str, ...]:
         """How large noises of angles may be, so that innovations in the region do not wrap."""
-        angles, m = self.system.output_residual, self.region.lower[None]
+        angles = self.system.output_residual
         if not isinstance(angles, Angles):
             return ()
-        if not isinstance(self.model, SmoothModel) or self.model.reason:
+        if self.model.reason:
             raise CertificateError(
                 "the outputs' angles have no enclosure, so that it is not known where they wrap"
             )
-        outputs = self.model.values(m, self.region.upper[None])
-        first = self.model.n + angles.components
-        width = (outputs.high - outputs.low)[0, first]
+        outputs = self.model.values(self.region.lower[None], self.region.upper[None])
+        width = (outputs.high - outputs.low)[0, self.system.n + angles.components]
         half = 0.5 * np.asarray(angles.periods)
+        largest = np.broadcast_to(np.asarray(self._sizes[1]), (self.p,))[angles.components]
         room = half - width
-        largest = np.broadcast_to(np.asarray(self._sizes[1]), (self.system.p,))[angles.components]
         if not (room > largest).all():
             k = int(np.argmin(room - largest))
             raise NotCertifiedError(
@@ -194,38 +146,57 @@ class Search:
             for j, each in zip(angles.components, np.floor(room * 1e4) / 1e4, strict=True)
         )
 
-    def _leave_out(self, fixed: NDArray[np.bool_], jacobians: Array) -> None:
+    def _leave_out(self, fixed: NDArray[np.bool_]) -> None:
         """Leave the states out that the region fixes; an error if it cannot be done."""
-        states, n = self.points[:, : self.system.n], self.system.n
+        n, free = self.system.n, self.free
+        states, width = self.points[:, :n], "a region with some width there"
         ahead = evaluated("f", self.system.f, states, self.points[:, n:])
-        kept = np.abs(ahead - states) <= _ROUNDING * np.abs(states)
-        moved = fixed & ~(kept.all(axis=0) & ~jacobians[:, :n][:, :, ~fixed].any(axis=(0, 2)))
-        corrected = fixed & (False if self.gain is None else self.gain.any(axis=1))
-        for who, which in (("f", moved), ("the observer's gain", corrected)):
+        kept = (np.abs(ahead - states) <= _ROUNDING * np.abs(states)).all(axis=0)
+        kept &= ~self.jacobians[:, :n, free].any(axis=(0, 2))
+        still = np.ones(n, np.bool_) if self.gain is None else ~self.gain.any(axis=1)
+        for who, which, helps in (
+            ("f", fixed & ~kept, (width,)),
+            ("the observer's gain", fixed & ~still, (width, "a gain with a row of zeros there")),
+        ):
             if which.any():
                 names = ", ".join(f"x[{j}]" for j in np.flatnonzero(which))
                 raise NotCertifiedError(
-                    f"the region has no width in {names}, but {who} moves it",
-                    ("a region with some width there", "a gain with a row of zeros there")
-                    if who != "f" else ("a region with some width there",),
+                    f"the region has no width in {names}, but {who} moves it", helps
                 )
-        if not self.free.size:
+        if not free.size:
             raise NotCertifiedError(
                 "the region is a single state, which has nothing to estimate",
                 ("a region with some width",),
             )
-        G = np.eye(n) if self._matrix is None else self._matrix
-        self.acting = np.flatnonzero(~G[fixed].any(axis=0) & G[~fixed].any(axis=0))
-        self._matrix = G[np.ix_(self.free, self.acting)]
-        if self.gain is not None:
-            self.gain = self.gain[self.free]
-        w, v = self._sizes
-        if np.shape(w) == (self.system.r,):
-            self._sizes = np.asarray(w)[self.acting], v
-        if not self.acting.size:
-            self._matrix, self._sizes = None, (0.0, v)
-        if isinstance(self.model, SmoothModel):
-            self.model = FreeModel(self.model, self.free)
+        self.jacobians = self.jacobians[:, np.append(~fixed, np.ones(self.p, np.bool_))][..., free]
+        self.gain = None if self.gain is None else self.gain[free]
+        G, (w, v) = self._matrix, self._sizes
+        acting = np.flatnonzero(~G[fixed].any(axis=0) & G[free].any(axis=0))
+        if not self._triangle:
+            self.acting = acting
+        if np.shape(w) == (G.shape[1],):
+            self._sizes = np.asarray(w)[acting], v
+        self._matrix = G[np.ix_(free, acting)]
+        if not acting.size:
+            self._matrix, self._sizes = np.eye(self.n), (0.0, v)
+
+    def enclose(self, lower: Array, upper: Array) -> Enclosure:
+        """As `SmoothModel.enclose`, of the free states.
+
+        Nothing is known where f is not shown to keep the others.
+        """
+        found, n = self.model.enclose(lower, upper), self.system.n
+        if self.n == n:
+            return found
+        rest = np.setdiff1d(np.arange(n), self.free)
+        size = np.abs(found.centre) + np.abs(found.slopes).sum(axis=1) + found.error
+        moves = size[:, rest][..., self.free].any(axis=(1, 2))
+        rows, columns = np.append(self.free, n + np.arange(self.p))[:, None], self.free
+        return replace(
+            found, centre=found.centre[:, rows, columns],
+            slopes=found.slopes[:, :, rows, columns], jacobian=found.jacobian[:, rows, columns],
+            error=np.where(moves[:, None, None], np.nan, found.error[:, rows, columns]), sides=(),
+        )
 
     def embedded(self, matrix: Array, places: NDArray[np.intp], size: int) -> Array:
         """A weight of what is not left out, as one of everything; what is left out weighs most."""
@@ -240,53 +211,36 @@ class Search:
     def program(self) -> Program:
         """The program at the states chosen so far."""
         if self._program is None:
-            at, matrix = (self.jacobians[self._chosen], self.scales), self._matrix
-            if self.gain is not None:
-                self._program = ObserverProgram(*at, self._sizes, self.gain, matrix)
-            elif self.kind == "synthesis":
-                self._program = GainProgram(*at, self._sizes, matrix)
-            else:
-                self._program = DetectabilityProgram(self.kind, *at, self._weights)
+            self._program = Program(
+                self.kind, self.jacobians[self._chosen], self.scales, self._sizes, self._matrix,
+                self.gain, self._growth, self._triangle,
+            )
         return self._program
-
-    def _smallest_rate(self) -> float:
-        """The smallest feasible rate at the chosen states, infinite if none below 1 is.
-
-        Where the time is over before, the smallest one that was tried and is.
-        """
-        deadline = self._deadline.part(_CHOICE)
-        low, high = 0.0, _LARGEST_RATE
-        if self._feasible(high, deadline).form is None:
-            return np.inf
-        while high - low > _TOLERANCE * (1.0 - low):
-            middle = 0.5 * (low + high)
-            try:
-                answer = self._feasible(middle, deadline)
-            except OutOfTimeError:
-                break
-            if answer.form is None:
-                low = middle
-            else:
-                high = middle
-        return high
 
     def answer(
         self, name: str, rate: float | None, advice: tuple[str, ...],
         why: Callable[[Search, str], NotCertifiedError],
     ) -> Found:
-        """An inequality with this rate, or with the best; `why` says why none is feasible."""
+        """An inequality with this rate, or with the best; `why` says why none is feasible.
+
+        When the time is over, it is the best one found so far that holds at the samples.
+        """
         if rate is not None:
             checked_rate(name, rate)
         try:
-            return self._find_best() if rate is None else self._find(rate)
+            return self._find_best() if rate is None else self._find(rate, given=True)
         except OutOfTimeError:
+            for one in sorted(self._answers, key=lambda each: each.objective):
+                found = None if one.form is None else self._verified(one.form, _FEW_CELLS)
+                if isinstance(found, Found):
+                    return found
             raise
         except NotCertifiedError as error:
             try:
                 smallest = self._smallest_rate()
             except OutOfTimeError:
                 raise error from None
-            if not np.isfinite(smallest):
+            if not math.isfinite(smallest):
                 raise why(self, error.finding) from error
             helps = (*error.suggestions, f"a larger {name}", *advice, "a smaller region")
             raise NotCertifiedError(
@@ -294,113 +248,114 @@ class Search:
                 tuple(dict.fromkeys(helps)), smallest,
             ) from error
 
-    def _feasible(self, rate: float, deadline: Deadline) -> Answer:
-        return self._solved(rate, _MARGINS[0] * min(1.0, rate * rate), deadline)
+    def _smallest_rate(self) -> float:
+        """The smallest feasible rate at the chosen states, infinite if none below 1 is.
+
+        Where the time is over before, the smallest one that was tried and is.
+        """
+        low, high, deadline = 0.0, 1.0, self._deadline.part(_CHOICE)
+        middle = _LARGEST_RATE
+        try:
+            while high - low > _TOLERANCE * (1.0 - low):
+                margin = _MARGINS[0] * min(1.0, middle * middle)
+                if self._solved(middle, margin, deadline).form is not None:
+                    high = middle
+                elif high == 1.0:
+                    return math.inf
+                else:
+                    low = middle
+                middle = 0.5 * (low + high)
+        except OutOfTimeError:
+            if high == 1.0:
+                raise
+        return high
 
     def _solved(self, rate: float, margin: float, deadline: Deadline) -> Answer:
         """What the program returns; an error if there is no time for it, or not enough."""
-        if deadline.passed:
-            raise self._out_of_time("it was over while matrices were sought and verified")
-        if self.program.expected_seconds > _MISJUDGED * deadline.left:
-            raise self._out_of_time(
-                f"a semidefinite program for {self.system.n} states takes about "
-                f"{self.program.expected_seconds:.2g} s, and {deadline.left:.2g} s were left"
+        expected, left = self.program.expected_seconds, deadline.left
+        answer = Answer("user_limit")
+        if not deadline.passed and expected <= _MISJUDGED * left:
+            answer = self.program.solve(rate, margin, left)
+        if answer.status == "user_limit" and (deadline.passed or expected > _MISJUDGED * left):
+            given = self._deadline.seconds
+            time = f"({given:.3g} s) was too short" if given > LEAST_SECONDS else "is over"
+            raise OutOfTimeError(
+                f"the time for this search {time}: a semidefinite program for {self.system.n} "
+                f"states takes about {expected:.2g} s, and {left:.2g} s were left",
+                ("more seconds", "a given rate, which spares the search for one",
+                 "a smaller model"),
             )
-        answer = self.program.solve(rate, margin, deadline.left)
-        if answer.status == "user_limit" and deadline.passed:
-            raise self._out_of_time(
-                f"a semidefinite program for {self.system.n} states was not solved in time"
-            )
+        self._answers.append(answer)
         return answer
 
-    def _out_of_time(self, what: str) -> OutOfTimeError:
-        given = self._deadline.seconds
-        time = (
-            f"the time for this search ({given:.3g} s) was too short" if given > LEAST_SECONDS else
-            "no time was left for this search"
-        )
-        return OutOfTimeError(
-            f"{time}: {what}",
-            ("more seconds", "a given rate, which spares the search for one", "a smaller model"),
-        )
+    def _best_rate(self, least: float) -> float:
+        """The rate with the smallest measure of what lasting disturbances and noises make.
 
-    def _best_rate(self, smallest: float) -> float:
-        """The rate with the smallest measure of what lasting disturbances and noises make."""
-        deadline, room = self._deadline.part(_CHOICE), 1.0 - smallest
-        measures: dict[float, float] = {}
+        By golden sections of the decades of 1 - rate; a rate that is too small has no measure.
+        """
+        deadline, measures = self._deadline.part(_CHOICE), dict[float, float]()
 
-        def measure(share: float) -> float:
-            if share not in measures:
-                rate = smallest + share * room
+        def measure(decade: float) -> float:
+            rate = round(1.0 - 10.0**decade, 9)
+            if rate not in measures:
                 margin = self._margins(rate, given=False)[1]
-                measures[share] = self._solved(rate, margin, deadline).objective
-            return measures[share]
+                measures[rate] = self._solved(rate, margin, deadline).objective
+            return measures[rate]
 
-        with contextlib.suppress(OutOfTimeError):
-            best = min(_SHARES, key=measure)
-            around = (0.0, *_SHARES, 1.0)
-            low, high = (around[around.index(best) + step] for step in (-1, 1))
-            for _ in range(_REFINEMENTS):
-                sides = 0.5 * (low + best), 0.5 * (best + high)
-                nearest = min((best, *sides), key=measure)
-                if nearest == sides[0]:
-                    high = best
-                elif nearest == sides[1]:
-                    low = best
+        low, high = math.log10(1.0 - _LARGEST_RATE), math.log10(1.0 - least)
+        try:
+            for _ in range(_STEPS):
+                step = _GOLDEN * (high - low)
+                if measure(low + step) < measure(high - step):
+                    low = high - step
                 else:
-                    low, high = sides
-                best = nearest
-        known = {share: value for share, value in measures.items() if np.isfinite(value)}
-        return smallest + min(known, key=known.__getitem__, default=0.0) * room
+                    high = low + step
+        except OutOfTimeError:
+            if not measures:
+                raise
+        best = min(measures, key=measures.__getitem__)
+        if math.isinf(measures[best]) and math.isinf(self._smallest_rate()):
+            raise NotCertifiedError(
+                "no rate below 1 was found for which the semidefinite program is feasible"
+            )
+        return best if math.isfinite(measures[best]) else _LARGEST_RATE
 
     def _find_best(self) -> Found:
         """An inequality with the best rate found."""
-        share, refused = _ABOVE, NotCertifiedError("no rate was tried")
-        if self._long:
-            for rate in _RATES:
-                try:
-                    return self._find(rate, given=False)
-                except (OutOfTimeError, _BrokenPairError):
-                    raise
-                except NotCertifiedError as error:
-                    refused = error
-            raise refused
-        for _ in range(_ATTEMPTS):
-            smallest = self._smallest_rate()
-            if not np.isfinite(smallest):
-                raise NotCertifiedError(
-                    "no rate below 1 was found for which the semidefinite program is feasible"
-                )
-            rate = max(smallest + share * (1.0 - smallest), self._best_rate(smallest))
+        least, refused = 0.0, NotCertifiedError("no rate was tried")
+        for further, one in zip(_FURTHER, _RATES if self._long else _FURTHER, strict=False):
+            rate = one if self._long else self._best_rate(least + further * (1.0 - least))
             try:
                 return self._find(rate, given=False)
             except (OutOfTimeError, _BrokenPairError):
                 raise
             except NotCertifiedError as error:
-                # What failed has left more states in the program, and moves the smallest rate.
-                refused, share = error, 3.0 * share
+                # What failed has left more states in the program, and moves the best rate.
+                refused, least = error, rate
         raise refused
 
     def _margins(self, rate: float, given: bool) -> list[float]:
         """The margins to try in turn."""
-        least = [each * min(1.0, rate * rate) for each in _MARGINS]
+        least, room = [each * min(1.0, rate * rate) for each in _MARGINS], 1.0 - rate * rate
+        if self._growth is not None:
+            least = [max(each, _DESIGN_MARGIN * min(rate * rate, 1e3 * room)) for each in least]
         if self._long:
-            return [each * (1.0 - rate * rate) for each in _WIDE_ROOM]
+            return [each * room for each in _WIDE_ROOM]
         if given or self.kind not in ("observer", "synthesis"):
             return least
-        return [least[0], *(each * (1.0 - rate * rate) for each in _ROOM)]
+        return [least[0], *(each * room for each in _ROOM)]
 
-    def _find(self, rate: float, *, given: bool = True) -> Found:
+    def _find(self, rate: float, *, given: bool) -> Found:
         """An inequality with this rate, verified as far as can be."""
-        level, margins = 0, self._margins(rate, given)
-        best: Found | None = None
-        status = "no round was left"
-        for turn in range(1, _ROUNDS + 1):
+        margins, best, status = self._margins(rate, given), None, "no round was left"
+        for turn in range(_ROUNDS):
             try:
-                answer = self._solved(rate, margins[level], self._deadline)
-                if isinstance(self.program, GainProgram):
-                    answer = self.program.improved(
-                        answer, margins[level], self._deadline.left
+                answer = self._solved(rate, margins[0], self._deadline)
+                if self.kind == "synthesis" and answer.form is not None:
+                    # A better P for the gain, which was rounded.
+                    assert answer.form.gain is not None
+                    answer = self.program.of_gain(answer.form.gain).solve(
+                        rate, margins[0], self._deadline.left
                     )
             except OutOfTimeError:
                 if best is None:
@@ -410,17 +365,17 @@ class Search:
                 status = answer.status
                 break
             # Where a few cells do, as for affine models, no room is needed.
-            self._few = not given and level == 0
-            outcome = self._verified(answer.form)
+            few = not given and margins[0] == self._margins(rate, given)[0]
+            outcome = self._verified(answer.form, _FEW_CELLS if few else _MOST_CELLS)
             if isinstance(outcome, Found):
                 if outcome.evidence is Evidence.PROVED or self.model.reason:
                     return outcome
                 best = outcome
-            elif self._added(outcome) and turn % 2 and not self._long:
+            elif self._added(outcome) and turn % 2 == 0 and not self._long:
                 continue
-            if level + 1 == len(margins):
+            if not margins[1:]:
                 break
-            level += 1
+            margins = margins[1:]
         if best is not None:
             return best
         raise NotCertifiedError(
@@ -430,36 +385,28 @@ class Search:
             f"(solver status: {status})"
         )
 
-    def _verified(self, form: Form) -> Found | Cover:
+    def _verified(self, form: Form, most_cells: int) -> Found | Cover:
         """What was shown, or the cover with the states where the inequality fails."""
-        if not all(definite(each)[0].all() for each in form.constants()):
-            return Cover(False, 0, 0.0, np.empty((0, 0)), np.empty((0, 0, 0)))
-        if self.model.reason:
-            return self._sampled(
-                form, f"f and h cannot be run with intervals ({self.model.reason})"
-            )
-        limit = {"most_cells": _FEW_CELLS} if self._few else {}
-        found = cover(
-            self.model, self.region, form, seconds=self._deadline.part(_VERIFICATION), **limit
-        )
-        if found.proved:
-            return Found(form, Evidence.PROVED, found.margin, found.cells, ())
-        if found.violations.shape[0]:
-            return found
-        end = ", when its time was over" if found.late else ""
-        return self._sampled(
-            form, f"the proof was given up after dividing the region into {found.cells} cells{end}"
-            f"{self.model.unknown}",
-        )
-
-    def _sampled(self, form: Form, why: str) -> Found | Cover:
-        shown, least = definite(form.matrices(Matrices.exact(self.jacobians)))
+        if not form.holds_always():
+            return Cover(False, 0, self.points[:0], self.jacobians[:0])
+        shown = definite(form.matrices(Matrices.exact(self.jacobians)))
         if not shown.all():
-            broken = ~shown
-            return Cover(False, 0, float(least.min()), self.points[broken], self.jacobians[broken])
+            return Cover(False, 0, self.points[~shown], self.jacobians[~shown])
+        why = f"f and h cannot be run with intervals ({self.model.reason})"
+        if not self.model.reason:
+            found = cover(self, self.region, form, most_cells, self._deadline.part(_VERIFICATION))
+            if found.proved:
+                return Found(form, Evidence.PROVED, found.cells, ())
+            if found.violations.shape[0]:
+                return found
+            end = ", when its time was over" if found.late else ""
+            why = (
+                f"the proof was given up after dividing the region into {found.cells} cells{end}"
+                f"{self.model.unknown}"
+            )
         self._check_pairs(form)
         note = f"{why}; the inequality holds at {self.points.shape[0]} states of the region"
-        return Found(form, Evidence.SAMPLED, float(least.min()), 0, (note,))
+        return Found(form, Evidence.SAMPLED, 0, (note,))
 
     def _check_pairs(self, form: Form) -> None:
         """Raise where the inequality does not hold between two of the samples."""
@@ -483,35 +430,22 @@ class Search:
 
     def _added(self, outcome: Cover) -> bool:
         """Take states where the inequality fails into the program; False if there are none."""
-        if not outcome.violations.shape[0]:
-            return False
-        chosen = _far_apart(outcome.jacobians, 6)
-        count = self.jacobians.shape[0]
+        chosen = _far_apart(outcome.jacobians, _MORE_POINTS)
+        self._chosen = np.append(self._chosen, len(self.points) + np.arange(len(chosen)))
         self.points = np.vstack((self.points, outcome.violations[chosen]))
         self.jacobians = np.concatenate((self.jacobians, outcome.jacobians[chosen]))
-        self._chosen = np.append(self._chosen, np.arange(count, count + len(chosen)))
         self._program = None
-        return True
+        return bool(len(chosen))
 
 
-def _far_apart(jacobians: Array, count: int = _MOST_POINTS) -> NDArray[np.intp]:
+def _far_apart(jacobians: Array, count: int) -> NDArray[np.intp]:
     """Indices of Jacobians that lie far apart from each other."""
-    flat = jacobians.reshape(jacobians.shape[0], -1)
-    size = np.ptp(flat, axis=0)
+    flat = jacobians.reshape(len(jacobians), math.prod(jacobians.shape[1:]))
+    size = np.ptp(flat, axis=0) if len(flat) else np.zeros(0)
     flat = flat[:, size > 0.0] / size[size > 0.0]
-    chosen = [0]
-    if flat.shape[1]:
-        away = np.linalg.norm(flat - flat[0], axis=1)
-        while len(chosen) < count and away.max() > 1e-9:
-            chosen.append(int(away.argmax()))
-            away = np.minimum(away, np.linalg.norm(flat - flat[chosen[-1]], axis=1))
+    chosen = [0][: len(flat)]
+    away = np.linalg.norm(flat - flat[chosen], axis=1)
+    while len(chosen) < count and away.max(initial=0.0) > 1e-9:
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(flat - flat[chosen[-1]], axis=1))
     return np.array(chosen, dtype=np.intp)
-
-
-def _typical_scales(region: Region, jacobians: Array, free: NDArray[np.intp]) -> Scales:
-    """Sizes of outputs on a region, and of the states that are not fixed."""
-    states = 0.5 * (region.upper - region.lower)[free]
-    states = np.maximum(states / states.max(), 1e-6)
-    outputs = np.abs(jacobians[:, free.size :] * states).sum(axis=2).max(axis=0)
-    return Scales(states, np.where(outputs > 0.0, outputs, 1.0))
-

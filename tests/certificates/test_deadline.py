@@ -25,9 +25,9 @@ from qpmhe.certificates.evidence import (
     NotCertifiedError,
     OutOfTimeError,
 )
-from qpmhe.certificates.inequalities import OutputWeight
+from qpmhe.certificates.inequalities import Form
 from qpmhe.certificates.regions import bounded_region
-from qpmhe.certificates.sdp import DetectabilityProgram, Scales
+from qpmhe.certificates.sdp import Program, Scales
 from qpmhe.certificates.search import Search
 from qpmhe.errors import OptionError
 
@@ -95,7 +95,7 @@ def test_infinite_derivatives_make_no_warning_and_no_proof():
     region = bounded_region(system, box(0.0, 1.0))
     model = SmoothModel(system, region)
     assert np.isnan(model.enclose(region.lower[None], region.upper[None]).error).all()
-    assert not cover(model, region, OutputWeight(np.eye(1), np.eye(1), 0.9), 50).proved
+    assert not cover(model, region, Form(np.eye(1), 0.9, np.eye(1)), 50).proved
 
 
 def test_a_cell_of_which_nothing_is_known_hides_nothing_of_the_others():
@@ -117,7 +117,7 @@ def test_proofs_end_with_the_time(ticking):
     system = qpmhe.models.pendulum()[0]
     region = bounded_region(system, PENDULUM)
     found = certify_detectability(system, PENDULUM, eta=0.9, seconds=math.inf)
-    form, model = OutputWeight(found.P, found.V, found.eta), SmoothModel(system, region)
+    form, model = Form(found.P, found.eta, found.V), SmoothModel(system, region)
     whole = cover(model, region, form, seconds=math.inf)
     part = cover(model, region, form, seconds=2.0)
     assert (whole.proved, whole.late) == (True, False)
@@ -179,7 +179,7 @@ def test_seconds_out_of_range(seconds):
 
 
 def test_no_search_is_begun_in_vain(monkeypatch):
-    monkeypatch.setattr(DetectabilityProgram, "solve", lambda *_, **__: pytest.fail("it was begun"))
+    monkeypatch.setattr(Program, "solve", lambda *_, **__: pytest.fail("it was begun"))
     n = 40
     with pytest.raises(OutOfTimeError, match=r"40 states takes about .* s were left"):
         certify_detectability(linear(0.9 * np.eye(n), np.ones((1, n))), unit_box(n))
@@ -193,7 +193,9 @@ def test_solver_keeps_to_its_time():
     n = 6
     A = 0.9 * np.eye(n) + 0.1 * np.random.default_rng(2).standard_normal((n, n))
     J = np.vstack((A, np.eye(n)[:2]))[None].repeat(4, axis=0)
-    program = DetectabilityProgram("output weight", J, Scales(np.ones(n), np.ones(2)), (1.0, 1.0))
+    program = Program(
+        "output weight", J, Scales(np.ones(n), np.ones(2)), (1.0, 1.0), np.eye(n), triangle=True
+    )
     assert program.solve(0.9, 1e-6).form is not None
     assert program.solve(0.9, 1e-6, seconds=1e-4).status == "user_limit"
 

@@ -9,9 +9,9 @@ import qpmhe
 from qpmhe.certificates import search as search_module
 from qpmhe.certificates.contraction import certify_detectability
 from qpmhe.certificates.evidence import Evidence, NotCertifiedError, weakest
-from qpmhe.certificates.inequalities import Matrices, OutputWeight, definite, norms
+from qpmhe.certificates.inequalities import Form, Matrices, definite, norms
 from qpmhe.certificates.properties import Detectability
-from qpmhe.certificates.sdp import Answer, DetectabilityProgram
+from qpmhe.certificates.sdp import Answer, Program
 from qpmhe.errors import OptionError
 
 from .attacks import attack_detectability
@@ -103,10 +103,10 @@ def test_what_holds_at_every_state_need_not_hold_for_averages():
     system = qpmhe.System(
         lambda x: 1.05 * x, lambda x: np.concatenate((np.sin(x), np.cos(x)), -1), n=1, p=2
     )
-    weight = OutputWeight(np.eye(1), 2.0 * np.eye(2), 0.9)
+    weight = Form(np.eye(1), 0.9, 2.0 * np.eye(2))
     x = np.linspace(0.0, 2.0 * np.pi, 50)
     J = np.stack((1.05 + 0.0 * x, np.cos(x), -np.sin(x)), 1)[..., None]
-    assert definite(weight.matrices(Matrices.exact(J)))[0].all()
+    assert definite(weight.matrices(Matrices.exact(J))).all()
     with pytest.raises(NotCertifiedError, match="no constant P"):
         certify_detectability(system, qpmhe.Box([0.0], [2.0 * np.pi]), eta=0.9)
     half = certify_detectability(system, qpmhe.Box([0.0], [1.5]), eta=0.9)
@@ -150,7 +150,7 @@ def test_too_many_cells_are_sampled(monkeypatch):
     full = search_module.cover
     monkeypatch.setattr(
         search_module, "cover",
-        lambda model, region, form, **options: full(model, region, form, 3, **options),
+        lambda model, region, form, cells, seconds: full(model, region, form, 3, seconds),
     )
     found = certify_detectability(qpmhe.models.pendulum()[0], PENDULUM, eta=0.9)
     assert found.evidence is Evidence.SAMPLED
@@ -160,12 +160,12 @@ def test_too_many_cells_are_sampled(monkeypatch):
 @pytest.mark.parametrize(
     ("answer", "words"),
     [(Answer("user_limit"), "user_limit"), *(
-        (Answer("solved", 1.0, OutputWeight(P, 1e-3 * np.eye(1), 0.9)), "no matrix that passes")
+        (Answer("solved", 1.0, Form(P, 0.9, 1e-3 * np.eye(1))), "no matrix that passes")
         for P in (np.eye(2), -np.eye(2), np.full((2, 2), np.nan))
     )],
 )
 def test_solvers_that_lie_or_stop_early_prove_nothing(monkeypatch, answer, words):
-    monkeypatch.setattr(DetectabilityProgram, "solve", lambda *_, **__: answer)
+    monkeypatch.setattr(Program, "solve", lambda *_, **__: answer)
     with pytest.raises(NotCertifiedError, match=words):
         certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=0.9)
 

@@ -9,15 +9,13 @@ import pytest
 
 from qpmhe.certificates.evidence import CertificateError
 from qpmhe.certificates.inequalities import (
-    ErrorContraction,
+    Form,
     Matrices,
-    OutputInjection,
-    OutputWeight,
     definite,
     eigenvalue_bounds,
     euclidean_constants,
     norm_bound,
-    quickly_definite,
+    norms,
 )
 
 
@@ -48,34 +46,14 @@ def test_never_more_than_exact_arithmetic_and_hardly_less(n):
         matrix -= generator.choice([0.0, 0.5, 0.999999, 1.000001, 2.0]) * float(
             np.linalg.eigvalsh(matrix)[0]
         ) * np.eye(n)
-        shown = bool(definite(Matrices.exact(matrix[None]))[0][0])
+        shown = bool(definite(Matrices.exact(matrix[None]))[0])
         truth = exactly_definite(matrix)
         assert truth or not shown
-        assert truth or not quickly_definite(Matrices.exact(matrix[None]))[0]
         proved += shown
     assert proved > 10
 
 
-def test_singular_and_broken_matrices_are_not_proved():
-    ones = np.ones((3, 3))
-    nan = np.full((3, 3), np.nan)
-    shown, least = definite(Matrices.exact(np.stack((ones, nan, -np.eye(3), np.eye(3)))))
-    assert shown.tolist() == [False, False, False, True]
-    assert least[1] == -np.inf
-
-
-def test_radius_is_covered():
-    matrix = np.eye(3)[None] + 0.1
-    generator = np.random.default_rng(5)
-    assert definite(Matrices(matrix, np.full((1, 3, 3), 0.1)))[0][0]
-    # A member is singular: (1.1 - r) I + (0.1 - r) (ones - I) from some r on.
-    assert not definite(Matrices(matrix, np.full((1, 3, 3), 0.5)))[0][0]
-    for _ in range(50):
-        noise = generator.uniform(-0.1, 0.1, (3, 3))
-        assert exactly_definite(matrix[0] + 0.5 * (noise + noise.T))
-
-
-def test_quick_proof_covers_radii_and_refuses_what_is_singular():
+def test_radii_are_covered_and_what_is_singular_is_refused():
     generator = np.random.default_rng(8)
     shown = 0
     for _ in range(200):
@@ -85,7 +63,7 @@ def test_quick_proof_covers_radii_and_refuses_what_is_singular():
         matrix = 0.5 * (matrix + matrix.T)
         sizes = np.sqrt(np.diag(matrix))
         radius = 10.0 ** generator.uniform(-6, 0) * np.outer(sizes, sizes)
-        if not quickly_definite(Matrices(matrix[None], radius[None]))[0]:
+        if not definite(Matrices(matrix[None], radius[None]))[0]:
             continue
         shown += 1
         noise = generator.choice([-1.0, 1.0], (n, n)) * radius
@@ -93,7 +71,7 @@ def test_quick_proof_covers_radii_and_refuses_what_is_singular():
     assert shown > 50
     ones, nan = np.ones((3, 3)), np.full((3, 3), np.nan)
     stack = np.stack((ones, nan, -np.eye(3), np.eye(3), 1e-30 * np.eye(3)))
-    assert quickly_definite(Matrices.exact(stack)).tolist() == [False, False, False, True, True]
+    assert definite(Matrices.exact(stack)).tolist() == [False, False, False, True, True]
 
 
 def test_products_hold_exact_products():
@@ -133,19 +111,44 @@ def test_matrices_are_what_they_say():
     J = Matrices.exact(np.array([[[a], [c]]]))
     one = np.ones((1, 1))
     for weight in (3.1, 3.3):  # (a^2 - eta^2) / c^2 = 3.2
-        shown = definite(OutputWeight(one, weight * one, eta).matrices(J))[0][0]
+        shown = definite(Form(one, eta, weight * one).matrices(J))[0]
         assert shown == (a * a < eta * eta + c * c * weight)
     for gain, expected in ((0.9, True), (0.7, False)):  # |a - gain c| < 0.8
-        assert definite(ErrorContraction(one, gain * one, eta).matrices(J))[0][0] == expected
-    injected = OutputInjection(one, r * one, -1.0 * one, 0 * one, 0 * one, eta)
-    found = definite(injected.matrices(J))[0][0]
+        assert definite(Form(one, eta, gain=gain * one).matrices(J))[0] == expected
+    injected = Form(one, eta, r * one, injection=(-1.0 * one, 0 * one, 0 * one))
+    found = definite(injected.matrices(J))[0]
     quadratic = np.array([[eta**2 - (a - c) ** 2, -(a - c)], [-(a - c), r - 1.0]])
     assert found == bool(np.linalg.eigvalsh(quadratic)[0] > 0)
     # Multipliers alone give what the output weight gives.
     m = (a * a - eta * eta) / c * 1.02
-    assert definite(
-        OutputInjection(one, 1.1 * m / c * one, 0 * one, m * one, 0 * one, eta).matrices(J)
-    )[0][0]
+    multiplied = Form(one, eta, 1.1 * m / c * one, injection=(0 * one, m * one, 0 * one))
+    assert definite(multiplied.matrices(J))[0]
+
+
+@pytest.mark.parametrize("observes", [False, True])
+def test_the_sum_of_squares_follows_from_both_inequalities(observes):
+    generator = np.random.default_rng(9)
+    shown = 0
+    for _ in range(200):
+        A, C, G, L = (
+            0.4 * generator.standard_normal(size) for size in ((2, 2), (1, 2), (2, 2), (2, 1))
+        )
+        P, X = np.eye(2), generator.uniform(0.3, 0.9) * np.eye(2)
+        Q, R = generator.uniform(0.5, 4.0) * np.eye(2), generator.uniform(0.5, 4.0) * np.eye(1)
+        form = Form(
+            P, 0.9, R, L if observes else None, None, X, np.hstack((G, -L)) if observes else G, Q
+        )
+        J = Matrices.exact(np.vstack((A, C))[None])
+        if not (form.holds_always() and definite(form.matrices(J))[0]):
+            continue
+        shown += 1
+        e, w, v = (generator.standard_normal((100, k)) for k in (2, 2, 1))
+        ahead = e @ A.T + w @ G.T - ((e @ C.T + v) @ L.T if observes else 0.0)
+        noise = v if observes else e @ C.T
+        supplied = 0.81 * norms(e, P) ** 2 + norms(w, Q) ** 2 + norms(noise, R) ** 2
+        assert (norms(ahead, P) ** 2 <= supplied).all()
+        assert (form.excess(e, e @ A.T, e @ C.T) <= 0.0).all()
+    assert shown > 20
 
 
 def test_constants_of_a_contraction():
