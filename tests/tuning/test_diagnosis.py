@@ -11,7 +11,7 @@ import qpmhe
 from qpmhe.cli.app import app
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError
 from qpmhe.tuning import observability
-from qpmhe.tuning.filter_bank import FilterBank, Hypothesis
+from qpmhe.tuning.bank import FilterBank, Hypothesis
 from qpmhe.tuning.observability import prior_shares
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "studies"))
@@ -301,9 +301,9 @@ def test_filters_are_kalman_filters():
         qpmhe.QuadraticCost.from_covariances(prior=prior, disturbance=disturbance, noise=noise),
         horizon=2, initial_state=[1.0, 0.0], max_qps=0)
     run = mhe.run(y)
-    bank = FilterBank(system, None, np.array([1.0, 0.0]), prior)
-    base = Hypothesis(y, np.zeros((60, 0)), noise, disturbance)
-    other = Hypothesis(y, np.zeros((60, 0)), 9.0 * noise, disturbance)
+    bank, start = FilterBank(system, None, prior), np.array([1.0, 0.0])
+    base = Hypothesis(y, np.zeros((60, 0)), noise, disturbance, start)
+    other = Hypothesis(y, np.zeros((60, 0)), 9.0 * noise, disturbance, start)
     found, alone = bank.run([base, other]), bank.run([other])
     assert found.states == pytest.approx(run.states[:-1], rel=1e-9, abs=1e-12)
     assert found.corrected == pytest.approx(run.filtered, rel=1e-9, abs=1e-12)
