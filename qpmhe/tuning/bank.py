@@ -94,9 +94,7 @@ class Filtered:
 
 
 class FilterBank:
-    """Runs filters over one record: of a system, with steps (T,) or the usual one, a prior's
-    covariance, and so many samples before this record with the same clocks.
-    """
+    """Runs filters over one record, with steps (T,) or the usual one, and samples before it."""
 
     def __init__(
         self, system: System, steps: Array | None, prior: Array, before: int = 0
@@ -132,7 +130,7 @@ class FilterBank:
         """The inputs of `model`: with the length of the step behind them where it takes one."""
         if not self._is_timed or self._steps is None:
             return inputs
-        lengths = np.broadcast_to(step * self._steps, (len(inputs),))
+        lengths = np.broadcast_to(step * self._steps[: len(inputs)], (len(inputs),))
         return np.column_stack((inputs, lengths))
 
     def errors(self, measured: Array, expected: Array) -> Array:
@@ -168,9 +166,8 @@ class FilterBank:
         eye_n, eye_p = np.eye(n), np.eye(p)
         x, covariance = start.copy(), np.tile(self._prior, (count, 1, 1))
         alive, logs = np.ones(count, np.bool_), np.zeros((total, count))
-        first = Filtered(logs, np.empty((total, n)), np.empty((total, n)), np.empty((total, p)),
-                         *np.empty((2, total, p, p)), *np.empty((2, total, n, n)),
-                         np.empty((total, p, n)), np.empty((total, n, p)))
+        shapes = (n,), (n,), (p,), (p, p), (p, p), (n, n), (n, n), (p, n), (n, p)
+        first = Filtered(logs, *(np.empty((total, *shape)) for shape in shapes))
         extreme = np.log(_SHARE / _WIDTH * np.sqrt(2.0 / np.pi))  # beside a normal distribution
         usual, any_outliers = np.log1p(-_SHARE), outliers.any()
         for t in range(total):

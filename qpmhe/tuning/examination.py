@@ -13,8 +13,8 @@ from ..costs import RobustCost
 from ..estimation.estimate import Status
 from ..estimation.run import Run, RunSource
 from ..model.residuals import difference
-from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
-from .faults import Fault, search
+from .bank import Array, FilterBank, Hypothesis, Mask
+from .faults import search
 from .findings import Finding, Names, listed, number, percent
 from .observability import observability, prior_shares, prior_units
 from .stuck import stuck
@@ -155,10 +155,13 @@ class Examination:
     def _starts(self) -> list[Array]:
         """The user's own estimate, and where the model moves it until the filter begins."""
         found = [self.run.states[0], self.run.states[0]]
-        inputs = self.bank.full_inputs(self.inputs[: self.first])
+        steps = self.source.steps
+        before = FilterBank(
+            self.source.system, None if steps is None else steps[: self.first], self.prior
+        )
         try:
-            for u in inputs:
-                found[1] = np.asarray(self.bank.model.f(found[1], u))
+            for u in before.full_inputs(self.inputs[: self.first]):
+                found[1] = np.asarray(before.model.f(found[1], u))
         except Exception:  # of a model that is not defined there
             found.pop()
         return [one for one in found if np.isfinite(one).all()]
@@ -171,7 +174,8 @@ class Examination:
         for pattern in np.unique(seen, axis=0):
             if pattern.any():
                 at = (seen == pattern).all(axis=1)
-                c, weight = along.outputs[at][:, pattern], inverse(self.noise[np.ix_(pattern, pattern)])
+                c = along.outputs[at][:, pattern]
+                weight = inverse(self.noise[np.ix_(pattern, pattern)])
                 information[at] = np.einsum("tji,jk,tkl->til", c, weight, c)
         units, inverse_units = prior_units(self.prior)
         sizes = np.abs(inverse_units @ along.transitions @ units).max(axis=(1, 2))

@@ -290,8 +290,8 @@ def _gains(
     if np.isfinite(null.logs).all() and usual.all():
         return
     p, m = base.measurements.shape[1], base.inputs.shape[1]
-    parts = [("input", (j,)) for j in range(m)] + [("gain", (j,)) for j in range(p)]
-    parts += [("gain", ())] * (p > 1)
+    parts: list[tuple[str, tuple[int, ...]]] = [("input", (j,)) for j in range(m)]
+    parts += [("gain", (j,)) for j in range(p)] + [("gain", ())] * (p > 1)
     # A wrong unit shows everywhere, also in the estimates from which the filters would begin.
     short = replace(base, measurements=base.measurements[:_FEW], inputs=base.inputs[:_FEW])
     begins = [replace(short, start=one) for one in starts] or [short]
