@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -182,7 +183,9 @@ def diagnose(
     """
     source = _source(run)
     names = _names(source, len(run), labels, outputs, inputs, dt, time_unit)
-    with np.errstate(all="ignore"):  # a filter under a wrong hypothesis may diverge
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        # A filter under a wrong hypothesis may diverge, and a sensor have no measurement.
+        warnings.simplefilter("ignore", RuntimeWarning)
         seen = Examination(run, source, names)
     blank = np.full((seen.first, source.system.p), np.nan)
     return Diagnosis(

@@ -1,33 +1,92 @@
-"""Which fault explains a record best: each one a filter of its own, judged by its likelihood."""
+"""The faults that a record can have: each a filter of its own, judged by its likelihood."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .filter_bank import FilterBank, Filtered, Hypothesis
-
-Array = NDArray[np.float64]
+from .bank import Array, FilterBank, Filtered, Hypothesis
+from .findings import Finding, Names, listed, number
 
 _FACTORS = (1 / 4096, 1 / 256, 1 / 16, 1 / 4, 4.0, 16.0, 64.0, 256.0, 4096.0)
 _STEPS = (0.5, 0.65, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.5, 2.0)
 _SHIFTS = (-2, -1, 1, 2)
 _DRIFTS = tuple(late for late in range(-16, 17) if abs(late) > 1)
+# Exponents of the gains that are tried first, and how closely they are searched.
+_GAINS, _CLOSELY = np.linspace(-7.0, 7.0, 29), 0.001
+# They are tried where the mean square of a sensor's normalised innovations is not within these, on
+# so many samples; the best ones are searched closely.
+_SUSPICIOUS, _FEW, _BEST = (0.5, 2.0), 100, 3
 # More components than this have no factors or pairs of their own.
 _MOST = 8
-# What a fault must gain in log likelihood: in all, and for each measurement unless it is local.
-_GAIN, _GAIN_EACH, _LOCAL = 12.0, 0.035, ("bias", "outliers")
+# What a fault must gain in log likelihood: in all, up to twice that where measurements are missing;
+# unless it is local, also for each measurement, and when no sample counts for more than the last.
+_GAIN, _GAIN_EACH, _MOST_EACH = 12.0, 0.035, 3.0
 # A further fault must gain this share of what the first did: what that has left may be its shadow.
 _BESIDE = 0.05
-# The least effect worth a word: factors of covariances, deviations of a bias, shares of a step and
-# of an input, samples.
-_LEAST = {
-    "noise": np.log(2.0), "disturbance": np.log(2.0), "bias": 0.5, "step": 0.02, "sign": 0.1,
-    "input": 0.1, "shift": 0.3, "clock": 0.5, "outliers": 0.0, "swapped": 0.0,
+
+
+class _Kind(NamedTuple):
+    """The least effect worth a word, what it is in words, the remedy, and whether it is local."""
+
+    least: float
+    text: str
+    remedy: str
+    local: bool = False
+
+
+# Effects: logarithms of factors, shares of a step or an input, deviations of a bias, samples.
+_KINDS = {
+    "noise": _Kind(
+        np.log(2.0),
+        "R{of} is too {small} by about {factor}: the measurements scatter {more} than it says.",
+        "{Multiply} the covariance of the noise by {factor}, or let qpmhe.tune choose the weights.",
+    ),
+    "disturbance": _Kind(
+        np.log(2.0),
+        "Q{of} is too {small} by about {factor}: the states move {more} than the model and Q say.",
+        "{Multiply} the covariance of the disturbance by {factor}, or let qpmhe.tune choose the "
+        "weights; look for what the model lacks.",
+    ),
+    "gain": _Kind(
+        np.log(1.5),
+        "{sensors} read{s} about {value} times what the model expects.",
+        "Check the units of the record and of the model's outputs, or correct the gain.",
+    ),
+    "bias": _Kind(
+        0.5, "{sensors} is off by {sigmas} sigma ({value}){stretch}.",
+        "Calibrate it, or estimate its bias as a further state.", local=True,
+    ),
+    "swapped": _Kind(0.0, "{sensors} are swapped.", "Exchange their columns."),
+    "step": _Kind(
+        0.02, "The true steps are about {value} times as long as the model's.",
+        "Correct dt, or the unit of the record's times.",
+    ),
+    "sign": _Kind(
+        0.1, "Input {input} has the wrong sign.", "Change its sign in the record, or in the model."
+    ),
+    "input": _Kind(
+        0.1, "Input {input} acts about {value} times as strongly as the model says.",
+        "Correct its unit or its gain, or estimate the gain as a parameter.",
+    ),
+    "shift": _Kind(
+        0.3, "The measurements of {sensors} come {samples} too {late}.",
+        "Shift them against the inputs, or add the delay to the model.",
+    ),
+    "clock": _Kind(
+        0.5,
+        "The sensors' clock drifts: at the end of the run their samples are {samples} {ahead} the "
+        "inputs'.",
+        "Synchronise the clocks, or resample the measurements at the inputs' times.",
+    ),
+    "outliers": _Kind(
+        0.0, "There are outliers: {shares} beyond 4 sigma.",
+        "Take a qpmhe.RobustCost, with qpmhe.Huber for the noise.", local=True,
+    ),
 }
 
 
@@ -40,8 +99,8 @@ class Fault:
     kind : str
         One of the keys above.
     value : float
-        Factor of a covariance, a step or an input; samples of a shift; the bias in the units of
-        the sensor.
+        Factor of a covariance, a sensor, a step or an input; samples of a shift; the bias in the
+        units of the sensor.
     hypothesis : Hypothesis
         The record and its covariances without the fault.
     subject : tuple of int
@@ -59,74 +118,105 @@ class Fault:
     span: tuple[int, int] | None = None
     gain: float = 0.0
 
+    def in_words(self, names: Names, deviations: Array, outliers: Array) -> Finding:
+        """The finding, with the noise's deviations and the shares of outliers of each sensor."""
+        kind, value, subject = _KINDS[self.kind], self.value, self.subject
+        of, sensors = "", "the sensors"
+        if self.kind == "disturbance" and subject:
+            of = f" of {listed([names.states[i] for i in subject])}"
+        elif subject and self.kind not in ("disturbance", "sign", "input"):
+            sensors = f"sensor {' and '.join(names.outputs[j] for j in subject)}"
+            of = f" of {sensors}"
+        first, last = self.span or (0, len(names.times) - 1)
+        stretch = names.between(first, last)
+        worst = [j for j in np.argsort(-outliers)[:3] if outliers[j] > 0.0]
+        grows = value > 1.0
+        words = {
+            "of": of, "sensors": sensors, "s": "s" * bool(subject), "value": number(value),
+            "factor": number(max(value, 1.0 / value)) if value > 0.0 else "",
+            "small": "small" if grows else "large", "more": "more" if grows else "less",
+            "Multiply": "Multiply" if grows else "Divide",
+            "input": names.inputs[subject[0]] if self.kind in ("sign", "input") else "",
+            "sigmas": number(abs(value) / deviations[subject[0]]) if self.kind == "bias" else "",
+            "stretch": f" for {names.duration(first, last)},{stretch}" if stretch else "",
+            "samples": names.samples(abs(value)), "late": "late" if value > 0.0 else "early",
+            "ahead": "ahead of" if value > 0.0 else "behind",
+            "shares": listed([f"{outliers[j]:.1%} of {names.outputs[j]}" for j in worst]),
+        }
+        text = kind.text.format(**words)
+        where = None if self.span is None else names.span(first, last)
+        return Finding(
+            self.kind, text[:1].upper() + text[1:], kind.remedy.format(**words), "fault", where
+        )
+
+    @property
+    def matters(self) -> bool:
+        """Whether its effect is worth a word."""
+        size, noise = self.value, self.hypothesis.noise
+        if self.kind in ("noise", "disturbance", "gain"):
+            size = np.log(size)
+        elif self.kind in ("step", "input"):
+            size -= 1.0
+        elif self.kind == "bias":
+            size /= np.sqrt(noise[self.subject[0], self.subject[0]])
+        return bool(abs(size) >= _KINDS[self.kind].least)
+
 
 def search(
-    bank: FilterBank, base: Hypothesis, most: int = 3
-) -> tuple[list[Fault], list[Filtered]]:
+    bank: FilterBank, base: Hypothesis, null: Filtered, starts: Sequence[Array] = (), most: int = 3
+) -> tuple[list[Fault], Filtered]:
     """Faults, the one that explains most first; each later one beside those before.
 
-    Also the filters without any fault, and with each of these.
+    Also the filter that knows of these. `starts` are further states where a filter may begin if
+    those of the estimator are none, as where units are wrong.
     """
     found: list[Fault] = []
-    passes: list[Filtered] = []
-    rounds = 0
-    while True:
-        null = bank.run([base])
-        passes.append(null)
-        if rounds == most:
-            return found, passes
-        best = _best(bank, base, null)
+    for _ in range(most):
+        best = _best(bank, base, null, starts)
         if best is None or (found and best.gain < _BESIDE * found[0].gain):
-            return found, passes
+            break
         base = best.hypothesis
-        same = [k for k, one in enumerate(found) if _is_same(one, best)]
+        null = bank.run([base])
+        same = [
+            k for k, one in enumerate(found)
+            if one.kind in ("noise", "disturbance", "gain", "step", "input")
+            and (one.kind, one.subject) == (best.kind, best.subject)
+        ]
         for k in same:
             best = replace(best, value=found[k].value * best.value, gain=found[k].gain + best.gain)
         found = [one for k, one in enumerate(found) if k not in same]
         found.insert(same[0] if same else len(found), best)
-        rounds += 1
+    return found, null
 
 
-def _is_same(one: Fault, other: Fault) -> bool:
-    """Whether both are a factor of the same."""
-    return (
-        one.kind in ("noise", "disturbance", "step", "input")
-        and (one.kind, one.subject) == (other.kind, other.subject)
-    )
-
-
-def _best(bank: FilterBank, base: Hypothesis, null: Filtered) -> Fault | None:
+def _best(
+    bank: FilterBank, base: Hypothesis, null: Filtered, starts: Sequence[Array]
+) -> Fault | None:
     tried = [
         *_scaled(base), *_exchanged(base), *_shifted(base), *_drifted(bank, base, null),
-        *_linear(bank, base, null),
+        *_linear(bank, base, null), *_gains(bank, base, null, starts),
     ]
-    likelihoods = bank.run([base, *(one.hypothesis for one in tried)]).likelihoods
-    reference, values = likelihoods[0], likelihoods[1:]
-    refined = list(_refined(base, tried, values, reference))
+    logs = bank.run([base, *(one.hypothesis for one in tried)]).logs
+    refined = list(_refined(base, tried, logs.sum(axis=0)))
     if refined:
-        further = bank.run([base, *(one.hypothesis for one in refined)]).likelihoods[1:]
-        tried, values = [*tried, *refined], np.append(values, further)
-    if not np.isfinite(reference):
-        reference = -1e300
-    each = _GAIN_EACH * np.isfinite(base.measurements).sum()
-    ranked = [
-        replace(one, gain=float(value - reference))
-        for one, value in zip(tried, values, strict=True)
-        if value - reference > _GAIN + each * (one.kind not in _LOCAL) and _matters(one, base)
-    ]
-    best = max(ranked, key=lambda one: one.gain, default=None)
+        further = bank.run([base, *(one.hypothesis for one in refined)]).logs[:, 1:]
+        tried, logs = [*tried, *refined], np.hstack((logs, further))
+    values, there = logs.sum(axis=0), np.isfinite(base.measurements)
+    fails = not np.isfinite(values[0])  # then any filter that does not is better
+    lowest = np.min(values, where=np.isfinite(values), initial=0.0) - 1e4
+    gains = values[1:] - (lowest if fails else values[0])
+    # Few samples that a filter mistakes, as after gaps, suit many faults: they are outvoted.
+    votes = np.clip(logs[:, 1:] - logs[:, :1], -_MOST_EACH, _MOST_EACH).sum(axis=0)
+    least = _GAIN * (2.0 - there.mean())
+    enough = (gains > least + _GAIN_EACH * there.sum()) & (fails | (votes > least))
+    best: Fault | None = None
+    # By their values: where the record is impossible without any, differences have no digits left.
+    for k in np.argsort(-values[1:], kind="stable").tolist():
+        one, gain = tried[k], float(gains[k])
+        if (gain > least if _KINDS[one.kind].local else enough[k]) and one.matters:
+            best = replace(one, gain=gain)
+            break
     return best if best is None or best.kind != "bias" else _with_ends(bank, base, null, best)
-
-
-def _matters(fault: Fault, base: Hypothesis) -> bool:
-    size, kind = fault.value, fault.kind
-    if kind in ("noise", "disturbance"):
-        size = np.log(size)
-    elif kind in ("step", "input"):
-        size -= 1.0
-    elif kind == "bias":
-        size /= np.sqrt(base.noise[fault.subject[0], fault.subject[0]])
-    return bool(abs(size) >= _LEAST[kind])
 
 
 def _times(covariance: Array, part: tuple[int, ...], factor: float) -> Array:
@@ -138,12 +228,25 @@ def _times(covariance: Array, part: tuple[int, ...], factor: float) -> Array:
 
 
 def _with_factor(base: Hypothesis, kind: str, part: tuple[int, ...], factor: float) -> Fault:
-    if kind == "step":
-        changed = replace(base, step=base.step * factor)
-    elif kind == "noise":
-        changed = replace(base, noise=_times(base.noise, part, factor))
-    else:
-        changed = replace(base, disturbance=_times(base.disturbance, part, factor))
+    where = list(part) if part else slice(None)
+    match kind:
+        case "step":
+            changed = replace(base, step=base.step * factor)
+        case "noise":
+            changed = replace(base, noise=_times(base.noise, part, factor))
+        case "disturbance":
+            changed = replace(base, disturbance=_times(base.disturbance, part, factor))
+        case "gain":
+            y, gains = base.measurements.copy(), np.ones(base.measurements.shape[1])
+            y[:, where] /= factor
+            gains[where] = factor
+            changed = replace(
+                base, measurements=y, gains=gains * (1.0 if base.gains is None else base.gains)
+            )
+        case _:  # sign, input
+            inputs = base.inputs.copy()
+            inputs[:, where] *= factor
+            changed = replace(base, inputs=inputs)
     return Fault(kind, factor, changed, part)
 
 
@@ -160,15 +263,13 @@ def _scaled(base: Hypothesis) -> Iterator[Fault]:
         yield _with_factor(base, "step", (), factor)
 
 
-def _refined(
-    base: Hypothesis, tried: list[Fault], values: Array, reference: float
-) -> Iterator[Fault]:
+def _refined(base: Hypothesis, tried: list[Fault], values: Array) -> Iterator[Fault]:
     """For each family of factors, the top of a parabola through the best ones."""
     families: dict[tuple[str, tuple[int, ...]], list[tuple[float, float]]] = {}
-    for one, value in zip(tried, values, strict=True):
+    for one, value in zip(tried, values[1:].tolist(), strict=True):
         if one.kind in ("noise", "disturbance", "step"):
-            families.setdefault((one.kind, one.subject), [(0.0, reference)]).append(
-                (float(np.log(one.value)), float(value))
+            families.setdefault((one.kind, one.subject), [(0.0, float(values[0]))]).append(
+                (float(np.log(one.value)), value)
             )
     for (kind, part), pairs in families.items():
         places, heights = np.array(sorted(pairs)).T
@@ -177,22 +278,54 @@ def _refined(
             continue
         curve = np.polyfit(places[k - 1 : k + 2], heights[k - 1 : k + 2], 2)
         if curve[0] < 0.0:
-            top = -0.5 * curve[1] / curve[0]
-            yield _with_factor(base, kind, part, float(np.exp(top)))
+            yield _with_factor(base, kind, part, float(np.exp(-0.5 * curve[1] / curve[0])))
+
+
+def _gains(
+    bank: FilterBank, base: Hypothesis, null: Filtered, starts: Sequence[Array]
+) -> Iterator[Fault]:
+    """Sensors and inputs in other units: of each, the factor that makes the record likeliest."""
+    sizes = np.nanmean(null.normalised**2, axis=0)
+    usual = (sizes > _SUSPICIOUS[0]) & (sizes < _SUSPICIOUS[1]) | np.isnan(sizes)
+    if np.isfinite(null.logs).all() and usual.all():
+        return
+    p, m = base.measurements.shape[1], base.inputs.shape[1]
+    parts: list[tuple[str, tuple[int, ...]]] = [("input", (j,)) for j in range(m)]
+    parts += [("gain", (j,)) for j in range(p)] + [("gain", ())] * (p > 1)
+    # A wrong unit shows everywhere, also in the estimates from which the filters would begin.
+    short = replace(base, measurements=base.measurements[:_FEW], inputs=base.inputs[:_FEW])
+    begins = [replace(short, start=one) for one in starts] or [short]
+    places = {(part, k): _GAINS for part in parts for k in range(len(begins))}
+    spacing = _GAINS[1] - _GAINS[0]
+    while True:
+        tried = [
+            (k, _with_factor(begins[k], *part, float(10.0**at)))
+            for (part, k), found in places.items() for at in found
+        ]
+        likelihoods = bank.run([short, *(one.hypothesis for _, one in tried)]).likelihoods[1:]
+        tops: dict[tuple[str, tuple[int, ...]], tuple[int, Fault]] = {}
+        for place in np.argsort(-likelihoods, kind="stable").tolist():
+            k, one = tried[place]
+            tops.setdefault((one.kind, one.subject), (k, one))
+        best = list(tops.items())[:_BEST]
+        if spacing < _CLOSELY:
+            for part, (k, one) in best:
+                whole = replace(base, start=begins[k].start)
+                yield _with_factor(whole, *part, one.value)
+            return
+        around = spacing * np.linspace(-1.0, 1.0, 9)
+        places = {(part, k): np.log10(one.value) + around for part, (k, one) in best}
+        spacing /= 4.0
 
 
 def _exchanged(base: Hypothesis) -> Iterator[Fault]:
-    p, m = base.measurements.shape[1], base.inputs.shape[1]
-    if p <= _MOST:
-        for pair in combinations(range(p), 2):
-            order = np.arange(p)
-            order[list(pair)] = pair[::-1]
-            exchanged = replace(base, measurements=base.measurements[:, order])
-            yield Fault("swapped", 0.0, exchanged, pair)
-    for j in range(m):
-        inputs = base.inputs.copy()
-        inputs[:, j] *= -1.0
-        yield Fault("sign", -1.0, replace(base, inputs=inputs), (j,))
+    p = base.measurements.shape[1]
+    for pair in combinations(range(p), 2) if p <= _MOST else ():
+        order = np.arange(p)
+        order[list(pair)] = pair[::-1]
+        yield Fault("swapped", 0.0, replace(base, measurements=base.measurements[:, order]), pair)
+    for j in range(base.inputs.shape[1]):
+        yield _with_factor(base, "sign", (j,), -1.0)
     yield Fault("outliers", 1.0, replace(base, outliers=True))
 
 
@@ -245,8 +378,7 @@ class _Signature:
 
 def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[_Signature]:
     total, p = base.measurements.shape
-    n = bank.system.n
-    none_x = np.zeros((total, n))
+    none_x = np.zeros((total, bank.system.n))
     inputs = bank.full_inputs(base.inputs, base.step)
     # At each sample from those before it alone: else noise would look like a fault.
     expected, moves = bank.moves(null.states, inputs)
@@ -263,9 +395,11 @@ def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[
             "input", (j,), expected - bank.model.h.batch(null.states, without),
             reached - bank.model.f.batch(null.corrected, without),
         )
+    blocks = max(1, min(32 if p <= _MOST else 8, total // 4))
+    edges = np.linspace(0, total, blocks + 1).astype(int).tolist()
     for j in range(p):
-        for first, last in _blocks(total, p):
-            yield _bias(bank, total, j, first, last)
+        for first, end in pairwise(edges):
+            yield _bias(bank, total, j, first, end - 1)
 
 
 def _bias(bank: FilterBank, total: int, sensor: int, first: int, last: int) -> _Signature:
@@ -274,13 +408,6 @@ def _bias(bank: FilterBank, total: int, sensor: int, first: int, last: int) -> _
     return _Signature(
         "bias", (sensor,), outputs, np.zeros((total, bank.system.n)), (first, last)
     )
-
-
-def _blocks(total: int, sensors: int) -> list[tuple[int, int]]:
-    """First and last samples of stretches that make up the record."""
-    count = max(1, min(32 if sensors <= _MOST else 8, total // 4))
-    edges = np.linspace(0, total, count + 1).astype(int)
-    return [(int(first), int(end) - 1) for first, end in pairwise(edges)]
 
 
 def _linear(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Fault]:
@@ -294,15 +421,17 @@ def _linear(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Faul
     Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation
     of jumps in linear systems, IEEE Transactions on Automatic Control 21 (1976).
     """
-    listed = [
+    if not np.isfinite(null.logs).all():
+        return
+    signatures = [
         one for one in _signatures(bank, base, null)
         if np.isfinite(one.outputs).all() and np.isfinite(one.states).all()
     ]
-    if not listed or not np.isfinite(null.likelihoods[0]):
+    if not signatures:
         return
-    against, own = _moments(listed, null)
+    against, own = _moments(signatures, null)
     best: dict[tuple[str, tuple[int, ...]], tuple[float, float, _Signature]] = {}
-    for one, size, gain in _candidates(bank, listed, against, own):
+    for one, size, gain in _candidates(bank, signatures, against, own):
         key = one.kind, one.subject
         if gain > 0.5 * _GAIN and gain > best.get(key, (0.0,))[0]:
             best[key] = gain, size, one
@@ -311,14 +440,14 @@ def _linear(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Faul
 
 
 def _candidates(
-    bank: FilterBank, listed: list[_Signature], against: Array, own: Array
+    bank: FilterBank, signatures: list[_Signature], against: Array, own: Array
 ) -> Iterator[tuple[_Signature, float, float]]:
-    """Signatures with size and gain: those listed, and of biases the best row of stretches."""
-    for k, one in enumerate(listed):
+    """Signatures with size and gain: those given, and of biases the best row of stretches."""
+    for k, one in enumerate(signatures):
         if one.kind != "bias" and own[k, k] > 0.0:
             yield one, against[k] / own[k, k], 0.5 * against[k] ** 2 / own[k, k]
     for j in range(bank.system.p):
-        at = [k for k, one in enumerate(listed) if one.kind == "bias" and one.subject == (j,)]
+        at = [k for k, one in enumerate(signatures) if (one.kind, one.subject) == ("bias", (j,))]
         if not at:
             continue
         # Signatures add up: sums over rows of stretches by prefix sums.
@@ -330,24 +459,23 @@ def _candidates(
         bottom = diagonal[None, :] + diagonal[:, None] - squares - squares.T
         gains = np.where(np.triu(bottom, 1) > 0.0, 0.5 * top**2 / bottom, 0.0)
         i, k = divmod(int(np.argmax(gains)), len(gains))
-        if gains[i, k] > 0.0:
-            first, last = (listed[at[i]].span or (0, 0))[0], (listed[at[k - 1]].span or (0, 0))[1]
-            one = _bias(bank, len(listed[0].outputs), j, first, last)
+        first, last = signatures[at[i]].span, signatures[at[k - 1]].span
+        if gains[i, k] > 0.0 and first is not None and last is not None:
+            one = _bias(bank, len(signatures[0].outputs), j, first[0], last[1])
             yield one, float(top[i, k] / bottom[i, k]), float(gains[i, k])
 
 
-def _moments(listed: list[_Signature], null: Filtered) -> tuple[Array, Array]:
+def _moments(signatures: list[_Signature], null: Filtered) -> tuple[Array, Array]:
     """Products of the signatures in the innovations with these (K,), and with each other (K, K)."""
-    outputs = np.stack([one.outputs for one in listed], axis=2)
-    states = np.stack([one.states for one in listed], axis=2)
+    outputs = np.stack([one.outputs for one in signatures], axis=2)
+    states = np.stack([one.states for one in signatures], axis=2)
     there = np.isfinite(null.innovations)
     errors = np.where(there, null.innovations, 0.0)
-    weights = np.linalg.inv(null.innovation_covariances)
     moved = np.zeros(states.shape[1:])
-    against, own = np.zeros(len(listed)), np.zeros((len(listed), len(listed)))
+    against, own = np.zeros(len(signatures)), np.zeros((len(signatures), len(signatures)))
     for t in range(len(outputs)):
         shown = null.outputs[t] @ moved + outputs[t] * there[t][:, None]
-        weighted = weights[t] @ shown
+        weighted = null.weights[t] @ shown
         against += errors[t] @ weighted
         own += shown.T @ weighted
         moved = null.transitions[t] @ (moved - null.gains[t] @ shown) + states[t]
@@ -360,20 +488,21 @@ def _with_ends(bank: FilterBank, base: Hypothesis, null: Filtered, bias: Fault) 
     first, last = bias.span or (0, total - 1)
     step = max(1, total // 64)
     while True:
-        listed = [
+        signatures = [
             _bias(bank, total, bias.subject[0], begin, end)
             for begin in sorted({max(first + d, 0) for d in (-step, 0, step)})
             for end in sorted({min(last + d, total - 1) for d in (-step, 0, step)})
             if end - begin >= 2
         ]
-        against, own = _moments(listed, null)
+        against, own = _moments(signatures, null)
         sizes = against / own.diagonal()
         k = int(np.argmax(sizes * against))
-        same, (first, last) = listed[k].span == (first, last), listed[k].span or (first, last)
+        same = signatures[k].span == (first, last)
+        first, last = signatures[k].span or (first, last)
         if same and step == 1:
             break
         step = max(1, step // 2) if same else step
-    refined = _removed(base, listed[k], float(sizes[k]))
+    refined = _removed(base, signatures[k], float(sizes[k]))
     values = bank.run([base, refined.hypothesis]).likelihoods
     gain = float(values[1] - values[0])
     return replace(refined, gain=gain) if gain > bias.gain else bias
@@ -382,9 +511,7 @@ def _with_ends(bank: FilterBank, base: Hypothesis, null: Filtered, bias: Fault) 
 def _removed(base: Hypothesis, one: _Signature, size: float) -> Fault:
     """The record without this fault."""
     if one.kind == "input":
-        inputs = base.inputs.copy()
-        inputs[:, one.subject[0]] *= 1.0 + size
         kind = "sign" if size < -1.0 else "input"
-        return Fault(kind, 1.0 + size, replace(base, inputs=inputs), one.subject)
+        return _with_factor(base, kind, one.subject, 1.0 + size)
     y = base.measurements - size * one.outputs
     return Fault(one.kind, size, replace(base, measurements=y), one.subject, one.span)

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .faults import Fault
-
 Array = NDArray[np.float64]
 
 
@@ -20,8 +18,9 @@ class Finding:
     Parameters
     ----------
     kind : str
-        ``dead``, ``saturated``, ``missing``, ``failing``, ``noise``, ``disturbance``, ``bias``,
-        ``swapped``, ``step``, ``sign``, ``input``, ``shift``, ``clock``, ``outliers``, ``unseen``,
+        ``dead``, ``saturated``, ``missing``, ``failing``, ``noise``, ``disturbance``, ``gain``,
+        ``bias``, ``swapped``, ``step``, ``sign``, ``input``, ``shift``, ``clock``, ``outliers``,
+        ``unseen``,
         ``correlated``, ``estimator``; a note also has ``prior``, ``kept``, ``innovations``,
         ``drift`` or ``record``.
     text : str
@@ -91,7 +90,7 @@ class Names:
 
     def samples(self, count: float) -> str:
         """A number of samples, and how long they take."""
-        words = f"{number(count)} sample{'s' * (abs(count) != 1.0)}"
+        words = f"{number(count)} sample{'' if abs(count) == 1.0 else 's'}"
         return words if self.unit == "samples" else (
             f"{words} ({number(count * self.step)} {self.unit})"
         )
@@ -123,84 +122,3 @@ def _time(value: float, step: float) -> str:
 def listed(names: Sequence[str]) -> str:
     """Names as in a sentence."""
     return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else "".join(names)
-
-
-def describe(fault: Fault, names: Names, deviations: Array, outliers: Array) -> Finding:
-    """A fault of the search as a finding.
-
-    Parameters
-    ----------
-    deviations : (p,) array
-        Standard deviations of the noise.
-    outliers : (p,) array
-        Shares of outlying samples by sensor.
-    """
-    value, subject = fault.value, fault.subject
-    sensors = "the sensors"
-    if subject and fault.kind in ("noise", "bias", "swapped", "shift"):
-        sensors = listed([f"sensor {names.outputs[j]}" for j in subject])
-    where = None if fault.span is None else names.span(*fault.span)
-    factor = number(max(value, 1.0 / value)) if value > 0.0 else ""
-    size = "small" if value > 1.0 else "large"
-    text = remedy = ""
-    match fault.kind:
-        case "noise":
-            whose = f" of {sensors}" if subject else ""
-            text = f"R{whose} is too {size} by about {factor}: the measurements scatter "
-            text += "more than it says." if value > 1.0 else "less than it says."
-            remedy = (
-                f"{'Multiply' if value > 1 else 'Divide'} the covariance of the noise by {factor}, "
-                "or let qpmhe.tune choose the weights."
-            )
-        case "disturbance":
-            whose = f" of {listed([names.states[i] for i in subject])}" if subject else ""
-            text = f"Q{whose} is too {size} by about {factor}"
-            text += (
-                ": the states move more than the model and Q explain." if value > 1.0
-                else ": the states move less than Q says."
-            )
-            remedy = (
-                f"{'Multiply' if value > 1 else 'Divide'} the covariance of the disturbance by "
-                f"{factor}, or let qpmhe.tune choose the weights; look for what the model lacks."
-            )
-        case "bias":
-            sigmas = abs(value) / deviations[subject[0]]
-            first, last = fault.span or (0, len(names.times) - 1)
-            stretch = names.between(first, last)
-            text = f"{sensors} is off by {number(sigmas)} sigma ({number(value)})"
-            text += f" for {names.duration(first, last)},{stretch}." if stretch else "."
-            remedy = "Calibrate it, or estimate its bias as a further state."
-        case "swapped":
-            text = f"{sensors} are swapped."
-            remedy = "Exchange their columns."
-        case "step":
-            text = f"The true steps are about {number(value)} times as long as the model's."
-            remedy = "Correct dt, or the unit of the record's times."
-        case "sign":
-            text = f"Input {names.inputs[subject[0]]} has the wrong sign."
-            remedy = "Change its sign in the record, or in the model."
-        case "input":
-            text = (
-                f"Input {names.inputs[subject[0]]} acts about {number(value)} times as strongly as "
-                "the model says."
-            )
-            remedy = "Correct its unit or its gain, or estimate the gain as a parameter."
-        case "shift":
-            word = "late" if value > 0.0 else "early"
-            text = f"The measurements of {sensors} come {names.samples(abs(value))} too {word}."
-            remedy = "Shift them against the inputs, or add the delay to the model."
-        case "clock":
-            word = "ahead of" if value > 0.0 else "behind"
-            text = (
-                f"The sensors' clock drifts: at the end of the run their samples are "
-                f"{names.samples(abs(value))} {word} the inputs'."
-            )
-            remedy = "Synchronise the clocks, or resample the measurements at the inputs' times."
-        case "outliers":
-            worst = np.argsort(-outliers)[:3]
-            shares = [
-                f"{outliers[j]:.1%} of {names.outputs[j]}" for j in worst if outliers[j] > 0.0
-            ]
-            text = f"There are outliers: {listed(shares)} beyond 4 sigma."
-            remedy = "Take a qpmhe.RobustCost, with qpmhe.Huber for the noise."
-    return Finding(fault.kind, text[:1].upper() + text[1:], remedy, "fault", where)

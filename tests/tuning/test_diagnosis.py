@@ -12,7 +12,7 @@ from qpmhe.cli.app import app
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError
 from qpmhe.estimation.observability import prior_shares
 from qpmhe.tuning import observability
-from qpmhe.tuning.filter_bank import FilterBank, Hypothesis
+from qpmhe.tuning.bank import FilterBank, Hypothesis
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "studies"))
 
@@ -140,6 +140,31 @@ def test_what_follows_a_gap_is_no_evidence(seed):
     y[60:110] = np.nan
     found = kinds(qpmhe.diagnose(case._replace(measurements=y).run()))
     assert not {"step", "disturbance", "bias"} & set(found)
+
+
+@pytest.mark.parametrize("seed", [1, 5, 7, 18, 32])
+def test_two_thirds_missing_are_no_fault(seed):
+    case = planted.healthy("cstr", seed)
+    y = case.measurements.copy()
+    y[np.random.default_rng(seed).random(len(y)) < 2 / 3] = np.nan
+    assert kinds(qpmhe.diagnose(case._replace(measurements=y).run())) == []
+
+
+@pytest.mark.parametrize(
+    ("model", "signal", "factor"),
+    [("van_der_pol", "y1", 1e6), ("van_der_pol", "y1", 1e-3), ("cstr", "y1", 1e6),
+     ("cstr", "u1", 1e3), ("pendulum", "y1", 1e3), ("battery_cell", "u1", 1e-3),
+     ("vehicle", "y1", 1e6), ("vehicle", "u1", 60.0)],
+)  # fmt: skip
+def test_wrong_units_are_named_first(model, signal, factor):
+    case = planted.healthy(model, 0)
+    y, u = case.measurements.copy(), None if case.inputs is None else case.inputs.copy()
+    (y if signal == "y1" else u)[:, 0] *= factor
+    first = qpmhe.diagnose(case._replace(measurements=y, inputs=u).run()).findings[0]
+    assert first.kind == ("gain" if signal == "y1" else "input")
+    assert "unit" in first.remedy
+    told = float(first.text.split("about ")[1].split(" times")[0])
+    assert told == pytest.approx(factor if signal == "y1" else 1.0 / factor, rel=0.05)
 
 
 def test_rare_measurements_are_evidence_nevertheless():
@@ -301,9 +326,9 @@ def test_filters_are_kalman_filters():
         qpmhe.QuadraticCost.from_covariances(prior=prior, disturbance=disturbance, noise=noise),
         horizon=2, initial_state=[1.0, 0.0], max_qps=0)
     run = mhe.run(y)
-    bank = FilterBank(system, None, np.array([1.0, 0.0]), prior)
-    base = Hypothesis(y, np.zeros((60, 0)), noise, disturbance)
-    other = Hypothesis(y, np.zeros((60, 0)), 9.0 * noise, disturbance)
+    bank, start = FilterBank(system, None, prior), np.array([1.0, 0.0])
+    base = Hypothesis(y, np.zeros((60, 0)), noise, disturbance, start)
+    other = Hypothesis(y, np.zeros((60, 0)), 9.0 * noise, disturbance, start)
     found, alone = bank.run([base, other]), bank.run([other])
     assert found.states == pytest.approx(run.states[:-1], rel=1e-9, abs=1e-12)
     assert found.corrected == pytest.approx(run.filtered, rel=1e-9, abs=1e-12)

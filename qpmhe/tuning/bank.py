@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..model.system import Function, System
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # Outliers have a Cauchy distribution, as they may be anything: their share, and its width.
 _SHARE, _WIDTH = 0.02, 8.0
@@ -30,156 +31,149 @@ class Hypothesis:
         y, NaN where it is missing, and u.
     noise, disturbance : (p, p) and (n, n) array
         Covariances R, and Q of what the disturbance adds to the state.
+    start : (n,) array
+        The first estimate.
     step : float
         The length of each step, as a multiple of what the record says.
     outliers : bool
         Whether single measurements may be outliers, which the filter then leaves out.
+    gains : (p,) array or None
+        What the record's numbers were divided by to make y.
     """
 
     measurements: Array
     inputs: Array
     noise: Array
     disturbance: Array
+    start: Array
     step: float = 1.0
     outliers: bool = False
+    gains: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """What the filters have found.
+    """What the filters have found: all but `logs` of the first filter alone.
 
     Attributes
     ----------
-    likelihoods : (H,) array
-        Log likelihood of the record under each hypothesis, for as many measurements as the first
-        has; -infinity where the filter failed.
+    logs : (T, H) array
+        Log likelihood of each sample under each hypothesis, for as many measurements as the first
+        has; -infinity in all samples where the filter failed.
     states, corrected : (T, n) array
-        Of the first filter: estimates before and after each measurement.
-    innovations, innovation_covariances : (T, p) and (T, p, p) array
-        Of the first filter: y(t) - h(x(t)), NaN where missing or left out, and the covariances.
+        Estimates before and after each measurement.
+    innovations, spreads, weights : (T, p), (T, p, p) and (T, p, p) array
+        y(t) - h(x(t)), NaN where missing or left out; their covariances S, and the inverses.
     covariances : (T, n, n) array
-        Of the first filter: of the estimates after each measurement.
+        Of the estimates after each measurement.
     transitions, outputs, gains : array
-        Of the first filter: A (T, n, n), C (T, p, n), and the measurement update's K (T, n, p).
+        A (T, n, n), C (T, p, n), and the measurement update's K (T, n, p).
     """
 
-    likelihoods: Array
+    logs: Array
     states: Array
     corrected: Array
     innovations: Array
-    innovation_covariances: Array
+    spreads: Array
+    weights: Array
     covariances: Array
     transitions: Array
     outputs: Array
     gains: Array
 
+    @property
+    def likelihoods(self) -> Array:
+        """Log likelihood of the record under each hypothesis (H,)."""
+        return np.asarray(self.logs.sum(axis=0))
+
+    @property
+    def normalised(self) -> Array:
+        """Innovations in their standard deviations."""
+        spread = np.diagonal(self.spreads, axis1=1, axis2=2)
+        return np.asarray(self.innovations / np.sqrt(spread))
+
 
 class FilterBank:
-    """Runs filters over one record.
-
-    Parameters
-    ----------
-    system : System
-        The model.
-    steps : (T,) array or None
-        Lengths of the steps; None for the usual one.
-    start, prior : (n,) and (n, n) array
-        The first estimate and its covariance.
-    before : int
-        Samples before this record, with the same clocks.
-    """
+    """Runs filters over one record, with steps (T,) or the usual one, and samples before it."""
 
     def __init__(
-        self, system: System, steps: Array | None, start: Array, prior: Array, before: int = 0
+        self, system: System, steps: Array | None, prior: Array, before: int = 0
     ) -> None:
-        self.before = before
-        self.system, self._start, self._prior = system, start, prior
-        #: Whether the model knows steps of other lengths exactly.
-        self.is_timed: bool
+        self.system, self.before, self._prior, self._steps = system, before, prior, steps
         #: Takes the length of the step as its last input where it can.
         self.model = system if system.make_timed is None else system.timed
-        self.is_timed = self.model is not system
-        self._steps = steps
-        if self.is_timed and steps is None:
+        self._is_timed = self.model is not system
+        if self._is_timed and steps is None:
             self._steps = np.array([float(system.dt or 1.0)])
         self._tried = False
-        states = system.states
-        self._low = None if states is None else states.lower
-        self._high = None if states is None else states.upper
 
-    def _try_batched(self, inputs: Array) -> None:
+    def _try_batched(self, start: Array, inputs: Array) -> None:
         """Let functions that no trace has proved to take many states do so if it looks like it."""
         self._tried = True
         if "looped" not in (self.model.f.mode, self.model.h.mode):
             return
-        self.model = self.model.copy(traced=True)
+        self.model = model = self.model.copy(traced=True)
         generator, count = np.random.default_rng(0), 2 * self.system.n + 7
         spread = 0.1 * np.sqrt(self._prior.diagonal())
-        x = self._start + spread * generator.standard_normal((count, self.system.n))
-        if self._low is not None:
-            x = np.clip(x, self._low, self._high)
-        u = inputs[np.arange(count) % len(inputs)]
-        for one in (
-            self.model.f, self.model.h, self.model.f_jacobian, self.model.h_jacobian
-        ):
-            one.try_batched(x, u)
+        x = self._bounded(start + spread * generator.standard_normal((count, self.system.n)))
+        for one in (model.f, model.h, model.f_jacobian, model.h_jacobian):
+            one.try_batched(x, inputs[np.arange(count) % len(inputs)])
+
+    def _bounded(self, x: Array) -> Array:
+        states = self.system.states
+        if states is None:
+            return x
+        turned = x if self.system.turns is None else self.system.turns(x)
+        return np.clip(turned, states.lower, states.upper)
 
     def full_inputs(self, inputs: Array, step: float = 1.0) -> Array:
         """The inputs of `model`: with the length of the step behind them where it takes one."""
-        if not self.is_timed or self._steps is None:
+        if not self._is_timed or self._steps is None:
             return inputs
-        lengths = np.broadcast_to(step * self._steps, (len(inputs),))
+        lengths = np.broadcast_to(step * self._steps[: len(inputs)], (len(inputs),))
         return np.column_stack((inputs, lengths))
+
+    def errors(self, measured: Array, expected: Array) -> Array:
+        """Measured minus expected outputs, the shorter way round where they are angles."""
+        found = measured - expected
+        if self.system.output_residual is not None:
+            self.system.output_residual.wrap(found, measured)
+        return found
 
     def moves(self, states: Array, inputs: Array) -> tuple[Array, Array]:
         """Expected outputs (T, p) at states (T, n), and how far they move within a step."""
         expected = _values(self.model.h.batch, states, inputs, (self.system.p,))
         following = _values(self.model.f.batch, states, inputs, (self.system.n,))
         later = _values(self.model.h.batch, following, inputs, (self.system.p,))
-        moves = later - expected
-        if self.system.output_residual is not None:
-            self.system.output_residual.wrap(moves, later)
-        return expected, moves
+        return expected, self.errors(later, expected)
 
     def run(self, hypotheses: Sequence[Hypothesis]) -> Filtered:
         """Filter the record under all hypotheses at once."""
-        system, count = self.system, len(hypotheses)
         y = np.array([one.measurements for one in hypotheses])
         u = np.array([self.full_inputs(one.inputs, one.step) for one in hypotheses])
+        start = np.array([one.start for one in hypotheses])
         if not self._tried:
-            self._try_batched(u[0])
-        model = self.model
+            self._try_batched(start[0], u[0])
+        model, (count, total, p), n = self.model, y.shape, self.system.n
         there = np.isfinite(y)
         y = np.where(there, y, 0.0)
-        noise = np.array([one.noise for one in hypotheses])
         disturbance = np.array([one.disturbance for one in hypotheses])
         outliers = np.array([one.outliers for one in hypotheses])
-        scale = np.array([1.0 if self.is_timed else one.step for one in hypotheses])[:, None]
-        total, (n, p) = y.shape[1], (system.n, system.p)
-        eye_n, eye_p = np.eye(n), np.eye(p)
-        x = np.tile(self._start, (count, 1))
-        covariance = np.tile(self._prior, (count, 1, 1))
-        alive = np.ones(count, np.bool_)
-        likelihoods = np.zeros(count)
-        first = Filtered(
-            likelihoods, np.empty((total, n)), np.empty((total, n)), np.full((total, p), np.nan),
-            np.empty((total, p, p)), np.empty((total, n, n)), np.empty((total, n, n)),
-            np.empty((total, p, n)), np.empty((total, n, p)),
-        )
+        scale = np.array([1.0 if self._is_timed else one.step for one in hypotheses])[:, None]
         # Outputs count in deviations of the usual noise, whatever their units.
         unit = np.sqrt(hypotheses[0].noise.diagonal())
-        noise = noise / np.multiply.outer(unit, unit)
+        noise = np.array([one.noise for one in hypotheses]) / np.multiply.outer(unit, unit)
+        eye_n, eye_p = np.eye(n), np.eye(p)
+        x, covariance = start.copy(), np.tile(self._prior, (count, 1, 1))
+        alive, logs = np.ones(count, np.bool_), np.zeros((total, count))
+        shapes = (n,), (n,), (p,), (p, p), (p, p), (n, n), (n, n), (p, n), (n, p)
+        first = Filtered(logs, *(np.empty((total, *shape)) for shape in shapes))
         extreme = np.log(_SHARE / _WIDTH * np.sqrt(2.0 / np.pi))  # beside a normal distribution
         usual, any_outliers = np.log1p(-_SHARE), outliers.any()
-        recovers = _recovering(there[0].any(axis=1))
         for t in range(total):
             now, seen = u[:, t], there[:, t]
-            known = likelihoods.copy() if recovers[t] else None
             c = _values(model.h_jacobian.batch, x, now, (p, n)) / unit[:, None]
-            e = y[:, t] - _values(model.h.batch, x, now, (p,))
-            if system.output_residual is not None:
-                system.output_residual.wrap(e, y[:, t])
-            e = e / unit
+            e = self.errors(y[:, t], _values(model.h.batch, x, now, (p,))) / unit
             transposed = covariance @ c.transpose(0, 2, 1)
             spread = c @ transposed
             if any_outliers:
@@ -187,61 +181,57 @@ class FilterBank:
                 far = outliers[:, None] & seen & (e * e > _OUTLIER**2 * own)
                 tail = np.log1p(e * e / own / _WIDTH**2) + 0.5 * np.log(own)
                 seen = seen & ~far
-                likelihoods += np.where(far, extreme - tail, 0.0).sum(axis=1)
-                likelihoods += usual * (outliers * seen.sum(axis=1))
+                logs[t] += np.where(far, extreme - tail, 0.0).sum(axis=1)
+                logs[t] += usual * (outliers * seen.sum(axis=1))
+            spread = spread + noise
             if not seen.all():
-                both = seen[:, :, None] & seen[:, None, :]
-                spread = np.where(both, spread + noise, eye_p)
+                spread = np.where(seen[:, :, None] & seen[:, None, :], spread, eye_p)
                 c, e = np.where(seen[:, :, None], c, 0.0), np.where(seen, e, 0.0)
                 transposed = np.where(seen[:, None, :], transposed, 0.0)
-            else:
-                spread = spread + noise
             good = alive & np.isfinite(x).all(axis=1) & np.isfinite(e).all(axis=1)
             good &= np.isfinite(spread).all(axis=(1, 2)) & np.isfinite(c).all(axis=(1, 2))
             if not good.all():
                 alive = good
-                x[~good], covariance[~good] = self._start, self._prior
-                e[~good], c[~good], spread[~good] = 0.0, 0.0, eye_p
-                transposed[~good] = 0.0
+                x[~good], covariance[~good] = start[~good], self._prior
+                e[~good], c[~good], spread[~good], transposed[~good] = 0.0, 0.0, eye_p, 0.0
             inverse = _inverses(spread, alive)
             gain = transposed @ inverse
-            likelihoods -= 0.5 * (
+            logs[t] -= 0.5 * (
                 np.einsum("hi,hij,hj->h", e, inverse, e) + np.linalg.slogdet(spread)[1]
             )
             first.states[t], first.outputs[t], first.gains[t] = x[0], c[0], gain[0]
-            first.innovations[t] = np.where(seen[0] & ~recovers[t], e[0], np.nan)
-            if known is not None:
-                likelihoods[...] = known
-            first.innovation_covariances[t] = spread[0]
-            x = x + np.einsum("hij,hj->hi", gain, e)
+            first.innovations[t] = np.where(seen[0], e[0], np.nan)
+            first.spreads[t], first.weights[t] = spread[0], inverse[0]
+            x = self._bounded(x + np.einsum("hij,hj->hi", gain, e))
             closed = eye_n - gain @ c
             covariance = closed @ covariance @ closed.transpose(0, 2, 1)
             covariance += gain @ noise @ gain.transpose(0, 2, 1)
-            if self._low is not None:
-                if system.turns is not None:
-                    x = system.turns(x)
-                x = np.clip(x, self._low, self._high)
             first.corrected[t], first.covariances[t] = x[0], covariance[0]
             a = _values(model.f_jacobian.batch, x, now, (n, n))
             following = _values(model.f.batch, x, now, (n,))
             if (scale != 1.0).any():
                 following = x + scale * (following - x)
                 a = eye_n + scale[:, :, None] * (a - eye_n)
-            first.transitions[t] = a[0]
-            x = following
+            first.transitions[t], x = a[0], following
             covariance = a @ covariance @ a.transpose(0, 2, 1) + disturbance
+        for k, one in enumerate(hypotheses):  # the density of the record's own numbers
+            if one.gains is not None:
+                logs[:, k] -= there[k] @ np.log(one.gains)
         # A shifted record lacks some samples, which must make no difference.
         counts = there.sum(axis=(1, 2))
-        likelihoods *= counts[0] / np.maximum(counts, 1)
-        likelihoods[~alive | ~np.isfinite(likelihoods)] = -np.inf
+        logs *= counts[0] / np.maximum(counts, 1)
+        recovers = _recovering(there[0].any(axis=1))
+        logs[recovers], first.innovations[recovers] = 0.0, np.nan
+        logs[:, ~alive | ~np.isfinite(logs).all(axis=0)] = -np.inf
         first.innovations[...] *= unit
-        first.innovation_covariances[...] *= np.multiply.outer(unit, unit)
+        first.spreads[...] *= np.multiply.outer(unit, unit)
+        first.weights[...] /= np.multiply.outer(unit, unit)
         first.outputs[...] *= unit[:, None]
         first.gains[...] /= unit
         return first
 
 
-def _recovering(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _recovering(seen: Mask) -> Mask:
     """Samples soon after a long gap: a linearised filter is as uncertain there as at the start."""
     found, missing, left = np.zeros(len(seen), np.bool_), 0, 0
     for t, there in enumerate(seen):
@@ -255,7 +245,7 @@ def _recovering(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return found if usual else np.zeros_like(found)
 
 
-def _inverses(matrices: Array, alive: NDArray[np.bool_]) -> Array:
+def _inverses(matrices: Array, alive: Mask) -> Array:
     """The inverses; the filter of a singular one is dead, and has the identity."""
     try:
         return np.asarray(np.linalg.inv(matrices), np.float64)
