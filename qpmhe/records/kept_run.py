@@ -22,6 +22,7 @@ class _Kept(NamedTuple):
     filtered: Array
     observer_state: Array
     delayed: Array | None
+    rejected: NDArray[np.bool_]
     cost: float
     candidate_cost: float
     step_time: float
@@ -53,7 +54,8 @@ class KeptRun:
         self._estimates.append(_Kept(
             estimate.state.copy(), estimate.filtered.copy(), estimate.observer_state.copy(),
             None if estimate.delayed is None else estimate.delayed.copy(),
-            *(getattr(estimate, name) for name in _Kept._fields[4:]),
+            estimate.rejected.copy(),
+            *(getattr(estimate, name) for name in _Kept._fields[5:]),
         ))
 
     def run(self) -> Run:
