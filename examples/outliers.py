@@ -3,7 +3,7 @@
 About one measurement in twenty is off by 8, more than the output itself. Both
 costs have the same weights, start, horizon and number of QPs; they differ in the noise's loss.
 All errors of the first seconds come from the wrong start, with and without outliers, so that the
-settled ones are told beside those of all times.
+settled ones are reported beside those of all times.
 
 The outliers also hit the auxiliary observer, whose state z(t-N) is the prior. So a second
 observer is tried, which takes a fitting error v up to 1 in full and of the rest a fifth:

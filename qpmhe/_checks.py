@@ -211,7 +211,7 @@ def choice(name: str, value: Any, known: Sequence[str]) -> str:
 
 
 def check_problem(state: Any, mine: tuple[int, ...]) -> None:
-    """Insist that a snapshot is of a problem of these sizes: (n, p, m, horizon)."""
+    """Check that a snapshot is of a problem of these sizes: (n, p, m, horizon)."""
     found = state.get("problem") if isinstance(state, dict) else state
     if (
         not isinstance(found, (tuple, list))

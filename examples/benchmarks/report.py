@@ -27,7 +27,7 @@ from qpmhe.codegen.compiler import find_compiler
 
 __all__ = ["environment", "picture", "rows", "show", "write"]
 
-#: Share of the time lost to other processes that is told.
+#: Shares of the time lost to other processes above this are reported.
 BUSY = 0.03
 
 # Okabe and Ito's palette, told apart by all colour vision; hatches tell the rest.
