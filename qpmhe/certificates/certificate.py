@@ -329,7 +329,7 @@ def _with_theorem(
     if weights is None:
         attempt("the theorem", lambda: _refused(about))
     output = about_output(system, region, deadline.part(_OUTPUT))
-    found = [output, *about_corrections(system, bare.observer, region), about]
+    found = [output, *about_corrections(system, bare.observer), about]
     if detectability is None:
         detectability = attempt("detectability", lambda: certify_detectability(
             system, region, weights=_cheapest(weights), seconds=deadline.part(_DETECTABILITY)
