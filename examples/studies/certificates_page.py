@@ -228,9 +228,8 @@ def attack(row: Row) -> None:
         if errors.max() > row.estimated:
             row.estimated, row.around = float(errors.max()), float(known[int(errors.argmax())])
         if certificate.constants:
-            paper = certificate.bound(
-                run, signals.w, signals.v, initial_error=np.zeros(system.n), kind="paper"
-            )
+            lengths = (np.linalg.norm(each, axis=1) for each in (signals.w, signals.v))
+            paper = certificate.of().result.bound(0.0, *lengths)
             compare(errors, paper[: len(errors)])
         return float(errors.max())
 
@@ -305,7 +304,7 @@ def second_line(row: Row) -> str:
         )]
     paper = ["-", "-"]
     if certificate.constants:
-        limit = certificate.limit(kind="paper")
+        limit = certificate.of().result.limit(*certificate.sizes.largest)
         paper = [str(row.case.horizon), short(limit)]
     return f"| {row.case.name} | {' | '.join((*cells, *paper))} | {certificate.diameter:.3g} |"
 

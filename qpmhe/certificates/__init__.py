@@ -11,7 +11,7 @@ from .evidence import (
     OutOfTimeError,
 )
 from .lyapunov import Design, design
-from .monitor import Hypotheses, Monitor, Reading, monitored_run
+from .monitor import Monitor, Reading, monitored_run
 from .observer_bound import Band, ObserverBound
 from .properties import Detectability, ObserverStability
 from .regions import Region
@@ -21,7 +21,7 @@ from .theorem import DecayingSums, TheoremConstants
 
 __all__ = [
     "Assumption", "Band", "Certificate", "CertificateError", "DecayingSums", "Design",
-    "Detectability", "Evidence", "Hypotheses", "MismatchError", "Monitor", "NotCertifiedError",
+    "Detectability", "Evidence", "MismatchError", "Monitor", "NotCertifiedError",
     "ObserverBound", "ObserverStability", "OutOfTimeError", "Reading", "Region", "Report", "Sizes",
     "Synthesis", "TheoremConstants", "certify", "certify_detectability", "certify_model",
     "certify_observer", "design", "monitored_run", "synthesise_gain",

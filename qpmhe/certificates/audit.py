@@ -11,7 +11,7 @@ import numpy as np
 from ..costs import Cost, CostConstants
 from ..errors import InvalidInputError, ShapeError
 from ..model.system import System, checked_system
-from ..observers import Observer, Sample
+from ..observers import Observer
 from .branch_and_bound import Cells, output_lipschitz
 from .contraction import gain_if_constant
 from .deadline import Deadline
@@ -22,7 +22,6 @@ from .regions import Region
 
 _SAMPLES, _SEED = 500, 20210829
 _MOST_CELLS, _CHUNK, _ROOM = 4000, 256, 1.01  # for L_f, and how far it may be above what was seen
-_SCALES = (1e-3, 1e-1, 1.0, 10.0)  # of fitting errors that are tried, in sizes of the output
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,50 +94,18 @@ def about_model(system: System, region: Region, deadline: Deadline) -> Assumptio
                  f"{model.reason or 'no bound was found in time'}", seen)
 
 
-def about_corrections(
-    system: System, observer: Observer, region: Region
-) -> tuple[Assumption, Assumption]:
+def about_corrections(system: System, observer: Observer) -> tuple[Assumption, Assumption]:
     """Whether the observer corrects where the output fits, and how much elsewhere."""
     none = partial(Assumption, "no correction without error", "ass:observer_0")
     bound = partial(Assumption, "correction bound", "eq:kappa")
-    gain, kind = gain_if_constant(observer, system), type(observer).__name__
+    gain = gain_if_constant(observer, system)
     if gain is not None:
         kappa = float(norm_bound(Matrices.exact(gain[None]))[0])
         return none(True, Evidence.PROVED, "L(z, v) = L v vanishes with v"), bound(
             True, Evidence.PROVED, f"kappa = |L| = {kappa:.6g}, of a constant gain", kappa
         )
-    if observer.initial_covariance() is not None or observer.needs_jacobians:
-        varying = f"{kind} multiplies v by its gain of the moment"
-        return none(True, Evidence.ASSUMED, varying), bound(
-            None, None, f"{kind} has a gain that follows from what was measured: its bound is "
-            "stated, ObserverStability.assumed(kappa=...)",
-        )
-    generator, sample = np.random.default_rng(_SEED), Sample(system, np.zeros(system.m))
-    points = region.sample(_SAMPLES, generator)
-    states = points[:, : system.n]
-    size = np.ptp(evaluated("h", system.h, states, points[:, system.n :]), axis=0)
-    errors = generator.choice(_SCALES, (len(states), 1)) * np.where(size > 0.0, size, 1.0)
-    errors = errors * generator.uniform(-1.0, 1.0, (len(states), system.p))
-    with np.errstate(all="ignore"):
-        still, moved = (
-            np.stack([
-                np.array(observer.correct(z, v, sample)[0], np.float64)
-                for z, v in zip(states, each, strict=True)
-            ])
-            for each in (np.zeros_like(errors), errors)
-        )
-        ratios = np.linalg.norm(moved, axis=1) / np.linalg.norm(errors, axis=1)
-    unmoved = none(True, Evidence.SAMPLED, f"L(z, 0) = 0 at {len(states)} states")
-    if still.any():
-        k = int(still.any(axis=1).argmax())
-        text = f"L(z, 0) = {still[k].tolist()} at z = {states[k].tolist()}"
-        unmoved = none(False, Evidence.PROVED, text)
-    k = int(np.where(np.isfinite(ratios), ratios, np.inf).argmax())
-    kappa = float(ratios[k]) if np.isfinite(ratios[k]) else np.inf
-    return unmoved, bound(
-        bool(np.isfinite(kappa)), Evidence.SAMPLED, f"kappa = {kappa:.6g}, the largest "
-        f"|L(z, v)| / |v| tried, at z = {states[k].tolist()}, v = {errors[k].tolist()}", kappa,
-    )
+    stated = f"{type(observer).__name__} has no constant gain: its constants are stated"
+    return none(True, Evidence.ASSUMED, stated), bound(None, None, stated)
 
 
 def about_cost(cost: Cost) -> tuple[CostConstants | None, Assumption]:

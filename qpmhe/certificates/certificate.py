@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from .._checks import Array, choice, count
+from .._checks import Array, count
 from ..costs import Cost, CostConstants
-from ..errors import InvalidInputError, OptionError, QpmheError
+from ..errors import OptionError, QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
@@ -40,14 +40,8 @@ from .observer_bound import ObserverBound, bound_observer, with_invariance
 from .properties import Detectability, ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
-from .sizes import Size, Sizes, initial_length, lengths_of, read_size
+from .sizes import Size, Sizes
 from .theorem import TheoremConstants
-
-Kind = Literal["observer", "paper"]
-KINDS: tuple[Kind, ...] = ("observer", "paper")
-
-# The constants are upper bounds, what is computed from them is not: this covers its rounding.
-_OUTWARD = 1.0 + 1e-9
 
 #: What no check can see.
 ASSUMED = (
@@ -120,111 +114,34 @@ class Certificate:
 
     def bound(
         self, run: Run, disturbances: Size | None = None, noises: Size | None = None, *,
-        initial_error: Size, horizon: int | None = None, kind: Kind = "observer",
+        initial_error: Size,
     ) -> Array:
         """The bound of the error |x(t) - x_hat(t)| along a run at t = 0, ..., T, (T + 1,).
 
-        Parameters
-        ----------
-        run : Run
-            The run; one that knows its estimator is compared with the certificate.
-        disturbances, noises : array_like or set, optional
-            w(t) and v(t) as (T, n) and (T, p), their Euclidean lengths (T,), or what bounds them
-            at all times, a length or a set; `sizes` if left out.
-        initial_error : (n,) array_like, float or set
-            x_0 - z_0, a bound on its length, or a set that holds it.
-        horizon : int, optional
-            N, for ``kind="paper"``; the run's, or the only one, if left out.
-        kind : {"observer", "paper"}
-            ``observer``: the distance to the farthest point of the set around the observer that
-            holds the true state, NaN from where the run shows that it no longer does, see
-            `ObserverBound.along`. ``paper``: the right-hand side of (eq:RGES_result).
-
-        Raises
-        ------
-        ShapeError, OptionError, InvalidInputError
-            If an argument does not fit, or there is no such bound.
-        MismatchError
-            If the run is of another system, observer, cost or horizon.
+        The distance to the farthest point of the set around the observer that holds the true
+        state, NaN from where the run shows that it no longer does; arguments and errors are those
+        of `ObserverBound.along`. An `OptionError` is raised if there is no bound of the observer.
         """
-        choice("kind", kind, KINDS)
-        if not isinstance(run, Run):
-            raise InvalidInputError(
-                f"run is of type {type(run).__name__}; expected a qpmhe.Run, as "
-                "MovingHorizonEstimator.run returns it."
-            )
-        if kind == "observer":
-            return self._proved().along(
-                run, disturbances, noises, initial_error=initial_error
-            ).error
-        if run.source is not None:
-            self._check("observer", run.source.observer)
-            self._check("cost", run.source.cost)
-        made_with = None if run.source is None else run.source.settings.horizon
-        if None not in (horizon, made_with) and horizon != made_with:
-            raise MismatchError(
-                f"horizon is {horizon}, but the run's estimator has {made_with}; take the bound "
-                "for its horizon, and certify again if there is none."
-            )
-        constants, n, p = self.of(horizon or made_with), self.system.n, self.system.p
-        start = initial_length(initial_error, np.eye(n))
-        w, v = (
-            np.broadcast_to(
-                lengths_of(name, read_size(name, usual if given is None else given), size,
-                           np.eye(size)), len(run)
-            )
-            for name, given, usual, size in (
-                ("disturbances", disturbances, self.sizes.disturbance, n),
-                ("noises", noises, self.sizes.noise, p),
-            )
-        )
-        return _OUTWARD * constants.result.bound(start, w, v)
-
-    def limit(self, *, horizon: int | None = None, kind: Kind = "observer") -> float:
-        """What the bound tends to as t grows, for disturbances and noises of these `sizes`.
-
-        Arguments and errors as for `bound`; of the observer, it is the bound of |x(t) - z(t)|.
-        """
-        if choice("kind", kind, KINDS) == "paper":
-            return _OUTWARD * self.of(horizon).result.limit(*self.sizes.largest)
-        proved = self._proved()
-        return float(proved.farthest(proved.limit(), np.zeros(self.system.n)))
-
-    def vacuous(self, *, horizon: int | None = None, kind: Kind = "observer") -> bool:
-        """Whether the bound says nothing: its limit is no less than the region's size.
-
-        State and estimate are both in the region, so that their distance is never more than its
-        diameter. Of the observer's bound each component must be less than the region is wide.
-        Arguments and errors are those of `limit`.
-        """
-        if choice("kind", kind, KINDS) == "paper":
-            return not self.limit(horizon=horizon, kind=kind) < self.diameter
-        proved = self._proved()
-        return not (proved.components(proved.limit()) < proved.widths).all()
-
-    def _proved(self) -> ObserverBound:
-        """The observer's bound, or an error that says why there is none."""
         if self.observer_bound is None:
             reason = self.errors.get(
                 "the observer", "its constants were stated, not certified: leave stability out."
             )
-            raise OptionError(
-                f"kind is 'observer', but there is no bound of the observer: {reason}"
-            )
-        return self.observer_bound
+            raise OptionError(f"there is no bound of the observer: {reason}")
+        return self.observer_bound.along(
+            run, disturbances, noises, initial_error=initial_error
+        ).error
 
     def of(self, horizon: int | None = None) -> TheoremConstants:
         """The theorem's constants for a horizon N, which may be left out if there is only one.
 
-        An `OptionError` says which there are if there are none for this one, or why there are
-        none at all.
+        ``certificate.of(N).result.bound(...)`` is its bound (eq:RGES_result) along a run. An
+        `OptionError` says for which horizons there are some, or why there are none.
         """
         if horizon is None and len(self.constants) == 1:
             return next(iter(self.constants.values()))
         if not self.constants:
             raise OptionError(
-                "the theorem's constants could not be certified, so that only kind='observer' is "
-                f"there: {'; '.join(self.failures)}"
+                f"the theorem's constants could not be certified: {'; '.join(self.failures)}"
             )
         if horizon is None or horizon not in self.constants:
             raise OptionError(
@@ -239,19 +156,19 @@ class Certificate:
         An observer with the same constant gain is the same one, whatever its metric. The cost
         matters only to the theorem's constants.
         """
-        for name in ("system", "observer", "cost"):
-            self._check(name, getattr(estimator, name))
-
-    def _check(self, name: str, theirs: Any) -> None:
-        same = getattr(self, name) is theirs or (name == "cost" and not self.constants)
-        if name == "observer" and not same:
-            gain, own = gain_if_constant(theirs, self.system), self.gain
-            same = gain is not None and own is not None and np.array_equal(gain, own)
-        if not same:
-            raise MismatchError(
-                f"the certificate is of another {name} than the estimator's; certify the very "
-                "objects that the estimator is made of."
-            )
+        gain, own = gain_if_constant(estimator.observer, self.system), self.gain
+        for name, same in (
+            ("system", estimator.system is self.system),
+            ("observer", estimator.observer is self.observer or (
+                gain is not None and own is not None and np.array_equal(gain, own)
+            )),
+            ("cost", estimator.cost is self.cost or not self.constants),
+        ):
+            if not same:
+                raise MismatchError(
+                    f"the certificate is of another {name} than the estimator's; certify the very "
+                    "objects that the estimator is made of."
+                )
 
     @property
     def headline(self) -> str:
@@ -286,9 +203,7 @@ class Certificate:
             "observer": self.stability and self.stability.to_dict(),
             "sizes": self.sizes.to_dict(),
             "paper": [
-                each.to_dict(self.sizes.largest)
-                | {"vacuous": self.vacuous(horizon=N, kind="paper")}
-                for N, each in self.constants.items()
+                each.to_dict(self.sizes.largest, self.diameter) for each in self.constants.values()
             ],
         })
         return content
@@ -414,7 +329,7 @@ def _with_theorem(
     if weights is None:
         attempt("the theorem", lambda: _refused(about))
     output = about_output(system, region, deadline.part(_OUTPUT))
-    found = [output, *about_corrections(system, bare.observer, region), about]
+    found = [output, *about_corrections(system, bare.observer), about]
     if detectability is None:
         detectability = attempt("detectability", lambda: certify_detectability(
             system, region, weights=_cheapest(weights), seconds=deadline.part(_DETECTABILITY)

@@ -24,12 +24,13 @@ from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
 from .contraction import _undetectable
 from .deadline import DEFAULT_SECONDS, Deadline
-from .dissipation import DesignSearch, Dissipation, growth
 from .evidence import Evidence, MismatchError, json_ready
+from .inequalities import Form
 from .invariance import supports
 from .observer_bound import largest_ratio
 from .regions import Region, bounded_region
 from .sdp import started
+from .search import Search
 from .sizes import OUTWARD, Size, Sizes, initial_length, lengths_of, read_size
 
 Kind = Literal["minimiser", "measured"]
@@ -67,7 +68,7 @@ class Design:
     ----------
     system, region
         Of what, and where.
-    form : Dissipation
+    form : Form
         The inequality that was verified.
     discount : float
         gamma.
@@ -84,7 +85,7 @@ class Design:
 
     system: System
     region: Region
-    form: Dissipation
+    form: Form
     discount: float
     sizes: Sizes
     horizon: int
@@ -113,11 +114,10 @@ class Design:
             discount=self.discount,
         )
 
-    def contraction(self, horizon: int | None = None, kind: Kind = "minimiser") -> float:
-        """The factor on the error over a window whose prior is an estimate."""
+    def contraction(self, horizon: int | None = None) -> float:
+        """The factor on a minimiser's error over a window whose prior is an estimate."""
         N = self.horizon if horizon is None else count("horizon", horizon, 1)
-        choice("kind", kind, KINDS)
-        return (2.0 if kind == "minimiser" else 1.0) * math.sqrt(self.discount**N)
+        return 2.0 * math.sqrt(self.discount**N)
 
     def least_horizon(self) -> int | None:
         """The least N for which a minimiser's error contracts; None if none up to 10,000 does."""
@@ -272,7 +272,7 @@ class Design:
             "prior": self.prior, "disturbance": self.disturbance, "noise": self.noise,
             "discount": self.discount, "horizon": self.horizon, "region": self.region.to_dict(),
             "sizes": self.sizes.to_dict(), "evidence": self.evidence.value, "notes": self.notes,
-            "contraction": {kind: self.contraction(kind=kind) for kind in KINDS},
+            "contraction": self.contraction(),
             "least_horizon": self.least_horizon(), "limit": self.components(self.limit()),
         })
         return content
@@ -281,6 +281,14 @@ class Design:
 def _first(wanted: Callable[[int], bool]) -> int | None:
     """The least horizon for which something holds."""
     return next((N for N in range(1, _MOST + 1) if wanted(N)), None)
+
+
+def growth(gamma: float, horizon: int | None) -> float:
+    r"""The square of the limit for a supply of 1: :math:`4 S / (1 - 4 \gamma^N)`, S its sum."""
+    left = 0.0 if horizon is None else gamma**horizon
+    if 4.0 * left >= 1.0:
+        return math.inf
+    return 4.0 * (1.0 - left) / ((1.0 - gamma) * (1.0 - 4.0 * left))
 
 
 def design(
@@ -319,11 +327,13 @@ def design(
         count("horizon", horizon, 1)
     if discount is not None and not 0.0 < discount < 1.0:
         raise OptionError(f"discount is {discount!r}; expected a number in (0, 1).")
-    search = DesignSearch(system, place, known, horizon, started(seconds))
+    search = Search(
+        system, place, None, known.extent, seconds=started(seconds),
+        growth=lambda rate: growth(rate * rate, horizon),
+    )
     rate = None if discount is None else math.sqrt(discount) * (1.0 - 1e-12)
     found = search.answer("the root of the discount", rate, (), _undetectable)
     form = found.form
-    assert isinstance(form, Dissipation)
     gamma = discount if discount is not None else _short(form.rate**2)
     proposed = _first(lambda N: growth(gamma, N) <= _ROOM**2 * growth(gamma, None))
     return Design(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -13,10 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import Array, record
 from ..errors import InvalidInputError, OptionError, ShapeError
-from ..estimation.constraints import Constraints
 from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
-from ..estimation.limits import FEASIBLE
 from ..estimation.run import Run
 from ..model.system import System
 from .certificate import Certificate
@@ -37,48 +35,18 @@ _MOVED = (
 )
 
 
-@dataclass(frozen=True)
-class Hypotheses:
-    """Which hypotheses of the theorem held at one sample, checked anew from its numbers.
-
-    Parameters
-    ----------
-    cost_decrease : bool
-        (eq:estimator): the estimate costs no more than the candidate, and the stated costs are
-        those of the trajectories (which is checked where the window is complete).
-    complete : bool
-        All measurements of the window are there, and the model could be evaluated.
-    observer_candidate : bool
-        (eq:warmstart): the candidate is the observer's trajectory and corrects by the certified
-        gain, where that is constant; or was projected onto X in the certified metric.
-    kappa : bool
-        (eq:kappa): |L| <= kappa |v_z| all along the candidate, but where it was so projected.
-    candidate_in_region, estimate_in_region : bool
-        All states of the window but the newest, from which nothing is concluded yet, lie in
-        the certified set, and so do the inputs.
-    candidate_in_sets, feasible : bool
-        Assumption ass:observer and (eq:constraints): the candidate and the estimate are in X, W
-        and V. Only reported: what is certified holds for any w and v.
-    """
-
-    cost_decrease: bool
-    complete: bool
-    observer_candidate: bool
-    kappa: bool
-    candidate_in_region: bool
-    estimate_in_region: bool
-    candidate_in_sets: bool
-    feasible: bool
-
-    @property
-    def failed(self) -> tuple[str, ...]:
-        """Names of those that the theorem's bound needs and that did not hold."""
-        return tuple(name for name in NEEDED if not getattr(self, name))
-
-
-#: The hypotheses that are only reported, and those that the bound needs.
-UNNEEDED = ("candidate_in_sets", "feasible")
-NEEDED = tuple(each.name for each in fields(Hypotheses) if each.name not in UNNEEDED)
+#: What the paper's bound needs at each sample, checked anew from the estimate's numbers. Whether
+#: candidate and estimate are in X, W and V is no part of it: what is certified holds for any w, v.
+HYPOTHESES = {
+    "cost decrease": "(eq:estimator): the estimate costs no more than the candidate, and both "
+    "costs are the trajectories' own",
+    "complete": "all measurements of the window are there, and the model could be evaluated",
+    "observer candidate": "(eq:warmstart): the candidate corrects by the certified gain, or was "
+    "projected onto X in the certified metric",
+    "kappa": "(eq:kappa): |L| <= kappa |v_z| where the candidate was not so projected",
+    "candidate in region": "the candidate's states but the newest, and the inputs, are certified",
+    "estimate in region": "the estimate's states but the newest, and the inputs, are certified",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +69,8 @@ class Reading:
         The sample after which the bound no longer holds.
     reason : str
         Why; empty while it holds.
-    hypotheses : Hypotheses or None
-        Those of the theorem, where a certificate is monitored.
+    failed : tuple of str
+        Which `HYPOTHESES` of the theorem did not hold, where a certificate is monitored.
     """
 
     time: int
@@ -113,7 +81,7 @@ class Reading:
     kind: str = "observer"
     lost: int | None = None
     reason: str = ""
-    hypotheses: Hypotheses | None = None
+    failed: tuple[str, ...] = ()
 
 
 class Monitor:
@@ -148,9 +116,9 @@ class Monitor:
     barred : str
         Why the theorem does not apply at all; empty if it may.
     steps, applied : int
-        Samples seen, and those up to the first at which a needed hypothesis did not hold.
+        Samples seen, and those up to the first at which one of the `HYPOTHESES` did not hold.
     missed : dict of str to int
-        At how many samples each hypothesis did not hold.
+        At how many samples each did not.
 
     Examples
     --------
@@ -210,7 +178,7 @@ class Monitor:
         self.barred = ""
         self._measured: MeasuredCost | None = None
         self.steps, self.applied = 0, 0
-        self.missed = dict.fromkeys((*NEEDED, *UNNEEDED), 0)
+        self.missed = dict.fromkeys(HYPOTHESES, 0)
         self._first: tuple[int, tuple[str, ...]] | None = None
         self._inputs: deque[Array] = deque(maxlen=estimator.horizon)
         self._projected: deque[bool] = deque(maxlen=estimator.horizon)
@@ -283,7 +251,7 @@ class Monitor:
                 self.lost, self.reason, self._radius = estimate.time, reason, math.nan
         if order or again:
             self.barred = self.barred or order or "a sample was estimated again (amend or set)"
-        held = None
+        failed: tuple[str, ...] = ()
         if not again:
             self._inputs.append(given)
             self._radii.append(self._radius)
@@ -292,11 +260,11 @@ class Monitor:
                 and Status.OBSERVER_PROJECTED in estimate.status
             )
         if self._certificate is not None and not order:
-            held = self._hypotheses(estimate, stages)
+            failed = self._failed(estimate, stages)
         self._time, self._z = estimate.time + 1, estimate.observer_state.copy()
-        return self._reading(estimate, stages, held)
+        return self._reading(estimate, stages, failed)
 
-    def _reading(self, estimate: Estimate, stages: int, held: Hypotheses | None) -> Reading:
+    def _reading(self, estimate: Estimate, stages: int, failed: tuple[str, ...]) -> Reading:
         """The smaller one of the observer's bound and the one with the measured cost."""
         nothing = np.full(self._system.n, np.nan)
         lower, upper, error, kind = nothing, nothing, math.nan, "observer"
@@ -310,7 +278,7 @@ class Monitor:
             if least < error:
                 error, kind = least, "measured"
         return Reading(
-            estimate.time, self._radius, lower, upper, error, kind, self.lost, self.reason, held
+            estimate.time, self._radius, lower, upper, error, kind, self.lost, self.reason, failed
         )
 
     def _order(self, time: int) -> str:
@@ -356,21 +324,21 @@ class Monitor:
         self._radius = bound.advanced(self._radius, self._entering)
         return CONTRADICTION if bound.is_empty(np.array(self._radius), z) else ""
 
-    def _hypotheses(self, estimate: Estimate, stages: int) -> Hypotheses:
-        """Those that held, counted."""
+    def _failed(self, estimate: Estimate, stages: int) -> tuple[str, ...]:
+        """The hypotheses that did not hold, counted."""
         assert self._certificate is not None
-        found = hypotheses(
+        failed = failed_hypotheses(
             self._certificate, estimate, np.array(self._inputs)[-stages:],
             np.array(self._projected)[-stages:],
         )
         if estimate.time >= self.steps:
             self.steps = estimate.time + 1
-            for name in self.missed:
-                self.missed[name] += not getattr(found, name)
-        if found.failed and self._first is None:
-            self._first = estimate.time, found.failed
+            for name in failed:
+                self.missed[name] += 1
+        if failed and self._first is None:
+            self._first = estimate.time, failed
         self.applied = self.steps if self._first is None else self._first[0]
-        return found
+        return failed
 
     @property
     def applies(self) -> bool:
@@ -388,23 +356,17 @@ class Monitor:
             return f"{text}The theorem does not apply: {self.barred}".strip()
         text += f"The certificate applied at {self.applied} of {self.steps} samples"
         if self._first is not None:
-            reasons = ", ".join(self._first[1]).replace("_", " ")
-            text += f": at sample {self._first[0]} it was lost ({reasons} did not hold)"
-        missed = ", ".join(
-            f"{name.replace('_', ' ')} at {times}{'' if name in NEEDED else ' (not needed)'}"
-            for name, times in self.missed.items() if times
-        )
-        return f"{text}.{f' Not held: {missed}.' if missed else ''}"
+            first = f"at sample {self._first[0]} it was lost ({', '.join(self._first[1])})"
+            missed = ", ".join(f"{name} at {k}" for name, k in self.missed.items() if k)
+            text += f": {first}. Not held: {missed}"
+        return f"{text}."
 
     def to_dict(self) -> dict[str, Any]:
         """What the summary says, in types that JSON knows."""
         return {
             "steps": self.steps, "applied": self.applied, "barred": self.barred,
-            "failed": [] if self._first is None else list(self._first[1]),
-            "lost": self.lost, "reason": self.reason, "hypotheses": {
-                name: {"needed": name in NEEDED, "failed": times, "held": self.steps - times}
-                for name, times in self.missed.items()
-            },
+            "failed": [] if self._first is None else list(self._first[1]), "lost": self.lost,
+            "reason": self.reason, "missed": self.missed, "hypotheses": HYPOTHESES,
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -464,18 +426,16 @@ def _barred(estimator: MovingHorizonEstimator) -> str:
     return ""
 
 
-def hypotheses(
+def failed_hypotheses(
     certificate: Certificate, estimate: Estimate, inputs: ArrayLike | None = None,
     projected: ArrayLike | None = None,
-) -> Hypotheses:
-    """Which hypotheses of the theorem held at one sample.
+) -> tuple[str, ...]:
+    """Which of the `HYPOTHESES` did not hold at one sample.
 
     Parameters
     ----------
-    certificate : Certificate
-        Of the estimator's system, observer and cost.
-    estimate : Estimate
-        What the update returned.
+    certificate, estimate
+        Of the estimator's system, observer and cost, and what the update returned.
     inputs : (K, m) array_like, optional
         The inputs of the window's K samples, for a system with inputs; a `ShapeError` is raised
         if they do not fit.
@@ -519,14 +479,13 @@ def hypotheses(
         ))
     low, high = region.lower[region.n :], region.upper[region.n :]
     usual = bool(((u >= low) & (u <= high)).all())
-    return Hypotheses(
-        cost_decrease=cheaper, complete=complete, observer_candidate=observed,
-        kappa=bool((moved | (sizes <= allowed + np.linalg.norm(rounding))).all()),
-        candidate_in_region=usual and bool(region.contains(estimate.candidate[:-1]).all()),
-        estimate_in_region=usual and bool(region.contains(estimate.trajectory[:-1]).all()),
-        candidate_in_sets=_in_sets(certificate, estimate.candidate, corrections, fit, y),
-        feasible=_in_sets(certificate, estimate.trajectory, w, estimate.noises, y),
+    held = (
+        cheaper, complete, observed,
+        bool((moved | (sizes <= allowed + np.linalg.norm(rounding))).all()),
+        *(usual and bool(region.contains(x[:-1]).all())
+          for x in (estimate.candidate, estimate.trajectory)),
     )
+    return tuple(name for name, each in zip(HYPOTHESES, held, strict=True) if not each)
 
 
 def monitored_run(
@@ -572,11 +531,3 @@ def _has_cost(
     rounding = float(np.sum(cost.stage_costs(_UNITS * sizes, each)))
     missed = abs(total - stated) if cost.observer_prior is None else total - stated
     return bool(missed <= _RELATIVE * abs(stated) + rounding / _RELATIVE)
-
-
-def _in_sets(certificate: Certificate, states: Array, w: Array, v: Array, y: Array) -> bool:
-    """Whether a trajectory is in X, W and V as the estimator itself judges it."""
-    cost, covariance = certificate.cost, certificate.observer.initial_covariance()
-    deviations = cost.prior_deviations(covariance)
-    sets = Constraints(certificate.system, cost, np.diag(deviations**2))
-    return sets.violation(states, np.hstack((w, v)), y) <= 2.0 * FEASIBLE

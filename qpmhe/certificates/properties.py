@@ -18,7 +18,7 @@ from .theorem import DecayingSums, checked_rate
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Certified:
-    """What detectability and the observer's stability share."""
+    """What both share: norms, and what they rest on; made or changed by hand, it is assumed."""
 
     region: Region | None = None
     notes: tuple[str, ...] = ()
@@ -54,10 +54,8 @@ class Detectability(_Certified):
         + c_v \sum_{\tau=1}^t \eta^\tau |\delta h(t-\tau)|
 
     with :math:`\delta w = w_1 - w_2` and :math:`\delta h = h(x_1) - h(x_2)`. Where P is
-    given, this follows from the sharper contraction, in norms :math:`|s|_M = \sqrt{s^\top M s}`,
-
-    .. math::
-        |x_1^+ - x_2^+|_P \le \eta |x_1 - x_2|_P + |\delta w|_P + |\delta h|_V .
+    given, this follows from :math:`|x_1^+ - x_2^+|_P \le \eta |x_1 - x_2|_P + |\delta w|_P +
+    |\delta h|_V`, in norms :math:`|s|_M = \sqrt{s^\top M s}`.
 
     Parameters
     ----------
@@ -76,8 +74,7 @@ class Detectability(_Certified):
     form : str
         Which inequality was shown: ``output weight``, ``output injection``, or ``assumed``.
     margin : float
-        The smallest eigenvalue of the verified matrices with their diagonals scaled to one,
-        rounded: what the solver's tolerance and rounding have left.
+        The smallest eigenvalue of the verified matrices with their diagonals scaled to one.
     cells : int
         In how many pieces of the region the inequality was verified; 0 if in none.
     system : System or None
@@ -99,10 +96,10 @@ class Detectability(_Certified):
 
         An `OptionError` names one that is not positive, or not below 1 for eta.
         """
-        return cls(
-            checked_rate("eta", eta), positive("c_p", c_p), positive("c_w", c_w),
-            positive("c_v", c_v), region=stated_region(region),
-        )
+        checked_rate("eta", eta)
+        for name, value in (("c_p", c_p), ("c_w", c_w), ("c_v", c_v)):
+            positive(name, value)
+        return cls(eta, c_p, c_w, c_v, region=stated_region(region))
 
     @property
     def sums(self) -> DecayingSums:
@@ -120,16 +117,9 @@ class ObserverStability(_Certified):
         |x(t) - z(t)| \le C_p |x_0 - z_0| \rho^t
         + C_w \sum_{\tau=1}^t \rho^\tau |w(t-\tau)| + C_v \sum_{\tau=1}^t \rho^\tau |v(t-\tau)|
 
-    Where P is given, this follows from the sharper contraction
-
-    .. math::
-        |x^+ - z^+|_P \le \rho |x - z|_P + |w|_P + |v|_V ,
-
-    and where Q and R are given, the sum of squares holds as well, whose limit
-    :math:`\sqrt{(|w|_Q^2 + |v|_R^2) / (1 - \rho^2)}` is in general smaller:
-
-    .. math::
-        |x^+ - z^+|_P^2 \le \rho^2 |x - z|_P^2 + |w|_Q^2 + |v|_R^2 .
+    Where P is given, this follows from :math:`|x^+ - z^+|_P \le \rho |x - z|_P + |w|_P + |v|_V`,
+    and where Q and R are given, :math:`|x^+ - z^+|_P^2 \le \rho^2 |x - z|_P^2 + |w|_Q^2 +
+    |v|_R^2` holds as well, whose limit is in general smaller.
 
     Parameters
     ----------
@@ -144,7 +134,7 @@ class ObserverStability(_Certified):
     P, V : (n, n) and (p, p) array or None
         Norms of error and disturbance, and of noise: V is L^T P L.
     Q, R : (r, r) and (p, p) array or None
-        Diagonal weights of disturbance and noise in the sum of squares.
+        Weights of disturbance and noise in the sum of squares.
     evidence, region, notes, margin, cells, system
         As for `Detectability`.
     """
@@ -164,11 +154,10 @@ class ObserverStability(_Certified):
         region: ConvexSet | Region | None = None,
     ) -> ObserverStability:
         """Constants that the user states without proof; see `Detectability.assumed`."""
-        return cls(
-            checked_rate("rho", rho), positive("C_p", C_p), positive("C_w", C_w),
-            positive("C_v", C_v), positive("kappa", kappa),
-            region=stated_region(region),
-        )
+        checked_rate("rho", rho)
+        for name, value in (("C_p", C_p), ("C_w", C_w), ("C_v", C_v), ("kappa", kappa)):
+            positive(name, value)
+        return cls(rho, C_p, C_w, C_v, kappa, region=stated_region(region))
 
     @property
     def sums(self) -> DecayingSums:
@@ -191,14 +180,13 @@ def sealed(result: Result, system: System, evidence: Evidence) -> Result:
 
 def fitting(part: Result, system: System, region: Region, gain: Array | None) -> Result:
     """A part of a certificate, if it is about this system, region and gain."""
-    what = "detectability" if hasattr(part, "eta") else "stability"
-    if part.region is not None:
-        difference = beyond(region, part.region)
-        if difference:
-            raise MismatchError(
-                f"the {what} that was passed does not hold on the whole region: {difference}. "
-                "Certify it on this region, with these inputs, or pass a region within its own."
-            )
+    what = "detectability" if isinstance(part, Detectability) else "stability"
+    difference = "" if part.region is None else beyond(region, part.region)
+    if difference:
+        raise MismatchError(
+            f"the {what} that was passed does not hold on the whole region: {difference}. "
+            "Certify it on this region, with these inputs, or pass a region within its own."
+        )
     own = getattr(part, "gain", None)
     if own is not None and (gain is None or not np.array_equal(own, gain)):
         theirs = "not constant" if gain is None else str(gain.tolist())

@@ -19,7 +19,7 @@ from ..models.scenario import Record, Scenario
 from ..observers import Observer
 from ..plots.bounds import error_and_bounds
 from ..plots.style import save
-from .certificate import KINDS, Certificate, examined, horizons_of
+from .certificate import Certificate, examined, horizons_of
 from .contraction import certify_observer, synthesise_gain
 from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import CertificateError, NotCertifiedError
@@ -109,15 +109,13 @@ class Report:
         w = record.states[1:] - system.f.batch(record.states[:-1], u)
         v = record.measurements - system.h.batch(record.states[:-1], u)
         start = record.states[0] - run.observer_states[0]
-        has = {"observer": certificate.observer_bound, "paper": certificate.constants}
-        horizon = max(certificate.constants, default=None)
-        bounds = {
-            LABELS[kind]: certificate.bound(
-                run, w, v, initial_error=start, kind=kind,
-                horizon=horizon if kind == "paper" else None,
-            )
-            for kind in KINDS if has[kind]
-        }
+        bounds = {}
+        if certificate.observer_bound is not None:
+            bounds[LABELS["observer"]] = certificate.bound(run, w, v, initial_error=start)
+        if certificate.constants:
+            lengths = (np.linalg.norm(each, axis=1) for each in (w, v))
+            last = certificate.of(max(certificate.constants))
+            bounds[LABELS["paper"]] = last.result.bound(np.linalg.norm(start), *lengths)
         return error_and_bounds(
             scenario.dt * np.arange(steps + 1.0),
             np.linalg.norm(record.states - run.states, axis=1), bounds,

@@ -99,12 +99,21 @@ class Sizes:
         return sizes
 
     @property
+    def extent(self) -> tuple[float | Array, float | Array]:
+        """The largest |w| and |v| or, of sets, half-widths by component."""
+        w, v = (
+            np.abs(sides_of(name, given)).max(axis=0) if isinstance(given, ConvexSet)
+            else float(given)
+            for name, given in (("disturbance", self.disturbance), ("noise", self.noise))
+        )
+        return w, v
+
+    @property
     def largest(self) -> tuple[float, float]:
         """The largest |w| and |v|."""
         w, v = (
-            float(given) if not isinstance(given, ConvexSet)
-            else float(np.linalg.norm(np.abs(sides_of(name, given)).max(axis=0))) * OUTWARD
-            for name, given in (("disturbance", self.disturbance), ("noise", self.noise))
+            each if isinstance(each, float) else float(np.linalg.norm(each)) * OUTWARD
+            for each in self.extent
         )
         return w, v
 
@@ -113,18 +122,16 @@ class Sizes:
 
         Where there is nothing of one kind, a thousandth of the other keeps the choice bounded.
         """
-        found: list[float | Array] = []
         lengths = self.largest if max(self.largest) > 0.0 else (1.0, 1.0)
         least = _LEAST * max(lengths)
-        for name, given, length, size in (
-            ("disturbance", self.disturbance, lengths[0], system.r),
-            ("noise", self.noise, lengths[1], system.p),
-        ):
-            sides = np.empty(0)
-            if isinstance(given, ConvexSet):
-                sides = np.abs(sides_of(name, given)).max(axis=0)
-            found.append(np.maximum(sides, least) if sides.size == size else max(length, least))
-        return found[0], found[1]
+        w, v = (
+            np.maximum(each, least) if np.size(each) == size and np.ndim(each)
+            else max(length, least)
+            for each, length, size in zip(
+                self.extent, lengths, (system.r, system.p), strict=True
+            )
+        )
+        return w, v
 
     def __str__(self) -> str:
         return f"{_words('w', self.disturbance)}, {_words('v', self.noise)} ({self.source})"

@@ -262,14 +262,19 @@ class TheoremConstants:
             checked_length("model_lipschitz", self.model_lipschitz)
             positive("the observer's C_w", self.observer.disturbance)
 
-    def to_dict(self, sizes: tuple[float, float]) -> dict[str, Any]:
-        """The constants, and the limit for the largest |w| and |v|, in types that JSON knows."""
+    def to_dict(self, sizes: tuple[float, float], diameter: float) -> dict[str, Any]:
+        """The constants, and the limit for the largest |w| and |v|, in types that JSON knows.
+
+        The limit is vacuous if it is no less than the diameter of the region, in which state and
+        estimate are anyway.
+        """
         names = (
             "horizon", "L_bar", "kappa_bar", "c_bar", "eta_bar", "rho_bar_1", "rho_bar_2", "C_bar",
             "C_prime", "C_double_prime", "C",
         )
+        limit = self.result.limit(*sizes)
         return {name: getattr(self, name) for name in names} | {
-            "lambda": self.lam, "limit": self.result.limit(*sizes),
+            "lambda": self.lam, "limit": limit, "vacuous": not limit < diameter,
         }
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rich import box as boxes
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -15,18 +13,16 @@ from .._checks import make_folder
 from ..certificates.certificate import ASSUMED, Certificate
 from ..certificates.deadline import Deadline
 from ..certificates.evidence import NotCertifiedError
-from ..certificates.lyapunov import Design, Kind, design
+from ..certificates.lyapunov import Design, design
 from ..certificates.regions import Region
 from ..certificates.report import Report, certify_model
+from ..certificates.theorem import DecayingSums
 from ..errors import OptionError
 from ..models.loading import build, find
 from ..records.record_model import model_parts
 from .values import read_box
 
-_MEANING: dict[Kind, str] = {
-    "minimiser": "J(estimate) <= J(truth), as of a global minimiser",
-    "measured": "J(estimate), known once it is there",
-}
+Rows = list[tuple[str, str]]
 
 
 def certify(
@@ -36,31 +32,29 @@ def certify(
 ) -> bool:
     """Certify a model with `qpmhe.certificates.certify_model`, and show the result."""
     horizons = _horizons(horizon)
-    if report is not None:
-        _check_report(report)  # before any work
+    if report is not None:  # before any work
+        if report.suffix != ".json":
+            raise OptionError(
+                f"--report is {str(report)!r}; expected a file name that ends with .json, beside "
+                "which the picture goes as .png and .svg."
+            )
+        make_folder(report.parent)
     source = find(model)
     (system, observer, cost), options = model_parts(source.name, build(source))
-    scenario = options.get("scenario")
     region = None if box is None else read_box("--box", box, system.n, "states")
     inputs = None if input_box is None else read_box("--input-box", input_box, system.m, "inputs")
     if not horizons and "horizon" not in options:
         raise OptionError(f"model {source.name!r} does not give its horizon; give --horizon.")
     with console.status("looking for matrices, and verifying them"):
         found = certify_model(
-            system, observer, cost, scenario, horizon=horizons or options["horizon"],
-            region=region, inputs=inputs, seed=seed, seconds=seconds, name=model,
+            system, observer, cost, options.get("scenario"),
+            horizon=horizons or options["horizon"], region=region, inputs=inputs, seed=seed,
+            seconds=seconds, name=model,
         )
     certificate = found.certificate
     other = "With a gain made for the region: " if found.replaced else ""
     _print(console, f"[bold]{other}{escape(certificate.headline)}[/]")
-    title = model if scenario is None else scenario.title or model
-    rows = Table.grid(padding=(0, 2))
-    for name, text in (
-        ("model", title), ("states", _words(certificate.region)),
-        *([("observer", found.replaced)] if found.replaced else []), *_findings(found, seed),
-    ):
-        rows.add_row(f"[dim]  {name}[/]", escape(text))
-    console.print(rows, highlight=False)
+    _show(console, _findings(found, seed))
     for text in certificate.failures:
         _print(console, f"[bold red]Not certified:[/] {escape(text)}")
     if not certificate.holds:
@@ -69,11 +63,13 @@ def certify(
             "observer's candidate, at each step and with any solver.",
         )
     if details:
-        _show_details(console, found)
+        _show(console, _details(found), "The theorem's assumptions and constants")
+        for text in ASSUMED:
+            _print(console, f"Assumed: {text}.")
     elif certificate.assumptions:
         _print(console, "[dim]The theorem's assumptions and constants: --details[/]")
     if with_design:
-        found.design = _show_design(console, certificate, horizons, seconds)
+        found.design = _designed(console, certificate, horizons, seconds)
     if report is not None:
         for path in found.save(report):
             console.print(f"wrote {escape(str(path))}", highlight=False, soft_wrap=True)
@@ -84,17 +80,31 @@ def _print(console: Console, text: str) -> None:
     console.print(text, highlight=False)
 
 
-def _findings(found: Report, seed: int) -> list[tuple[str, str]]:
+def _show(console: Console, rows: Rows, title: str = "") -> None:
+    """Rows of a name and what there is to say of it."""
+    table = Table.grid(padding=(0, 2))
+    for name, text in rows:
+        table.add_row(f"[dim]  {escape(name)}[/]", escape(text))
+    if title:
+        _print(console, f"\n[bold]{escape(title)}[/]")
+    console.print(table, highlight=False)
+
+
+def _findings(found: Report, seed: int) -> Rows:
     """What the bounds are for, what they need, and what they came to on the simulated record."""
-    certificate, proved, rows = found.certificate, found.certificate.observer_bound, []
+    certificate, proved = found.certificate, found.certificate.observer_bound
+    title = "" if found.scenario is None else found.scenario.title
+    rows = [("model", title or found.name), ("states", _words(certificate.region))]
+    if found.replaced:
+        rows.append(("observer", found.replaced))
     if proved is not None:
         rows += [("for", str(proved.sizes)), ("stays", proved.condition)]
         if certificate.system.states is not None and not proved.projects:
+            metric = np.array2string(proved.metric, separator=", ", floatmode="unique")
             rows.append((
                 "projection", "the observer is projected onto X in another metric than the "
-                "certified one: samples at which it is end the bound. Luenberger(gain, "
-                f"metric={np.array2string(proved.metric, separator=', ', floatmode='unique')})"
-                .replace("\n", "") + " keeps it",
+                "certified one: samples at which it is end the bound. Luenberger(gain, metric="
+                f"{metric})".replace("\n", "") + " keeps it",
             ))
     if found.band is not None and found.run is not None and found.record is not None:
         errors = np.linalg.norm(found.record.states - found.run.states, axis=1)
@@ -103,58 +113,50 @@ def _findings(found: Report, seed: int) -> list[tuple[str, str]]:
             "simulated", f"seed {seed}: |x - x_hat| <= {found.band.error[held].max():.3g} was "
             f"guaranteed, and {errors[held].max():.3g} was the largest; {found.band}",
         ))
-    for N in certificate.constants:
+    for N, each in certificate.constants.items():
+        limit = each.result.limit(*certificate.sizes.largest)
         vacuous = ""
-        if certificate.vacuous(horizon=N, kind="paper"):
+        if not limit < certificate.diameter:
             vacuous = f": vacuous, the region's diameter is {certificate.diameter:.3g}"
         rows.append((
-            f"N = {N}", f"|x - x_hat| <= {certificate.limit(horizon=N, kind='paper'):.3g} in the "
-            f"limit by the paper's constants ({certificate.evidence}){vacuous}",
+            f"N = {N}", f"|x - x_hat| <= {limit:.4g} in the limit by the paper's constants "
+            f"({certificate.evidence}){vacuous}",
         ))
     return rows
 
 
-def _show_details(console: Console, found: Report) -> None:
+def _details(found: Report) -> Rows:
+    """The theorem's assumptions, constants and hypotheses."""
     certificate = found.certificate
-    if certificate.assumptions:
-        _show(
-            console, "Assumptions", ("assumption", "holds", "evidence", "what was found"),
-            [
-                (f"{each.name} ({each.label})", {True: "yes", False: "no", None: "-"}[each.holds],
-                 str(each.evidence or "-"), each.text)
-                for each in certificate.assumptions
-            ],
-        )
-    rows: list[tuple[Any, ...]] = []
+    rows = [
+        (f"{each.name} ({each.label})", " ".join(filter(None, (
+            {True: "", False: "does not hold", None: "not examined"}[each.holds],
+            "" if each.evidence is None else f"({each.evidence})", each.text,
+        ))))
+        for each in certificate.assumptions
+    ]
+
+    def constants(sums: DecayingSums, names: tuple[str, str, str, str]) -> str:
+        values = (*sums.constants, sums.rate)
+        return ", ".join(f"{name} {value:.4g}" for name, value in zip(names, values, strict=True))
+
     for name, part in (
         ("e-IOSS (eq:eIOSS)", certificate.detectability),
         ("observer (eq:RGES)", certificate.stability),
     ):
         if part is not None:
-            rows.append((name, part.sums.rate, *part.sums.constants, str(part.evidence)))
-    if rows:
-        _show(
-            console, "Detectability and observer", ("", "rate", "c_p", "c_w", "c_v", "evidence"),
-            rows, "Rate per step; constants of initial error, disturbance and noise.",
-        )
-    if certificate.constants:
-        _show(
-            console, "The paper's bound (eq:RGES_result)",
-            ("N", "C_1", "C_2", "C_3", "lambda", "limit", ""), [
-                (str(N), *each.C, each.lam, certificate.limit(horizon=N, kind="paper"),
-                 "vacuous" if certificate.vacuous(horizon=N, kind="paper") else "")
-                for N, each in certificate.constants.items()
-            ],
-            f"Limit: for {certificate.sizes}. Vacuous: no less than {certificate.diameter:.4g}, "
-            f"the diameter of the set. Evidence of all: {certificate.evidence}.",
-        )
+            text = constants(part.sums, ("c_p", "c_w", "c_v", "rate"))
+            rows.append((name, f"{text} ({part.evidence})"))
+    for N, each in certificate.constants.items():
+        rows.append((
+            f"N = {N} (eq:RGES_result)", constants(each.result, ("C_1", "C_2", "C_3", "lambda"))
+        ))
     if found.monitor is not None:
-        _print(console, f"Simulated record: {found.monitor.summary()}")
-    for text in ASSUMED:
-        _print(console, f"Assumed: {text}.")
+        rows.append(("simulated record", found.monitor.summary()))
+    return rows
 
 
-def _show_design(
+def _designed(
     console: Console, certificate: Certificate, horizons: list[int], seconds: float
 ) -> Design | None:
     """Design for a certificate's model, region and sizes, and print what is to be pasted."""
@@ -169,29 +171,19 @@ def _show_design(
             return None
     limits = made.components(made.limit())
     widths = (made.region.upper - made.region.lower)[: limits.size]
-    texts = ", ".join(
-        f"{value:.3g}" if value < width else f"({value:.3g})"
-        for value, width in zip(limits.tolist(), widths.tolist(), strict=True)
-    )
-    names = [f"x{j + 1}" for j in range(made.region.n)]
-    if len(names) > 3:
-        names[1:-1] = ["..."]
-    _show(
-        console, f"Lyapunov design ({made.evidence}), for {made.sizes}",
-        ("what bounds J(estimate)", "N", "contraction", "least N", f"limit of {', '.join(names)}"),
-        [
-            (_MEANING[kind], str(made.horizon), made.contraction(kind=kind), *(
-                (str(made.least_horizon() or "-"), texts) if kind == "minimiser" else ("1", "-")
-            ))
-            for kind in _MEANING
-        ],
-        "Contraction: by which factor the error shrinks over a window that starts at an estimate. "
-        "Least N: from which it is below 1. Limit: of each state's error, for noises that always "
-        "act in the worst direction; -, none in advance; in brackets, no less than the region's "
-        "width, so that it says nothing.",
-    )
-    for note in made.notes:
-        _print(console, f"Note: {escape(note)}")
+    nothing = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limits >= widths))
+    rows = [
+        ("for", str(made.sizes)),
+        ("contraction", f"of the error by {made.contraction():.3g} over a window of N = "
+         f"{made.horizon} that starts at an estimate, if J(estimate) <= J(truth), as of a global "
+         f"minimiser; below 1 from N = {made.least_horizon() or '-'} on"),
+        ("limit", "then "
+         + ", ".join(f"|x{i + 1} - x_hat{i + 1}| <= {each:.3g}" for i, each in enumerate(limits))
+         + (f": it says nothing of {nothing}" if nothing else "")),
+        ("any QPs", "the bound with J(estimate) as it came back: Design.along"),
+        *(("note", each) for each in made.notes),
+    ]
+    _show(console, rows, f"Lyapunov design ({made.evidence})")
     console.print()
     console.print(made.code(), highlight=False, markup=False, soft_wrap=True)
     return made
@@ -216,36 +208,3 @@ def _words(region: Region) -> str:
         for j, (low, high) in enumerate(zip(region.lower, region.upper, strict=True))
     ]
     return ", ".join(parts) + ("" if region.is_box else ", and general inequalities")
-
-
-def _check_report(report: Path) -> None:
-    if report.suffix != ".json":
-        raise OptionError(
-            f"--report is {str(report)!r}; expected a file name that ends with .json, beside which "
-            "the picture goes as .png and .svg."
-        )
-    make_folder(report.parent)
-
-
-def _show(
-    console: Console, title: str, names: tuple[str, ...], rows: list[tuple[Any, ...]],
-    caption: str | None = None,
-) -> None:
-    """A table; words give way where it is narrow, figures are never cut."""
-    table = Table(
-        title=escape(title), title_justify="left", caption=caption and escape(caption),
-        caption_justify="left", box=boxes.SIMPLE, padding=(0, 1, 0, 0),
-    )
-    texts = [
-        [f"{value:.4g}" if isinstance(value, float) else str(value) for value in row]
-        for row in rows
-    ]
-    for j, name in enumerate(names):
-        figures = name.endswith("N") or any(isinstance(row[j], float) for row in rows)
-        width = max([len(name), *(len(row[j]) for row in texts)]) if figures else None
-        table.add_column(
-            name, justify="right" if figures else "left", overflow="fold", min_width=width
-        )
-    for row in texts:
-        table.add_row(*map(escape, row))
-    console.print(table)

@@ -32,7 +32,6 @@ from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, S
 
 from .helpers import REACTOR, box, linear, scalar, unit_box, unit_cost
 
-KINDS = ("observer", "paper")
 FOREVER = Deadline(math.inf)
 
 
@@ -51,11 +50,9 @@ def test_the_reactors_constants_are_the_theorems(reactor):
             horizon=N,
         )
         assert pytest.approx(again.C, rel=1e-9) == certificate.of(N).C
-        limits.append(certificate.limit(horizon=N, kind="paper"))
-        assert certificate.vacuous(horizon=N, kind="paper")
+        limits.append(certificate.of(N).result.limit(0.3, 0.6))
     assert limits == sorted(limits)
-    assert not certificate.vacuous()
-    assert certificate.limit() < certificate.diameter < limits[0]
+    assert certificate.diameter < limits[0]
 
 
 def played(certificate, scenario, seed, **options):
@@ -70,30 +67,31 @@ def played(certificate, scenario, seed, **options):
     return (run, w, v), states[0] - run.states[0], np.linalg.norm(states - run.states, axis=1)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+def paper_bound(certificate, record, start):
+    lengths = (np.linalg.norm(each, axis=1) for each in record[1:])
+    return certificate.of(5).result.bound(np.linalg.norm(start), *lengths)
+
+
 @pytest.mark.parametrize("max_qps", [0, 2])
-def test_no_bound_is_below_the_error(reactor, kind, max_qps):
+def test_no_bound_is_below_the_error(reactor, max_qps):
     for seed in range(3):
         record, start, error = played(*reactor, seed, max_qps=max_qps)
-        bound = reactor[0].bound(*record, initial_error=start, kind=kind)
+        bound = reactor[0].bound(*record, initial_error=start)
         assert (error <= bound).all()
+        assert (bound <= paper_bound(reactor[0], record, start)).all()
 
 
 def test_the_paper_bound_is_the_right_hand_side(reactor):
     certificate, _ = reactor
-    (run, w, v), start, _ = played(*reactor, 0)
-    C, lam = certificate.of(5).C, certificate.of(5).lam
-    found = certificate.bound(run, w, v, initial_error=start, kind="paper")
+    record, start, _ = played(*reactor, 0)
+    (_, w, v), C, lam = record, certificate.of(5).C, certificate.of(5).lam
+    found = paper_bound(certificate, record, start)
     for t in (0, 3, 60):
         expected = C[0] * np.sqrt(8.0) * lam**t + sum(
             lam**tau * (C[1] * np.linalg.norm(w[t - tau]) + C[2] * abs(v[t - tau, 0]))
             for tau in range(1, t + 1)
         )
         assert found[t] == pytest.approx(expected, rel=1e-8)
-    # Bounds for all times instead: they tend to the limit for these sizes.
-    always = certificate.bound(run, initial_error=qpmhe.Box([-2.0] * 2, [2.0] * 2), kind="paper")
-    assert always[0] == pytest.approx(found[0])
-    assert always[-1] <= certificate.limit(horizon=5, kind="paper") + C[0] * np.sqrt(8.0)
 
 
 def test_sizes_that_are_not_stated_come_from_the_cost(linear):
@@ -116,7 +114,7 @@ def test_assumed_constants_give_the_papers_bound_and_say_so():
     assert certificate.evidence is Evidence.ASSUMED
     assert certificate.of().cost.exponent == 1.5
     with pytest.raises(OptionError, match="no bound of the observer: its constants were stated"):
-        certificate.limit()
+        certificate.bound(None, initial_error=1.0)
 
 
 def test_json_holds_everything(reactor):
@@ -127,8 +125,7 @@ def test_json_holds_everything(reactor):
     for each in content["paper"]:
         paper = certificate.of(each["horizon"])
         assert (each["C"], each["lambda"]) == (list(paper.C), paper.lam)
-        limit = certificate.limit(horizon=paper.horizon, kind="paper")
-        assert each["limit"] == pytest.approx(limit)
+        assert each["limit"] == pytest.approx(paper.result.limit(*certificate.sizes.largest))
         assert each["vacuous"] is True
     assert [each["name"] for each in content["assumptions"]] == [
         "output Lipschitz", "no correction without error", "correction bound", "cost bounds"
@@ -141,9 +138,9 @@ def test_json_holds_everything(reactor):
         stability=ObserverStability.assumed(rho=1e-5, C_p=1.0, C_w=1.0, C_v=1.0, kappa=0.1),
     )
     assert math.isinf(far.of().C[0])
-    assert far.vacuous(kind="paper")
     content = json.loads(json.dumps(far.to_dict(), allow_nan=False))
     assert content["paper"][0]["C"][0] is None
+    assert content["paper"][0]["vacuous"] is True
 
 
 # The theorem's assumptions
@@ -153,7 +150,7 @@ def test_the_reactor_meets_the_assumptions():
     system, observer, cost, _ = qpmhe.models.batch_reactor()
     region = bounded_region(system, REACTOR)
     output, constants = about_output(system, region, FOREVER), about_cost(cost)[0]
-    kappa = about_corrections(system, observer, region)[1]
+    kappa = about_corrections(system, observer)[1]
     np.testing.assert_allclose([output.value, kappa.value], [np.sqrt(2), np.sqrt(2) * 0.05])
     assert output.value >= np.sqrt(2) * (1 - 1e-15)
     for name, exact in (("prior", 1.0), ("disturbance", 100.0), ("noise", 25.0)):
@@ -172,27 +169,6 @@ def test_lipschitz_constants_of_known_maps(h, exact):
     found = about_output(system, bounded_region(system, box(-1.0, 2.0)), FOREVER)
     assert found.evidence is Evidence.PROVED
     assert exact * (1 - 1e-12) <= found.value <= exact * 1.002
-
-
-CORRECTIONS = {  # function, then (holds, evidence, words) of L(z, 0) = 0 and of kappa
-    "not 0": (lambda z, v: 0.1 * v + np.where(z > 0.5, 0.01, 0.0), 0, False, Evidence.PROVED,
-              "L(z, 0) = [0.01] at z = ["),
-    "of a function": (lambda z, v: 0.3 * np.tanh(v), 1, True, Evidence.SAMPLED, "kappa = 0.3,"),
-    "unbounded": (lambda z, v: np.where(v > 0.0, np.inf, 0.0), 1, False, Evidence.SAMPLED,
-                  "kappa = inf"),
-}
-
-
-@pytest.mark.parametrize("case", CORRECTIONS)
-def test_corrections_say_whether_they_hold_and_why(case):
-    function, which, holds, evidence, words = CORRECTIONS[case]
-    system = scalar()
-    found = about_corrections(
-        system, qpmhe.OutputInjection(function), bounded_region(system, unit_box(1))
-    )[which]
-    assert (found.holds, found.evidence) == (holds, evidence)
-    assert words in found.text
-    json.dumps(found.to_dict(), allow_nan=False)
 
 
 HUBER = qpmhe.RobustCost(prior=np.eye(2), disturbance=np.eye(2), noise=qpmhe.Huber(1.0))
@@ -264,42 +240,10 @@ def test_an_undetectable_system_is_named_with_its_mode():
         )
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error", "words"),
-    [
-        ({"horizon": 7}, MismatchError, "horizon is 7, but the run's estimator has 5"),
-        ({"noises": np.zeros((4, 2))}, ShapeError, "noises"),
-        ({"initial_error": np.zeros(3)}, ShapeError, "initial_error"),
-        ({"initial_error": -1.0}, OptionError, "initial_error is"),
-        ({"disturbances": -1.0}, OptionError, "disturbances is"),
-        ({"kind": "best"}, OptionError, "kind is 'best'; expected one of 'observer', 'paper'"),
-    ],
-)
-def test_bad_arguments_of_a_bound_are_named(reactor, arguments, error, words):
-    run = played(*reactor, 0)[0][0]
-    given = {"disturbances": 0.1, "noises": 0.1, "initial_error": 1.0, "kind": "paper"} | arguments
-    with pytest.raises(error, match=words):
-        reactor[0].bound(run, **given)
-
-
-def test_limits_of_other_horizons_and_runs_of_other_costs_are_refused(reactor):
-    certificate, scenario = reactor
+def test_constants_of_other_horizons_are_refused(reactor):
     for horizon in (7, None):
         with pytest.raises(OptionError, match=r"expected one of \[1, 5, 10\]"):
-            certificate.limit(horizon=horizon, kind="paper")
-    with pytest.raises(OptionError, match="kind is 'own'"):
-        certificate.limit(kind="own")
-    for name, other in (
-        ("cost", qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=1.0)),
-        ("observer", qpmhe.Luenberger([[0.2], [0.2]])),
-    ):
-        parts = {"cost": certificate.cost, "observer": certificate.observer} | {name: other}
-        run = qpmhe.MovingHorizonEstimator(
-            certificate.system, parts["observer"], parts["cost"], horizon=5,
-            initial_state=scenario.initial_estimate, max_qps=0,
-        ).run(np.ones((4, 1)))
-        with pytest.raises(MismatchError, match=f"another {name}"):
-            certificate.bound(run, initial_error=1.0, kind="paper")
+            reactor[0].of(horizon)
 
 
 # What was certified for one system, gain and region is not used for another

@@ -50,7 +50,6 @@ def test_one_state_by_hand():
     )
     assert plan.least_horizon() == 3  # 4 * 0.6^3 = 0.864, 4 * 0.6^2 = 1.44
     assert plan.contraction(3) == pytest.approx(2.0 * 0.6**1.5)
-    assert plan.contraction(3, "measured") == pytest.approx(0.6**1.5)
     N = 5
     S = (1.0 - 0.6**N) / 0.4
     by_hand = 2.0 * math.sqrt(S / (1.0 - 4.0 * 0.6**N) / P)
@@ -296,7 +295,6 @@ def test_bad_input_is_refused(double):
         (lambda: design(system, region, sizes=sizes, discount=math.nan), OptionError, "discount"),
         (lambda: design(system, region, sizes=sizes, horizon=0), OptionError, "horizon"),
         (lambda: design(hidden, region, sizes=sizes), NotCertifiedError, "detectable"),
-        (lambda: plan.contraction(kind="best"), OptionError, "kind is 'best'"),
         (lambda: along(kind="decrease"), OptionError, "kind"),
         (lambda: along(initial_error=np.zeros(3)), ShapeError, "initial_error"),
         (lambda: along(noises=np.zeros(4)), ShapeError, "samples"),
