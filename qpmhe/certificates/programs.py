@@ -10,8 +10,7 @@ import numpy as np
 
 from .._checks import Array
 from .graph import Graph
-from .intervals import OPERATIONS, Interval
-from .polynomials import BRANCHES
+from .intervals import BRANCHES, OPERATIONS, Interval
 
 # Numbers that are held at once, of both ends of intervals.
 _HELD = 1_000_000
