@@ -174,7 +174,7 @@ class SmoothModel:
         self.affine_output = not (
             self.output_reason
             or any(
-                self._slopes.of(slope) or self._graph.open_conditions([slope])
+                self._slopes.of(slope) or self._graph.comparisons([slope])
                 for root in self._output for slope in self._slopes.of(root).values()
             )
             or self._obstacle("h", region.lower, region.upper)
@@ -299,8 +299,7 @@ class _Plan:
             for table, count in ((first, 2), (second, 3))
         )
         nodes = [one[-1] for one in first]
-        self._conditions = graph.open_conditions(nodes)
-        decisions = [pair[0] for pair in self._conditions]
+        self._conditions = decisions = graph.comparisons(nodes)
         above = [set(graph.ancestors([node])) for node in nodes]
         self._depends = np.array([
             [one in each for one in decisions] for each in above
@@ -320,11 +319,7 @@ class _Plan:
         Those for which truths (B, C) are given are taken to be so.
         """
         cells, N, q, n = *lower.shape, self._q, self._n
-        forced = {} if truths is None else {
-            node: truths[:, k] if sign else 1.0 - truths[:, k]
-            for k, pair in enumerate(self._conditions)
-            for node, sign in zip(pair, (True, False), strict=False)
-        }
+        forced = {} if truths is None else dict(zip(self._conditions, truths.T, strict=True))
         centre, half = middles(lower, upper)
         point, cell = self._point(centre, centre, forced), self._cell(lower, upper, forced)
         (rows, columns), (row, this, other) = self._first, self._second

@@ -17,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from .polynomials import BRANCHES, Polynomial, Polynomials, UnclearError, holds, total
+from .intervals import BRANCHES
+from .polynomials import gap_of
 
-CONDITIONS = ("less", "atmost", "equal", "and", "or", "not")
+CONDITIONS = ("less", "equal", "and", "or", "not")
 
 
 class Graph:
@@ -162,25 +163,42 @@ class Graph:
     def negated(self, c: int) -> int:
         """The opposite of a condition."""
         operation, arguments, _ = self.nodes[c]
-        if operation in ("less", "atmost"):
-            return self.of("atmost" if operation == "less" else "less", *arguments[::-1])
-        if operation in ("and", "or"):
-            return self.of("or" if operation == "and" else "and", *map(self.negated, arguments))
         return arguments[0] if operation == "not" else self.of("not", c)
+
+    def atmost(self, a: int, b: int) -> int:
+        """The condition that a <= b."""
+        return self.negated(self.of("less", b, a))
 
     def choice(self, c: int, a: int, b: int) -> int:
         """A where the condition c holds, b elsewhere."""
-        a, b = self._assumed(a, c), self._assumed(b, self.negated(c))
+        operation, sides, _ = self.nodes[c]
+        if operation == "not":
+            return self.choice(sides[0], b, a)
+        a, b = self._assumed(a, c, 1), self._assumed(b, c, 2)
         if a == b:
             return a
-        operation, sides, _ = self.nodes[c]
-        if operation in ("less", "atmost") and set(sides) == {a, b}:
+        if operation == "less" and set(sides) == {a, b}:
             return self.least(a, b) if sides == (a, b) else self.largest(a, b)
-        gap = self._gap(c, a, b)
+        gap = gap_of(self.nodes, c, a, b)
         if gap is None:
             return self.of("jump", c, a, b)
         found = self.of("either", c, a, b)
         return self.node("near", found, parameter=gap) if gap else found
+
+    def _assumed(self, node: int, c: int, side: int) -> int:
+        """A node where a condition holds (side 1) or does not (side 2)."""
+        operation, arguments, parameter = self.nodes[node]
+        if operation in BRANCHES and arguments[0] == c:
+            return self._assumed(arguments[side], c, side)
+        if operation not in (*BRANCHES, "near"):
+            return node
+        moved = [self._assumed(one, c, side) for one in arguments[-2:]]
+        if moved == list(arguments[-2:]):
+            return node
+        return (
+            self.node("near", *moved, parameter=parameter) if operation == "near"
+            else self.choice(arguments[0], *moved)
+        )
 
     def absolute(self, a: int) -> int:
         """|a|."""
@@ -189,79 +207,16 @@ class Graph:
     def largest(self, a: int, b: int) -> int:
         """The larger one of two."""
         a, b = sorted((a, b))
-        return a if a == b else self.of("max", self.of("atmost", b, a), a, b)
+        return a if a == b else self.of("max", self.of("less", b, a), a, b)
 
     def least(self, a: int, b: int) -> int:
         """The smaller one of two."""
         a, b = sorted((a, b))
-        return a if a == b else self.of("min", self.of("atmost", a, b), a, b)
+        return a if a == b else self.of("min", self.of("less", a, b), a, b)
 
-    def _assumed(self, node: int, c: int) -> int:
-        """The node where a condition holds."""
-        operation, arguments, parameter = self.nodes[node]
-        if operation == "near":
-            moved = self._assumed(arguments[0], c)
-            return node if moved == arguments[0] else self.node("near", moved, parameter=parameter)
-        if operation not in BRANCHES:
-            return node
-        other, first, second = arguments
-        if other in (c, self.negated(c)):
-            return self._assumed(first if other == c else second, c)
-        inner = self._assumed(first, c), self._assumed(second, c)
-        return node if inner == (first, second) else self.choice(other, *inner)
-
-    def _gap(self, c: int, a: int, b: int) -> float | None:
-        """How far a and b are apart where the condition changes; None if that is not known."""
-        operation, sides, _ = self.nodes[c]
-        if operation in ("and", "or", "not"):
-            gaps = [self._gap(side, a, b) for side in sides]
-            return max((gap for gap in gaps if gap is not None), default=None) if (
-                None not in gaps
-            ) else None
-        for changed in self._boundaries(*sides):
-            side = Polynomials(self, changed)
-            try:
-                rest = total(side.of(a), side.of(b), -1)
-                gap = side.gap(rest) if rest else 0.0
-            except (UnclearError, OverflowError):
-                continue
-            if gap is not None:
-                return gap
-        return None
-
-    def _boundaries(self, p: int, q: int) -> Iterable[dict[Any, Polynomial]]:
-        """What p = q says of a node, or of one of the variables."""
-        plain = Polynomials(self, {})
-        try:
-            first, second = plain.of(p), plain.of(q)
-            equation = total(first, second, -1)
-        except (UnclearError, OverflowError):
-            return
-        for one, other in ((p, second), (q, first)):
-            if self.value(one) is None:
-                yield {one: other}
-        for monomial, weight in equation.items():
-            if len(monomial) == 1 and monomial[0][1] == 1:
-                atom = monomial[0][0]
-                rest = {one: -each / weight for one, each in equation.items() if one != monomial}
-                if not any(holds(one, atom) for one in rest):
-                    yield {atom: rest}
-
-    def open_conditions(self, roots: Iterable[int]) -> list[tuple[int, ...]]:
-        """The comparisons that these depend on, each with its negation if there is that, too."""
-        found = {}
-        for one in self.ancestors(roots):
-            if self.nodes[one][0] in ("less", "atmost", "equal"):
-                negation = self._numbers.get(self._negation_of(one))
-                found[min(one, one if negation is None else negation)] = (
-                    (one,) if negation is None else (one, negation)
-                )
-        return list(found.values())
-
-    def _negation_of(self, c: int) -> Any:
-        operation, arguments, _ = self.nodes[c]
-        other = {"less": "atmost", "atmost": "less"}.get(operation)
-        return other, arguments[::-1], None
+    def comparisons(self, roots: Iterable[int]) -> list[int]:
+        """The comparisons that these depend on."""
+        return [one for one in self.ancestors(roots) if self.nodes[one][0] in ("less", "equal")]
 
     def ancestors(self, roots: Iterable[int]) -> list[int]:
         """All nodes that these are computed from, and themselves, in order."""

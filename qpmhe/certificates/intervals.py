@@ -280,6 +280,8 @@ def _erf(s: Interval) -> Interval:
     return s.increasing(erf, -1.0, 1.0, 4 * _LIBRARY_ULPS)
 
 
+#: Choices between two nodes, behind a condition.
+BRANCHES = ("either", "jump", "max", "min", "abs")
 #: What is defined where, as `Graph` names it: elementwise functions of intervals.
 OPERATIONS: dict[str, Callable[..., Interval]] = {
     "add": lambda s, t: s + t, "sub": lambda s, t: s - t, "mul": lambda s, t: s * t,
@@ -304,7 +306,6 @@ OPERATIONS: dict[str, Callable[..., Interval]] = {
     "min": lambda c, s, t: either(c, s, t, minimum(s, t)),
     "abs": lambda c, s, t: either(c, s, t, abs(s)),
     "less": lambda s, t: _truth(s.high < t.low, s.low < t.high, s, t),
-    "atmost": lambda s, t: _truth(s.high <= t.low, s.low <= t.high, s, t),
     "equal": lambda s, t: _truth(
         (s.low == t.high) & (s.high == t.low), (s.low <= t.high) & (t.low <= s.high), s, t),
     "not": lambda s: Interval(1.0 - s.high, 1.0 - s.low),

@@ -1,45 +1,72 @@
-"""Nodes of a graph as polynomials with rational coefficients, to show that they are equal."""
+"""Choices by a condition: whether both sides agree where it changes, as polynomials."""
 
 from __future__ import annotations
 
+import contextlib
 from collections import defaultdict
+from collections.abc import Iterable
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
-from .intervals import OPERATIONS, Interval
+from .intervals import BRANCHES, OPERATIONS, Interval
 
 Polynomial = dict[Any, Fraction]
 
-#: Choices between two nodes, behind a condition.
-BRANCHES = ("either", "jump", "max", "min", "abs")
-_MOST_TERMS, _MOST_LEVELS = 40, 25
+_MOST_TERMS, _MOST_LEVELS, _MOST_POWER = 40, 25, 4
 # Constants that differ by less, beside what they are computed from, are equal but for rounding.
 _ROUNDING = 1e-14
 _NUMBER = "number"
-_AT_ZERO = {
-    **dict.fromkeys(("exp", "cos", "cosh"), 1.0),
-    **dict.fromkeys(("sqrt", "sin", "tan", "asin", "atan", "sinh", "tanh", "asinh", "atanh", "erf",
-                     "expm1", "log1p", "floor", "ceil", "trunc", "sign"), 0.0),
-    "sigmoid": 0.5,
-}
 
 
-class UnclearError(Exception):
+class _UnclearError(Exception):
     """A polynomial of too many terms, or none."""
 
 
-class Polynomials:
+def gap_of(nodes: Any, c: int, a: int, b: int) -> float | None:
+    """How far a and b are apart where the condition c changes; None if that is not known."""
+    operation, sides, _ = nodes[c]
+    if operation in ("and", "or", "not"):
+        gaps = [gap_of(nodes, side, a, b) for side in sides]
+        known = [gap for gap in gaps if gap is not None]
+        return max(known) if len(known) == len(gaps) else None
+    with contextlib.suppress(_UnclearError, OverflowError):
+        for changed in _boundaries(nodes, *sides):
+            side = _Polynomials(nodes, changed)
+            with contextlib.suppress(_UnclearError, OverflowError):
+                gap = side.gap(_total(side.of(a), side.of(b), -1))
+                if gap is not None:
+                    return gap
+    return None
+
+
+def _boundaries(nodes: Any, p: int, q: int) -> Iterable[dict[Any, Polynomial]]:
+    """What p = q says of a node, or of one of the atoms."""
+    plain = _Polynomials(nodes, {})
+    first, second = plain.of(p), plain.of(q)
+    for one, other in ((p, second), (q, first)):
+        if nodes[one][0] != "constant":
+            yield {one: other}
+    equation = _total(first, second, -1)
+    for monomial, weight in equation.items():
+        if len(monomial) == 1 and monomial[0][1] == 1:
+            atom = monomial[0][0]
+            rest = {one: -each / weight for one, each in equation.items() if one != monomial}
+            if not any(_holds(one, atom) for one in rest):
+                yield {atom: rest}
+
+
+class _Polynomials:
     """Nodes as polynomials with rational coefficients, where some nodes or atoms are others.
 
     Atoms are variables and what is no polynomial: they count as independent of each other.
     """
 
-    def __init__(self, graph: Any, known: dict[Any, Polynomial]) -> None:
-        self._graph, self._known = graph, known
+    def __init__(self, nodes: Any, known: dict[Any, Polynomial]) -> None:
+        self._nodes, self._known = nodes, known
         self._found: dict[int, Polynomial] = {}
-        self.size = 0.0  # of the largest constant
+        self._size = 0.0  # of the largest constant
 
     def of(self, node: int, level: int = 0) -> Polynomial:
         """The polynomial of a node."""
@@ -49,7 +76,7 @@ class Polynomials:
             found = self._of(node, level + 1)
             if len(found) > _MOST_TERMS:
                 found = self._atom((node,))
-            self.size = max(self.size, float(abs(found.get((), 0))))
+            self._size = max(self._size, float(abs(found.get((), 0))))
             self._found[node] = found
         return self._found[node]
 
@@ -58,10 +85,10 @@ class Polynomials:
         return {((key, 1),): Fraction(1)} if found is None else found
 
     def _of(self, node: int, level: int) -> Polynomial:
-        operation, arguments, parameter = self._graph.nodes[node]
+        operation, arguments, parameter = self._nodes[node]
         if operation == "constant":
             if not np.isfinite(parameter):
-                raise UnclearError
+                raise _UnclearError
             return _number(Fraction(parameter))
         if operation == "variable" or level > _MOST_LEVELS:
             return self._atom((node,))
@@ -71,65 +98,74 @@ class Polynomials:
                 arguments[1 if holds else 2], level
             )
         parts = [self.of(one, level) for one in arguments]
-        if operation in ("add", "sub"):
-            return total(parts[0], parts[1], 1 if operation == "add" else -1)
-        if operation == "neg":
-            return total({}, parts[0], -1)
-        if operation == "near":
-            return parts[0]
-        if operation == "mul":
-            return _product(parts[0], parts[1])
-        if operation == "pow" and 0 < parameter < 5:
-            found = parts[0]
-            for _ in range(parameter - 1):
-                found = _product(found, parts[0])
-            return found
+        match operation:
+            case "add" | "sub":
+                return _total(parts[0], parts[1], 1 if operation == "add" else -1)
+            case "neg":
+                return _total({}, parts[0], -1)
+            case "near":
+                return parts[0]
+            case "mul":
+                return _product(parts[0], parts[1])
+            case "pow" if 0 < parameter <= _MOST_POWER:
+                found = parts[0]
+                for _ in range(parameter - 1):
+                    found = _product(found, parts[0])
+                return found
         if not all(set(part) <= {()} for part in parts):
             return self._atom((operation, parameter, *(frozenset(part.items()) for part in parts)))
         values = [part.get((), Fraction(0)) for part in parts]
         if operation == "pow" and values[0]:
             return _number(values[0] ** parameter)
-        if not any(values) and operation in _AT_ZERO:
-            return _number(Fraction(_AT_ZERO[operation]))
-        return self._atom((_NUMBER, operation, parameter, *values))
+        key = (_NUMBER, operation, parameter, *values)
+        if parts and not any(values):
+            # Functions whose value at zero is close to a half or a whole number have that value.
+            value = _value(key)
+            half = np.round(2.0 * value.middle) / 2.0
+            if abs(half - value.middle) <= value.radius:
+                return _number(Fraction(float(half)))
+        return self._atom(key)
 
     def gap(self, rest: Polynomial) -> float | None:
         """How large a polynomial may be, if it is zero but for rounding errors."""
-        size, found = self.size, Interval.of(0.0)
+        size, found = self._size, Interval.of(0.0)
         for monomial, weight in rest.items():
             term = Interval.of(float(weight))
-            for (kind, *key), k in monomial:
-                if kind != _NUMBER:
+            for key, k in monomial:
+                if key[0] != _NUMBER:
                     return None
-                operation, parameter, *values = key
-                value = OPERATIONS[operation](
-                    *(Interval.of(float(one)) for one in values),
-                    *(() if parameter is None else (parameter,)),
-                )
-                term = term * value.power(k)
+                term = term * _value(key).power(k)
             size, found = max(size, float(term.magnitude)), found + term
         gap = float(found.magnitude) + 1e-15 * size * len(rest)  # weights, too, are rounded
-        return gap if gap <= _ROUNDING * size else None
+        return gap if gap <= _ROUNDING * size else 0.0 if not rest else None
 
     def _decided(self, c: int, level: int) -> bool | None:
         """Whether a condition holds, if that is known."""
-        operation, sides, _ = self._graph.nodes[c]
-        if operation not in ("less", "atmost", "equal"):
+        operation, sides, _ = self._nodes[c]
+        if operation not in ("less", "equal"):
             return None
-        gap = total(self.of(sides[1], level), self.of(sides[0], level), -1)
+        gap = _total(self.of(sides[1], level), self.of(sides[0], level), -1)
         if not set(gap) <= {()}:
             return None
         value = gap.get((), Fraction(0))
-        if operation == "equal":
-            return not value
-        return value > 0 or (operation == "atmost" and not value)
+        return not value if operation == "equal" else value > 0
+
+
+def _value(key: Any) -> Interval:
+    """The value of a function of rational numbers."""
+    _, operation, parameter, *values = key
+    with np.errstate(all="ignore"):
+        return OPERATIONS[operation](
+            *(Interval.of(float(one)) for one in values),
+            *(() if parameter is None else (parameter,)),
+        )
 
 
 def _number(value: Fraction) -> Polynomial:
     return {(): value} if value else {}
 
 
-def total(a: Polynomial, b: Polynomial, sign: int) -> Polynomial:
+def _total(a: Polynomial, b: Polynomial, sign: int) -> Polynomial:
     """The sum a + b, or the difference."""
     found = dict(a)
     for monomial, weight in b.items():
@@ -139,7 +175,7 @@ def total(a: Polynomial, b: Polynomial, sign: int) -> Polynomial:
 
 def _product(a: Polynomial, b: Polynomial) -> Polynomial:
     if len(a) * len(b) > _MOST_TERMS**2:
-        raise UnclearError
+        raise _UnclearError
     found: Polynomial = {}
     for one, weight in a.items():
         for other, another in b.items():
@@ -151,8 +187,8 @@ def _product(a: Polynomial, b: Polynomial) -> Polynomial:
     return {one: weight for one, weight in found.items() if weight}
 
 
-def holds(monomial: Any, atom: Any) -> bool:
+def _holds(monomial: Any, atom: Any) -> bool:
     """Whether an atom occurs in a monomial, or in what its atoms are made of."""
     return atom == monomial or (
-        isinstance(monomial, (tuple, frozenset)) and any(holds(one, atom) for one in monomial)
+        isinstance(monomial, (tuple, frozenset)) and any(_holds(one, atom) for one in monomial)
     )

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 
 from .._checks import Array
 from .graph import Graph
-from .intervals import OPERATIONS, Interval
-from .polynomials import BRANCHES
+from .intervals import BRANCHES, OPERATIONS, Interval
 
 # Numbers that are held at once, of both ends of intervals.
 _HELD = 1_000_000
@@ -32,37 +31,19 @@ class Program:
     """Some nodes of a graph, evaluated on many cells at once: equal operations together."""
 
     def __init__(self, graph: Graph, roots: Sequence[int]) -> None:
-        self._graph = graph
-        nodes = graph.ancestors(roots)
-        self._order: list[int] = []
-        waiting, users = {}, defaultdict(list)
-        ready: dict[tuple[str, Any, int], list[int]] = defaultdict(list)
-        leaves = []
-        for node in nodes:
+        self._graph, depth = graph, dict[int, int]()
+        for node in graph.ancestors(roots):
+            depth[node] = 1 + max((depth[one] for one in graph.nodes[node][1]), default=0)
+
+        def kind(node: int) -> tuple[Any, ...]:
             operation, arguments, parameter = graph.nodes[node]
-            waiting[node] = len(set(arguments))
-            for one in set(arguments):
-                users[one].append(node)
-            if operation in ("variable", "constant", "unknown"):
-                leaves.append(node)
-        groups: list[tuple[tuple[str, Any, int], list[int]]] = []
-        done = leaves
-        while True:
-            self._order += done
-            for one in done:
-                for user in users[one]:
-                    waiting[user] -= 1
-                    if not waiting[user]:
-                        operation, arguments, parameter = graph.nodes[user]
-                        ready[operation, parameter, len(arguments)].append(user)
-            if not ready:
-                break
-            key = max(ready, key=lambda one: len(ready[one]))
-            done = ready.pop(key)
-            groups.append((key, done))
+            return (depth[node], operation, repr(parameter), len(arguments)) if arguments else (1,)
+
+        self._order = sorted(depth, key=kind)
         self._place = place = {node: k for k, node in enumerate(self._order)}
         self._roots = np.array([place[root] for root in roots], np.intp)
-        self._leaves = len(leaves)
+        groups = [list(members) for _, members in groupby(self._order, kind)]
+        leaves = groups[0] if groups else []
         self._columns = [
             (k, graph.nodes[node][2]) for k, node in enumerate(leaves)
             if graph.nodes[node][0] == "variable"
@@ -72,11 +53,9 @@ class Program:
             for node in leaves
         ])
         self._groups = []
-        for (operation, parameter, count), members in groups:
-            rows = [
-                np.array([place[graph.nodes[node][1][j]] for node in members], np.intp)
-                for j in range(count)
-            ]
+        for members in groups[1:]:
+            operation, _, parameter = graph.nodes[members[0]]
+            rows = np.array([[place[one] for one in graph.nodes[node][1]] for node in members]).T
             self._groups.append((
                 OPERATIONS[operation], rows, () if parameter is None else (parameter,),
                 place[members[0]], place[members[0]] + len(members),
@@ -91,24 +70,21 @@ class Program:
             (self._place[node], values) for node, values in (forced or {}).items()
             if node in self._place
         ]
-        parts = [
-            self._held(
-                lower[k : k + size], upper[k : k + size],
-                [(row, values[k : k + size]) for row, values in rows],
+        low, high = np.empty((2, len(self._roots), len(lower)))
+        for start in range(0, len(lower), size):
+            part = slice(start, start + size)
+            found = self._held(
+                lower[part], upper[part], [(row, values[part]) for row, values in rows]
             )[self._roots]
-            for k in range(0, len(lower), size)
-        ]
-        return Interval(
-            np.concatenate([one.low for one in parts], axis=1),
-            np.concatenate([one.high for one in parts], axis=1),
-        )
+            low[:, part], high[:, part] = found.low, found.high
+        return Interval(low, high)
 
     def _held(
         self, lower: Array, upper: Array, forced: Sequence[tuple[int, Array]] = ()
     ) -> Interval:
         """All nodes, in order."""
         low, high = np.empty((2, len(self._order), len(lower)))
-        low[: self._leaves] = high[: self._leaves] = self._constants[:, None]
+        low[: self._constants.size] = high[: self._constants.size] = self._constants[:, None]
         for row, column in self._columns:
             low[row], high[row] = lower[:, column], upper[:, column]
         with np.errstate(all="ignore"):

@@ -145,14 +145,14 @@ _READ: dict[str, Callable[..., int]] = {
         "INV": lambda graph, a: _divided(graph, graph.constant(1.0), a),
         "ASSIGN": _same, "LIFT": _same,
         "LT": lambda graph, a, b: graph.of("less", a, b),
-        "LE": lambda graph, a, b: graph.of("atmost", a, b),
+        "LE": Graph.atmost,
         "FABS": Graph.absolute,
         "ATAN2": lambda graph, a, b: graph.of("angle", a, b),
         "HYPOT": lambda graph, a, b: graph.of("length", a, b),
         "FMOD": lambda graph, a, b: graph.sub(
             a, graph.mul(b, graph.of("trunc", _divided(graph, a, b)))),
         "COPYSIGN": lambda graph, a, b: graph.choice(
-            graph.of("atmost", graph.constant(0.0), b), graph.absolute(a),
+            graph.atmost(graph.constant(0.0), b), graph.absolute(a),
             graph.neg(graph.absolute(a))),
     }).items()},
     **{name: _of_numbers(partial(_elementary, name.lower())) for name in (

@@ -16,7 +16,7 @@ from fractions import Fraction
 import numpy as np
 
 from .graph import CONDITIONS, Graph
-from .polynomials import BRANCHES
+from .intervals import BRANCHES
 
 _STEPS = (*CONDITIONS, "floor", "ceil", "sign", "trunc", "truth")
 
