@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -19,12 +20,9 @@ from ..costs import Cost
 from ..errors import OptionError
 from ..observers import Observer
 from ..plots.style import STYLES, panels
-from .data import Data
 from .likelihood import Likelihood
 from .score import Score
 from .search import NORMAL, limit
-from .structures import Structure
-from .weights import Weights
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -89,25 +87,26 @@ class Tuning:
     """
 
     def __init__(
-        self, structure: Structure, data: list[Data], likelihood: Likelihood, score: Score,
-        weights_at: Callable[[Array], Weights], theta: Array, hessian: Array,
-        refined: Array | None, objective: str, ahead: int, seconds: dict[str, float],
-        labels: Mapping[str, Sequence[str]], constant: list[int],
+        self, likelihood: Likelihood, score: Score, theta: Array, hessian: Array,
+        refined: Array | None, seconds: dict[str, float], labels: Mapping[str, Sequence[str]],
+        constant: list[int],
     ) -> None:
-        self._structure, self._data, self._likelihood = structure, data, likelihood
-        self._score, self._weights_at = score, weights_at
-        self._objective, self._ahead, self._labels = objective, ahead, labels
-        self.seconds = seconds
-        self._judged = [one.held if any(each.held.any() for each in data)
-                        else np.ones(len(one), np.bool_) for one in data]
-        chosen = theta
-        self.judgement = "by the likelihood alone."
-        if refined is not None:
-            chosen, self.judgement = self._judge(theta, refined)
-        self._likeliest, self._theta = theta, chosen
-        self.weights = weights_at(chosen)
-        self.start, self.values = structure.values(structure.start), structure.values(chosen)
-        self.likeliest = structure.values(theta)
+        self._likelihood, self._structure, self._score = likelihood, likelihood.structure, score
+        self._data, self._labels, self.seconds = likelihood.data, labels, seconds
+        blocks = [(one, one.block == k) for one in self._data for k in np.unique(one.block)]
+        #: Record, samples, and whether it is held out, of each block.
+        self._blocks = [(one, inside, bool(one.held[inside].any())) for one, inside in blocks]
+        every = not any(held for _, _, held in self._blocks)
+        self._judges = "all blocks" if every else "held-out blocks"
+        self._judged = [one.held | every for one in self._data]
+        self._theta, self.judgement = (
+            (theta, "by the likelihood alone.") if refined is None else self._judge(theta, refined)
+        )
+        structure, self._likeliest = self._structure, theta
+        self.weights = structure.weights(self._theta)
+        self.start, self.values, self.likeliest = map(
+            structure.values, (structure.start, self._theta, theta)
+        )
         self._find_intervals(theta, hessian)
         self.notes = tuple(
             f"input {j + 1} is constant in all records, so nothing that it acts by is identified; "
@@ -141,9 +140,8 @@ class Tuning:
 
         Among several starts or models for the same records, the least one is the likeliest.
         """
-        chosen = [~one.held for one in self._data]
-        samples = sum(int(mask.sum()) for mask in chosen)
-        return self._likelihood.value(self._likeliest, chosen) / samples
+        samples = sum(int(mask.sum()) for mask in self._likelihood.tuned)
+        return self._likelihood.value(self._likeliest) / samples
 
     def cost(self) -> Cost:
         """The cost of these weights, ready for `qpmhe.MovingHorizonEstimator`."""
@@ -157,112 +155,87 @@ class Tuning:
         """Write the weights as TOML, for `qpmhe.tuning.load` and ``qpmhe estimate --weights``."""
         return self.weights.save(path, str(self))
 
-    @cached_property
-    def _samples(self) -> dict[str, list[Array]]:
-        """The estimator's score of each sample, before and after."""
-        first = self._weights_at(self._structure.start)
-        return {"before": self._score.samples(first), "after": self._score.samples(self.weights)}
-
-    @property
-    def _judges(self) -> str:
-        return "held-out blocks" if any(one.held.any() for one in self._data) else "all blocks"
-
     def _judge(self, theta: Array, refined: Array) -> tuple[Array, str]:
         """The weights to take: those of a search where they are better beyond chance."""
-        start = self._structure.start
-        found = [self._score.samples(self._weights_at(at)) for at in (start, theta, refined)]
-        what = "error" if self._objective == "truth" else "prediction error"
-        blocks = self._judges
-        count = len(self._block_gains(found[0], found[1]))
+        points = self._structure.start, theta, refined
+        scores = [self._score.samples(self._structure.weights(at)) for at in points]
+        held = np.array([held or self._judges == "all blocks" for _, _, held in self._blocks])
+        means = np.array([self._block_means(samples) for samples in scores])[:, held]
+        means = means[:, np.isfinite(means[0])]
+        what = "error" if self._score.truth else "prediction error"
+        blocks, count = self._judges, means.shape[1]
         if count < 2:
             return theta, (
                 f"by the likelihood: {count} {blocks} cannot judge the estimator's {what}; record "
                 "for longer."
             )
 
-        def gain(old: list[Array], new: list[Array]) -> tuple[float, float]:
-            gains = self._block_gains(old, new)
-            each = 100.0 / self._mean(old)
-            spread = each * np.std(gains, ddof=1) / np.sqrt(count)
-            return each * float(np.mean(gains)), float(spread)
+        def gain(old: int, new: int) -> tuple[float, float]:
+            """By how many per cent the new one is better, and the standard error."""
+            gains = 100.0 / self._mean(scores[old]) * (means[old] - means[new])
+            return float(np.mean(gains)), float(np.std(gains, ddof=1) / np.sqrt(count))
 
-        share, doubt = gain(found[1], found[2])
-        best, chosen = (2, refined) if share > doubt else (1, theta)
-        loss, spread = gain(found[best], found[0])
+        share, doubt = gain(1, 2)
+        best = 2 if share > doubt else 1
+        loss, spread = gain(best, 0)
         if loss > spread:
-            return start, (
+            return points[0], (
                 f"as at the start: the estimator's mean square {what} on {blocks} is larger with "
                 "what was found. The model's error is no white noise, or the records are too "
                 "short; tune with the truth, fewer parameters, or a better model."
             )
         if best == 2:
-            return chosen, (
+            return refined, (
                 f"by the likelihood, then by the estimator's {what}: its mean square on {blocks} "
                 f"falls by {share:.2g} % more (standard error {doubt:.2g} %)."
             )
-        return chosen, (
+        return theta, (
             f"by the likelihood: tuning the estimator's {what} as well would change its mean "
             f"square on {blocks} by {-share:+.2g} % (standard error {doubt:.2g} %), no gain "
             "beyond chance."
         )
 
-    def _block_gains(self, old: list[Array], new: list[Array]) -> list[float]:
-        """By how much each block that judges is better."""
-        gains = []
-        for one, mask, before, after in zip(self._data, self._judged, old, new, strict=True):
-            for block in np.unique(one.block[mask]):
-                inside = (before - after)[mask & (one.block == block)]
-                if np.isfinite(inside).any():
-                    gains.append(float(np.nanmean(inside)))
-        return gains
+    def _block_means(self, samples: list[Array]) -> list[float]:
+        """The mean score of each block, NaN where there is nothing to compare."""
+        of = {id(one): each for one, each in zip(self._data, samples, strict=True)}
+        parts = [of[id(one)][inside] for one, inside, _ in self._blocks]
+        return [float(np.nanmean(one)) if np.isfinite(one).any() else np.nan for one in parts]
 
     def _find_intervals(self, theta: Array, hessian: Array) -> None:
-        structure, count = self._structure, self._structure.seen
+        structure = self._structure
         values, vectors = np.linalg.eigh(hessian)
         inverse = (vectors / np.maximum(values, _FLAT)) @ vectors.T
         deviations = np.sqrt(inverse.diagonal())
-        self.intervals: dict[str, tuple[float, float]] = {}
-        ends, unknown = {}, []
-        for k in range(count):
-            low, high = structure.limits[k]
-            width, ways = float(NORMAL * deviations[k]), (-1.0, 1.0)
-            ends[k] = [float(theta[k]) + way * width for way in ways]
-            if width > _CRUDE or ends[k][0] < low or ends[k][1] > high:
-                found = [
-                    limit(self._likelihood, theta, hessian, structure, self._data, k, way)
-                    for way in ways
-                ]
-                ends[k] = [
-                    way * np.inf if one is None else one
-                    for way, one in zip(ways, found, strict=True)
-                ]
-            widest = _WIDEST_LOG if structure.is_log(k) else _WIDEST
-            if max(theta[k] - ends[k][0], ends[k][1] - theta[k]) > widest:
-                unknown.append(k)
-            self.intervals[structure.names[k]] = self._stands_for(theta, k, ends[k])
         correlations = inverse / np.outer(deviations, deviations)
-        told: set[int] = set()
-        texts = []
-        for k in unknown:
-            if k not in told:
-                members = [
-                    j for j in unknown if j == k or abs(correlations[k, j]) > _TOGETHER
-                ]
-                told.update(members)
-                texts.append(self._words(members, correlations))
+        self.intervals: dict[str, tuple[float, float]] = {}
+        unknown = []
+        for k, width in enumerate((NORMAL * deviations).tolist()):
+            (low, high), at = structure.limits[k], float(theta[k])
+            ends = [at - width, at + width]
+            if width > _CRUDE or ends[0] < low or ends[1] > high:
+                for side, way in enumerate((-1.0, 1.0)):
+                    end = limit(self._likelihood, theta, hessian, k, way)
+                    ends[side] = way * np.inf if end is None else end
+            widest = _WIDEST_LOG if structure.is_log(k) else _WIDEST
+            if max(at - ends[0], ends[1] - at) > widest:
+                unknown.append(k)
+            stands_for = [self._stands_for(theta, k, end) for end in ends]
+            self.intervals[structure.names[k]] = min(stands_for), max(stands_for)
+        texts: list[str] = []
+        while unknown:
+            k = unknown[0]
+            members = [j for j in unknown if j == k or abs(correlations[k, j]) > _TOGETHER]
+            unknown = [j for j in unknown if j not in members]
+            texts.append(self._words(members, correlations))
         self.unidentified = tuple(texts)
 
-    def _stands_for(self, theta: Array, k: int, ends: list[float]) -> tuple[float, float]:
-        """The ends of an interval in the unit of what the component stands for."""
-        found = []
-        for end in ends:
-            if np.isinf(end):
-                found.append(0.0 if end < 0.0 and self._structure.is_log(k) else end)
-                continue
-            at = theta.copy()
-            at[k] = end
-            found.append(self._structure.values(at)[self._structure.names[k]])
-        return min(found), max(found)
+    def _stands_for(self, theta: Array, k: int, end: float) -> float:
+        """An end of an interval in the unit of what the component stands for."""
+        if np.isinf(end):
+            return 0.0 if end < 0.0 and self._structure.is_log(k) else end
+        at = theta.copy()
+        at[k] = end
+        return self._structure.values(at)[self._structure.names[k]]
 
     def _words(self, members: list[int], correlations: Array) -> str:
         """What the records do not determine, as a sentence."""
@@ -292,26 +265,30 @@ class Tuning:
         The negative log likelihood per sample, and root mean square errors in units of output or
         state.
         """
-        start, found = self._structure.start, {}
+        structure, ahead = self._structure, self._score.ahead
         samples = sum(int(mask.sum()) for mask in self._judged)
-        found["negative log likelihood per sample"] = tuple(
-            self._likelihood.value(at, self._judged) / samples for at in (start, self._likeliest)
+        before, after = (
+            self._likelihood.value(at, self._judged) / samples
+            for at in (structure.start, self._likeliest)
         )
-        errors = [self._score.errors(self._weights_at(at)) for at in (start, self._theta)]
-        truth = self._objective == "truth"
-        labels = self._labels["prior" if truth else "noise"]
-        for j, label in enumerate(labels):
-            sizes = []
-            for each in errors:
-                part = np.concatenate(
-                    [one[mask, j] for one, mask in zip(each, self._judged, strict=True)]
-                )
-                part = part[np.isfinite(part)]
-                sizes.append(float(np.sqrt(np.mean(part * part))) if part.size else np.nan)
-            name = f"error of {label}" if truth else f"{label}, {self._ahead} ahead"
-            if np.isfinite(sizes[0]):
-                found[name] = sizes[0], sizes[1]
-        return {name: (float(a), float(b)) for name, (a, b) in found.items()}
+        found = {"negative log likelihood per sample": (before, after)}
+        sizes = []
+        for weights in (structure.first, self.weights):
+            errors = self._score.errors(weights)
+            every = np.concatenate(
+                [one[mask] for one, mask in zip(errors, self._judged, strict=True)]
+            )
+            there = np.isfinite(every)
+            with np.errstate(invalid="ignore"):
+                squares = np.where(there, every, 0.0) ** 2
+                sizes.append(np.sqrt(squares.sum(axis=0) / there.sum(axis=0)))
+        for label, one, other in zip(
+            self._labels["prior" if self._score.truth else "noise"], *sizes, strict=True
+        ):
+            if np.isfinite(one):
+                name = f"error of {label}" if self._score.truth else f"{label}, {ahead} ahead"
+                found[name] = float(one), float(other)
+        return found
 
     def horizons(
         self, horizons: Sequence[int] = (2, 5, 10, 20, 40),
@@ -333,19 +310,15 @@ class Tuning:
         list of HorizonScore
             In the order of ``horizons``; scores have the unit of those before tuning.
         """
-        rows = []
         if not isinstance(horizons, Iterable):
             raise OptionError(f"horizons is {shown(horizons)}; expected several, such as (5, 10).")
-        for horizon in horizons:
+        rows = []
+        for horizon, arrival in product(horizons, arrivals):
             dimension("horizon", horizon, 1)
-            for arrival in arrivals:
-                weights = Weights(**{
-                    **vars(self.weights), "horizon": horizon, "arrival": arrival,
-                })
-                began = perf_counter()
-                samples = self._score.samples(weights)
-                spent = (perf_counter() - began) / sum(map(len, self._data))
-                rows.append(HorizonScore(horizon, arrival, self._mean(samples), spent))
+            began = perf_counter()
+            samples = self._score.samples(replace(self.weights, horizon=horizon, arrival=arrival))
+            spent = (perf_counter() - began) / sum(map(len, self._data))
+            rows.append(HorizonScore(horizon, arrival, self._mean(samples), spent))
         return rows
 
     def _mean(self, samples: list[Array]) -> float:
@@ -355,31 +328,24 @@ class Tuning:
 
     def __str__(self) -> str:
         from rich.console import Console
-        from rich.table import Table
 
-        weights = Table(box=None, pad_edge=False, title="Weights, as standard deviations",
-                        title_justify="left")
-        for title in ("", "before", "after", "95 % interval"):
-            weights.add_column(title, justify="left" if not title else "right", no_wrap=True)
-        for name, value in self.values.items():
-            interval = self.intervals.get(name)
-            text = "" if interval is None else f"{interval[0]:.3g} to {interval[1]:.3g}"
-            weights.add_row(name, f"{self.start[name]:.4g}", f"{value:.4g}", text)
-        scores = Table(box=None, pad_edge=False, title=f"Scores on {self._judges}, less is better",
-                       title_justify="left")
-        for title in ("", "before", "after"):
-            scores.add_column(title, justify="left" if not title else "right", no_wrap=True)
-        for name, (before, after) in self.scores.items():
-            scores.add_row(name, f"{before:.4g}", f"{after:.4g}")
+        weights = [
+            (name, f"{self.start[name]:.4g}", f"{value:.4g}",
+             " to ".join(f"{end:.3g}" for end in self.intervals.get(name, ())))
+            for name, value in self.values.items()
+        ]
+        scores = [(name, f"{a:.4g}", f"{b:.4g}") for name, (a, b) in self.scores.items()]
         console = Console(file=io.StringIO(), width=110, no_color=True)
-        console.print(weights)
-        console.print()
-        console.print(scores)
-        console.print()
-        texts = [f"Chosen {self.judgement}"]
-        texts += [f"Not identified: {one}" for one in self.unidentified]
-        texts += [f"Note: {one}" for one in self.notes]
-        for text in texts:
+        for title, last, rows in (
+            ("Weights, as standard deviations", ["95 % interval"], weights),
+            (f"Scores on {self._judges}, less is better", [], scores),
+        ):
+            console.print(_table(title, ["", "before", "after", *last], rows))
+            console.print()
+        for text in (
+            f"Chosen {self.judgement}", *(f"Not identified: {one}" for one in self.unidentified),
+            *(f"Note: {one}" for one in self.notes),
+        ):
             console.print(text, highlight=False, markup=False)
         file = console.file
         assert isinstance(file, io.StringIO)
@@ -437,24 +403,30 @@ class Tuning:
         axes.legend(fontsize="small", loc="best", frameon=False)
 
     def _draw_blocks(self, axes: Axes) -> None:
-        where, rows = [], {"before": [], "after": []}  # type: ignore[var-annotated]
-        for k, one in enumerate(self._data):
-            for block in np.unique(one.block):
-                inside = one.block == block
-                if not np.isfinite(self._samples["before"][k][inside]).any():
-                    continue
-                where.append(bool(one.held[inside].any()))
-                for name, found in rows.items():
-                    found.append(float(np.nanmean(self._samples[name][k][inside])))
-        at = np.arange(len(where))
-        for k, (name, found) in enumerate(rows.items()):
-            style = STYLES[1 - k]
-            axes.plot(at, found, marker="o", markersize=3.5, label=name, **style)
-        for k in np.flatnonzero(where).tolist():
+        means = np.array([
+            self._block_means(self._score.samples(weights))
+            for weights in (self._structure.first, self.weights)
+        ])
+        shown = np.isfinite(means[0])
+        held = np.array([held for _, _, held in self._blocks])[shown]
+        for k, name in enumerate(("before", "after")):
+            axes.plot(means[k, shown], marker="o", markersize=3.5, label=name, **STYLES[1 - k])
+        for k in np.flatnonzero(held).tolist():
             axes.axvspan(k - 0.5, k + 0.5, color="0.93", zorder=0,
-                         label="held out" if k == int(np.argmax(where)) else None)
+                         label="held out" if k == int(np.argmax(held)) else None)
         axes.set_xlabel("block")
-        what = "error" if self._objective == "truth" else f"error {self._ahead} ahead"
+        what = "error" if self._score.truth else f"error {self._score.ahead} ahead"
         axes.set_ylabel(f"mean square {what}, scaled")
         axes.set_ylim(bottom=0.0)
         axes.legend(fontsize="small", loc="best", frameon=False)
+
+
+def _table(title: str, headings: list[str], rows: Sequence[Sequence[str]]) -> Any:
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, title=title, title_justify="left")
+    for heading in headings:
+        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    return table

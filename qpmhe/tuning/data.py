@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,6 +106,11 @@ class Data:
 
     def __len__(self) -> int:
         return len(self.y)
+
+    def inputs(self, system: System, parameters: Mapping[str, float]) -> Array:
+        """The inputs, with the model's parameters behind where these are inputs."""
+        behind = list(parameters.values())[: system.m - self.u.shape[1]]
+        return np.hstack((self.u, np.tile(behind, (len(self), 1)))) if behind else self.u
 
 
 def _truth(name: str, given: ArrayLike, system: System, observed: Mask) -> Array:
@@ -211,3 +216,16 @@ def check_enough(data: list[Data], names: Sequence[str], noise: Sequence[int]) -
             f"({', '.join(names)}); expected {_LEAST} for each at least. Record for longer, or "
             "take structure='scalar' or groups."
         )
+
+
+def constant_inputs(data: list[Data], needed: bool) -> list[int]:
+    """The inputs that never change, which identify no parameters."""
+    us = np.concatenate([one.u for one in data])
+    still = np.flatnonzero(np.ptp(us, axis=0) == 0.0).tolist() if us.size else []
+    if needed and us.shape[1] and len(still) == us.shape[1]:
+        raise InvalidInputError(
+            "all inputs are constant in all records: what they act by cannot be told from an "
+            "offset, so parameters of the model cannot be tuned. Record with inputs that change, "
+            "or leave parameters out."
+        )
+    return still

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from .._checks import Array
-from ..errors import ModelError, QpmheError
+from ..errors import QpmheError
 from ..model.expressions import import_casadi
 from ..model.system import System
 from .data import Data, Mask
-from .structures import Setting, Structure
+from .structures import Structure
+from .weights import Weights
 
 # Step of central differences by numbers without unit: rounding and curvature are balanced.
 _STEP = 3e-5
@@ -44,110 +45,84 @@ class Likelihood:
         self, structure: Structure, data: list[Data], make: Callable[[dict[str, float]], System],
         remade: bool,
     ) -> None:
-        self._structure, self._data, self._make = structure, data, make
+        self.structure, self.data, self._make = structure, data, make
         self._remade = remade  # a change of parameters makes another system
+        #: The samples that tune: those not held out.
+        self.tuned = [~one.held for one in data]
         #: What makes another one of the same structure and data.
-        self.recipe = make, remade
+        self.recipe = structure, data, make, remade
         self._filters: dict[tuple[float, ...], _Filter] = {}
         #: The first thing that a model has raised far from the start; blank if none did.
         self.failure = ""
 
-    def value(self, theta: Array, chosen: list[Mask]) -> float:
+    def value(self, theta: Array, chosen: list[Mask] | None = None) -> float:
         """At theta, of the samples chosen in each record; infinite where the model fails."""
-        found = self._values([self._structure.setting(theta)], chosen)
-        return float(found[0])
+        return float(self._values([self.structure.weights(theta)], chosen or self.tuned)[0])
 
-    def gradient(self, theta: Array, chosen: list[Mask]) -> tuple[float, Array]:
+    def gradient(self, theta: Array, chosen: list[Mask] | None = None) -> tuple[float, Array]:
         """The value, and the derivative by theta."""
-        structure = self._structure
-        setting = structure.setting(theta)
-        filter_ = self._filter(setting)
-        slope = np.zeros(len(theta))
-        exact = filter_ is not None and filter_.traced
-        differenced = range(structure.seen)
-        if filter_ is not None and exact:
-            value, slopes, behind = filter_.adjoint(setting, self._data, chosen)
-            by = behind if not self._remade else np.zeros(len(structure.parameters))
+        structure, slope, begin, value = self.structure, np.zeros(len(theta)), 0, np.inf
+        chosen = chosen or self.tuned
+        weights = structure.weights(theta)
+        made = self._filter(weights)
+        if made is not None and made.traced:
+            value, slopes, behind = made.adjoint(weights, self.data, chosen)
+            begin = structure.covariances if self._remade else structure.seen
+            by = np.zeros(len(structure.parameters)) if self._remade else behind
             slope = structure.adjoint(theta, slopes, by)
-            own = structure.covariances if self._remade else structure.seen
-            differenced = range(own, structure.seen)
-        if differenced:
-            moved = _STEP * np.eye(len(theta))[list(differenced)]
-            points = [theta, *(theta + one for one in moved), *(theta - one for one in moved)]
-            values = self._values([structure.setting(one) for one in points], chosen)
-            half = len(moved)
+        if begin < structure.seen:
+            moved = _STEP * np.eye(len(theta))[begin : structure.seen]
+            points = [theta, *(theta + moved), *(theta - moved)]
+            values = self._values([structure.weights(one) for one in points], chosen)
+            ahead, behind = np.split(values[1:], 2)
             with np.errstate(invalid="ignore"):
-                slope[list(differenced)] = (values[1 : half + 1] - values[half + 1 :]) / (2 * _STEP)
+                slope[begin : structure.seen] = (ahead - behind) / (2 * _STEP)
             value = float(values[0])
         if not (np.isfinite(value) and np.isfinite(slope).all()):
             return np.inf, np.zeros(len(theta))
         return value, slope
 
-    def innovations(self, theta: Array) -> list[Array]:
-        """The innovations in standard deviations, L^-1 e, of each record, NaN where missing."""
-        setting = self._structure.setting(theta)
-        found = []
-        for one in self._data:
-            made = self._required(setting)
-            whitened = made.run([setting], one)[1][:, 0]
-            found.append(np.where(one.observed, whitened, np.nan))
-        return found
-
-    def _required(self, setting: Setting) -> _Filter:
-        made = self._filter(setting)
-        if made is None:
-            raise ModelError(f"the model fails at the tuned parameters: {self.failure}")
-        return made
-
-    def _values(self, settings: list[Setting], chosen: list[Mask]) -> Array:
+    def _values(self, settings: list[Weights], chosen: list[Mask]) -> Array:
         """The values at several settings; those of one system at once."""
-        values = np.zeros(len(settings))
-        groups: dict[int, tuple[_Filter, list[int]]] = {}
-        for k, setting in enumerate(settings):
-            made = self._filter(setting)
-            if made is None:
-                values[k] = np.inf
-            else:
-                groups.setdefault(id(made), (made, []))[1].append(k)
-        for made, members in groups.values():
-            for one, mask in zip(self._data, chosen, strict=True):
-                try:
-                    costs, _ = made.run([settings[k] for k in members], one)
-                    values[members] += costs[mask].sum(axis=0)
-                except Exception as error:  # whatever a model raises far from the data
-                    self._note(settings[members[0]], error)
-                    values[members] = np.inf
+        values = np.full(len(settings), np.inf)
+        made = [self._filter(weights) for weights in settings]
+        for filter_ in {id(one): one for one in made if one is not None}.values():
+            members = [k for k, one in enumerate(made) if one is filter_]
+            try:
+                values[members] = sum(
+                    filter_.costs([settings[k] for k in members], one)[mask].sum(axis=0)
+                    for one, mask in zip(self.data, chosen, strict=True)
+                )
+            except Exception as error:  # whatever a model raises far from the data
+                self._note(settings[members[0]], error)
         values[~np.isfinite(values)] = np.inf
         return values
 
-    def _filter(self, setting: Setting) -> _Filter | None:
-        key = tuple(setting.parameters.values()) if self._remade else ()
+    def _filter(self, weights: Weights) -> _Filter | None:
+        key = tuple(weights.parameters.values()) if self._remade else ()
         if key not in self._filters:
             try:
-                made = _Filter(self._make(setting.parameters), setting)
+                made = _Filter(self._make(weights.parameters), weights)
             except Exception as error:
-                self._note(setting, error)
+                self._note(weights, error)
                 return None
             if len(self._filters) > 16:
                 self._filters.pop(next(iter(self._filters)))
             self._filters[key] = made
         return self._filters[key]
 
-    def _note(self, setting: Setting, error: Exception) -> None:
-        if not self.failure:
-            at = ", ".join(f"{name} = {value:.6g}" for name, value in setting.parameters.items())
-            said = str(error) if isinstance(error, QpmheError) else (
-                f"{type(error).__name__}: {error}"
-            )
-            self.failure = f"{f'at {at}: ' if at else ''}{said}"
+    def _note(self, weights: Weights, error: Exception) -> None:
+        at = ", ".join(f"{name} = {value:.6g}" for name, value in weights.parameters.items())
+        said = str(error) if isinstance(error, QpmheError) else f"{type(error).__name__}: {error}"
+        self.failure = self.failure or f"{f'at {at}: ' if at else ''}{said}"
 
 
 class _Filter:
     """The filter of one system, in CasADi where it is traced and in NumPy where it is not."""
 
-    def __init__(self, system: System, setting: Setting) -> None:
-        self._system = system.copy(np.sqrt(setting.prior.diagonal().clip(1e-300)), traced=True)
-        self._threshold = setting.threshold
+    def __init__(self, system: System, weights: Weights) -> None:
+        self._system = system.copy(np.sqrt(weights.prior.diagonal().clip(1e-300)), traced=True)
+        self._threshold = weights.threshold
         self._clip = _bounds(system)
         self._sweeps: dict[int, tuple[Any, Any]] = {}
         self._step: Any = None
@@ -158,31 +133,17 @@ class _Filter:
             and (residual is None or residual.periods is not None)
         )
         if self.traced:
-            self._step = _symbolic_step(model, self._system, self._clip, setting.threshold)
+            self._step = _symbolic_step(model, self._system, self._clip, weights.threshold)
 
-    def _covariances(self, setting: Setting) -> tuple[Array, Array, Array]:
-        return (
-            setting.prior, self._system.state_covariance(setting.disturbance), setting.noise
-        )
+    def _covariances(self, weights: Weights) -> tuple[Array, Array, Array]:
+        entering = self._system.state_covariance(weights.disturbance)
+        return weights.prior, entering, weights.noise
 
-    def _inputs(self, setting: Setting, one: Data) -> Array:
-        """U (T, m) with the model's parameters behind, where they are inputs."""
-        missing = self._system.m - one.u.shape[1]
-        if not missing:
-            return one.u
-        behind = list(setting.parameters.values())[:missing]
-        return np.hstack((one.u, np.tile(behind, (len(one), 1))))
-
-    def run(self, settings: list[Setting], one: Data) -> tuple[Array, Array]:
-        """Costs (T, B) and whitened innovations (T, B, p) of a record at B settings."""
+    def costs(self, settings: list[Weights], one: Data) -> Array:
+        """Costs (T, B) of a record at B settings."""
         if not self.traced:
             return self._run_together(settings, one)
-        costs, whitened = [], []
-        for setting in settings:
-            _, _, cost, white = self._forward(setting, one)
-            costs.append(cost)
-            whitened.append(white)
-        return np.stack(costs, axis=1), np.stack(whitened, axis=1)
+        return np.stack([self._forward(weights, one)[2] for weights in settings], axis=1)
 
     # In CasADi
 
@@ -196,7 +157,7 @@ class _Filter:
             z, P, *known = symbols
             seeds = [ca.SX.sym("seed", *z.shape), ca.SX.sym("seed", *P.shape), ca.SX.sym("seed")]
             nothing = [ca.SX(*step.size_out(i)) for i in range(step.n_out())]
-            found = back(*symbols, *nothing, *seeds, ca.SX(*step.size_out(3)))
+            found = back(*symbols, *nothing, *seeds)
             made = ca.Function(
                 "back", [*seeds[:2], z, P, *known, seeds[2]],
                 [ca.densify(found[0]), ca.densify(found[1]), *map(ca.densify, found[2:])],
@@ -205,56 +166,46 @@ class _Filter:
             self._sweeps[samples] = forward, backward
         return self._sweeps[samples]
 
-    def _given(self, setting: Setting, one: Data) -> list[Any]:
+    def _given(self, weights: Weights, one: Data) -> list[Any]:
         """What the step takes besides z and P, sample beside sample."""
-        _, q, r = self._covariances(setting)
+        _, q, r = self._covariances(weights)
         observed = one.observed.T.astype(np.float64)
         dt = np.full((1, len(one)), self._system.dt or 0.0) if one.dt is None else one.dt[None]
         return [
-            np.where(one.observed, one.y, 0.0).T, self._inputs(setting, one).T, dt, observed,
-            np.tile(q, len(one)), np.tile(r, len(one)),
+            np.where(one.observed, one.y, 0.0).T, one.inputs(self._system, weights.parameters).T,
+            dt, observed, np.tile(q, len(one)), np.tile(r, len(one)),
         ]
 
-    def _forward(self, setting: Setting, one: Data) -> tuple[Array, Array, Array, Array]:
-        """Z (n, T) and P (n, n T) after each sample, costs (T,), whitened innovations (T, p)."""
-        forward, _ = self._sweep(len(one))
-        z, covariance, cost, white = (
-            np.asarray(each) for each in forward(
-                one.start, self._covariances(setting)[0], *self._given(setting, one)
-            )
-        )
-        return z, covariance, cost[0], white.T
+    def _forward(self, weights: Weights, one: Data) -> tuple[Array, Array, Array]:
+        """Z (n, T) and P (n, n T) after each sample, and costs (T,)."""
+        z, covariance, cost = map(np.asarray, self._sweep(len(one))[0](
+            one.start, weights.prior, *self._given(weights, one)
+        ))
+        return z, covariance, cost[0]
 
     def adjoint(
-        self, setting: Setting, data: list[Data], chosen: list[Mask]
+        self, weights: Weights, data: list[Data], chosen: list[Mask]
     ) -> tuple[float, dict[str, Array], Array]:
         """The value, and its derivatives by the covariances and the parameters among the inputs."""
-        system, count = self._system, len(setting.parameters)
-        n, p, behind = system.n, system.p, np.zeros(count)
+        system, n, p = self._system, self._system.n, self._system.p
         prior, entering, noise = np.zeros((n, n)), np.zeros((n, n)), np.zeros((p, p))
-        total = 0.0
+        total, behind = 0.0, np.zeros(len(weights.parameters))
         for one, mask in zip(data, chosen, strict=True):
-            z, covariance, cost, _ = self._forward(setting, one)
+            z, covariance, cost = self._forward(weights, one)
             total += float(cost[mask].sum())
             if not np.isfinite(total):
                 break
             blocks = covariance.reshape(n, len(one), n)
-            first = self._covariances(setting)[0]
-            before = [
+            begun = np.concatenate((weights.prior[:, None], blocks[:, :-1]), axis=1)
+            given = self._given(weights, one)
+            found = list(map(np.asarray, self._sweep(len(one))[1](
+                np.zeros(n), np.zeros((n, n)),
                 np.hstack((one.start[:, None], z[:, :-1]))[:, ::-1],
-                np.concatenate((first[:, None], blocks[:, :-1]), axis=1)[:, ::-1].reshape(n, -1),
-            ]
-            given = self._given(setting, one)
-            reversed_ = [each[:, ::-1] for each in given[:4]]
-            _, backward = self._sweep(len(one))
-            found = [
-                np.asarray(each) for each in backward(
-                    np.zeros(n), np.zeros((n, n)), *before, *reversed_, *given[4:],
-                    mask[None, ::-1].astype(np.float64),
-                )
-            ]
+                begun[:, ::-1].reshape(n, -1), *(each[:, ::-1] for each in given[:4]), *given[4:],
+                mask[None, ::-1].astype(np.float64),
+            )))
             prior += found[1][:, -n:]
-            if count and system.m > one.u.shape[1]:
+            if behind.size and system.m > one.u.shape[1]:
                 behind += found[3][one.u.shape[1] :].sum(axis=1)
             entering += found[6].reshape(n, -1, n).sum(axis=1)
             noise += found[7].reshape(p, -1, p).sum(axis=1)
@@ -264,22 +215,17 @@ class _Filter:
 
     # In NumPy, several settings at once
 
-    def _run_together(self, settings: list[Setting], one: Data) -> tuple[Array, Array]:
-        system, timed = self._system, one.dt is not None
-        model = system.timed if timed else system
-        p, samples, count = system.p, len(one), len(settings)
-        parts = [self._covariances(setting) for setting in settings]
-        P, Q, R = (np.array([part[k] for part in parts]) for k in range(3))
-        u = np.stack([self._inputs(setting, one) for setting in settings], axis=1)
-        if timed:
-            assert one.dt is not None
-            u = np.concatenate((u, np.broadcast_to(one.dt[:, None, None], (samples, count, 1))), 2)
-        z = np.tile(one.start, (count, 1))
-        costs, white = np.zeros((samples, count)), np.zeros((samples, count, p))
-        low, high = self._clip
+    def _run_together(self, settings: list[Weights], one: Data) -> Array:
+        system, count, k = self._system, len(settings), self._threshold
+        model, (low, high) = system if one.dt is None else system.timed, self._clip
+        P, Q, R = map(np.array, zip(*map(self._covariances, settings), strict=True))
+        u = np.stack([one.inputs(system, each.parameters) for each in settings], axis=1)
+        if one.dt is not None:
+            lengths = np.broadcast_to(one.dt[:, None, None], (len(one), count, 1))
+            u = np.concatenate((u, lengths), axis=2)
+        z, costs = np.tile(one.start, (count, 1)), np.zeros((len(one), count))
         with np.errstate(all="ignore"):
-            for t in range(samples):
-                there = one.observed[t]
+            for t, there in enumerate(one.observed):
                 A = model.f_jacobian.batch(z, u[t])
                 C = model.h_jacobian.batch(z, u[t]) * there[:, None]
                 e = one.y[t] - model.h.batch(z, u[t])
@@ -289,19 +235,17 @@ class _Filter:
                 r = R * np.outer(there, there) + np.diag(1.0 - there)
                 S = C @ P @ C.swapaxes(1, 2) + r
                 L = _cholesky(S)
-                white[t] = np.linalg.solve(L, e[..., None])[..., 0]
+                white = np.linalg.solve(L, e[..., None])[..., 0]
                 size = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
-                costs[t] = size + _loss(white[t], self._threshold)
-                used = white[t]
-                if self._threshold is not None:
-                    used = np.clip(used, -self._threshold, self._threshold)
+                costs[t] = size + _loss(white, k)
+                used = white if k is None else np.clip(white, -k, k)
                 gain = np.linalg.solve(S, C @ P @ A.swapaxes(1, 2)).swapaxes(1, 2)
                 move = gain @ (L @ used[..., None])
                 z = np.clip(model.f.batch(z, u[t]) + move[..., 0], low, high)
                 closed = A - gain @ C
                 P = closed @ P @ closed.swapaxes(1, 2) + gain @ (r @ gain.swapaxes(1, 2)) + Q
                 P = 0.5 * (P + P.swapaxes(1, 2))
-        return costs, white
+        return costs
 
 
 def _cholesky(S: Array) -> Array:
@@ -346,7 +290,7 @@ def _bounds(system: System) -> tuple[Array, Array]:
 def _symbolic_step(
     model: Any, system: System, clip: tuple[Array, Array], threshold: float | None
 ) -> Any:
-    """One step: (z, P, y, u, dt, observed, Q, R) to z and P after it, cost, and L^-1 e."""
+    """One step: (z, P, y, u, dt, observed, Q, R) to z and P after it, and cost."""
     ca = import_casadi()
     n, p, m = model.n, model.p, model.m
     z, P = ca.SX.sym("z", n), ca.SX.sym("P", n, n)
@@ -384,13 +328,11 @@ def _symbolic_step(
         rest = W[i, :] - sum((L[k, i] * gain[k, :] for k in range(i + 1, p)), ca.SX(1, n))
         gain[i, :] = rest / L[i, i]
     moved = following + ca.mtimes(W.T, used)
-    for i in range(n):
-        if np.isfinite(clip[0][i]):
-            moved[i] = ca.fmax(moved[i], clip[0][i])
-        if np.isfinite(clip[1][i]):
-            moved[i] = ca.fmin(moved[i], clip[1][i])
+    for bounds, nearest in zip(clip, (ca.fmax, ca.fmin), strict=True):
+        for i in np.flatnonzero(np.isfinite(bounds)).tolist():
+            moved[i] = nearest(moved[i], bounds[i])
     closed = A - ca.mtimes(gain.T, C)
     covariance = ca.mtimes([closed, P, closed.T]) + ca.mtimes([gain.T, r, gain]) + Q
     cost = ca.sum1(losses) + ca.sum1(ca.log(ca.diag(L)))
-    found = (moved, 0.5 * (covariance + covariance.T), cost, white)
+    found = (moved, 0.5 * (covariance + covariance.T), cost)
     return ca.Function("step", [z, P, y, u, dt, there, Q, R], [ca.densify(one) for one in found])

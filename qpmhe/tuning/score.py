@@ -32,38 +32,17 @@ class Score:
     and s its root mean square at the start weights (1.48 times the median of :math:`|e|` with a
     robust loss), a sample's score is the mean of :math:`e^2 / s^2` over the components, in which
     errors beyond 3 s count with their size only, if the loss is robust.
-
-    Parameters
-    ----------
-    data : list of Data
-        The records.
-    make : callable
-        From the model's parameters to the system.
-    kind : callable
-        From covariances to the observer.
-    start : Weights
-        Those before tuning.
-    ahead : int
-        k.
-    truth : bool
-        Whether the truth is compared with.
-    robust : bool
-        Whether the loss is robust.
-    options : dict
-        Of `qpmhe.MovingHorizonEstimator`.
     """
 
     def __init__(
         self, data: list[Data], make: Callable[[dict[str, float]], System],
-        kind: Callable[..., Observer], start: Weights, *, ahead: int, truth: bool, robust: bool,
+        kind: Callable[..., Observer], start: Weights, *, ahead: int, truth: bool,
         options: dict[str, Any],
     ) -> None:
         self._data, self._make, self.kind = data, make, kind
-        self._ahead, self._truth, self._robust = ahead, truth, robust
-        self._options, self._start = options, start
-        #: What ran the steps last, and the first failure of a run.
-        self.engine = "python"
-        self.failure = ""
+        #: Steps ahead, and whether the truth is compared with.
+        self.ahead, self.truth = ahead, truth
+        self._robust, self._options, self._start = start.threshold is not None, options, start
 
     @cached_property
     def scale(self) -> Array:
@@ -107,8 +86,7 @@ class Score:
         """The mean score of the samples that are not held out; infinite where the model fails."""
         try:
             found = self.samples(weights)
-        except (QpmheError, np.linalg.LinAlgError, FloatingPointError) as error:
-            self.failure = self.failure or str(error)
+        except (QpmheError, np.linalg.LinAlgError, FloatingPointError):
             return np.inf
         used = np.concatenate([
             each[~one.held] for each, one in zip(found, self._data, strict=True)
@@ -118,7 +96,7 @@ class Score:
 
     def _of_record(self, system: System, weights: Weights, one: Data) -> Array:
         states = self._estimates(system, weights, one)
-        if self._truth and one.truth is not None:
+        if self.truth and one.truth is not None:
             errors = np.full((len(one), system.n), np.nan)
             count = min(len(one), len(one.truth) - 1)
             errors[:count] = states[:count] - one.truth[1 : count + 1]
@@ -126,10 +104,10 @@ class Score:
                 system.state_residual.wrap(errors, states)
             return errors
         errors = np.full((len(one), system.p), np.nan)
-        k, count = self._ahead, len(one) - self._ahead
+        k, count = self.ahead, len(one) - self.ahead
         if count <= 0:
             return errors
-        reached, model, u = states[:count], system, self._inputs(system, weights, one)
+        reached, model, u = states[:count], system, one.inputs(system, weights.parameters)
         if one.dt is not None:
             model, u = system.timed, np.hstack((u, one.dt[:, None]))
         with np.errstate(all="ignore"):
@@ -141,14 +119,8 @@ class Score:
             system.output_residual.wrap(errors[:count], measured)
         return errors
 
-    def _inputs(self, system: System, weights: Weights, one: Data) -> Array:
-        missing = system.m - one.u.shape[1]
-        behind = list(weights.parameters.values())[:missing]
-        return np.hstack((one.u, np.tile(behind, (len(one), 1)))) if missing else one.u
-
     def _estimator(self, system: System, weights: Weights, one: Data) -> MovingHorizonEstimator:
-        options = dict(self._options)
-        missing = system.m - one.u.shape[1]
+        options, missing = dict(self._options), system.m - one.u.shape[1]
         if missing:
             options["parameters"] = list(weights.parameters.values())[:missing]
         return MovingHorizonEstimator(
@@ -162,7 +134,6 @@ class Score:
             warnings.simplefilter("ignore", ObserverWarning)
             warnings.simplefilter("ignore", EngineWarning)
             mhe = self._estimator(system, weights, one)
-            self.engine = mhe.engine
             u = one.u if one.u.shape[1] else None
             if one.dt is None:
                 return mhe.run(one.y, u).states[1:]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -15,11 +15,9 @@ from scipy.optimize import minimize
 
 from .._checks import Array, need
 from ..errors import ModelError, QpmheError
-from .data import Data
 from .likelihood import Likelihood
 from .score import Score
 from .structures import Structure
-from .weights import Weights
 
 _FORMAT = 1
 # Seconds from checkpoint to checkpoint.
@@ -100,37 +98,38 @@ class Checkpoint:
             self.path.unlink(missing_ok=True)
 
 
-def identity_of(data: Sequence[Data], structure: Structure, value: float, options: Any) -> str:
+def identity_of(likelihood: Likelihood, value: float, options: Any) -> str:
     """A digest of what a search depends on; the likelihood's value stands for the model."""
-    digest = hashlib.sha256(repr((structure.names, f"{value:.6e}", options)).encode())
-    for one in data:
+    structure = likelihood.structure
+    start = {
+        name: one.tolist() if isinstance(one, np.ndarray) else one
+        for name, one in vars(structure.first).items()
+    }
+    digest = hashlib.sha256(repr((structure.names, start, f"{value:.6e}", options)).encode())
+    for one in likelihood.data:
         for array in (one.y, one.u, one.start, one.dt, one.truth, one.held):
             digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:24]
 
 
 def search_likelihood(
-    likelihood: Likelihood, structure: Structure, data: list[Data], begin: Array,
-    note: Callable[[Array, float, bool], None],
+    likelihood: Likelihood, begin: Array, note: Callable[[Array, float, bool], None]
 ) -> tuple[Array, float]:
     """The minimum of the likelihood near a start, and its value per sample."""
-    chosen = [~one.held for one in data]
-    samples = sum(int(mask.sum()) for mask in chosen)
+    samples = sum(int(mask.sum()) for mask in likelihood.tuned)
     best: list[Any] = [begin.copy(), np.inf]
 
     def cost(theta: Array) -> tuple[float, Array]:
-        value, slope = likelihood.gradient(theta, chosen)
+        value, slope = likelihood.gradient(theta)
         if not np.isfinite(value):
             return _FAILED, np.zeros(len(theta))
         if value / samples < best[1]:
             best[:] = theta.copy(), value / samples
         return value / samples, slope / samples
 
-    def after(_theta: Array) -> None:
-        note(best[0], best[1], False)
-
-    minimize(  # type: ignore[call-overload]
-        cost, begin, jac=True, method="L-BFGS-B", bounds=structure.limits, callback=after,
+    minimize(
+        cost, begin, jac=True, method="L-BFGS-B", bounds=likelihood.structure.limits,
+        callback=lambda _: note(best[0], best[1], False),
         options={"maxiter": _ITERATIONS, "ftol": 1e-9, "gtol": 1e-6},
     )
     note(best[0], best[1], True)
@@ -138,24 +137,19 @@ def search_likelihood(
 
 
 def search_all(
-    likelihood: Likelihood, structure: Structure, data: list[Data], starts: list[Array],
-    checkpoint: Checkpoint, jobs: int, advance: Callable[[str], None],
-) -> tuple[Array, float]:
+    likelihood: Likelihood, starts: list[Array], checkpoint: Checkpoint, jobs: int,
+    advance: Callable[[str], None],
+) -> Array:
     """The best minimum of the likelihood over all starts; those known are not searched again."""
     waiting = []
     for k, begin in enumerate(starts):
         theta, _, done = checkpoint.known(f"start {k}")
-        if done:
-            advance(f"start {k + 1} was done")
-        else:
+        if not done:
             waiting.append((k, begin if theta is None else theta))
     if jobs > 1 and len(waiting) > 1:
         joblib = need("joblib", "a search in several processes")
-        tasks = (
-            joblib.delayed(_alone)(likelihood.recipe, structure, data, k, begin)
-            for k, begin in waiting
-        )
         workers = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
+        tasks = (joblib.delayed(_alone)(likelihood.recipe, k, begin) for k, begin in waiting)
         for k, theta, value in workers(tasks):
             checkpoint.note(f"start {k}", theta, value, True)
             advance(f"start {k + 1} of {len(starts)}")
@@ -165,103 +159,90 @@ def search_all(
                 checkpoint.note(f"start {k}", theta, value, done)
                 advance(f"start {k + 1} of {len(starts)}, {value:.6g} per sample")
 
-            search_likelihood(likelihood, structure, data, begin, note)
+            search_likelihood(likelihood, begin, note)
     found = [checkpoint.known(f"start {k}")[:2] for k in range(len(starts))]
     theta, value = min(found, key=lambda one: one[1])
     if theta is None or not np.isfinite(value):
-        raise ModelError(f"the search found no weights at which the model works: "
-                         f"{likelihood.failure}")
-    return theta, value
+        raise ModelError(
+            f"the search found no weights at which the model works: {likelihood.failure}"
+        )
+    return theta
 
 
-def _alone(
-    recipe: tuple[Any, ...], structure: Structure, data: list[Data], k: int, begin: Array
-) -> tuple[int, Array, float]:
+def _alone(recipe: tuple[Any, ...], k: int, begin: Array) -> tuple[int, Array, float]:
     """One search in a process of its own."""
-    likelihood = Likelihood(structure, data, *recipe)
-    theta, value = search_likelihood(likelihood, structure, data, begin, lambda *_: None)
-    return k, theta, value
+    return k, *search_likelihood(Likelihood(*recipe), begin, lambda *_: None)
 
 
-def curvature(likelihood: Likelihood, theta: Array, data: list[Data], count: int) -> Array:
-    """The Hessian of the likelihood by its first components, from differences of gradients."""
-    chosen = [~one.held for one in data]
-    rows = []
-    for k in range(count):
-        move = np.zeros(len(theta))
-        move[k] = _HESSIAN_STEP
-        ahead, behind = (likelihood.gradient(theta + s * move, chosen)[1] for s in (1.0, -1.0))
-        rows.append((ahead - behind)[:count] / (2 * _HESSIAN_STEP))
-    found = np.array(rows)
-    return 0.5 * (found + found.T)
+def _curvature(likelihood: Likelihood, theta: Array) -> Array:
+    """The Hessian by what the likelihood depends on, from differences of gradients."""
+    count = likelihood.structure.seen
+    moves = _HESSIAN_STEP * np.eye(len(theta))[:count]
+    rows = [
+        likelihood.gradient(theta + move)[1] - likelihood.gradient(theta - move)[1]
+        for move in moves
+    ]
+    found = np.array(rows)[:, :count] / (2 * _HESSIAN_STEP)
+    return np.asarray(0.5 * (found + found.T))
 
 
-def polish(
-    likelihood: Likelihood, theta: Array, structure: Structure, data: list[Data]
-) -> tuple[Array, Array]:
+def polish(likelihood: Likelihood, theta: Array) -> tuple[Array, Array]:
     """Newton's steps to the minimum, and the Hessian there."""
-    chosen, count = [~one.held for one in data], structure.seen
-    low, high = np.array(structure.limits).T
-    value, slope = likelihood.gradient(theta, chosen)
-    H = curvature(likelihood, theta, data, count)
+    count = likelihood.structure.seen
+    value, slope = likelihood.gradient(theta)
+    H = _curvature(likelihood, theta)
     for _ in range(5):
         values, vectors = np.linalg.eigh(H)
-        usable = values > 1e-3
+        usable = vectors[:, values > 1e-3]
         step = np.zeros(len(theta))
-        step[:count] = -(vectors[:, usable] / values[usable]) @ (
-            vectors[:, usable].T @ slope[:count]
-        )
-        moved = np.clip(theta + np.clip(step, -1.0, 1.0), low, high)
-        reached, by = likelihood.gradient(moved, chosen)
+        step[:count] = -(usable / values[values > 1e-3]) @ (usable.T @ slope[:count])
+        moved = likelihood.structure.bounded(theta + np.clip(step, -1.0, 1.0))
+        reached, by = likelihood.gradient(moved)
         if not reached < value:
             break
         gain, theta, value, slope = value - reached, moved, reached, by
-        H = curvature(likelihood, theta, data, count)
+        H = _curvature(likelihood, theta)
         if gain < 1e-6:
             break
     return theta, H
 
 
 def limit(
-    likelihood: Likelihood, theta: Array, hessian: Array, structure: Structure, data: list[Data],
-    k: int, sign: float,
+    likelihood: Likelihood, theta: Array, hessian: Array, k: int, sign: float
 ) -> float | None:
     """Where component k is, one way, when the likelihood's minimum has risen to the 95 % limit.
 
     The others follow. None if it never rises so far within the component's range.
     """
-    chosen, count = [~one.held for one in data], structure.seen
-    least, end = likelihood.value(theta, chosen), structure.limits[k][1 if sign > 0 else 0]
-    others = [j for j in range(count) if j != k]
+    structure = likelihood.structure
+    least, end = likelihood.value(theta), structure.limits[k][1 if sign > 0 else 0]
+    others = [j for j in range(structure.seen) if j != k]
     # Coordinates of the others in which the likelihood curves alike in all directions.
     values, vectors = np.linalg.eigh(hessian[np.ix_(others, others)])
     spread = vectors / np.sqrt(np.maximum(values, 1.0))
-    low, high = np.array(structure.limits).T
     point = theta.copy()
 
     def rise(to: float) -> float:
-        """The rise in standard deviations, and the point where the others are best."""
+        """The rise in standard deviations at the point where the others are best."""
         begin = point.copy()
         begin[k] = to
 
         def cost(part: Array) -> tuple[float, Array]:
             whole = begin.copy()
             whole[others] += spread @ part
-            value, slope = likelihood.gradient(np.clip(whole, low, high), chosen)
+            value, slope = likelihood.gradient(structure.bounded(whole))
             if not np.isfinite(value):
                 return _FAILED, np.zeros(len(others))
             return value - least, spread.T @ slope[others]
 
-        if others:
-            found = minimize(
-                cost, np.zeros(len(others)), jac=True, method="L-BFGS-B",
-                options={"maxiter": 15, "gtol": 0.05, "ftol": 1e-4},
-            )
+        found = minimize(
+            cost, np.zeros(len(others)), jac=True, method="L-BFGS-B",
+            options={"maxiter": 15, "gtol": 0.05, "ftol": 1e-4},
+        ) if others else None
+        if found is not None:
             begin[others] += spread @ found.x
-            difference = float(found.fun)
-        else:
-            difference = likelihood.value(begin, chosen) - least
-        point[:] = np.clip(begin, low, high)
+        difference = likelihood.value(begin) - least if found is None else float(found.fun)
+        point[:] = structure.bounded(begin)
         return float(np.sqrt(2.0 * max(difference, 0.0)))
 
     inside, outside, inner, outer = float(theta[k]), None, 0.0, np.inf
@@ -278,8 +259,7 @@ def limit(
         if abs(found - NORMAL) < 0.03:
             break
         if outside is None:
-            growth = np.clip(NORMAL / max(found, 1e-3), 1.2, 3.0)
-            to = theta[k] + growth * (to - theta[k])
+            to = theta[k] + np.clip(NORMAL / max(found, 1e-3), 1.2, 3.0) * (to - theta[k])
         else:
             share = np.clip((NORMAL - inner) / (outer - inner), 0.1, 0.9)
             to = inside + share * (outside - inside)
@@ -287,8 +267,8 @@ def limit(
 
 
 def refine(
-    score: Score, weights_at: Callable[[Array], Weights], theta: Array, structure: Structure,
-    checkpoint: Checkpoint, advance: Callable[[str], None],
+    score: Score, structure: Structure, theta: Array, checkpoint: Checkpoint,
+    advance: Callable[[str], None],
 ) -> Array:
     """The minimum of the estimator's score, by differences of runs.
 
@@ -297,27 +277,24 @@ def refine(
     known, value, done = checkpoint.known("estimator")
     if done and known is not None:
         return known
-    low, high = np.array(structure.limits).T
-    anchor = min((theta, structure.start), key=lambda point: score.total(weights_at(point)))
+
+    def plain(point: Array) -> float:
+        return score.total(structure.weights(structure.bounded(point)))
+
+    anchor = min((theta, structure.start), key=plain)
     best: list[Any] = [anchor if known is None else known, value]
 
     def total(point: Array) -> float:
-        found = score.total(weights_at(point))
-        return found + _STAY * float(np.sum((point - anchor) ** 2))
+        return min(plain(point) + _STAY * float(np.sum((point - anchor) ** 2)), _FAILED)
 
     def cost(point: Array) -> tuple[float, Array]:
-        value = total(point)
-        if not np.isfinite(value):
-            return _FAILED, np.zeros(len(point))
+        value, slope = total(point), np.zeros(len(point))
+        if value == _FAILED:
+            return _FAILED, slope
         if value < best[1]:
             best[:] = point.copy(), value
-        slope = np.zeros(len(point))
-        for k in range(len(point)):
-            move = np.zeros(len(point))
-            move[k] = _STEP
-            ahead = min(total(np.minimum(point + move, high)), _FAILED)
-            behind = min(total(np.maximum(point - move, low)), _FAILED)
-            slope[k] = (ahead - behind) / (2 * _STEP)
+        for k, move in enumerate(_STEP * np.eye(len(point))):
+            slope[k] = (total(point + move) - total(point - move)) / (2 * _STEP)
             advance(f"estimator, score {best[1]:.5g}")
         checkpoint.note("estimator", best[0], best[1], False)
         return value, slope

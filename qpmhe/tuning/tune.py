@@ -16,16 +16,16 @@ from numpy.typing import ArrayLike
 
 from qpmhe_solvers.values import shown
 
-from .._checks import Array, checked_path, choice, count, dimension
+from .._checks import checked_path, choice, count, dimension
 from ..errors import InvalidInputError, ModelError, OptionError, QpmheError
 from ..model.system import System
 from ..observers import ExtendedKalman, Observer
 from .answer import Tuning
-from .data import Data, check_enough, checked_data, hold_out
+from .data import check_enough, checked_data, constant_inputs, hold_out
 from .likelihood import Likelihood
 from .score import Score
 from .search import Checkpoint, identity_of, polish, refine, search_all
-from .structures import KINDS, Setting, Structure, checked_start
+from .structures import Structure, checked_start
 from .weights import ARRIVALS, Weights
 
 if TYPE_CHECKING:
@@ -151,35 +151,32 @@ def tune(
     began = perf_counter()
     choice("objective", objective, _OBJECTIVES)
     choice("arrival", arrival, ARRIVALS)
-    dimension("horizon", horizon, 1)
-    dimension("ahead", ahead, 1)
-    dimension("starts", starts, 1)
-    dimension("jobs", jobs, 1)
+    for name, value in (
+        ("horizon", horizon), ("ahead", ahead), ("starts", starts), ("jobs", jobs)
+    ):
+        dimension(name, value, 1)
     count("seed", seed, 0)
-    started = _mapping("parameters", parameters, "{'mass': 0.5}")
-    if not callable(observer):
-        raise OptionError(
-            f"observer is {shown(observer)}; expected what makes one from prior, disturbance and "
-            "noise, such as qpmhe.ExtendedKalman."
-        )
     kept_in = None if checkpoint is None else checked_path("checkpoint", checkpoint)
-    make, remade = _maker(system, started)
-    first = make(started)
+    started = _mapping("parameters", parameters, "{'mass': 0.5}")
+    make, remade, first = _maker(system, started)
     inputs = first.m if remade else first.m - len(started)
     if inputs < 0:
         raise InvalidInputError(
             f"parameters names {len(started)}, and the system has {first.m} inputs, the last of "
             "which are the parameters; give a function make(**parameters) as system instead."
         )
-    sizes = {"prior": first.n, "disturbance": first.r, "noise": first.p}
-    start = checked_start(sizes, prior, disturbance, noise, discount, threshold, started)
+    start = checked_start(
+        {"prior": first.n, "disturbance": first.r, "noise": first.p}, prior, disturbance, noise,
+        discount, threshold, started, horizon=horizon, arrival=arrival,
+    )
     _check_observer(observer, start)
     data = checked_data(records, first, inputs, initial_state)
     hold_out(data, held_out, 2 * ahead)
     labels = _labels(first, names)
     plan = Structure(start, structure, labels)
-    check_enough(data, plan.names, _noise_outputs(plan, labels["noise"]))
-    constant = _constant_inputs(data, bool(started))
+    noises = [j for j, one in enumerate(labels["noise"]) if f"noise {one}" in plan.names]
+    check_enough(data, plan.names, noises)
+    constant = constant_inputs(data, bool(started))
     has_truth = all(one.truth is not None for one in data)
     if objective == "truth" and not has_truth:
         raise InvalidInputError(
@@ -188,16 +185,8 @@ def tune(
     if objective == "auto":
         objective = "truth" if has_truth else "prediction"
     options = {"max_qps": 2, **options}
-
-    def weights_at(theta: Array) -> Weights:
-        at = plan.setting(theta)
-        return Weights(
-            at.prior, at.disturbance, at.noise, horizon, at.discount, at.threshold, arrival,
-            at.parameters,
-        )
-
     likelihood = Likelihood(plan, data, make, remade)
-    at_start = likelihood.value(plan.start, [~one.held for one in data])
+    at_start = likelihood.value(plan.start)
     if not np.isfinite(at_start):
         raise ModelError(
             "the likelihood is not finite at the start: "
@@ -205,58 +194,43 @@ def tune(
             "another initial_state or other parameters, or bound the states by System(states=...)."
         )
     score = Score(
-        data, make, observer, weights_at(plan.start), ahead=ahead, truth=objective == "truth",
-        robust=threshold is not None, options=options,
+        data, make, observer, start, ahead=ahead, truth=objective == "truth", options=options
     )
     if objective != "likelihood":
         if sum(map(len, data)) * len(plan.names) > _WORTH_COMPILING:
-            score.compile(weights_at(plan.start))
+            score.compile(start)
         _ = score.scale  # what is wrong with the options shows before the search
-    kept = Checkpoint(
-        kept_in,
-        identity_of(data, plan, at_start, (horizon, objective, ahead, arrival, seed, starts,
-                                           _plain(start), sorted(options.items(), key=str))),
+    kept = Checkpoint(kept_in, identity_of(
+        likelihood, at_start, (objective, ahead, seed, starts, sorted(options.items(), key=str))
+    ))
+    spread = _SPREAD * np.random.default_rng(seed).standard_normal(
+        (starts - 1, len(plan.start))
     )
-    generator = np.random.default_rng(seed)
-    low, high = np.array(plan.limits).T
-    beginnings = [plan.start] + [
-        np.clip(plan.start + _SPREAD * generator.standard_normal(len(low)), low, high)
-        for _ in range(starts - 1)
-    ]
+    beginnings = [plan.start, *map(plan.bounded, plan.start + spread)]
     with _interruptible(), _shown(progress) as advance:
-        found, _ = search_all(likelihood, plan, data, beginnings, kept, jobs, advance)
-        found, hessian = polish(likelihood, found, plan, data)
-        seconds = {"likelihood": perf_counter() - began}
-        refined = None
+        found = search_all(likelihood, beginnings, kept, jobs, advance)
+        found, hessian = polish(likelihood, found)
+        seconds, refined = {"likelihood": perf_counter() - began}, None
         if objective != "likelihood":
-            refined = refine(score, weights_at, found, plan, kept, advance)
+            refined = refine(score, plan, found, kept, advance)
             seconds["estimator"] = perf_counter() - began - seconds["likelihood"]
-        tuning = Tuning(
-            plan, data, likelihood, score, weights_at, found, hessian, refined, objective, ahead,
-            seconds, labels, constant,
-        )
+        tuning = Tuning(likelihood, score, found, hessian, refined, seconds, labels, constant)
     kept.remove()
     return tuning
 
 
-def _plain(start: Setting) -> list[Any]:
-    matrices = [getattr(start, kind).tolist() for kind in KINDS]
-    return [*matrices, start.discount, start.threshold, start.parameters]
-
-
 def _maker(
     system: Any, parameters: dict[str, float]
-) -> tuple[Callable[[dict[str, float]], System], bool]:
-    """What makes the system from its parameters, and whether it is another one for each."""
+) -> tuple[Callable[[dict[str, float]], System], bool, System]:
+    """What makes the system from its parameters, whether anew for each, and the first one."""
     if isinstance(system, System):
-        return _Same(system), False
+        return lambda _: system, False, system
     if not callable(system):
         raise ModelError(
             f"system is {shown(system)}; expected a qpmhe.System, or a function make(**parameters)."
         )
-    make = _Making(system)
     try:
-        made = make(parameters)
+        made = system(**parameters)
     except QpmheError:
         raise
     except Exception as error:
@@ -269,45 +243,29 @@ def _maker(
         raise ModelError(
             f"the function given as system returned {shown(made)}; expected a qpmhe.System."
         )
-    return make, bool(parameters)
+    return lambda at: system(**at), bool(parameters), made
 
 
-class _Same:
-    """Makes one and the same system; an object, so that other processes can have it."""
-
-    def __init__(self, system: System) -> None:
-        self._system = system
-
-    def __call__(self, _parameters: dict[str, float]) -> System:
-        return self._system
-
-
-class _Making:
-    """Makes a system of its parameters."""
-
-    def __init__(self, function: Callable[..., System]) -> None:
-        self._function = function
-
-    def __call__(self, parameters: dict[str, float]) -> System:
-        return self._function(**parameters)
-
-
-def _check_observer(kind: Callable[..., Observer], start: Setting) -> None:
+def _check_observer(kind: Any, start: Weights) -> None:
     """Make one, so that what is wrong shows before the search."""
+    expected = (
+        "expected what makes an observer of prior, disturbance and noise, such as "
+        "qpmhe.ExtendedKalman."
+    )
+    if not callable(kind):
+        raise OptionError(f"observer is {shown(kind)}; {expected}")
     try:
-        made = kind(prior=start.prior, disturbance=start.disturbance, noise=start.noise)
+        made = start.observer(kind)
     except QpmheError:
         raise
     except Exception as error:
         raise OptionError(
             f"observer(prior=..., disturbance=..., noise=...) raised {type(error).__name__}: "
-            f"{error}; expected what makes an observer of these covariances, such as "
-            "qpmhe.ExtendedKalman."
+            f"{error}; {expected}"
         ) from error
     if not isinstance(made, Observer):
         raise OptionError(
-            f"observer(prior=..., disturbance=..., noise=...) returned {shown(made)}; expected an "
-            "observer, as qpmhe.ExtendedKalman makes it."
+            f"observer(prior=..., disturbance=..., noise=...) returned {shown(made)}; {expected}"
         )
 
 
@@ -322,36 +280,16 @@ def _labels(system: System, names: Mapping[str, Sequence[str]] | None) -> dict[s
     given = _mapping("names", names, "{'states': ['position', 'speed']}")
     found = {}
     for kind, letter, size in (("states", "x", system.n), ("outputs", "y", system.p)):
-        labels = [str(one) for one in given.pop(kind, [])]
-        if not labels:
-            labels = [f"{letter}{i + 1}" for i in range(size)]
+        labels = [str(one) for one in given.pop(kind, [])] or [
+            f"{letter}{i + 1}" for i in range(size)
+        ]
         if len(labels) != size or len(set(labels)) != size:
             raise OptionError(f"names of {kind} are {labels}; expected {size} different ones.")
         found[kind] = labels
     if given:
         raise OptionError(f"names has {', '.join(map(repr, given))}; expected states, outputs.")
-    w = found["states"]
-    if system.r != system.n:
-        w = [f"w{i + 1}" for i in range(system.r)]
+    w = found["states"] if system.r == system.n else [f"w{i + 1}" for i in range(system.r)]
     return {"prior": found["states"], "disturbance": w, "noise": found["outputs"]}
-
-
-def _noise_outputs(plan: Structure, outputs: Sequence[str]) -> list[int]:
-    """The outputs whose own noise is tuned."""
-    return [j for j, name in enumerate(outputs) if f"noise {name}" in plan.names]
-
-
-def _constant_inputs(data: list[Data], needed: bool) -> list[int]:
-    """The inputs that never change, which identify no parameters."""
-    us = np.concatenate([one.u for one in data])
-    still = np.flatnonzero(np.ptp(us, axis=0) == 0.0).tolist() if us.size else []
-    if needed and us.shape[1] and len(still) == us.shape[1]:
-        raise InvalidInputError(
-            "all inputs are constant in all records: what they act by cannot be told from an "
-            "offset, so parameters of the model cannot be tuned. Record with inputs that change, "
-            "or leave parameters out."
-        )
-    return still
 
 
 @contextmanager

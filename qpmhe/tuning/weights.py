@@ -16,9 +16,9 @@ from .._version import __version__
 from ..costs import Cost, Huber, ObserverPrior, QuadraticCost, RobustCost
 from ..errors import InvalidInputError, QpmheError
 from ..observers import ExtendedKalman, Observer
-from .structures import KINDS
 
 _FORMAT = 1
+KINDS = ("prior", "disturbance", "noise")
 #: What may weigh the prior.
 ARRIVALS = ("observer", "constant")
 

@@ -7,7 +7,8 @@ from estimator.untraced import untraced as untraced_function
 import qpmhe
 from qpmhe.tuning.data import checked_data
 from qpmhe.tuning.likelihood import Likelihood
-from qpmhe.tuning.structures import KINDS, Setting, Structure
+from qpmhe.tuning.structures import Structure
+from qpmhe.tuning.weights import KINDS, Weights
 
 
 def untraced(system):
@@ -25,7 +26,7 @@ def labels(system):
 
 
 def problem(system, record, prior, disturbance, noise, structure="diagonal", start=None, **others):
-    setting = Setting(prior, disturbance, noise, **others)
+    setting = Weights(prior, disturbance, noise, **others)
     plan = Structure(setting, dict.fromkeys(KINDS, structure), labels(system))
     inputs = 0 if record[1] is None else record[1].shape[1]
     data = checked_data([record], system, inputs, start)
@@ -124,7 +125,7 @@ def test_steps_of_other_lengths():
         for dt in (np.full(40, scenario.dt), np.linspace(0.05, 0.2, 40)):
             record = qpmhe.tuning.TuningRecord(y, dt=dt)
             data = checked_data([record], one, 0, scenario.initial_estimate)
-            plan = Structure(Setting(*parts), "diagonal", labels(one))
+            plan = Structure(Weights(*parts), "diagonal", labels(one))
             likelihood = Likelihood(plan, data, lambda _, one=one: one, False)
             values.append(likelihood.value(plan.start, [np.ones(40, bool)]))
     usual = problem(system, (y, None), *parts, start=scenario.initial_estimate)[0]
@@ -146,7 +147,7 @@ def test_parameters_of_the_model(remade):
     u = generator.standard_normal((50, 1))
     y = generator.standard_normal((50, 1))
     one = np.eye(1)
-    setting = Setting(one, one, one, parameters={"k": 0.7})
+    setting = Weights(one, one, one, parameters={"k": 0.7})
     system = make(0.7) if remade else both
     plan = Structure(setting, "diagonal", labels(system))
     data = checked_data([(y, u)], system, 1, [0.0])

@@ -257,11 +257,11 @@ def test_several_starts_and_processes():
 def test_a_search_that_was_stopped_resumes(tmp_path, monkeypatch):
     path, real, calls = tmp_path / "search.json", search.search_likelihood, []
 
-    def stopped(likelihood, structure, data, begin, note):
+    def stopped(likelihood, begin, note):
         calls.append(begin)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return real(likelihood, structure, data, begin, note)
+        return real(likelihood, begin, note)
 
     monkeypatch.setattr(search, "search_likelihood", stopped)
     with pytest.raises(KeyboardInterrupt):
