@@ -31,7 +31,7 @@ HORIZON = 20
 # Samples: until it runs steadily, with another inertia from CHANGE on, until it accelerates again.
 STEADY, CHANGE, AGAIN, END = 8 * HORIZON, 18 * HORIZON, 21 * HORIZON, 26 * HORIZON
 INERTIAS = 2.4, 1.4  # g m^2
-SEEDS, FEW = 12, 2
+SEEDS, FEW = 12, 1
 LOST = 100.0  # per cent
 HELD, STIFFER = "MHE, 2 QPs, held", "MHE, 2 QPs, stiff"
 SHOWN = ("EKF", "MHE, 2 QPs", STIFFER, HELD)
