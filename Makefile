@@ -37,6 +37,7 @@ examples: $(VENV)/.test
 	$(BIN)/python examples/paper_figure.py --out results
 	$(BIN)/python examples/outliers.py --seeds 4 --out results
 	$(BIN)/python -m examples.gallery.reactors --quick --out results/gallery
+	$(BIN)/python -m examples.gallery.weak_excitation --quick --out results/gallery
 	$(BIN)/python examples/benchmarks/compare_peers.py --quick --problem reactor --out results
 	$(BIN)/python examples/benchmarks/constrained.py --steps 60 --out results
 	$(BIN)/python examples/benchmarks/batch.py --members 200 --steps 40 --out results
@@ -51,6 +52,7 @@ examples: $(VENV)/.test
 gallery: DATA ?= data
 gallery: $(VENV)/.test
 	$(BIN)/python -m examples.gallery.reactors --out results/gallery
+	$(BIN)/python -m examples.gallery.weak_excitation --out results/gallery
 	$(BIN)/python -m examples.gallery.indoor_uwb --data "$(DATA)/indoor_uwb" --out results/gallery
 
 # All benchmarks, beside all that PyPI has: an hour, most of it compiling; QUICK=--quick for minutes.

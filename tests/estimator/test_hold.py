@@ -283,10 +283,9 @@ def test_snapshots_of_other_holds_and_damaged_ones_are_refused(engine):
         with pytest.raises(InvalidInputError, match="another"):
             other.load_state_dict(state)
     if engine == "python":
-        state["window"]["trusted"] = np.full((2, 1), np.nan)
+        state["window/trusted"][...] = np.nan
     else:
-        record_of = state["memory"].view(mhe._engine._memory.dtype)
-        record_of["trusted"] = np.nan
+        state["memory"].view(mhe._engine._memory.dtype)["trusted"] = np.nan
     with pytest.raises(InvalidInputError, match="damaged"):
         mhe.load_state_dict(state)
 

@@ -30,8 +30,8 @@ HOLD = 0.1
 HORIZON = 20
 # Samples: until it runs steadily, with another inertia from CHANGE on, until it accelerates again.
 STEADY, CHANGE, AGAIN, END = 8 * HORIZON, 18 * HORIZON, 21 * HORIZON, 26 * HORIZON
-INERTIAS = 1.5, 2.6  # g m^2
-SEEDS, FEW = 12, 2
+INERTIAS = 2.4, 1.4  # g m^2
+SEEDS, FEW = 12, 1
 LOST = 100.0  # per cent
 HELD, STIFFER = "MHE, 2 QPs, held", "MHE, 2 QPs, stiff"
 SHOWN = ("EKF", "MHE, 2 QPs", STIFFER, HELD)
@@ -124,6 +124,6 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> An
     for axes in (above, below):
         axes.axvspan(DT * STEADY, DT * AGAIN, color="0.92", zorder=0)
     below.set(xlabel="time (s)", ylabel="inertia (g m²)")
-    below.set_ylim(0.5, 4.0)
+    below.set_ylim(0.9, 3.6)
     figure.legend(*below.get_legend_handles_labels(), loc="outside upper center", ncols=5)
     return figure
