@@ -9,20 +9,20 @@ depend on that state.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
 import qpmhe
+from qpmhe.plots.style import LIGHT, STYLES
 from qpmhe.tuning import Weights
 
 from ..problem import Array, Problem, Record, Result, Way
-from ..report import tracks
+from ..report import BY_HAND, tracks
 from .bank import Bank
 from .record import Drive, folders, read
 
@@ -31,6 +31,9 @@ SHORT, LONG, DELAY, SETTLING = 10.0, 80.0, 40.0, 10.0
 # Metres from the truth, and runs from each: of the starts.
 STARTS, FEW = {5.0: 4, 100.0: 4}, {5.0: 1, 100.0: 1}
 HUBER = 1.345
+CAUSAL = f"MHE, Geman-McClure, {LONG:.0f} s"
+LATE = f"the same, {DELAY:.0f} s late"
+LONG_HUBER = f"MHE, Huber, {LONG:.0f} s"
 #: dBHz: weaker signals are reflected ones more often than not.
 STRONG = 35.0
 # Random walks a root of a second: of position, height, heading, clock, its drift, the offsets of
@@ -108,6 +111,12 @@ def starts(drive: Drive, away: float, count: int) -> list[Array]:
     ]
 
 
+def distance(x: Array, truth: Array) -> Array:
+    """The error on the map, in m."""
+    found: Array = np.hypot(*(x[:, :2] - truth).T)
+    return found
+
+
 def problems(folder: Path, quick: bool) -> list[Problem]:
     """Each record of the folder, with all signals and with the strong ones only."""
     found = []
@@ -141,32 +150,33 @@ def problem(name: str, which: str, drive: Drive, quick: bool) -> Problem:
             for away, count in (FEW if quick else STARTS).items()
             for begin in starts(drive, away, count)
         ],
-        by_hand, lambda x, real: np.hypot(*(x[:, :2] - real).T), "m", 100.0,
+        by_hand, distance, "m", 100.0,
         tuning=None if quick else {
             "structure": {"disturbance": groups, "noise": {"pseudorange": range(made.p)}},
         },
-        own=partial(own, drive, quick),
+        own=partial(own, drive, quick), note=(
+            f"Errors on the map, without the first {SETTLING:.0f} s; the late estimates have none "
+            f"of the last {DELAY:.0f} s."
+        ),
     )
 
 
-def own(
-    drive: Drive, quick: bool, problem: Problem, weights: Weights
-) -> dict[str, Way]:
+def own(drive: Drive, quick: bool, problem: Problem, weights: Weights) -> dict[str, Way]:
     """Over windows in which the car drives round some corners, and against reflections."""
     step = float(np.median(drive.lengths))
-    horizon = min(round(LONG / step), len(drive.times))
-    options: dict[str, Any] = {"horizon": horizon, "max_qps": 5, "warm_start": True}
+    options: dict[str, Any] = {
+        "horizon": min(round(LONG / step), len(drive.times)), "max_qps": 5, "warm_start": True,
+    }
     prior, walk, noise = (
         np.linalg.inv(one) for one in (weights.prior, weights.disturbance, weights.noise)
     )
     huber = qpmhe.RobustCost(
         prior=prior, disturbance=walk, noise=qpmhe.Huber(noise, HUBER, per_component=True)
     )
-    redescending = qpmhe.RobustCost(
-        prior=prior, disturbance=walk, noise=qpmhe.GemanMcClure(
-            noise, drive.deviation * np.sqrt(noise[0, 0]), per_component=True, graduation=1.0
-        )
-    )
+    # Of all starts the least cost is taken: no graduation.
+    redescending = qpmhe.RobustCost(prior=prior, disturbance=walk, noise=qpmhe.GemanMcClure(
+        noise, drive.deviation * np.sqrt(noise[0, 0]), per_component=True, graduation=1.0,
+    ))
     bank = Bank(
         partial(problem.estimator, weights=weights, cost=redescending, delay=round(DELAY / step),
                 **options),
@@ -177,24 +187,30 @@ def own(
             problem.estimator, weights=weights, max_qps=0, horizon=1, project_observer=False,
             observer=partial(qpmhe.ExtendedKalman, innovation=qpmhe.HuberInnovation(HUBER)),
         ),
-        f"MHE, Huber, {LONG:.0f} s": partial(
-            problem.estimator, weights=weights, cost=huber, **options
-        ),
-        f"MHE, Geman-McClure, {LONG:.0f} s": bank.causal,
-        f"the same, {DELAY:.0f} s late": bank.late,
+        LONG_HUBER: partial(problem.estimator, weights=weights, cost=huber, **options),
+        CAUSAL: bank.causal,
+        LATE: bank.late,
     }
 
 
 def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Any:
-    """The map of the first record, and the errors in time."""
-    problem, found = problems[0], results[0]
-    record = [one for one in problem.records if one.name == found[-1].record][0]
-    wanted = ["EKF", *own_names()]
-    shown = {
-        one.estimator: one.middle for one in found
-        if one.weights == BY_HAND and one.record == record.name and one.estimator in wanted
-    }
+    """A map of each record, and the errors in time, with weights by hand from far away."""
     with rc_context(LIGHT):
-        figure = Figure(figsize=(11.0, 5.6), layout="constrained")
-        places, errors = figure.subplots(1, 2, width_ratios=(1, 1.2))
+        figure = Figure(figsize=(10.0, 5.2 * len(problems)), layout="constrained")
+        panels = figure.subplots(len(problems), 2, squeeze=False, width_ratios=(1.0, 1.2))
+    for (places, errors), problem, found in zip(panels, problems, results, strict=True):
+        record = problem.records[-1]
+        shown = {
+            one.estimator: one.middle for one in found if one.weights == BY_HAND
+            and one.record == record.name and one.estimator in ("EKF", LONG_HUBER, CAUSAL, LATE)
+        }
+        tracks(record.truth, {name: path[:, :2] for name, path in shown.items()},
+               labels=("east", "north"), axes=places)
+        places.set_title(problem.title, loc="left")
+        times = np.cumsum(record.inputs[:, 2]) - record.inputs[0, 2]
+        for style, (name, path) in zip(STYLES, shown.items(), strict=False):
+            errors.plot(times, problem.error(path, record.truth), linewidth=1.2, label=name,
+                        **style)
+        errors.set(xlabel="time (s)", ylabel="error (m)", ylim=(0.0, None))
+        errors.legend()
     return figure
