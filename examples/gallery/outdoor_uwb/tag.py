@@ -26,13 +26,18 @@ from .ranges import SOURCE, Walk, folders, read
 __all__ = ["SOURCE", "draw", "problems"]
 
 STARTS, FEW = 12, 2
+QUICK = 300  # samples, what --quick takes of each record
 HEIGHT = 1.0  # m, of a tag that somebody carries
 HORIZON = 80
 # A walker changes its speed by 0.05 m/s from sample to sample. A range is good to 0.1 m, but its
 # error lasts for a second or so: white noise that says as little of the position is larger.
 SPEED, RANGE = 0.05, 0.2
-SHOWN = ("EKF", "EKF, gated", "MHE, Geman-McClure, 2 QPs")
-LOSSES = {"Huber": qpmhe.Huber, "Cauchy": qpmhe.Cauchy, "Geman-McClure": qpmhe.GemanMcClure}
+SHOWN = ("EKF", "EKF, gated", "MHE, Geman-McClure, 5 QPs")
+ROBUST = {
+    "Huber, 5 QPs": (qpmhe.Huber, 5), "Cauchy, 5 QPs": (qpmhe.Cauchy, 5),
+    "Geman-McClure, 2 QPs": (qpmhe.GemanMcClure, 2),
+    "Geman-McClure, 5 QPs": (qpmhe.GemanMcClure, 5),
+}
 
 
 def model(anchors: Array) -> qpmhe.System:
@@ -92,7 +97,14 @@ def problem_of(walk: Walk, quick: bool) -> Problem:
 
 def problems(folder: Path, quick: bool) -> list[Problem]:
     """One for each record: the anchors may differ."""
-    return [problem_of(read(one), quick) for one in folders(folder)]
+    walks = [read(one) for one in folders(folder)]
+    return [problem_of(cut(walk, QUICK) if quick else walk, quick) for walk in walks]
+
+
+def cut(walk: Walk, count: int) -> Walk:
+    """Its first samples."""
+    part = {name: getattr(walk, name)[:count] for name in ("times", "steps", "ranges", "path")}
+    return walk._replace(**part)
 
 
 def own(problem: Problem, weights: Weights) -> dict[str, Way]:
@@ -102,12 +114,12 @@ def own(problem: Problem, weights: Weights) -> dict[str, Way]:
         np.linalg.inv(one) for one in (weights.prior, weights.disturbance, weights.noise)
     )
     found: dict[str, Way] = {}
-    for name, loss in LOSSES.items():
+    for name, (loss, count) in ROBUST.items():
         cost = qpmhe.RobustCost(
             prior=prior, disturbance=disturbance, noise=loss(noise, per_component=True)
         )
-        found[f"MHE, {name}, 2 QPs"] = partial(
-            problem.estimator, weights=weights, observer=gated, cost=cost, max_qps=2,
+        found[f"MHE, {name}"] = partial(
+            problem.estimator, weights=weights, observer=gated, cost=cost, max_qps=count,
             warm_start=True,
         )
     return found
