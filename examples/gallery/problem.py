@@ -213,9 +213,9 @@ def judge(
 
 
 def outside(system: qpmhe.System, estimates: Array) -> float:
-    """The share of estimates outside of X, by more than rounding."""
+    """The share of estimates outside of X, by more than rounding; NaN without an X."""
     if system.states is None:
-        return 0.0
+        return np.nan
     rounding = 1e-9 * np.abs(estimates).max(axis=1, keepdims=True)
     return float(np.mean([
         system.states.violation(x, rounding=slack) > 0.0
