@@ -18,6 +18,7 @@ from qpmhe.plots.style import LIGHT, REAL, STYLES
 from .problem import Array, Problem, Result
 
 BY_HAND, TUNED = "by hand", "tuned"
+WIDTH = 120
 ENGINES = {"compiled": "C", "python": "py"}
 
 
@@ -96,7 +97,8 @@ def write(
         title = (f"{record}, weights {weights}, {rows['runs'].iloc[0]} runs; "
                  f"root mean square error in {problem.unit}")
         shown = Table(*columns, title=f"{problem.title}: {title}", box=None, title_justify="left",
-                      caption=legend(whole), caption_justify="left")
+                      caption=legend(whole), caption_justify="left", collapse_padding=True,
+                      pad_edge=False)
         lines = [cells(row, whole, bounded) for _, row in rows.iterrows()]
         for column in shown.columns:
             column.no_wrap = True
@@ -104,7 +106,8 @@ def write(
         for line in lines:
             shown.add_row(*line)
         words = verdict(problem, rows, baselines)
-        console.print(shown)
+        # Digits that do not fit are worse than lines that wrap.
+        console.print(shown, width=max(console.width, WIDTH), crop=False)
         console.print(f"[bold]{words}[/]\n", highlight=False, soft_wrap=True)
         text += [f"## {title}", "", *markdown(columns, lines), "", legend(whole), "", words, ""]
     if problem.note:
