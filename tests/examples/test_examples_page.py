@@ -32,3 +32,22 @@ def test_every_section_has_a_command_and_a_picture(section):
     # Those of docs/img/gallery.py; others have pages of their own.
     if not picture.startswith(("img/battery", "img/benchmark")):
         assert (DOCS / picture).stat().st_size <= 150_000
+
+
+FOLDERS = sorted(path.parent.name for path in EXAMPLES.glob("gallery/*/__main__.py"))
+PAGES = sorted(path.stem for path in DOCS.glob("gallery/*.md") if path.stem != "index")
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_make_gallery_runs_every_folder(name):
+    assert f"-m examples.gallery.{name} " in (ROOT / "Makefile").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_every_page_of_the_gallery_has_its_command_and_its_line(name):
+    assert name in FOLDERS
+    text = (DOCS / "gallery" / f"{name}.md").read_text(encoding="utf-8")
+    assert f"python -m examples.gallery.{name} " in text
+    assert f"]({name}.md)" in (DOCS / "gallery" / "index.md").read_text(encoding="utf-8")
+    for picture in re.findall(r"^!\[.+\]\((.+\.png)\)$", text, flags=re.MULTILINE):
+        assert (DOCS / "gallery" / picture).stat().st_size <= 150_000
