@@ -45,8 +45,6 @@ examples: $(VENV)/.test
 	$(BIN)/python examples/closed_loop.py --steps 60 --seeds 1 --out results
 	$(BIN)/python examples/learnt_noise/with_jax.py --steps 4 --records 1 --tests 2
 	$(BIN)/qpmhe compare --seeds 2 --steps 40 --solver-iterations 2,none --store results/quick.sqlite --out results/compare
-	if [ -d "$(DATA)" ]; then $(BIN)/python examples/battery_soc/study.py --quick --data "$(DATA)" --out results; \
-	else echo "no battery data at '$(DATA)': battery example left out"; fi
 
 # The problems of docs/gallery. DATA holds a folder for each data set; a problem without its own says where to get it.
 gallery: DATA ?= data

@@ -14,7 +14,7 @@ SECTIONS = PAGE.split("\n## ")[1:]
 def programs():
     top = [path.name for path in EXAMPLES.glob("*.py")]
     notebooks = [f"notebooks/{path.name}" for path in EXAMPLES.glob("notebooks/*.ipynb")]
-    return sorted([*top, *notebooks, "battery_soc/study.py"])
+    return sorted([*top, *notebooks])
 
 
 @pytest.mark.parametrize("name", programs())
@@ -30,7 +30,7 @@ def test_every_section_has_a_command_and_a_picture(section):
     (picture,) = re.findall(r"^!\[.+\]\((img/[\w-]+\.png)\)$", section, flags=re.MULTILINE)
     assert (DOCS / picture).is_file()
     # Those of docs/img/gallery.py; others have pages of their own.
-    if not picture.startswith(("img/battery", "img/benchmark")):
+    if not picture.startswith("img/benchmark"):
         assert (DOCS / picture).stat().st_size <= 150_000
 
 
