@@ -45,15 +45,16 @@ examples: $(VENV)/.test
 	$(BIN)/python examples/closed_loop.py --steps 60 --seeds 1 --out results
 	$(BIN)/python examples/learnt_noise/with_jax.py --steps 4 --records 1 --tests 2
 	$(BIN)/qpmhe compare --seeds 2 --steps 40 --solver-iterations 2,none --store results/quick.sqlite --out results/compare
-	if [ -d "$(DATA)" ]; then $(BIN)/python examples/battery_soc/study.py --quick --data "$(DATA)" --out results; \
-	else echo "no battery data at '$(DATA)': battery example left out"; fi
 
-# The problems of docs/gallery. DATA holds a folder for each data set; without them a problem says where to get its own.
+# The problems of docs/gallery. DATA holds a folder for each data set; a problem without its own says where to get it.
 gallery: DATA ?= data
 gallery: $(VENV)/.test
 	$(BIN)/python -m examples.gallery.reactors --out results/gallery
 	$(BIN)/python -m examples.gallery.weak_excitation --out results/gallery
 	$(BIN)/python -m examples.gallery.indoor_uwb --data "$(DATA)/indoor_uwb" --out results/gallery
+	$(BIN)/python -m examples.gallery.outdoor_uwb --data "$(DATA)/uwb_outdoor" --out results/gallery
+	$(BIN)/python -m examples.gallery.smartloc --data "$(DATA)/smartloc_berlin" --out results/gallery
+	$(BIN)/python -m examples.gallery.battery --data "$(DATA)/samsung_30t" --out results/gallery
 
 # All benchmarks, beside all that PyPI has: an hour, most of it compiling; QUICK=--quick for minutes.
 benchmarks: $(VENV)/.test

@@ -47,6 +47,10 @@ class Record:
     tunes: int = 0
     known: Array | None = None
 
+    def first(self, values: Array | None) -> Array | None:
+        """The rows of the part that tunes."""
+        return None if values is None else values[: self.tunes]
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -108,12 +112,9 @@ class Problem:
             # The same measurements with other starts tune once.
             if record.tunes and id(record.measurements) not in seen:
                 seen.add(id(record.measurements))
-                until = slice(record.tunes)
+                arrays = record.measurements, record.inputs, record.known
                 parts.append(TuningRecord(
-                    record.measurements[until],
-                    None if record.inputs is None else record.inputs[until],
-                    None if record.known is None else record.known[until],
-                    initial_state=self._likeliest(record),
+                    *map(record.first, arrays), initial_state=self._likeliest(record)
                 ))
         w = self.weights
         options = {"horizon": w.horizon, "threshold": w.threshold, "arrival": w.arrival,
@@ -122,7 +123,7 @@ class Problem:
             self.system, parts, prior=w.prior, disturbance=w.disturbance, noise=w.noise,
             progress=console, **options,
         )
-        console.print(str(tuning), highlight=False, markup=False)
+        console.print(str(tuning), highlight=False, markup=False, soft_wrap=True)
         return tuning.weights
 
     def _likeliest(self, record: Record) -> Array:
@@ -134,8 +135,7 @@ class Problem:
 
     def _misfit(self, record: Record, start: Array) -> float:
         """The mean square of the filter's innovations in the part that tunes."""
-        part = slice(record.tunes)
-        y, u = record.measurements[part], None if record.inputs is None else record.inputs[part]
+        y, u = record.first(record.measurements), record.first(record.inputs)
         with _quiet():
             run = self.estimator(start, self.weights, max_qps=0).run(y, u)
             inputs = np.zeros((len(y), 0)) if u is None else u
@@ -213,9 +213,9 @@ def judge(
 
 
 def outside(system: qpmhe.System, estimates: Array) -> float:
-    """The share of estimates outside of X, by more than rounding."""
+    """The share of estimates outside of X, by more than rounding; NaN without an X."""
     if system.states is None:
-        return 0.0
+        return np.nan
     rounding = 1e-9 * np.abs(estimates).max(axis=1, keepdims=True)
     return float(np.mean([
         system.states.violation(x, rounding=slack) > 0.0

@@ -18,6 +18,7 @@ from qpmhe.plots.style import LIGHT, REAL, STYLES
 from .problem import Array, Problem, Result
 
 BY_HAND, TUNED = "by hand", "tuned"
+WIDTH = 120
 ENGINES = {"compiled": "C", "python": "py"}
 
 
@@ -33,14 +34,14 @@ def frame(results: Sequence[Result]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def cells(row: Any, whole: bool) -> list[str]:
+def cells(row: Any, whole: bool, bounded: bool) -> list[str]:
     """A row of the table as text."""
     texts = [row["estimator"], number(row["median"]), number(row["worst"])]
     if whole:
         texts += [number(row["whole median"]), number(row["whole worst"])]
     engine, micro = ENGINES.get(row["engine"], row["engine"]), 1e6 * row["step"]
     step = f"{micro:.1f}" if micro < 10.0 else f"{micro:.0f}"
-    shares = [f"{100 * row[name]:.0f}" for name in ("lost", "outside")]
+    shares = [f"{100 * row[name]:.0f}" for name in ("lost", *["outside"] * bounded)]
     return [*texts, *shares, f"{step} {engine}"]
 
 
@@ -51,10 +52,10 @@ def number(value: float) -> str:
     return f"{value:#.3g}" if 1e-3 <= abs(value) < 1e3 else f"{value:.0e}"
 
 
-def headings(whole: bool) -> list[str]:
+def headings(whole: bool, bounded: bool) -> list[str]:
     """Those of `cells`."""
-    names = ["estimator", "median", "worst", *(["all", "worst"] * whole)]
-    return [*names, "lost %", "not in X %", "us/step"]
+    names = ["estimator", "median", "worst", *["all", "worst"] * whole]
+    return [*names, "lost %", *["not in X %"] * bounded, "us/step"]
 
 
 def legend(whole: bool) -> str:
@@ -90,20 +91,23 @@ def write(
     out.mkdir(parents=True, exist_ok=True)
     table.to_csv(out / f"{problem.name}.csv", index=False)
     whole = any(record.tunes for record in problem.records)
-    columns, text = headings(whole), [f"# {problem.title}", ""]
+    bounded = problem.system.states is not None
+    columns, text = headings(whole, bounded), [f"# {problem.title}", ""]
     for (weights, record), rows in table.groupby(["weights", "record"], sort=False):
         title = (f"{record}, weights {weights}, {rows['runs'].iloc[0]} runs; "
                  f"root mean square error in {problem.unit}")
         shown = Table(*columns, title=f"{problem.title}: {title}", box=None, title_justify="left",
-                      caption=legend(whole), caption_justify="left")
-        lines = [cells(row, whole) for _, row in rows.iterrows()]
+                      caption=legend(whole), caption_justify="left", collapse_padding=True,
+                      pad_edge=False)
+        lines = [cells(row, whole, bounded) for _, row in rows.iterrows()]
         for column in shown.columns:
             column.no_wrap = True
             column.justify = "left" if column is shown.columns[0] else "right"
         for line in lines:
             shown.add_row(*line)
         words = verdict(problem, rows, baselines)
-        console.print(shown)
+        # Digits that do not fit are worse than lines that wrap.
+        console.print(shown, width=max(console.width, WIDTH), crop=False)
         console.print(f"[bold]{words}[/]\n", highlight=False, soft_wrap=True)
         text += [f"## {title}", "", *markdown(columns, lines), "", legend(whole), "", words, ""]
     if problem.note:
