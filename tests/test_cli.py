@@ -3,6 +3,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -55,9 +56,26 @@ def test_reproduce_writes_what_it_says(tmp_path: Path, method):
     )
 
 
+def test_reproduction_over_seeds_is_the_mean_of_single_ones():
+    options = {"steps": 20, "backend_name": "banded"}
+    one, two, three = (qpmhe.studies.reproduce(seed=k, **options) for k in (4, 5, 6))
+    found = qpmhe.studies.reproduce(seed=4, seeds=3, **options)
+    for row, *singles in zip(found.rows, one.rows, two.rows, three.rows, strict=True):
+        for name in ("rmse", "rmse_settled"):
+            values = np.array([getattr(single, name) for single in singles])
+            assert getattr(row, name) == pytest.approx(values.mean())
+            half = 4.302652729749464 * values.std(ddof=1) / np.sqrt(3.0)  # Student's, 2 degrees
+            assert getattr(row, f"{name}_half") == pytest.approx(half)
+        assert row.states.tolist() == singles[0].states.tolist()
+    assert [found.excess(row) for row in found.backends] == pytest.approx(
+        [one.excess(row) for row in one.backends], abs=1e-12
+    )
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["--seeds", "0"], "--seeds"),
         (["--backend", "nonsense"], "nonsense"),
         (["--steps", "0"], "--steps"),
         (["--method", "heun"], "heun"),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from qpmhe_solvers import available, backend, create
 
-from .._checks import Array, make_folder
+from .._checks import Array, count, make_folder
 from ..estimation.estimate import Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
@@ -25,6 +26,7 @@ from ..plots import save, trajectories
 from .cell import ENGINE
 from .ipopt import IpoptEstimator
 from .metrics import accuracy, timing
+from .summary import student
 
 # The paper's i = 0, 2, 5 and converged, and i = 1 beside them; the paper's own of Ipopt.
 _ITERATIONS: tuple[int | None, ...] = (0, 1, 2, 5, None)
@@ -82,6 +84,9 @@ class Row:
 
     The RMSEs are over all t and from `SETTLED` on, the times the median and the 95th percentile
     of the seconds per update, ``mean_cost`` the mean of J, and ``stopped`` what ended the steps.
+    Over several seeds all are means over the seeds, and ``rmse_half`` and ``rmse_settled_half``
+    the half-widths of the 95 % confidence intervals (Student's) of the RMSEs; ``states`` and
+    ``stopped`` are those of the first seed.
     """
 
     label: str
@@ -94,6 +99,8 @@ class Row:
     improved: float
     mean_cost: float
     stopped: str
+    rmse_half: float = math.nan
+    rmse_settled_half: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -110,6 +117,10 @@ class Reproduction:
         Every installed backend at each cap, with i = 2.
     files : list of Path
         What was written.
+    seeds : int
+        Records that ``rows`` are means over, from that of ``study`` on.
+    converged_cost : float
+        Mean J of the converged estimates on the first record.
     """
 
     study: PaperStudy
@@ -117,17 +128,19 @@ class Reproduction:
     rows: list[Row]
     backends: list[Row]
     files: list[Path]
+    seeds: int
+    converged_cost: float
 
     def excess(self, row: Row) -> float:
-        """How far a row's mean cost is above the converged one, relative."""
-        converged = next(one for one in self.rows if one.label == "converged")
-        return row.mean_cost / converged.mean_cost - 1.0
+        """How far the mean cost of a row of ``backends`` is above the converged one, relative."""
+        return row.mean_cost / self.converged_cost - 1.0
 
 
 def reproduce(
     out: str | Path | None = None,
     *,
     seed: int = 0,
+    seeds: int = 1,
     steps: int = 150,
     method: str = "euler",
     backend_name: str = "auto",
@@ -142,6 +155,9 @@ def reproduce(
         Folder for the figure (PNG, SVG) and tables (CSV); without it nothing is written.
     seed, steps, method
         As of `PaperStudy`.
+    seeds : int
+        Records of the paper's rows: those of ``seed``, ``seed`` + 1, ... Figure and backends have
+        the first one.
     backend_name : str
         QP backend of the paper's rows.
     ipopt : bool
@@ -159,39 +175,63 @@ def reproduce(
     BackendError, InvalidInputError
         If the backend or CasADi is missing, or the folder cannot be made.
     """
+    count("seeds", seeds, 1)
     create(backend_name)  # before any work: a wrong name must not cost a minute
     folder = None if out is None else make_folder(out)
     study = PaperStudy(seed, steps, method)
-    runs: list[tuple[str, int | None, Callable[[], Any]]] = [
+    paper: list[tuple[str, int | None, Callable[[], Any]]] = [
         ("converged" if i is None else f"i = {i}", None, partial(study.estimator, i, backend_name))
         for i in _ITERATIONS
     ]
     if ipopt:
-        runs += [
+        paper += [
             ("Ipopt converged" if i is None else f"Ipopt i = {i}", None, partial(study.ipopt, i))
             for i in _IPOPT_ITERATIONS
         ]
-    first = len(runs)
-    runs += [
+    compared: list[tuple[str, int | None, Callable[[], Any]]] = [
         (name, cap, partial(study.estimator, _COMPARED, name, cap))
         for name in available() if name != "auto" and ":" not in name
         for cap in (_CAPS if backend(name).iteration_cap else (None,))
     ]
-    record, model = study.record(), study.model
-    rows, done = [], 0
-    for label, cap, make in runs:
+    records = [replace(study, seed=seed + k).record() for k in range(seeds)]
+    done, total = 0, (len(paper) * seeds + len(compared)) * steps
+
+    def row_of(label: str, cap: int | None, make: Callable[[], Any], record: Record) -> Row:
+        nonlocal done
         mhe, estimates = make(), []
         for y in record.measurements:
             estimates.append(mhe.update(y))
             done += 1
             if progress is not None:
-                progress(done, len(runs) * steps)
-        run = Run.of(model.scenario.initial_estimate, estimates)
-        rows.append(_row(label, cap, run, record, model.scenario.dt))
-    found = Reproduction(study, backend_name, rows[:first], rows[first:], [])
+                progress(done, total)
+        scenario = study.model.scenario
+        run = Run.of(scenario.initial_estimate, estimates)
+        return _row(label, cap, run, record, scenario.dt)
+
+    each = [[row_of(*one, record) for record in records] for one in paper]
+    converged = next(rows[0] for rows in each if rows[0].label == "converged")
+    backends = [row_of(*one, records[0]) for one in compared]
+    found = Reproduction(
+        study, backend_name, [_mean(rows) for rows in each], backends, [], seeds,
+        converged.mean_cost,
+    )
     if folder is not None:
-        found.files.extend(_write(found, record, folder))
+        found.files.extend(_write(found, records[0], folder))
     return found
+
+
+def _mean(rows: list[Row]) -> Row:
+    """The means of a row over seeds, with confidence limits of the RMSEs."""
+    names = ("rmse", "rmse_settled", "median_time", "high_time", "improved", "mean_cost")
+    table = np.array([[getattr(row, name) for name in names] for row in rows])
+    means = dict(zip(names, table.mean(axis=0).tolist(), strict=True))
+    halves: dict[str, float] = {}
+    if len(rows) > 1:
+        factor = float(student(np.array([len(rows)]))[0]) / math.sqrt(len(rows))
+        widths = (factor * table[:, :2].std(axis=0, ddof=1)).tolist()
+        halves = {"rmse_half": widths[0], "rmse_settled_half": widths[1]}
+    combined: dict[str, Any] = means | halves
+    return replace(rows[0], **combined)
 
 
 def _row(label: str, cap: int | None, run: Run, record: Record, dt: float) -> Row:
@@ -239,9 +279,11 @@ def _write(found: Reproduction, record: Record, folder: Path) -> list[Path]:
     tables: dict[str, list[list[Any]]] = {
         "reproduce": [[*columns], *np.column_stack(list(columns.values())).tolist()],
         "reproduce_summary": [
-            ["run", "rmse", "rmse_settled", "median_s", "p95_s", "improved", "mean_J", "stopped"],
-            *([row.label, row.rmse, row.rmse_settled, row.median_time, row.high_time,
-               row.improved, row.mean_cost, row.stopped] for row in found.rows),
+            ["run", "rmse", "rmse_half", "rmse_settled", "rmse_settled_half", "median_s", "p95_s",
+             "improved", "mean_J", "seeds", "stopped"],
+            *([row.label, row.rmse, row.rmse_half, row.rmse_settled, row.rmse_settled_half,
+               row.median_time, row.high_time, row.improved, row.mean_cost, found.seeds,
+               row.stopped] for row in found.rows),
         ],
         "reproduce_backends": [
             ["backend", "cap", "rmse", "J_excess", "improved", "median_s", "stopped"],

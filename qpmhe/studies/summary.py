@@ -142,7 +142,7 @@ def _reason_shares(cells: DataFrame) -> dict[str, float]:
 def _add_means(summary: DataFrame, done: DataFrame, names: list[str]) -> None:
     groups = done.groupby(list(CONFIGURATION), dropna=False)[names]
     mean, deviation, count = groups.mean(), groups.std(), groups.count()
-    half = _student(count) * deviation / np.sqrt(count)
+    half = student(count) * deviation / np.sqrt(count)
     for name in names:
         low, high = mean[name] - half[name], mean[name] + half[name]
         if name in _POSITIVE:
@@ -180,11 +180,11 @@ def cells_of(cells: DataFrame, row: Any, keys: tuple[str, ...]) -> DataFrame:
     return cells[chosen]
 
 
-def _student(count: Any) -> Any:
+def student(count: Any) -> Any:
     """Half the width of the confidence interval of a mean, in standard errors."""
-    from scipy.stats import t as student
+    from scipy.stats import t
 
-    return student.ppf(0.5 + 0.5 * _CONFIDENCE, np.maximum(count - 1, 1))
+    return t.ppf(0.5 + 0.5 * _CONFIDENCE, np.maximum(count - 1, 1))
 
 
 def _state_means(lists: Series, place: int) -> list[float] | None:
@@ -195,7 +195,7 @@ def _state_means(lists: Series, place: int) -> list[float] | None:
     mean, count = np.mean(rows, axis=0), len(rows)
     half = np.full(mean.shape, np.nan)
     if count > 1:
-        half = _student(count) * np.std(rows, axis=0, ddof=1) / np.sqrt(count)
+        half = student(count) * np.std(rows, axis=0, ddof=1) / np.sqrt(count)
     values: list[float] = (mean, np.maximum(mean - half, 0.0), mean + half)[place].tolist()
     return values
 
