@@ -1,7 +1,8 @@
 """Searches for trajectories that violate a certified bound: drawn at random, then made worse."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import cycle, product
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -28,16 +29,6 @@ NOISES = {
 }
 
 
-@dataclass
-class Attack:
-    """The largest error as a share of its bound, and the run that reaches it."""
-
-    ratio: float
-    refuted: bool
-    compared: int
-    example: dict
-
-
 def attack_detectability(system, region, claim, *, trials, steps=20, polish=40):
     """Look for two trajectories in the region that violate (eq:eIOSS).
 
@@ -52,62 +43,45 @@ def attack_detectability(system, region, claim, *, trials, steps=20, polish=40):
         h1, h2 = (system.h.batch(x[:, :-1], u) for x in pairs)
         apart = np.linalg.norm(pairs[0] - pairs[1], axis=-1)
         w = np.linalg.norm((pairs[0][:, 1:] - f1) - (pairs[1][:, 1:] - f2), axis=-1)
-        return apart, bounds(claim, apart[:, 0], w, np.linalg.norm(h1 - h2, axis=-1))
+        return share_of(apart, bounds(claim, apart[:, 0], w, np.linalg.norm(h1 - h2, axis=-1)))
 
-    def change(pairs, size):
-        width = (region.upper - region.lower)[: region.n]
-        move = size * width * rng.standard_normal(pairs.shape)
-        return inside(region, pairs + move * (rng.random((*pairs.shape[:-1], 1)) < 0.3))
+    pairs = drawn_pairs(system, region, u, rng)
+    share, width = shares(pairs).max(axis=1), (region.upper - region.lower)[: region.n]
+    for i in range(polish):  # keep what raises the largest share of each
+        move = 10.0 ** (-0.5 - 3.0 * i / polish) * width * rng.standard_normal(pairs.shape)
+        other = inside(region, pairs + move * (rng.random((*pairs.shape[:-1], 1)) < 0.3))
+        better = (new := shares(other).max(axis=1)) > share
+        pairs = np.where(better[:, None, None], other, pairs)
+        share = np.maximum(share, new)
+    return float(share.max())
 
-    return verdict(*polished(drawn_pairs(system, region, u, rng), shares, change, polish))
 
-
-def attack_observer(system, region, gain, claim, *, trials, steps=30, polish=40):
+def attack_observer(system, region, gain, claim, *, trials, steps=30):
     """Look for a run of an observer with constant gain that violates (eq:RGES).
 
-    A run counts as long as the observer's state stays in the region; the true one does
-    throughout.
+    A run counts as long as the observer's state stays in the region; the true one does throughout.
+    The largest share of the bound, and how many errors were compared.
     """
-    rng, n, p = np.random.default_rng(0), system.n, system.p
+    rng = np.random.default_rng(0)
     u = any_inputs(region, trials, steps, rng)
-    truth = drawn_pairs(system, region, u, rng)[0]
-    scale = np.abs(system.h.batch(truth[:, 0], u[:, 0])).max() + 1e-3
-    noises = sizes(trials, rng) * scale * rng.standard_normal((trials, steps, p))
-    noises *= rng.random((trials, steps, 1)) < rng.choice([0.0, 0.1, 1.0], (trials, 1, 1))
-    points = region.sample(trials, rng)[:, :n]
-    starts = points[rng.integers(len(points), size=trials)]
-    near = rng.random((trials, 1)) < 0.5
-    starts = np.where(near, inside(region, truth[:, 0] + 0.05 * (starts - truth[:, 0])), starts)
-    # One array of all that may be changed: true states, noises, and the observer's start.
-    runs = np.zeros((trials, steps + 1, n + p + n))
-    runs[..., :n], runs[:, :-1, n : n + p], runs[:, 0, n + p :] = truth, noises, starts
-    width = (region.upper - region.lower)[:n]
-    widths = np.concatenate((width, np.full(p, scale), width))
-
-    def shares(several):
-        runs = several[0]
-        x, v, z = runs[..., :n], runs[:, :-1, n : n + p], runs[:, 0, n + p :]
-        y = system.h.batch(x[:, :-1], u) + v
-        w = x[:, 1:] - system.f.batch(x[:, :-1], u)
-        alive = np.ones((trials, steps + 1), bool)
-        error = np.empty((trials, steps + 1))
-        error[:, 0] = np.linalg.norm(x[:, 0] - z, axis=-1)
-        for t in range(steps):
-            alive[:, t + 1] = alive[:, t] & region.contains(z)
-            held = np.where(alive[:, t + 1, None], z, x[:, t])
-            z = system.f.batch(held, u[:, t]) + (y[:, t] - system.h.batch(held, u[:, t])) @ gain.T
-            error[:, t + 1] = np.linalg.norm(x[:, t + 1] - z, axis=-1)
-        bound = bounds(claim, error[:, 0], np.linalg.norm(w, axis=-1), np.linalg.norm(v, axis=-1))
-        return np.where(alive, error, np.nan), bound
-
-    def change(several, size):
-        move = size * widths * rng.standard_normal(several.shape)
-        moved = several + move * (rng.random((*several.shape[:-1], 1)) < 0.3)
-        for part in (slice(0, n), slice(n + p, None)):
-            moved[..., part] = inside(region, moved[..., part])
-        return moved
-
-    return verdict(*polished(runs[None], shares, change, polish))
+    x, starts = drawn_pairs(system, region, u, rng)
+    z, alive = starts[:, 0], np.ones((trials, steps + 1), bool)
+    size = np.abs(system.h.batch(x[:, 0], u[:, 0])).max() + 1e-3
+    v = size * 10.0 ** rng.uniform(-5.0, 0.0, (trials, 1, 1)) * rng.standard_normal(
+        (trials, steps, system.p)
+    )
+    v *= rng.random((trials, steps, 1)) < rng.choice([0.0, 0.1, 1.0], (trials, 1, 1))
+    w = x[:, 1:] - system.f.batch(x[:, :-1], u)
+    error = np.empty((trials, steps + 1))
+    error[:, 0] = np.linalg.norm(x[:, 0] - z, axis=-1)
+    for t in range(steps):
+        alive[:, t + 1] = alive[:, t] & region.contains(z)
+        held = np.where(alive[:, t + 1, None], z, x[:, t])
+        misfit = system.h.batch(x[:, t], u[:, t]) + v[:, t] - system.h.batch(held, u[:, t])
+        z = system.f.batch(held, u[:, t]) + misfit @ gain.T
+        error[:, t + 1] = np.linalg.norm(x[:, t + 1] - z, axis=-1)
+    bound = bounds(claim, error[:, 0], *(np.linalg.norm(each, axis=-1) for each in (w, v)))
+    return float(share_of(error, bound)[alive].max()), int(alive.sum())
 
 
 def inside(region, points):
@@ -129,11 +103,6 @@ def any_inputs(region, trials, steps, rng):
     return low + (high - low) * rng.random((trials, steps, low.size))
 
 
-def sizes(trials, rng):
-    """Sizes of noise from none to large, one a trajectory."""
-    return 10.0 ** rng.uniform(-5.0, 0.0, (trials, 1, 1)) * (rng.random((trials, 1, 1)) > 0.1)
-
-
 def drawn_pairs(system, region, u, rng):
     """Pairs of trajectories in the region, (2, trials, steps + 1, n).
 
@@ -142,17 +111,17 @@ def drawn_pairs(system, region, u, rng):
     """
     (trials, steps), n = u.shape[:2], region.n
     points = region.sample(4 * trials, rng)[:, :n]
-    width = (region.upper - region.lower)[:n]
+    sizes = 10.0 ** rng.uniform(-5.0, 0.0, (2, trials, 1))
 
     def any_point():
         return points[rng.integers(len(points), size=trials)]
 
     pairs = np.empty((2, trials, steps + 1, n))
     pairs[:, :, 0] = any_point(), any_point()
-    near = pairs[0, :, 0] + sizes(trials, rng)[:, 0] * (pairs[1, :, 0] - pairs[0, :, 0])
+    near = pairs[0, :, 0] + sizes[0] * (pairs[1, :, 0] - pairs[0, :, 0])
     pairs[1, :, 0] = np.where(rng.random((trials, 1)) < 0.5, near, pairs[1, :, 0])
     kind = rng.integers(5, size=trials)[:, None]
-    size = sizes(trials, rng)[:, 0] * width
+    size = sizes[1] * (region.upper - region.lower)[:n]
     for t in range(steps):
         shared, own = size * rng.standard_normal((2, trials, n))
         quiet = (kind == 1) | ((kind == 2) & (rng.random((trials, 1)) > 0.1))
@@ -160,19 +129,16 @@ def drawn_pairs(system, region, u, rng):
         first = np.where(kind == 0, any_point(), ahead[0] + np.where(quiet, 0.0, shared))
         pairs[0, :, t + 1] = inside(region, first)
         second = ahead[1] + np.where(kind == 3, shared, np.where(quiet, 0.0, own))
-        if t + 1 < steps:
-            moved = hidden(system, ahead[1], pairs[0, :, t + 1], u[:, t + 1])
-            second = np.where(kind == 4, moved, second)
+        if t + 1 < steps:  # to first order, with the other one's output
+            C = np.broadcast_to(
+                system.h_jacobian.batch(ahead[1], u[:, t + 1]), (trials, system.p, n)
+            )
+            apart = system.h.batch(pairs[0, :, t + 1], u[:, t + 1])
+            apart = apart - system.h.batch(ahead[1], u[:, t + 1])
+            moved = ahead[1] + np.einsum("bnp,bp->bn", np.linalg.pinv(C), apart)
+            second = np.where((kind == 4) & np.isfinite(moved), moved, second)
         pairs[1, :, t + 1] = inside(region, np.where(kind == 0, any_point(), second))
     return pairs
-
-
-def hidden(system, points, like, u):
-    """Points moved so that, to first order, they have the outputs of others."""
-    C = np.broadcast_to(system.h_jacobian.batch(points, u), (len(points), system.p, system.n))
-    apart = system.h.batch(like, u) - system.h.batch(points, u)
-    moved = points + np.einsum("bnp,bp->bn", np.linalg.pinv(C), apart)
-    return np.where(np.isfinite(moved), moved, points)
 
 
 def bounds(claim, start, w, v):
@@ -184,43 +150,8 @@ def bounds(claim, start, w, v):
 
 
 def share_of(error, bound):
-    """Errors as shares of their bounds; those within rounding of nothing do not count."""
-    return np.where(error > ABSOLUTE, error / np.maximum(bound, ABSOLUTE), 0.0)
-
-
-def polished(states, shares, change, rounds):
-    """Change what is drawn at random, and keep what raises the largest share of each."""
-    error, bound = shares(states)
-    for i in range(rounds):
-        other = change(states, 10.0 ** (-0.5 - 3.0 * i / max(1, rounds)))
-        other_error, other_bound = shares(other)
-        better = share_of(other_error, other_bound).max(axis=1) > share_of(error, bound).max(axis=1)
-        states = np.where(better.reshape((1, -1) + (1,) * (states.ndim - 2)), other, states)
-        error = np.where(better[:, None], other_error, error)
-        bound = np.where(better[:, None], other_bound, bound)
-    return error, bound
-
-
-def verdict(error, bound):
-    share = share_of(error, bound)
-    worst = int(share.max(axis=1).argmax())
-    return Attack(
-        float(share.max()), bool((error > bound * (1.0 + RELATIVE) + ABSOLUTE).any()),
-        int(np.isfinite(error).sum()), {"error": error[worst], "bound": bound[worst]},
-    )
-
-
-@dataclass
-class Trial:
-    """What may be changed to make a run of the estimator worse."""
-
-    start: np.ndarray
-    estimate: np.ndarray
-    w: np.ndarray
-    v: np.ndarray
-    u: np.ndarray
-    backend: str
-    cap: int
+    """Errors as shares of their bounds, but for the rounding of what they are differences of."""
+    return np.maximum(error - ABSOLUTE, 0.0) / np.maximum(bound, ABSOLUTE)
 
 
 def attack_estimator(
@@ -231,34 +162,39 @@ def attack_estimator(
 
     Backends, caps and kinds of noise take turns; sizes are drawn over four decades. The worst
     runs are then made worse. Runs count as long as the monitor lets the certificate apply;
-    returned are the attacks on the paper's bound and on the monitor's, and how many runs it let
-    go.
+    returned are the largest shares of the paper's bound and of the monitor's, and how many errors
+    were compared.
     """
-    rng = np.random.default_rng(seed)
+    rng, region, found = np.random.default_rng(seed), certificate.region, []
     noises = list(product(NOISES, NOISES))
     rng.shuffle(noises)
     names = qpmhe.solvers.available() if backends is None else backends
-    found = []
 
     def play(trial):
-        error, *bounds = played(certificate, trial)
-        found.append((share_of(error, bounds[-1]).max(), trial, error, bounds))
-        return found[-1][0]
+        error, *known = played(certificate, trial)
+        shares = [share_of(error, each).max(initial=0.0) for each in known]
+        found.append((shares[-1], len(found), trial, shares, len(error)))
+        return shares[-1]
 
     turns = zip(cycle(product(names, caps)), cycle(noises), range(trials), strict=False)
     for (backend, cap), kinds, _ in turns:
         play(drawn_trial(certificate, backend, cap, kinds, steps, rng))
-    ranked = sorted(found, key=lambda each: -each[0])
+    ranked = sorted(found, reverse=True)
     # A large disturbance reaches its own bound one step later; without any, more can be found.
-    silent = [each for each in ranked if not each[1].w.any()]
-    for most, best, *_ in ranked[: polished - polished // 2] + silent[: polished // 2]:
+    silent = [each for each in ranked if not each[2].w.any()]
+    for most, _, best, *_ in ranked[: polished - polished // 2] + silent[: polished // 2]:
         for i in range(rounds):
-            other = worse(certificate.region, best, 10.0 ** (-0.3 - 2.0 * i / rounds), rng)
+            size = 10.0 ** (-0.3 - 2.0 * i / rounds)
+            moved = {
+                name: values + size * (np.abs(values).max() or 1e-3 * (name != "w"))
+                * rng.standard_normal(values.shape)
+                for name, values in vars(best).items() if name in ("start", "guess", "w", "v")
+            }
+            moved |= {name: inside(region, moved[name]) for name in ("start", "guess")}
+            other = SimpleNamespace(**vars(best) | moved)
             if (reached := play(other)) > most:
                 best, most = other, reached
-    error = np.array([each[2] for each in found])
-    attacks = [verdict(error, np.array([each[3][k] for each in found])) for k in (0, 1)]
-    return *attacks, sum(int(np.isnan(row).any()) for row in error)
+    return *np.max([each[3] for each in found], axis=0), sum(each[4] for each in found)
 
 
 def drawn_trial(certificate, backend, cap, kinds, steps, rng):
@@ -266,29 +202,17 @@ def drawn_trial(certificate, backend, cap, kinds, steps, rng):
     n, width = system.n, (region.upper - region.lower)[: system.n]
     points = region.sample(8, rng)
     start, other = inside(region, points[rng.integers(len(points), size=2), :n])
-    estimate = inside(region, start + 10.0 ** rng.uniform(-3.0, 0.0) * (other - start))
-    w = 10.0 ** rng.uniform(-4.0, -0.5) * width * NOISES[kinds[0]](rng, steps, n)
     size = max(1e-3, float(np.abs(system.h.batch(points[:, :n], points[:, n:])).max()))
-    v = 10.0 ** rng.uniform(-4.0, -0.5) * size * NOISES[kinds[1]](rng, steps, system.p)
-    return Trial(start, estimate, w, v, any_inputs(region, 1, steps, rng)[0], backend, cap)
-
-
-def worse(region, trial, size, rng):
-    """The same run, with everything moved a little."""
-
-    def moved(values):
-        scale = float(np.abs(values).max(initial=0.0)) or 1e-3
-        return values + size * scale * rng.standard_normal(values.shape)
-
-    return replace(
-        trial, start=inside(region, moved(trial.start)),
-        estimate=inside(region, moved(trial.estimate)),
-        w=moved(trial.w) if trial.w.any() else trial.w, v=moved(trial.v),
+    return SimpleNamespace(
+        start=start, guess=inside(region, start + 10.0 ** rng.uniform(-3.0, 0.0) * (other - start)),
+        w=10.0 ** rng.uniform(-4.0, -0.5) * width * NOISES[kinds[0]](rng, steps, n),
+        v=10.0 ** rng.uniform(-4.0, -0.5) * size * NOISES[kinds[1]](rng, steps, system.p),
+        u=any_inputs(region, 1, steps, rng)[0], backend=backend, cap=cap,
     )
 
 
 def played(certificate, trial):
-    """Error of a run, NaN once the certificate is lost, the paper's bound and the monitor's."""
+    """Errors of a run while the certificate applies, the paper's bound and the monitor's."""
     system, region = certificate.system, certificate.region
     x, y, w = [trial.start], [], []
     for noise, disturbance, u in zip(trial.v, trial.w, trial.u, strict=True):
@@ -299,19 +223,28 @@ def played(certificate, trial):
     signals = [np.linalg.norm(each, axis=1) for each in (w, trial.v)]
     mhe = qpmhe.MovingHorizonEstimator(
         system, certificate.observer, certificate.cost, horizon=next(iter(certificate.constants)),
-        initial_state=trial.estimate, backend=trial.backend, max_qps=trial.cap,
+        initial_state=trial.guess, backend=trial.backend, max_qps=trial.cap,
     )
     start = x[0] - mhe.observer_state
+    paper = certificate.of().result.bound(np.linalg.norm(start), *signals)[1:]
     watch = Monitor(
         certificate, mhe, initial_error=start, sizes=Sizes(*(float(e.max()) for e in signals))
     )
-    error, known = np.full((2, len(y)), np.nan)
+    error, known = [], []
     for t, u in enumerate(trial.u):
         given = u if system.m else None
         estimate = mhe.update(y[t], given)
         reading = watch.check(estimate, given)
-        if watch.applies:
-            error[t] = np.linalg.norm(x[t + 1] - estimate.state)
-            known[t] = np.inf if np.isnan(reading.error) else reading.error
-    paper = certificate.of().result.bound(np.linalg.norm(start), *signals)[1:]
-    return error, paper, known
+        if not watch.applies:
+            break
+        error.append(np.linalg.norm(x[t + 1] - estimate.state))
+        known.append(reading.error if reading.lost is None else np.inf)
+    return np.array(error), paper[: len(error)], np.array(known)
+
+
+def with_wrong_bound(certificate):
+    """The same, with a bound of the observer that claims too much."""
+    bound = certificate.observer_bound
+    wrong = replace(bound.stability, P=100.0 * bound.metric, rho=0.3)
+    object.__setattr__(certificate, "observer_bound", replace(bound, stability=wrong))
+    return certificate

@@ -14,7 +14,7 @@ from qpmhe.certificates.properties import Detectability
 from qpmhe.certificates.sdp import Answer, Program
 from qpmhe.errors import OptionError
 
-from .attacks import attack_detectability
+from .attacks import RELATIVE, attack_detectability
 from .helpers import PENDULUM, REACTOR, linear, scalar, unit_box
 
 TRIANGLE = qpmhe.Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 2.0]], [0.0, 0.0, 1.0])
@@ -62,10 +62,9 @@ def test_pairs_of_trajectories_keep_to_the_bound(name):
     system = getattr(qpmhe.models, name)()[0]
     found = certify_detectability(system, box, eta=0.9, inputs=inputs)
     assert found.evidence is Evidence.PROVED
-    attack = attack_detectability(
+    assert attack_detectability(
         system, found.region, found.sums, trials=100, steps=15, polish=4
-    )
-    assert not attack.refuted
+    ) <= 1.0 + RELATIVE
     # The contraction behind it, in one step.
     n, rng = system.n, np.random.default_rng(8)
     points = found.region.sample(400, rng)
@@ -95,7 +94,7 @@ def test_nonlinear_output_takes_output_injection():
     assert any("not affine" in note for note in found.notes)
     sharp = 0.8 / 0.7 / 0.6
     assert sharp < found.c_v < 1.05 * sharp
-    assert not attack_detectability(system, found.region, found.sums, trials=500).refuted
+    assert attack_detectability(system, found.region, found.sums, trials=500) <= 1.0 + RELATIVE
 
 
 def test_what_holds_at_every_state_need_not_hold_for_averages():
