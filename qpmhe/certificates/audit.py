@@ -6,22 +6,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from ..costs import Cost, CostConstants
 from ..errors import InvalidInputError, ShapeError
 from ..model.system import System, checked_system
 from ..observers import Observer
-from .branch_and_bound import Cells, output_lipschitz
+from .branch_and_bound import lipschitz
 from .contraction import gain_if_constant
 from .deadline import Deadline
-from .enclosures import SmoothModel, evaluated
 from .evidence import CertificateError, Evidence, json_ready
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
 from .regions import Region
 
 _SAMPLES, _SEED = 500, 20210829
-_MOST_CELLS, _CHUNK, _ROOM = 4000, 256, 1.01  # for L_f, and how far it may be above what was seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,41 +53,20 @@ class Assumption:
 
 def about_output(system: System, region: Region, deadline: Deadline) -> Assumption:
     """L_h, Assumption ass:lipschitz."""
-    slope = output_lipschitz(system, region, seconds=deadline)
+    slope = lipschitz(system, region, "h", deadline)
     return Assumption(
         "output Lipschitz", "ass:lipschitz", True, slope.evidence,
-        f"L_h = {slope.value:.6g} ({slope.note}); the gradient has the norm "
-        f"{slope.attained:.6g} at {np.round(slope.at, 4).tolist()}", slope.value,
+        f"L_h = {slope.value:.6g}, {slope.note}", slope.value,
     )
 
 
 def about_model(system: System, region: Region, deadline: Deadline) -> Assumption:
     """L_f, which takes the place of kappa where the observer is projected."""
-    model, n = SmoothModel(system, region), system.n
-    points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
-    slopes = evaluated("the Jacobian of f", system.f_jacobian, points[:, :n], points[:, n:])
-    seen = float(np.linalg.norm(slopes, 2, axis=(1, 2)).max())
-    found = partial(Assumption, "model Lipschitz", "in place of eq:kappa", True)
-    cells, proved = Cells(region), 0.0 if not model.reason else np.inf
-    while len(cells.lower) and not model.reason:
-        if cells.taken and (deadline.passed or cells.taken > _MOST_CELLS):
-            proved = max(proved, float(cells.inherited.max()))
-            break
-        low, high = cells.take(_CHUNK)
-        corners, error = model.enclose(low, high).corners()
-        with np.errstate(all="ignore"):
-            each = norm_bound(Matrices(
-                corners[:, :, :n].reshape(-1, n, n), np.repeat(error[:, :n], corners.shape[1], 0)
-            )).reshape(len(low), -1).max(axis=1)
-        each = np.where(np.isnan(each), np.inf, each)
-        left = ~(each <= _ROOM * seen)
-        proved = max(proved, float(each[~left].max(initial=0.0)))
-        cells.halve(low[left], high[left], np.zeros_like(low[left]), each[left])
-    if np.isfinite(proved):
-        text = f"L_f = {proved:.6g}, bounded on {cells.taken} cells, for the projected observer"
-        return found(Evidence.PROVED, text, proved)
-    return found(Evidence.SAMPLED, f"L_f = {seen:.6g}, the largest of {len(points)} Jacobians; "
-                 f"{model.reason or 'no bound was found in time'}", seen)
+    slope = lipschitz(system, region, "f", deadline)
+    return Assumption(
+        "model Lipschitz", "in place of eq:kappa", True, slope.evidence,
+        f"L_f = {slope.value:.6g}, {slope.note}, for the projected observer", slope.value,
+    )
 
 
 def about_corrections(system: System, observer: Observer) -> tuple[Assumption, Assumption]:

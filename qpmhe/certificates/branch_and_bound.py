@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .._checks import Array
 from ..model.system import System
 from .deadline import PART_SECONDS, Deadline
-from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel, check_values, evaluated
+from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel, joint_jacobians
 from .evidence import Evidence
 from .inequalities import Form, Matrices, definite, norm_bound
 from .regions import Region
@@ -24,9 +24,8 @@ _WORK = 4e7
 # Cells are split by what their width adds to the error; what it adds to the corners counts
 # a little, for cells that reach out of a polytope.
 _CORNER_SHARE = 1e-3
-_MOST_OUTPUT_CELLS = 20_000
-_TOLERANCE = 1e-3
-_SAMPLES = 2000
+_MOST_LIPSCHITZ_CELLS, _TOLERANCE = 20_000, 1e-3
+_SAMPLES, _SEED = 400, 20210829
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,75 +143,43 @@ def _broken(form: Form, jacobians: Array) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class LipschitzConstant:
-    """L_h, with what it rests on."""
+    """L_h or L_f, with what it rests on."""
 
-    value: float  # in units of the output per unit of the state
+    value: float  # in units of the output, or of the state, per unit of the state
     evidence: Evidence  # PROVED for an upper bound, SAMPLED for the largest value seen
-    attained: float  # the largest norm of the Jacobian that was seen, a lower bound
-    at: Array  # (n + m,): where
-    note: str  # how the bound was found
+    note: str  # how it was found
 
 
-def output_lipschitz(
-    system: System, region: Region, model: SmoothModel | None = None,
+def lipschitz(
+    system: System, region: Region, name: Literal["f", "h"],
     seconds: float | Deadline = PART_SECONDS,
 ) -> LipschitzConstant:
-    r"""The smallest :math:`L_h` with :math:`|h(x_1) - h(x_2)| \le L_h |x_1 - x_2|`.
+    r"""The smallest L with :math:`|h(x_1) - h(x_2)| \le L |x_1 - x_2|`, or that of f.
 
-    On a convex set it is the supremum of the Jacobian's spectral norm. For an affine h this
-    is one number; otherwise cells are divided until the bound exceeds the largest norm seen
-    by a thousandth at most, or the time is over; f is not used.
+    On a convex set it is the supremum of the Jacobian's spectral norm. Cells are divided until the
+    bound exceeds the largest norm seen by a thousandth at most, or the time is over.
     """
     deadline, n = Deadline.of(seconds), system.n
-    model = model or SmoothModel(system, region)
-    points = region.sample(_SAMPLES, np.random.default_rng(20210829))
-    check_values(system, points, output_only=True)
-    gradients = evaluated("the Jacobian of h", system.h_jacobian, points[:, :n], points[:, n:])
-    attained, at = _largest(gradients, points, np.inf)
-
-    def seen(why: str) -> LipschitzConstant:
-        note = f"largest of {len(points)} gradients; {why}"
-        return LipschitzConstant(attained, Evidence.SAMPLED, attained, at, note)
-
-    if model.output_reason:
-        return seen(f"h cannot be run with intervals ({model.output_reason})")
-    cells, bound, end = Cells(region), 0.0, ""
-    while len(cells.lower):
-        if cells.taken and (deadline.passed or cells.taken > _MOST_OUTPUT_CELLS):
-            end = ", when its time was over" if deadline.passed else ", the most that are allowed"
+    rows = slice(0, n) if name == "f" else slice(n, None)
+    points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
+    norms = np.linalg.norm(joint_jacobians(system, points)[:, rows], 2, axis=(1, 2))
+    seen, model = float(norms.max()), SmoothModel(system, region)
+    cells, bound = Cells(region), 0.0
+    while len(cells.lower) and not model.reason:
+        if cells.taken and (deadline.passed or cells.taken > _MOST_LIPSCHITZ_CELLS):
             bound = max(bound, float(cells.inherited.max()))
-            if np.isfinite(bound):
-                break
-            return seen(f"no bound was found with {cells.taken} cells{end}{model.unknown}")
+            break
         low, high = cells.take(_CHUNK)
-        enclosure = model.enclose(low, high, output_only=True)
-        bounds, middles = _norm_bounds(enclosure), 0.5 * low + 0.5 * high
-        inside = region.contains(middles[:, :n])
-        if inside.any():
-            largest, where = _largest(enclosure.jacobian[inside], middles[inside], -np.inf)
-            if largest > attained:
-                attained, at = largest, where
-        goal = np.inf if model.affine_output else attained * (1.0 + _TOLERANCE)
-        left = np.flatnonzero(~(bounds <= goal))
-        bound = max(bound, float(np.delete(bounds, left).max(initial=0.0)))
-        if left.size:
-            cells.halve(low[left], high[left], _scores(enclosure, left), bounds[left])
-    how = "h is affine" if model.affine_output else f"bounded on {cells.taken} cells{end}"
-    return LipschitzConstant(bound, Evidence.PROVED, attained, at, how)
-
-
-def _largest(jacobians: Array, points: Array, unknown: float) -> tuple[float, Array]:
-    """The largest norm of some Jacobians, and where; those that are not finite count as given."""
-    usable = np.isfinite(jacobians).all(axis=(-2, -1))
-    norms = np.full(len(jacobians), unknown)
-    norms[usable] = np.linalg.norm(jacobians[usable], 2, axis=(-2, -1))
-    worst = int(norms.argmax())
-    return float(norms[worst]), points[worst]
-
-
-def _norm_bounds(enclosure: Enclosure) -> Array:
-    """Upper bounds on the norm of the Jacobian of h on each cell, infinite where unknown."""
-    matrices, cells = _at_corners(enclosure)
-    with np.errstate(all="ignore"):
-        each: Array = norm_bound(matrices).reshape(cells, -1).max(axis=1)
-    return np.where(np.isnan(each), np.inf, each)
+        enclosure = model.enclose(low, high)
+        matrices, count = _at_corners(enclosure)
+        with np.errstate(all="ignore"):
+            each = norm_bound(matrices[:, rows]).reshape(count, -1).max(axis=1)
+        each = np.where(np.isnan(each), np.inf, each)
+        left = np.flatnonzero(each > seen * (1.0 + _TOLERANCE))
+        bound = max(bound, float(np.delete(each, left).max(initial=0.0)))
+        cells.halve(low[left], high[left], _scores(enclosure, left), each[left])
+    if model.reason or not np.isfinite(bound):
+        why = model.reason or f"no bound was found with {cells.taken} cells{model.unknown}"
+        note = f"largest of {len(points)} gradients; {why}"
+        return LipschitzConstant(seen, Evidence.SAMPLED, note)
+    return LipschitzConstant(bound, Evidence.PROVED, f"bounded on {cells.taken} cells")

@@ -12,6 +12,7 @@ from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
 from ..observers import Luenberger, Observer
 from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
+from .enclosures import evaluated
 from .evidence import CertificateError, NotCertifiedError
 from .inequalities import Matrices, euclidean_constants, norm_bound
 from .properties import Detectability, ObserverStability, sealed
@@ -21,7 +22,9 @@ from .search import Search
 
 # Of an output in its own size, for a state in the region's.
 _UNSEEN = 1e-9
-_STEEP = 1e6
+_FAST, _STEEP = 1e3, 1e6
+_NEAR = 1e-9, 1e-12  # of the region's width: what changes as much over less jumps
+_OTHER_GAIN = "another gain, such as synthesise_gain finds"
 _PAIR_STAYS = "it holds for trajectories that stay in the region, both of a pair, with equal inputs"
 
 
@@ -93,58 +96,57 @@ def certify_detectability(
 
 def _undetectable(search: Search, text: str) -> NotCertifiedError:
     """Why no rate is feasible."""
-    mode = _undetected(search)
-    if mode is not None:
-        return NotCertifiedError(
-            f"the system is not exponentially detectable by any constant P: {mode}",
-            (
-                "measure something that this mode acts on",
-                "leave the mode out of the model if it is not to be estimated",
-            ),
-        )
+    n, states, outputs = search.n, search.scales.states, search.scales.outputs
+    for point, jacobian in zip(search.points, search.jacobians, strict=True):
+        A = jacobian[:n] * states / states[:, None]
+        C = jacobian[n:] * states / outputs[:, None]
+        for value in np.linalg.eigvals(A):
+            # Large rows are scaled down, so that no size of A can hide what C sees.
+            rest = A - value * np.eye(n)
+            rest = rest / np.maximum(1.0, np.abs(rest).max(axis=1, keepdims=True))
+            _, sizes, vectors = np.linalg.svd(np.vstack((rest, C)))
+            if abs(value) < 1.0 - 1e-9 or sizes[-1] > _UNSEEN:
+                continue
+            direction = states * vectors[-1].conj()
+            direction = np.real_if_close(direction / np.linalg.norm(direction))
+            return NotCertifiedError(
+                "the system is not exponentially detectable by any constant P: at "
+                f"{np.round(point, 4).tolist()} the mode with eigenvalue {value:.6g}, along "
+                f"{np.round(direction, 4).tolist()}, does not decay and is not in the output",
+                ("measure something that this mode acts on",
+                 "leave the mode out of the model if it is not to be estimated"),
+            )
+    steep = _steepest(search)
     return NotCertifiedError(
-        f"{text}: no constant P shows detectability on the whole region, although "
-        f"every single linearisation may be detectable{_steepest(search)}",
+        f"{text}: no constant P shows detectability on the whole region, although every single "
+        f"linearisation may be detectable{steep}",
         ("a smaller region", "other coordinates of the state"),
     )
 
 
 def _steepest(search: Search) -> str:
-    """Where f grows so fast that rounding alone may spoil a program; empty if nowhere."""
-    n = search.n
+    """Where f grows so fast that rounding alone may spoil a program; an error where it jumps."""
+    n, system = search.n, search.system
     radii = np.abs(np.linalg.eigvals(search.jacobians[:, :n])).max(axis=1)
-    worst = int(radii.argmax())
-    if radii[worst] < _STEEP:
+    point, largest = search.points[int(radii.argmax())], float(radii.max())
+    if largest < _FAST:
         return ""
-    return (
-        f"; f's Jacobian has an eigenvalue of size {radii[worst]:.3g} at "
-        f"{np.round(search.points[worst], 4).tolist()}, where the model may not be meant to hold"
+    room = np.diag(search.region.upper - search.region.lower)[search.free]
+    ends = np.stack([
+        evaluated("f", system.f, *np.split(point + share * room, [system.n], axis=1))
+        for share in (*_NEAR, *(-each for each in _NEAR))
+    ])
+    near, nearer = np.abs(ends[:2] - ends[2:])
+    where = np.round(point, 4).tolist()
+    if (nearer > np.maximum(0.5 * near, _NEAR[0] * np.abs(ends).max(axis=0))).any():
+        raise NotCertifiedError(
+            f"f jumps at {where}: over {2.0 * _NEAR[1]:.0e} of the region's width it changes by "
+            f"{nearer.max():.3g}", ("a model without the jump", "a smaller region"),
+        )
+    return "" if largest < _STEEP else (
+        f"; f's Jacobian has an eigenvalue of size {largest:.3g} at {where}, where the model may "
+        "not be meant to hold"
     )
-
-
-def _undetected(search: Search) -> str | None:
-    """A mode that does not decay and is not seen, at one of the states."""
-    n = search.n
-    states, outputs = search.scales.states, search.scales.outputs
-    for point, jacobian in zip(search.points, search.jacobians, strict=True):
-        A = jacobian[:n] * states / states[:, None]
-        C = jacobian[n:] * states / outputs[:, None]
-        for value in np.linalg.eigvals(A):
-            if abs(value) < 1.0 - 1e-9:
-                continue
-            # Large rows are scaled down, so that no size of A can hide what C sees.
-            rest = A - value * np.eye(n)
-            rest = rest / np.maximum(1.0, np.abs(rest).max(axis=1, keepdims=True))
-            _, sizes, vectors = np.linalg.svd(np.vstack((rest, C)))
-            if sizes[-1] <= _UNSEEN:
-                direction = states * vectors[-1].conj()
-                direction = np.real_if_close(direction / np.linalg.norm(direction))
-                return (
-                    f"at {np.round(point, 4).tolist()} the mode with eigenvalue {value:.6g}, "
-                    f"along {np.round(direction, 4).tolist()}, does not decay and is not in the "
-                    "output"
-                )
-    return None
 
 
 _RUN_STAYS = "it holds while the states of system and observer stay in the region"
@@ -157,30 +159,27 @@ def constant_gain(observer: Observer, system: System) -> Array:
             f"observer is {observer!r}; expected an observer, such as qpmhe.Luenberger(gain)."
         )
     gain, shape = observer.constant_gain, (system.n, system.p)
-    if gain is not None:
-        if gain.shape != shape:
-            raise ShapeError(f"gain has shape {gain.shape}; expected (n, p) = {shape}.")
-        return gain
-    kind = type(observer).__name__
-    reason = (
-        "its gain follows from what was measured before"
-        if observer.needs_jacobians or observer.initial_covariance() is not None
-        else "its correction is a function of the state as well"
-    )
-    raise CertificateError(
-        f"{kind} has no constant gain: {reason}. Detectability can be certified nevertheless; "
-        "for the observer, take a Luenberger observer (synthesise_gain finds one), or state "
-        "its constants yourself: ObserverStability.assumed(rho=..., C_p=..., C_w=..., C_v=..., "
-        "kappa=...)."
-    )
+    if gain is not None and gain.shape != shape:
+        raise ShapeError(f"gain has shape {gain.shape}; expected (n, p) = {shape}.")
+    if gain is None:
+        varies = observer.needs_jacobians or observer.initial_covariance() is not None
+        reason = (
+            "its gain follows from what was measured before" if varies
+            else "its correction is a function of the state as well"
+        )
+        raise CertificateError(
+            f"{type(observer).__name__} has no constant gain: {reason}. Detectability can be "
+            "certified nevertheless; for the observer, take a Luenberger observer "
+            "(synthesise_gain finds one), or state its constants yourself: "
+            "ObserverStability.assumed(rho=..., C_p=..., C_w=..., C_v=..., kappa=...)."
+        )
+    return gain
 
 
 def gain_if_constant(observer: Observer, system: System) -> Array | None:
     """The gain of `constant_gain`, or None where the observer has none."""
-    try:
-        return constant_gain(observer, system)
-    except CertificateError:
-        return None
+    varies = isinstance(observer, Observer) and observer.constant_gain is None
+    return None if varies else constant_gain(observer, system)
 
 
 def certify_observer(
@@ -190,7 +189,7 @@ def certify_observer(
 ) -> ObserverStability:
     """Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
 
-    A constant P with the inequality of `qpmhe.certificates.inequalities.ErrorContraction` is sought
+    A constant P with the inequality of `qpmhe.certificates.inequalities.Form` is sought
     and verified as in `certify_detectability`. It serves linear and nonlinear outputs. Among all
     P, and all rates, it is the one for which disturbances and noises of the given sizes leave the
     smallest error in the limit, in the size of the region.
@@ -221,13 +220,21 @@ def certify_observer(
     search = Search(
         system, bounded_region(system, region, inputs), "observer", sizes, gain, started(seconds)
     )
-    _check_stability(search)
+    radii = _radii(search)
+    worst = int(radii.argmax())
+    if radii[worst] >= 1.0:  # then there is no P
+        steep = _steepest(search)
+        raise NotCertifiedError(
+            f"the observer's error does not contract: A - L C has the spectral radius "
+            f"{radii[worst]:.6g} at {np.round(search.points[worst], 4).tolist()}, in the region"
+            f"{steep}", (_OTHER_GAIN, "a smaller region"),
+        )
     return _stability(search, rho)
 
 
 def _stability(search: Search, rho: float | None) -> ObserverStability:
     """The constants that follow from a verified contraction of the error."""
-    others = () if search.gain is None else ("another gain, such as synthesise_gain finds",)
+    others = () if search.gain is None else (_OTHER_GAIN,)
     found = search.answer("rho", rho, others, _unstable)
     form = found.form
     assert form.gain is not None
@@ -274,18 +281,6 @@ def _radii(search: Search) -> Array:
     return radii
 
 
-def _check_stability(search: Search) -> None:
-    """Spare the search for what cannot be: no P is for an A - L C that is not stable."""
-    radii = _radii(search)
-    worst = int(radii.argmax())
-    if radii[worst] >= 1.0:
-        raise NotCertifiedError(
-            f"the observer's error does not contract: A - L C has the spectral radius "
-            f"{radii[worst]:.6g} at {np.round(search.points[worst], 4).tolist()}, in the region",
-            ("another gain, such as synthesise_gain finds", "a smaller region"),
-        )
-
-
 def _unstable(search: Search, text: str) -> NotCertifiedError:
     """Why no rate is feasible."""
     if search.gain is None:
@@ -294,11 +289,10 @@ def _unstable(search: Search, text: str) -> NotCertifiedError:
             "is infeasible for every rate below 1",
             ("a smaller region", "an observer with a varying gain", "other coordinates"),
         )
-    radii = _radii(search)
     return NotCertifiedError(
-        f"{text}: no constant P shows contraction on the whole region, although A - L C "
-        f"is stable at each of {radii.size} states (spectral radius up to {radii.max():.6g})",
-        ("another gain, such as synthesise_gain finds", "a smaller region"),
+        f"{text}: no constant P shows contraction on the whole region, although A - L C is stable "
+        f"at each of {len(search.points)} states (spectral radius up to "
+        f"{_radii(search).max():.6g})", (_OTHER_GAIN, "a smaller region"),
     )
 
 
@@ -317,16 +311,8 @@ def synthesise_gain(
 ) -> Synthesis:
     r"""Find a constant gain L whose observer contracts on a region, and verify it.
 
-    With Y = P L, the two inequalities of `qpmhe.certificates.inequalities.ErrorContraction` are
-    jointly linear in P, Y, Q and R:
-
-    .. math::
-        \begin{pmatrix} P & P A - Y C & P G & -Y \\ \cdot & \rho^2 P & 0 & 0 \\
-        \cdot & \cdot & Q & 0 \\ \cdot & \cdot & \cdot & R \end{pmatrix} \succ 0 .
-
-    Minimised is the trace of the inverse of P, in states of the region's size, for which
-    disturbances and noises of the given sizes leave :math:`|e|_P \le 1` in the limit. The rounded
-    gain is then verified like any other.
+    The gain and P are sought together, with Y = P L, for the smallest limit of the error in states
+    of the region's size. The gain is rounded, and then verified like any other.
 
     Parameters
     ----------

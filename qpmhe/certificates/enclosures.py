@@ -32,26 +32,26 @@ _TRACEABLE = "Write it with NumPy's functions of x and u, numpy.where in place o
 
 def evaluated(name: str, function: Any, x: Array, u: Array) -> Array:
     """A function's values; the state is named where it raises."""
-    with np.errstate(all="ignore"):
+    for k in (slice(None), *range(len(x))):
         try:
-            return np.array(function.batch(x, u), np.float64)
+            with np.errstate(all="ignore"):
+                values = np.array(
+                    function.batch(np.atleast_2d(x[k]), np.atleast_2d(u[k])), np.float64
+                )
         except Exception as error:  # a user's function may raise anything
-            raise ModelError(_raised(name, function, x, u, error)) from error
-
-
-def _raised(name: str, function: Any, x: Array, u: Array, first: Exception) -> str:
-    for k in range(len(x)):
-        try:
-            np.array(function.batch(x[k : k + 1], u[k : k + 1]), np.float64)
-        except Exception as error:
-            return (
+            if k == slice(None):
+                first = error
+                continue
+            raise ModelError(
                 f"{name} raises {type(error).__name__} at {place(x[k], u[k])}, within the region: "
                 f"{error}. {_REMEDY}"
-            )
-    return (
+            ) from error
+        if k == slice(None):
+            return values
+    raise ModelError(
         f"{name} raises {type(first).__name__} at several states of the region at once, though "
         f"not at any of them alone: {first}. Write it for one state at a time."
-    )
+    ) from first
 
 
 def place(x: Array, u: Array) -> str:
@@ -59,11 +59,11 @@ def place(x: Array, u: Array) -> str:
     return f"x = {x.tolist()}" + (f", u = {u.tolist()}" if u.size else "")
 
 
-def check_values(system: System, points: Array, *, output_only: bool = False) -> None:
+def check_values(system: System, points: Array) -> None:
     """Raise a ModelError where f or h raises or is not finite."""
     x, u = points[:, : system.n], points[:, system.n :]
-    for name, function in (("f", system.f), ("h", system.h))[output_only:]:
-        values = evaluated(name, function, x, u)
+    for name in ("f", "h"):
+        values = evaluated(name, getattr(system, name), x, u)
         broken = ~np.isfinite(values).all(axis=1)
         if broken.any():
             k = int(np.argmax(broken))
@@ -77,20 +77,17 @@ def joint_jacobians(system: System, points: Array) -> Array:
     """The joint Jacobians at some states."""
     check_values(system, points)  # a step in the imaginary direction may not see NaN
     x, u = points[:, : system.n], points[:, system.n :]
-    joint = np.concatenate(
-        (
-            evaluated("the Jacobian of f", system.f_jacobian, x, u),
-            evaluated("the Jacobian of h", system.h_jacobian, x, u),
-        ),
-        axis=1,
-    )
+    joint = np.concatenate([
+        evaluated(f"the Jacobian of {name}", getattr(system, f"{name}_jacobian"), x, u)
+        for name in ("f", "h")
+    ], axis=1)
     broken = ~np.isfinite(joint).all(axis=(1, 2))
     if broken.any():
         raise ModelError(
             f"the Jacobians of f and h are not finite at {points[broken][0].tolist()}, within the "
             "region; expected functions with derivatives there. Take a smaller region."
         )
-    return np.asarray(joint, np.float64)
+    return joint
 
 
 # Beyond, corners would be many: what the other coordinates do is covered by the error.
@@ -154,31 +151,30 @@ class SmoothModel:
     have in double precision. Functions in NumPy are traced, under watch (`qpmhe.model.tracing`).
     At samples of the region, the functions' values must lie where the expressions' values do.
 
-    ``reason`` says why f and h have no enclosure, ``output_reason`` why h alone has none; empty
-    if they have. ``affine_output``: the Jacobian of h is constant on the region.
+    ``reason`` says why f and h have no enclosure; empty if they have. ``affine_output``: the
+    Jacobian of h is constant on the region.
     """
 
     def __init__(self, system: System, region: Region) -> None:
         self._system, self._region = system, region
         self.n, self.p = system.n, system.p
         self._graph = Graph(system.n + system.m)
-        self._slopes = Slopes(self._graph)
         self._programs: dict[str, Program] = {}
-        self._plans: dict[bool, _Plan] = {}
         self._unknown: tuple[Array, Array] | None = None
-        self.output_reason, self._output = self._read("h")
-        self.reason, following = (
-            (self.output_reason, []) if self.output_reason else self._read("f")
-        )
-        self._rows = following + self._output
+        self.reason, output = self._read("h")
+        following: list[int] = []
+        if not self.reason:
+            self.reason, following = self._read("f")
+        self._rows, slopes = following + output, Slopes(self._graph)
         self.affine_output = not (
-            self.output_reason
+            self.reason
             or any(
-                self._slopes.of(slope) or self._graph.comparisons([slope])
-                for root in self._output for slope in self._slopes.of(root).values()
+                slopes.of(slope) or self._graph.comparisons([slope])
+                for root in output for slope in slopes.of(root).values()
             )
-            or self._obstacle("h", region.lower, region.upper)
+            or self._programs["h"].obstacle(region.lower, region.upper)
         )
+        self._plan = None if self.reason else _Plan(self._graph, slopes, self._rows, self.n)
 
     def _read(self, name: str) -> tuple[str, list[int]]:
         """Why a function has no enclosure, or the nodes of its values."""
@@ -188,13 +184,10 @@ class SmoothModel:
         roots = read(self._graph, expression.function)
         self._programs[name] = Program(self._graph, roots)
         middle = 0.5 * self._region.lower + 0.5 * self._region.upper
-        obstacle = self._obstacle(name, middle, middle)
+        obstacle = self._programs[name].obstacle(middle, middle)
         if obstacle:
             return f"{name} has {obstacle}", []
         return self._differs(name), roots
-
-    def _obstacle(self, name: str, lower: Array, upper: Array) -> str:
-        return self._programs[name].obstacle(lower, upper)
 
     @property
     def unknown(self) -> str:
@@ -208,14 +201,12 @@ class SmoothModel:
 
     def obstacle(self, lower: Array, upper: Array) -> str:
         """What has no enclosure on a cell (N,), in words; blank if all has."""
-        for name in ("f", "h"):
-            found = self._obstacle(name, lower, upper) if name in self._programs else ""
+        parts = {**{f"{name} has": one for name, one in self._programs.items()},
+                 "a derivative has": self._plan}
+        for words, part in parts.items():
+            found = part.obstacle(lower, upper) if part is not None else ""
             if found:
-                return f"{name} has {found}"
-        for plan in self._plans.values():
-            found = plan.obstacle(lower, upper)
-            if found:
-                return f"a derivative has {found}"
+                return f"{words} {found}"
         return ""
 
     def _differs(self, name: str) -> str:
@@ -241,28 +232,24 @@ class SmoothModel:
 
     def values(self, lower: Array, upper: Array) -> Interval:
         """Enclosures (B, n + p) of f and h over cells (B, N); NaN where there are none."""
-        if "values" not in self._programs:
-            self._programs["values"] = Program(self._graph, self._rows)
-        found = self._programs["values"](lower, upper)
+        assert self._plan is not None
+        found = self._plan.values(lower, upper)
         return Interval(found.low.T, found.high.T)
 
-    def enclose(self, lower: Array, upper: Array, *, output_only: bool = False) -> Enclosure:
+    def enclose(self, lower: Array, upper: Array) -> Enclosure:
         """The joint Jacobian over cells."""
         with np.errstate(all="ignore"):
-            found = self._enclosed(lower, upper, output_only)
+            found = self._enclosed(lower, upper)
         unknown = np.isnan(found.error).any(axis=(1, 2))
         if unknown.any():
             self._unknown = lower[unknown][-1], upper[unknown][-1]
             middles = 0.5 * lower[unknown] + 0.5 * upper[unknown]
-            middles = middles[self._region.contains(middles[:, : self.n])]
-            check_values(self._system, middles, output_only=output_only)
+            check_values(self._system, middles[self._region.contains(middles[:, : self.n])])
         return found
 
-    def _enclosed(self, lower: Array, upper: Array, output_only: bool) -> Enclosure:
-        if output_only not in self._plans:
-            roots = self._output if output_only else self._rows
-            self._plans[output_only] = _Plan(self._graph, self._slopes, roots, self.n)
-        plan = self._plans[output_only]
+    def _enclosed(self, lower: Array, upper: Array) -> Enclosure:
+        plan = self._plan
+        assert plan is not None
         found, open_ends = plan.enclosed(lower, upper)
         count = open_ends.sum(axis=1)
         kinked = (count > 0) & (count <= _MOST_KINKS) & np.isfinite(found.error).all(axis=(1, 2))
@@ -304,6 +291,7 @@ class _Plan:
         self._depends = np.array([
             [one in each for one in decisions] for each in above
         ], np.bool_).reshape(len(nodes), len(decisions))
+        self.values = Program(graph, roots)
         self._point = Program(graph, roots + nodes + decisions)
         self._cell = Program(graph, roots + nodes + [one[-1] for one in second] + decisions)
 
@@ -320,7 +308,7 @@ class _Plan:
         """
         cells, N, q, n = *lower.shape, self._q, self._n
         forced = {} if truths is None else dict(zip(self._conditions, truths.T, strict=True))
-        centre, half = middles(lower, upper)
+        centre, half = halved(lower, upper)
         point, cell = self._point(centre, centre, forced), self._cell(lower, upper, forced)
         (rows, columns), (row, this, other) = self._first, self._second
         ends = np.cumsum([q, rows.size, row.size])
@@ -370,7 +358,7 @@ class _Plan:
         ), open_ends
 
 
-def middles(lower: Array, upper: Array) -> tuple[Array, Array]:
+def halved(lower: Array, upper: Array) -> tuple[Array, Array]:
     """Centres and half-widths of cells, which cover them; zero where there is no width."""
     centre = np.where(lower == upper, lower, 0.5 * lower + 0.5 * upper)
     half = np.nextafter(np.maximum(upper - centre, centre - lower), np.inf)

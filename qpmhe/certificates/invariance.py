@@ -24,8 +24,8 @@ from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from .branch_and_bound import Cells
 from .deadline import PART_SECONDS, Deadline
-from .enclosures import SmoothModel, place
-from .evidence import Evidence
+from .enclosures import SmoothModel, halved, place
+from .evidence import Evidence, json_ready
 from .inequalities import Matrices, definite
 from .regions import Region, bounded_region, bounds, inequalities, row_bounds
 
@@ -50,10 +50,8 @@ class Invariance:
         it is not known.
     region : Region
         The region.
-    face : (n,) array or None
-        The outward normal g of the side through which the state leaves.
     limit, reach : float
-        c, and the largest :math:`g^\top x^+` that is known; NaN without such a side.
+        c, and the largest :math:`g^\top x^+` that is known; NaN where no state is known to leave.
     at : (n + m,) array or None
         From where: state and input.
     cells : int
@@ -63,7 +61,6 @@ class Invariance:
     holds: bool | None
     text: str
     region: Region
-    face: Array | None = None
     limit: float = np.nan
     reach: float = np.nan
     at: Array | None = None
@@ -79,19 +76,15 @@ class Invariance:
 
     def to_dict(self) -> dict[str, Any]:
         """All but the region, in types that JSON knows."""
-        known = self.face is not None
-        return {
-            "holds": self.holds, "text": self.text, "cells": self.cells,
-            "face": None if self.face is None else self.face.tolist(),
-            "at": None if self.at is None else self.at.tolist(),
-            "limit": self.limit if known else None, "reach": self.reach if known else None,
-        }
+        content: dict[str, Any] = json_ready(
+            {name: value for name, value in vars(self).items() if name != "region"}
+        )
+        return content
 
 
 def certify_invariance(
     system: System, region: ConvexSet | Region | None = None, *, inputs: Box | None = None,
-    disturbance: ArrayLike = 0.0, model: SmoothModel | None = None,
-    seconds: float | Deadline = PART_SECONDS,
+    disturbance: ArrayLike = 0.0, seconds: float | Deadline = PART_SECONDS,
 ) -> Invariance:
     """Prove that a region is invariant, or say where the state leaves it.
 
@@ -101,8 +94,6 @@ def certify_invariance(
         As for `certify`.
     disturbance : float or (r,) array_like
         The largest disturbance w: a length, or half-widths by component; G w acts on the state.
-    model : SmoothModel, optional
-        Of this system and region, if there is one already.
     seconds : float or Deadline
         How long it may take, about.
 
@@ -113,39 +104,31 @@ def certify_invariance(
     """
     deadline, where = Deadline.of(seconds), bounded_region(system, region, inputs)
     rows, limits = inequalities(where.states)
-    room = limits - _added(system, rows, disturbance)
-    model = model or SmoothModel(system, where)
+    added, cells = _added(system, rows, disturbance), Cells(where)
+    model = SmoothModel(system, where)
+    unknown = "it is not known whether x stays"
     if model.reason:
-        return Invariance(None, f"it is not known whether x stays: {model.reason}", where)
+        return Invariance(None, f"{unknown}: {model.reason}", where)
     points = where.sample(_SAMPLES, np.random.default_rng(_SEED))
-    found = _leaving(model, where, rows, room, limits, points)
-    if found is not None:
-        return found
-    cells = Cells(where)
-    while len(cells.lower):
-        if cells.taken and (deadline.passed or cells.taken > _MOST_CELLS):
-            end = "when its time was over" if deadline.passed else "the most that are allowed"
-            return Invariance(
-                None, f"it is not known whether x stays, after {cells.taken} cells, {end}", where,
-                cells=cells.taken,
-            )
-        low, high = cells.take(_CHUNK)
-        reach, parts = _reach(model, rows, low, high)
-        excess = reach - room
-        left = np.flatnonzero(~(excess <= 0.0).all(axis=1))
-        if not left.size:
-            continue
-        low, high = low[left], high[left]
-        middles = 0.5 * low + 0.5 * high
-        found = _leaving(model, where, rows, room, limits, middles[where.contains(
-            middles[:, : where.n]
-        )], cells.taken)
+    while True:
+        found = _leaving(model, where, rows, limits, added, points, cells.taken)
         if found is not None:
             return found
-        worst = np.where(np.isnan(excess[left]), np.inf, excess[left]).argmax(axis=1)
-        scores = parts[left, worst]
-        cells.halve(low, high, scores, np.full(len(left), np.inf))
-    return Invariance(True, "x stays in the region", where, cells=cells.taken)
+        if not len(cells.lower):
+            return Invariance(True, "x stays in the region", where, cells=cells.taken)
+        if cells.taken and (deadline.passed or cells.taken > _MOST_CELLS):
+            end = "when its time was over" if deadline.passed else "the most that are allowed"
+            text = f"{unknown}, after {cells.taken} cells, {end}"
+            return Invariance(None, text, where, cells=cells.taken)
+        low, high = cells.take(_CHUNK)
+        reach, parts = _reach(model, rows, low, high)
+        excess = reach - (limits - added)
+        left = np.flatnonzero(~(excess <= 0.0).all(axis=1))
+        low, high, excess = low[left], high[left], excess[left]
+        points = 0.5 * low + 0.5 * high
+        points = points[where.contains(points[:, : where.n])]
+        worst = np.where(np.isnan(excess), np.inf, excess).argmax(axis=1)
+        cells.halve(low, high, parts[left, worst], np.full(len(left), np.inf))
 
 
 def inner_region(region: Region, metric: Array, radius: float) -> Region | None:
@@ -220,12 +203,9 @@ def _added(system: System, rows: Array, disturbance: ArrayLike) -> Array:
 
 def _reach(model: SmoothModel, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
     """Upper bounds (B, r) on g^T f over cells, and what each coordinate adds (B, r, N)."""
-    n = model.n
-    middle = 0.5 * low + 0.5 * high
-    half = np.nextafter(np.maximum(high - middle, middle - low), np.inf)
-    half = np.where(low == high, 0.0, half)
+    n, (middle, half) = model.n, halved(low, high)
     start, end = low.copy(), high.copy()
-    start[:, :n] = end[:, :n] = np.where(low == high, low, middle)[:, :n]
+    start[:, :n] = end[:, :n] = middle[:, :n]
     with np.errstate(all="ignore"):
         enclosure = model.enclose(low, high)
         J = enclosure.centre[:, :n]
@@ -246,41 +226,37 @@ def _reach(model: SmoothModel, rows: Array, low: Array, high: Array) -> tuple[Ar
 
 
 def _leaving(
-    model: SmoothModel, region: Region, rows: Array, room: Array, limits: Array, points: Array,
-    cells: int = 0,
+    model: SmoothModel, region: Region, rows: Array, limits: Array, added: Array, points: Array,
+    cells: int,
 ) -> Invariance | None:
     """The state among some of the region's from which f reaches farthest, if it leaves."""
     if not len(points):
         return None
-    found = model.values(points, points)
-    least = row_bounds(rows, found.low[:, : region.n], found.high[:, : region.n])[0]
-    added = (limits - room) / _OUTWARD**2
-    beyond = least + added - limits
-    widths = (region.upper - region.lower)[: region.n]
-    scale = np.abs(rows) @ np.where(widths > 0.0, widths, 1.0)
-    relative = np.where(np.isnan(beyond), -np.inf, beyond / scale)
-    k, side = np.unravel_index(int(relative.argmax()), relative.shape)
-    if not relative[k, side] > 0.0:
+    n, found = region.n, model.values(points, points)
+    # What disturbances add at most was rounded up.
+    most = row_bounds(rows, found.low[:, :n], found.high[:, :n])[0] + added / _OUTWARD**2
+    widths = (region.upper - region.lower)[:n]
+    beyond = (most - limits) / (np.abs(rows) @ np.where(widths > 0.0, widths, 1.0))
+    beyond = np.where(np.isnan(beyond), -np.inf, beyond)
+    k, side = np.unravel_index(int(beyond.argmax()), beyond.shape)
+    if not beyond[k, side] > 0.0:
         return None
-    reach, limit = float(least[k, side] + added[side]), float(limits[side])
-    row = rows[side]
+    reach, limit, row = float(most[k, side]), float(limits[side]), rows[side]
     sign, relation = (1.0, "<=") if row[np.flatnonzero(row)[0]] > 0.0 else (-1.0, ">=")
     names = _words(sign * row)
     who = "f and the disturbances reach" if added[side] > 0.0 else "f reaches"
-    x, u = (np.round(one, 4) for one in np.split(points[k], [region.n]))
     text = (
         f"{who} {names} = {sign * reach:.4g} through the face {names} {relation} "
-        f"{sign * limit:.4g}, from {place(x, u)}"
+        f"{sign * limit:.4g}, from {place(*np.split(np.round(points[k], 4), [n]))}"
     )
-    return Invariance(False, text, region, row, limit, reach, points[k], cells)
+    return Invariance(False, text, region, limit, reach, points[k], cells)
 
 
 def _words(row: Array) -> str:
     """A linear form in words."""
-    terms = [
-        ("" if abs(row[j]) == 1.0 else f"{abs(row[j]):.4g} ") + f"x{j + 1}"
-        for j in np.flatnonzero(row)
-    ]
-    signs = ["-" if row[j] < 0.0 else "+" for j in np.flatnonzero(row)]
-    first = terms[0] if signs[0] == "+" else f"-{terms[0]}"
-    return " ".join([first, *(f"{a} {b}" for a, b in zip(signs[1:], terms[1:], strict=True))])
+    text = ""
+    for j in np.flatnonzero(row):
+        sign = "-" if row[j] < 0.0 else "+"
+        text += f" {sign} " if text else sign.strip("+")
+        text += ("" if abs(row[j]) == 1.0 else f"{abs(row[j]):.4g} ") + f"x{j + 1}"
+    return text

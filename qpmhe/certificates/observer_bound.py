@@ -1,6 +1,6 @@
 r"""The proved bound of the observer's error, and the set around its state that holds the truth.
 
-Where the observer is shown to contract on a region (`ErrorContraction`), any two x, z of it have
+Where the observer is shown to contract on a region (`Form`), any two x, z of it have
 
 .. math::
     |e^+|_P \le \rho |e|_P + |w - L v|_P, \qquad e = x - z,

@@ -129,7 +129,14 @@ def bounded_region(
                 f"only, or angles. Leave {name} out, with outputs and states that do not wrap "
                 "within the region."
             )
-    where = _bounded(system, region, inputs)
+    where = region if isinstance(region, Region) else _bounded(system, region, inputs)
+    if where.n != system.n or where.lower.size != system.n + system.m:
+        raise SetError(
+            f"the region is of {where.n} states and {where.lower.size - where.n} inputs; "
+            f"expected {system.n} and {system.m}."
+        )
+    if where is region and inputs is not None:
+        raise SetError("the region already has bounds on the inputs; leave inputs out.")
     if isinstance(system.state_residual, Angles):
         angles = system.state_residual
         width = (where.upper - where.lower)[angles.components]
@@ -145,19 +152,8 @@ def bounded_region(
     return where
 
 
-def _bounded(
-    system: System, region: ConvexSet | Region | None, inputs: Box | None
-) -> Region:
+def _bounded(system: System, region: ConvexSet | None, inputs: Box | None) -> Region:
     """A set of states with a box around it."""
-    if isinstance(region, Region):
-        if region.n != system.n or region.lower.size != system.n + system.m:
-            raise SetError(
-                f"the region is of {region.n} states and {region.lower.size - region.n} inputs; "
-                f"expected {system.n} and {system.m}."
-            )
-        if inputs is not None:
-            raise SetError("the region already has bounds on the inputs; leave inputs out.")
-        return region
     chosen = system.states if region is None else region
     if chosen is None:
         raise SetError(

@@ -278,10 +278,17 @@ class Search:
             answer = self.program.solve(rate, margin, left)
         if answer.status == "user_limit" and (deadline.passed or expected > _MISJUDGED * left):
             given = self._deadline.seconds
-            time = f"({given:.3g} s) was too short" if given > LEAST_SECONDS else "is over"
+            time = (
+                f"the time for this search ({given:.3g} s) was too short" if given > LEAST_SECONDS
+                else "no time was left for this search"
+            )
+            why = (
+                f"a semidefinite program for {self.system.n} states takes about {expected:.2g} s, "
+                f"and {left:.2g} s were left" if expected > left > 0.0
+                else "it was over while matrices were sought and verified"
+            )
             raise OutOfTimeError(
-                f"the time for this search {time}: a semidefinite program for {self.system.n} "
-                f"states takes about {expected:.2g} s, and {left:.2g} s were left",
+                f"{time}: {why}",
                 ("more seconds", "a given rate, which spares the search for one",
                  "a smaller model"),
             )

@@ -4,25 +4,18 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates.branch_and_bound import output_lipschitz
+from qpmhe.certificates.branch_and_bound import cover, lipschitz
 from qpmhe.certificates.certificate import certify
 from qpmhe.certificates.contraction import certify_detectability, certify_observer, synthesise_gain
-from qpmhe.certificates.enclosures import SmoothModel
+from qpmhe.certificates.enclosures import Enclosure, SmoothModel
 from qpmhe.certificates.evidence import Evidence, NotCertifiedError
-from qpmhe.certificates.inequalities import euclidean_constants
+from qpmhe.certificates.inequalities import Form
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.errors import ModelError
 
-COST = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
+from .helpers import box, scalar, unit_cost
+
 GAIN = qpmhe.Luenberger([[0.1]])
-
-
-def box(low, high):
-    return qpmhe.Box([low], [high])
-
-
-def scalar(f=lambda x: 0.5 * x, h=lambda x: 1.0 * x, **options):
-    return qpmhe.System(f, h, n=1, p=1, **options)
 
 
 def picky(x):
@@ -39,17 +32,19 @@ QUESTIONS = {
     "detectability": lambda s, r: certify_detectability(s, r),
     "observer": lambda s, r: certify_observer(s, GAIN, r),
     "synthesis": lambda s, r: synthesise_gain(s, r),
-    "certificate": lambda s, r: certify(s, GAIN, COST, horizon=2, region=r),
+    "certificate": lambda s, r: certify(s, GAIN, unit_cost(), horizon=2, region=r),
 }
 
 
 @pytest.mark.parametrize("which", QUESTIONS)
-@pytest.mark.parametrize("letter", ["f", "h"])
-def test_a_function_that_raises_is_told_with_the_state(which, letter):
-    with pytest.raises(
-        ModelError, match=rf"{letter} raises ValueError at x = \[100.0\].*too large.*smaller region"
-    ):
-        QUESTIONS[which](scalar(**{letter: picky}), box(-100.0, 100.0))
+def test_what_raises_or_is_not_finite_is_named_with_the_state(which):
+    for letter in "fh":
+        words = rf"{letter} raises ValueError at x = \[100.0\].*too large.*smaller region"
+        with pytest.raises(ModelError, match=words):
+            QUESTIONS[which](scalar(**{letter: picky}), box(-100.0, 100.0))
+    for place in ((6.0, 10.0), (-10.0, 5.001)):
+        with pytest.raises(ModelError, match=r"f is not finite at x = .*nan.*smaller region"):
+            QUESTIONS[which](scalar(lost), box(*place))
 
 
 def test_a_function_with_a_branch_that_no_sample_takes_is_not_proved():
@@ -66,13 +61,6 @@ def test_a_function_with_a_branch_that_no_sample_takes_is_not_proved():
     assert "the truth of a comparison" in found.notes[0]
 
 
-@pytest.mark.parametrize("which", list(QUESTIONS))
-@pytest.mark.parametrize("place", [(6.0, 10.0), (-10.0, 10.0), (-10.0, 5.001)])
-def test_what_is_not_finite_is_refused(which, place):
-    with pytest.raises(ModelError, match=r"f is not finite at x = .*nan.*smaller region"):
-        QUESTIONS[which](scalar(lost), box(*place))
-
-
 @pytest.mark.parametrize("f", [
     lost, lambda x: np.maximum(0.5 * x, lost(x)), lambda x: 0.5 * x + 0.1 * lost(x) ** 2,
 ])
@@ -86,33 +74,47 @@ def test_nothing_is_enclosed_where_the_value_is_not_a_number(f):
     assert np.isfinite(model.enclose(np.array([[-9.0]]), np.array([[4.0]])).error).all()
 
 
-@pytest.mark.parametrize(
-    "f",
-    [
-        lambda x: 0.5 * x + 5.0 * np.sign(x),
-        lambda x: 0.5 * x + 5.0 * np.floor(x),
-        lambda x: np.array([0.5 * float(x[0]) + (5.0 if x[0] > 0.3 else 0.0)]),
-    ],
-)
+def test_infinite_derivatives_make_no_warning_and_no_proof():
+    system = scalar(lambda x: (1e154 * x) ** 2)
+    region = bounded_region(system, box(0.0, 1.0))
+    model = SmoothModel(system, region)
+    assert np.isnan(model.enclose(region.lower[None], region.upper[None]).error).all()
+    assert not cover(model, region, Form(np.eye(1), 0.9, np.eye(1)), 50).proved
+
+
+def test_a_cell_of_which_nothing_is_known_hides_nothing_of_the_others():
+    ones, nothing = np.ones((1, 1, 1)), np.full((1, 1, 1), np.nan)
+    centre = np.concatenate((ones, nothing))
+    enclosure = Enclosure(
+        centre, np.concatenate((0.5 * ones[None], nothing[None])),
+        np.concatenate((0.0 * ones, nothing)), np.zeros((2, 1)), centre,
+    )
+    corners, error = enclosure.corners()
+    assert corners[0].min() - error[0].max() <= 0.5
+    assert corners[0].max() + error[0].max() >= 1.5
+    assert np.isnan(error[1]).all()
+
+
+@pytest.mark.parametrize("f", [
+    lambda x: 0.5 * x + 5.0 * np.sign(x), lambda x: 0.5 * x + 5.0 * np.floor(x),
+    lambda x: np.array([0.5 * float(x[0]) + (5.0 if x[0] > 0.3 else 0.0)]),
+])
 def test_what_jumps_is_not_certified_from_its_derivatives(f):
     for ask in (
         lambda s, r: certify_detectability(s, r, eta=0.9, seconds=2.0),
-        lambda s, r: certify_observer(s, GAIN, r, rho=0.9, seconds=2.0),
         lambda s, r: certify_observer(s, GAIN, r, seconds=2.0),
     ):
         with pytest.raises(NotCertifiedError, match=r"but not between \[.*may jump"):
             ask(scalar(f, lambda x: 0.0 * x), box(-0.973, 0.931))  # no sample is at a jump
 
 
-@pytest.mark.parametrize(("h", "word"), [
-    (lambda x: np.where(x > 0.3, 1e-9 + x, x), "h has a choice (numpy.where, if_else) that may"),
-    (lambda x: x + 1e-9 * np.floor(x), "h has a jump of floor"),
-    (lambda x: np.sqrt(np.maximum(x, 0.0)), "a derivative has a division by a value that may be"),
+@pytest.mark.parametrize("ask", [
+    lambda s, r: certify_detectability(s, r), lambda s, r: certify_observer(s, GAIN, r),
 ])
-def test_what_could_not_be_enclosed_is_named(h, word):
-    found = output_lipschitz(scalar(h=h), bounded_region(scalar(h=h), box(-0.973, 0.931)), None, 1)
-    assert found.evidence is Evidence.SAMPLED
-    assert word in found.note
+def test_a_jump_in_the_middle_is_a_jump(ask):
+    system = scalar(lambda x: np.array([0.5 * float(x[0]) + (5.0 if x[0] > 0.0 else 0.0)]))
+    with pytest.raises(NotCertifiedError, match=r"f jumps at \[0.0\].*changes by 5"):
+        ask(system, box(-1.0, 1.0))
 
 
 def test_what_is_steep_or_kinked_is_not_said_to_jump():
@@ -124,32 +126,37 @@ def test_what_is_steep_or_kinked_is_not_said_to_jump():
         certify_detectability(scalar(lambda x: 1e6 * x, lambda x: 0.0 * x), box(-1.0, 1.0))
 
 
-def wrong_slope(slope):
-    """h(x) = x, with a derivative that is wrong where the system's own check does not look."""
-    return scalar(h_jacobian=lambda x: np.array([[1.0 if x[0] < 3.0 else slope]]))
+@pytest.mark.parametrize(("h", "word"), [
+    (lambda x: np.where(x > 0.3, 1e-9 + x, x), "h has a choice (numpy.where, if_else) that may"),
+    (lambda x: x + 1e-9 * np.floor(x), "h has a jump of floor"),
+    (lambda x: np.sqrt(np.maximum(x, 0.0)), "a derivative has a division by a value that may be"),
+    (lambda x: np.array([float(x[0])]), "float() of a symbol"),
+])
+def test_what_could_not_be_enclosed_is_named(h, word):
+    found = lipschitz(scalar(h=h), bounded_region(scalar(h=h), box(-0.973, 0.931)), "h", 1)
+    assert found.evidence is Evidence.SAMPLED
+    assert word in found.note
+
+
+def test_lipschitz_constants():
+    system = qpmhe.System(
+        lambda x: np.stack([0.5 * x[..., 0] ** 2, x[..., 1]], -1),
+        lambda x: x[..., :1] + 3.0 * np.sin(x[..., :1]) + 0.1 * x[..., 1:] ** 2, n=2, p=1,
+    )
+    region = bounded_region(system, box([-9.0] * 2, [9.0] * 2))
+    for name, true in (("f", 9.0), ("h", np.hypot(4.0, 1.8))):
+        found = lipschitz(system, region, name)
+        assert found.evidence is Evidence.PROVED
+        assert true * (1.0 - 1e-12) <= found.value <= 1.002 * true
 
 
 def test_no_proof_rests_on_a_given_derivative():
+    # h(x) = x, with a derivative that is wrong where the system's own check does not look.
+    wrong = scalar(h_jacobian=lambda x: np.array([[1.0 if x[0] < 3.0 else 0.01]]))
     observer, region = qpmhe.Luenberger([[0.4]]), box(4.0, 10.0)
-    right, wrong = (
-        certify(system, observer, COST, horizon=3, region=region)
-        for system in (scalar(), wrong_slope(0.01))
-    )
-    assert wrong.evidence is Evidence.PROVED
-    np.testing.assert_allclose(wrong.of().C, right.of().C, rtol=1e-6)
-
-
-def test_the_slope_of_the_output_is_that_of_the_enclosure():
-    region = box(4.0, 10.0)
-    for system in (scalar(), wrong_slope(0.01)):
-        found = output_lipschitz(system, bounded_region(system, region))
-        assert found.evidence is Evidence.PROVED
-        assert 1.0 <= found.value <= 1.0 + 1e-9
-    system = scalar(h=lambda x: np.array([float(x[0])]))  # it cannot be enclosed
-    assert output_lipschitz(system, bounded_region(system, region)).evidence is Evidence.SAMPLED
-
-
-def test_an_output_weight_below_zero_by_rounding_is_no_weight():
-    c_p, c_w, c_v = euclidean_constants(np.eye(1), np.array([[-1e-9]]), 0.5)
-    assert (c_p, c_w) == pytest.approx((1.0, 2.0))
-    assert 0.0 < c_v < 1e-3
+    found = [
+        certify(system, observer, unit_cost(), horizon=3, region=region)
+        for system in (scalar(), wrong)
+    ]
+    assert found[1].evidence is Evidence.PROVED
+    np.testing.assert_allclose(*(each.of().C for each in found), rtol=1e-6)
