@@ -123,7 +123,7 @@ def diagnose(
     measurements after a gap of ten samples or more are no evidence.
 
     * R or Q, of all or of one component, too small or too large by a factor;
-    * a biased sensor, throughout or for a time; two sensors that are swapped;
+    * a biased sensor, throughout or for a time, one in another unit; two that are swapped;
     * a dead sensor, one that is saturated, and outliers;
     * steps of another length, measurements that are late or early, clocks that drift;
     * an input with the wrong sign, or another gain.
@@ -157,9 +157,10 @@ def diagnose(
     Notes
     -----
     The weights count as inverse covariances, also with a discount. A fault is reported if it
-    makes the record more likely by a factor of :math:`e^{12}`, and by 3.5 % for each measurement
-    where it concerns all of them; and if it is large enough to matter. Inputs that a controller
-    computes from states that it does not measure can look like delays.
+    makes the record more likely by a factor of :math:`e^{12}`, up to :math:`e^{24}` where
+    measurements are missing, and by 3.5 % for each measurement where it concerns all of them, no
+    sample counting for more than a factor of :math:`e^3`; and if it is large enough to matter.
+    Inputs that a controller computes from states that it does not measure can look like delays.
 
     References
     ----------
