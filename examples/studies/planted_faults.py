@@ -2,7 +2,7 @@
 
     python examples/studies/planted_faults.py --seeds 20
 
-prints a table, in Markdown, of twelve faults and of healthy runs.
+prints a table, in Markdown, of faults and of healthy runs.
 """
 
 from __future__ import annotations
@@ -113,12 +113,17 @@ def saturated(y: np.ndarray, _: Any, __: Any, sensor: int) -> None:
     y[:, sensor] = np.minimum(y[:, sensor], np.quantile(y[:, sensor], 0.75))
 
 
-def wrong_sign(model: str, seed: int) -> Case:
-    """One of the inputs."""
+def in_thousandths(y: np.ndarray, _: Any, __: Any, sensor: int) -> None:
+    """The numbers of a sensor are a thousand times as large, as in millimetres."""
+    y[:, sensor] *= 1000.0
+
+
+def scaled_input(model: str, seed: int, factor: float) -> Case:
+    """One of the inputs, in another unit or with the wrong sign."""
     case = healthy(model, seed)
     assert case.inputs is not None
     inputs = case.inputs.copy()
-    inputs[:, seed % inputs.shape[1]] *= -1.0
+    inputs[:, seed % inputs.shape[1]] *= factor
     return case._replace(inputs=inputs)
 
 
@@ -190,7 +195,15 @@ FAULTS: dict[str, tuple[str, Callable[[str, int], Case], tuple[str, ...]]] = {
     "steps 1.25 times as long": (
         "step", lambda model, seed: timed(model, seed, step=1.25),
         ("van_der_pol", "pendulum", "vehicle")),
-    "wrong sign of an input": ("sign", wrong_sign, ("battery_cell", "cstr", "vehicle")),
+    "wrong sign of an input": (
+        "sign", lambda model, seed: scaled_input(model, seed, -1.0),
+        ("battery_cell", "cstr", "vehicle")),
+    "sensor in another unit, 1000 times": (
+        "gain", lambda model, seed: measured(model, seed, in_thousandths),
+        ("van_der_pol", "cstr", "vehicle")),
+    "input in another unit, a thousandth": (
+        "input", lambda model, seed: scaled_input(model, seed, 1e-3),
+        ("battery_cell", "cstr", "vehicle")),
     "one sample late": (
         "shift", lambda model, seed: measured(model, seed, late),
         ("battery_cell", "cstr", "vehicle")),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -14,9 +13,8 @@ from numpy.typing import NDArray
 
 from .._checks import positive
 from ..errors import InvalidInputError, OptionError, ShapeError
-from ..estimation.observability import Observability
 from ..estimation.run import Run, RunSource
-from .examination import Correlations, Examination
+from .examination import Examination
 from .findings import Finding, Names
 
 Array = NDArray[np.float64]
@@ -26,8 +24,7 @@ _LEAST_SAMPLES = 30
 _WIDTH = 92  # of the text
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+class Diagnosis(Examination):
     """What `diagnose` has found; its text begins with the findings.
 
     Attributes
@@ -60,31 +57,20 @@ class Diagnosis:
         How much the prior still matters, for the horizons 0, ..., K.
     """
 
-    findings: list[Finding]
-    notes: list[Finding]
-    run: Run
-    names: Names
-    first: int
-    innovations: Array
-    nis: Array
-    nis_limits: tuple[float, float]
-    nis_mean: float
-    nis_mean_limits: tuple[float, float]
-    correlations: Correlations
-    outliers: Array
-    clipped: Array
-    observability: Observability
-    prior_shares: Array
-
     @property
     def is_healthy(self) -> bool:
         """Whether nothing was found."""
         return not self.findings
 
-    def __str__(self) -> str:
+    @property
+    def verdict(self) -> str:
+        """How many findings there are."""
         count = len(self.findings)
         head = f"{count} finding{'s' * (count != 1)}" if count else "No fault was found"
-        lines = [f"{head} in {len(self.run)} samples."]
+        return f"{head} in {len(self.run)} samples."
+
+    def __str__(self) -> str:
+        lines = [self.verdict]
         lines += [_wrapped(f"{k}. ", one) for k, one in enumerate(self.findings, start=1)]
         if self.notes:
             lines += ["", "Worth knowing:", *(_wrapped("- ", one) for one in self.notes)]
@@ -137,7 +123,7 @@ def diagnose(
     measurements after a gap of ten samples or more are no evidence.
 
     * R or Q, of all or of one component, too small or too large by a factor;
-    * a biased sensor, throughout or for a time; two sensors that are swapped;
+    * a biased sensor, throughout or for a time, one in another unit; two that are swapped;
     * a dead sensor, one that is saturated, and outliers;
     * steps of another length, measurements that are late or early, clocks that drift;
     * an input with the wrong sign, or another gain.
@@ -171,9 +157,10 @@ def diagnose(
     Notes
     -----
     The weights count as inverse covariances, also with a discount. A fault is reported if it
-    makes the record more likely by a factor of :math:`e^{12}`, and by 3.5 % for each measurement
-    where it concerns all of them; and if it is large enough to matter. Inputs that a controller
-    computes from states that it does not measure can look like delays.
+    makes the record more likely by a factor of :math:`e^{12}`, up to :math:`e^{24}` where
+    measurements are missing, and by 3.5 % for each measurement where it concerns all of them, no
+    sample counting for more than a factor of :math:`e^3`; and if it is large enough to matter.
+    Inputs that a controller computes from states that it does not measure can look like delays.
 
     References
     ----------
@@ -186,13 +173,7 @@ def diagnose(
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         # A filter under a wrong hypothesis may diverge, and a sensor have no measurement.
         warnings.simplefilter("ignore", RuntimeWarning)
-        seen = Examination(run, source, names)
-    blank = np.full((seen.first, source.system.p), np.nan)
-    return Diagnosis(
-        seen.findings, seen.notes, run, names, seen.first, np.vstack((blank, seen.normalised)),
-        np.append(blank[:, 0], seen.nis), seen.nis_limits, seen.nis_mean, seen.nis_mean_limits,
-        seen.correlations, seen.outliers, seen.clipped, seen.view, seen.prior_shares,
-    )
+        return Diagnosis(run, source, names)
 
 
 def _source(run: Run) -> RunSource:
@@ -225,21 +206,19 @@ def _names(
     source: RunSource, total: int, labels: Sequence[str] | None, outputs: Sequence[str] | None,
     inputs: Sequence[str] | None, dt: float | None, time_unit: str | None,
 ) -> Names:
-    system, sizes = source.system, {}
+    system, found = source.system, []
     for name, given, letter, size in (
         ("labels", labels, "x", system.n), ("outputs", outputs, "y", system.p),
         ("inputs", inputs, "u", system.m),
     ):
-        if given is not None and not isinstance(given, Iterable):
+        usual = [f"{letter}{i + 1}" for i in range(size)]
+        fits = given is None or (isinstance(given, Iterable) and not isinstance(given, str))
+        texts = list(given or usual) if fits else []
+        if name == "inputs":  # parameters behind the inputs have no name
+            texts += usual[len(texts) :]
+        if len(texts) != size or not all(isinstance(one, str) for one in texts):
             raise ShapeError(f"{name} is {given!r}; expected {size} strings.")
-        found = [f"{letter}{i + 1}" for i in range(size)] if given is None else list(given)
-        if name == "inputs" and given is not None:  # parameters behind the inputs have no name
-            found += [f"u{i + 1}" for i in range(len(found), size)]
-        if isinstance(given, str) or len(found) != size or not all(
-            isinstance(one, str) for one in found
-        ):
-            raise ShapeError(f"{name} is {given!r}; expected {size} strings.")
-        sizes[name] = found
+        found.append(texts)
     step = system.dt if dt is None else positive("dt", dt)
     times = (step or 1.0) * np.arange(total, dtype=np.float64)
     if source.steps is not None:
@@ -249,4 +228,4 @@ def _names(
     if not (time_unit is None or isinstance(time_unit, str)):
         raise OptionError(f"time_unit is {time_unit!r}; expected a string, such as 'h'.")
     unit = "samples" if step is None else time_unit or "s"
-    return Names(sizes["labels"], sizes["outputs"], sizes["inputs"], times, unit)
+    return Names(found[0], found[1], found[2], times, unit)

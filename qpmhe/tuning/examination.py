@@ -82,13 +82,15 @@ class Examination:
         self.along = self.best if same and np.isfinite(self.best.logs).all() else self.null
         self.horizon = min(length, len(self.along.states))
         self._linearise()
-        self.view = observability(
+        self.observability = observability(
             self.transitions, self.information, disturbance, self.prior, self.horizon
         )
         seen = np.isfinite(self.null.innovations)
         errors, count = np.where(seen, self.null.innovations, 0.0), max(1, int(seen.sum()))
         squares = np.einsum("ti,tij,tj->t", errors, self.null.weights, errors)
-        self.nis = np.where(seen.any(axis=1), squares, np.nan)
+        blank = np.full((self.first, system.p), np.nan)
+        self.innovations = np.vstack((blank, self.normalised))
+        self.nis = np.append(blank[:, 0], np.where(seen.any(axis=1), squares, np.nan))
         self.nis_limits, self.nis_mean = _limits(system.p), float(np.nansum(self.nis) / count)
         low, high = _limits(count)
         self.nis_mean_limits = low / count, high / count
@@ -243,7 +245,7 @@ class Examination:
 
     def _unseen(self) -> Iterator[Finding]:
         """Directions that the data do not see, that no filter has learnt, and that stay."""
-        view, names, length = self.view, self.names, self.horizon
+        view, names, length = self.observability, self.names, self.horizon
         units, inverse_units = prior_units(self.prior)
         ends = inverse_units @ self.along.covariances[length - 1 :] @ inverse_units.T
         count = len(ends)

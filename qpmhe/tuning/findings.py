@@ -46,19 +46,7 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Names:
-    """How the signals of a run are called, and its times.
-
-    Parameters
-    ----------
-    labels : sequence of str
-        Of the states, with units.
-    outputs, inputs : sequence of str
-        Names, one for each.
-    times : (T,) array
-        Of the samples.
-    unit : str
-        Of the times; ``samples`` where the length of the step is not known.
-    """
+    """How the signals of a run are called, its times (T,), and their unit, or ``samples``."""
 
     labels: Sequence[str]
     outputs: Sequence[str]

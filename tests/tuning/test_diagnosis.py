@@ -338,7 +338,7 @@ def test_filters_are_kalman_filters():
 
 
 def test_command_writes_the_page(tmp_path):
-    case = planted.wrong_sign("cstr", 0)
+    case = planted.scaled_input("cstr", 0, -1.0)
     generator = np.random.default_rng(0)
     times = np.append(0.0, np.cumsum(generator.uniform(0.99, 1.01, len(case.inputs) - 1) * 0.05))
     record = tmp_path / "record.csv"
