@@ -14,12 +14,12 @@ def motor(gallery):
 
 @pytest.fixture(scope="module")
 def errors(motor):
-    """Median errors of the estimators of the picture, with weights by hand: unseen, and again."""
+    """Median errors with weights by hand, unseen and again, of an EKF and of those in the picture."""
     judge = import_module("gallery.problem").judge
     estimators = import_module("gallery.baselines").estimators
     (problem,) = motor.problems(Path(), True)
     ways, found = estimators(problem, problem.weights), {}
-    for name in motor.SHOWN:
+    for name in ("EKF", *motor.SHOWN):
         found[name] = [
             np.median(judge(problem, "by hand", name, ways[name], [
                 one for one in problem.records if one.name == part

@@ -76,6 +76,9 @@ def case(draw):
         "candidate": ("observer", "reinitialized")[int(draw.random() < 0.2)],
     }
     cost = qpmhe.QuadraticCost.from_covariances(**covariances)
+    if system.state_residual is None and draw.random() < 0.2:  # as `augment_parameters` does
+        held = draw.permutation(n)[: draw.integers(1, n + 1)]
+        system.held = {int(j): float(draw.uniform(0.05, 1.0)) for j in held}
     mhe = qpmhe.MovingHorizonEstimator(
         system, observer, cost, horizon=int(draw.integers(1, 7)),
         initial_state=draw.normal(size=n), **options,

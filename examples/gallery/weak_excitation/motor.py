@@ -34,7 +34,7 @@ INERTIAS = 2.4, 1.4  # g m^2
 SEEDS, FEW = 12, 1
 LOST = 100.0  # per cent
 HELD, STIFFER = "MHE, 2 QPs, held", "MHE, 2 QPs, stiff"
-SHOWN = ("EKF", "MHE, 2 QPs", STIFFER, HELD)
+SHOWN = (HELD, "MHE, 2 QPs", STIFFER)
 NOTE = (
     "Unseen: while the speed is steady, up to the change. Again: from two horizons after the first "
     "acceleration on; what is before tunes."
@@ -124,6 +124,6 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> An
     for axes in (above, below):
         axes.axvspan(DT * STEADY, DT * AGAIN, color="0.92", zorder=0)
     below.set(xlabel="time (s)", ylabel="inertia (g m²)")
-    below.set_ylim(0.9, 3.6)
+    below.set_ylim(1.0, 3.2)
     figure.legend(*below.get_legend_handles_labels(), loc="outside upper center", ncols=5)
     return figure
