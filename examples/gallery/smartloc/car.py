@@ -164,9 +164,8 @@ def problem(name: str, which: str, drive: Drive, quick: bool) -> Problem:
 def own(drive: Drive, quick: bool, problem: Problem, weights: Weights) -> dict[str, Way]:
     """Over windows in which the car drives round some corners, and against reflections."""
     step = float(np.median(drive.lengths))
-    options: dict[str, Any] = {
-        "horizon": min(round(LONG / step), len(drive.times)), "max_qps": 5, "warm_start": True,
-    }
+    horizon = min(round(LONG / step), len(drive.times))
+    options: dict[str, Any] = {"horizon": horizon, "max_qps": 5, "warm_start": True}
     prior, walk, noise = (
         np.linalg.inv(one) for one in (weights.prior, weights.disturbance, weights.noise)
     )
@@ -178,8 +177,8 @@ def own(drive: Drive, quick: bool, problem: Problem, weights: Weights) -> dict[s
         noise, drive.deviation * np.sqrt(noise[0, 0]), per_component=True, graduation=1.0,
     ))
     bank = Bank(
-        partial(problem.estimator, weights=weights, cost=redescending, delay=round(DELAY / step),
-                **options),
+        partial(problem.estimator, weights=weights, cost=redescending,
+                delay=min(round(DELAY / step), horizon), **options),
         np.sqrt(weights.prior.diagonal()[:2]), compiled=not quick,
     )
     return {
@@ -198,19 +197,19 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> An
     with rc_context(LIGHT):
         figure = Figure(figsize=(10.0, 5.2 * len(problems)), layout="constrained")
         panels = figure.subplots(len(problems), 2, squeeze=False, width_ratios=(1.0, 1.2))
-    for (places, errors), problem, found in zip(panels, problems, results, strict=True):
-        record = problem.records[-1]
-        shown = {
-            one.estimator: one.middle for one in found if one.weights == BY_HAND
-            and one.record == record.name and one.estimator in ("EKF", LONG_HUBER, CAUSAL, LATE)
-        }
-        tracks(record.truth, {name: path[:, :2] for name, path in shown.items()},
-               labels=("east", "north"), axes=places)
-        places.set_title(problem.title, loc="left")
-        times = np.cumsum(record.inputs[:, 2]) - record.inputs[0, 2]
-        for style, (name, path) in zip(STYLES, shown.items(), strict=False):
-            errors.plot(times, problem.error(path, record.truth), linewidth=1.2, label=name,
-                        **style)
-        errors.set(xlabel="time (s)", ylabel="error (m)", ylim=(0.0, None))
-        errors.legend()
+        for (places, errors), problem, found in zip(panels, problems, results, strict=True):
+            record = problem.records[-1]
+            shown = {
+                one.estimator: one.middle for one in found if one.weights == BY_HAND
+                and one.record == record.name and one.estimator in ("EKF", LONG_HUBER, CAUSAL, LATE)
+            }
+            tracks(record.truth, {name: path[:, :2] for name, path in shown.items()},
+                   labels=("east", "north"), axes=places)
+            places.set_title(problem.title, loc="left")
+            times = np.cumsum(record.inputs[:, 2]) - record.inputs[0, 2]
+            for style, (name, path) in zip(STYLES, shown.items(), strict=False):
+                errors.plot(times, problem.error(path, record.truth), linewidth=1.2, label=name,
+                            **style)
+            errors.set(xlabel="time (s)", ylabel="error (m)", ylim=(0.0, None))
+            errors.legend()
     return figure
