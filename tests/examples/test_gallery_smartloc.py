@@ -154,8 +154,8 @@ def test_folders_that_are_no_records_are_refused(gallery, parts, tmp_path, chang
 def test_the_least_cost_is_found_from_far_away(parts, tmp_path):
     """A third of the signals is reflected: filters are off by more, and a far start is no harm."""
     found = parts["record"].read(write(tmp_path / "made", reflected=60.0))
-    problem = parts["car"].problem("made", "", found, True)
-    ways = parts["car"].own(found, True, problem, problem.weights)
+    problem = parts["car"].problem("made", "", found, {5.0: 1, 100.0: 1}, compiled=False)
+    ways = parts["car"].own(found, False, problem, problem.weights)
     y, u = found.ranges, parts["car"].inputs(found)
     for start in (problem.records[0].starts[0], problem.records[1].starts[0]):
         off = problem.error(ways[parts["car"].CAUSAL](start).run(y, u).filtered,
