@@ -8,7 +8,8 @@ depend on that state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from .record import Drive, folders, read
 # Seconds: of the windows, of the delay, and before an error counts.
 SHORT, LONG, DELAY, SETTLING = 10.0, 80.0, 40.0, 10.0
 # Metres from the truth, and runs from each: of the starts.
-STARTS, FEW = {5.0: 4, 100.0: 4}, {5.0: 1, 100.0: 1}
+STARTS, FEW, FAR = {5.0: 2, 100.0: 4}, {5.0: 1, 100.0: 1}, {100.0: 4}
 HUBER = 1.345
 CAUSAL = f"MHE, Geman-McClure, {LONG:.0f} s"
 LATE = f"the same, {DELAY:.0f} s late"
@@ -122,51 +123,54 @@ def problems(folder: Path, quick: bool) -> list[Problem]:
     found = []
     for one in folders(folder):
         drive = read(one)
-        found.append(problem(one.name, "", drive, quick))
-        if not quick:
-            found.append(problem(
-                f"{one.name}_strong", f", signals of {STRONG:.0f} dBHz and more",
-                drive.strong(STRONG), quick,
-            ))
+        if quick:
+            found.append(problem(one.name, "", drive, FEW, compiled=False))
+            continue
+        every = problem(one.name, "", drive, STARTS)
+        found += [
+            replace(every, tuning=tuning(drive)),
+            problem(f"{one.name}_strong", f", signals of {STRONG:.0f} dBHz and more",
+                    drive.strong(STRONG), FAR),
+        ]
     return found
 
 
-def problem(name: str, which: str, drive: Drive, quick: bool) -> Problem:
-    """A record from starts near and far."""
-    made, by_hand, u = system(drive), weights(drive), inputs(drive)
-    half = len(drive.times) // 2
-    truth = np.where(
-        (drive.times - drive.times[0] >= SETTLING)[:, None], drive.positions[:, :2], np.nan
-    )
-    known = np.full((len(truth), made.n), np.nan)
-    known[:, :3] = drive.positions
-    groups = {kind: [] for kind in names(drive)}
-    for state, kind in enumerate(names(drive)):
-        groups[kind].append(state)
+def tuning(drive: Drive) -> dict[str, Any]:
+    """Options of `qpmhe.tune`: what the odometry adds is known, the receiver's errors are not."""
+    kinds = names(drive)
+    groups = {
+        one: [k for k, kind in enumerate(kinds) if kind == one]
+        for one in ("clock", "drift", "offset") if one in kinds
+    }
+    noise = {"pseudorange": list(range(drive.ranges.shape[1]))}
+    return {"objective": "likelihood", "structure": {"disturbance": groups, "noise": noise}}
+
+
+def problem(
+    name: str, which: str, drive: Drive, away: Mapping[float, int], compiled: bool = True
+) -> Problem:
+    """A record from starts near and far; ``away`` has the numbers of runs by the distances."""
+    u, half = inputs(drive), len(drive.times) // 2
+    late = drive.times - drive.times[0] >= SETTLING
+    truth = np.where(late[:, None], drive.positions[:, :2], np.nan)
     return Problem(
-        name, f"A car between houses{which}", made,
+        name, f"A car between houses{which}", system(drive),
         [
-            Record(f"start {away:.0f} m off", drive.ranges, u, truth, [begin], half, known)
-            for away, count in (FEW if quick else STARTS).items()
-            for begin in starts(drive, away, count)
+            Record(f"start {one:.0f} m off", drive.ranges, u, truth, [begin], half)
+            for one, count in away.items() for begin in starts(drive, one, count)
         ],
-        by_hand, distance, "m", 100.0,
-        tuning=None if quick else {
-            "structure": {"disturbance": groups, "noise": {"pseudorange": range(made.p)}},
-        },
-        own=partial(own, drive, quick), note=(
+        weights(drive), distance, "m", 100.0, own=partial(own, drive, compiled), note=(
             f"Errors on the map, without the first {SETTLING:.0f} s; the late estimates have none "
             f"of the last {DELAY:.0f} s."
         ),
     )
 
 
-def own(drive: Drive, quick: bool, problem: Problem, weights: Weights) -> dict[str, Way]:
+def own(drive: Drive, compiled: bool, problem: Problem, weights: Weights) -> dict[str, Way]:
     """Over windows in which the car drives round some corners, and against reflections."""
     step = float(np.median(drive.lengths))
-    options: dict[str, Any] = {
-        "horizon": min(round(LONG / step), len(drive.times)), "max_qps": 5, "warm_start": True,
-    }
+    horizon = min(round(LONG / step), len(drive.times))
+    options: dict[str, Any] = {"horizon": horizon, "max_qps": 5, "warm_start": True}
     prior, walk, noise = (
         np.linalg.inv(one) for one in (weights.prior, weights.disturbance, weights.noise)
     )
@@ -178,9 +182,9 @@ def own(drive: Drive, quick: bool, problem: Problem, weights: Weights) -> dict[s
         noise, drive.deviation * np.sqrt(noise[0, 0]), per_component=True, graduation=1.0,
     ))
     bank = Bank(
-        partial(problem.estimator, weights=weights, cost=redescending, delay=round(DELAY / step),
-                **options),
-        np.sqrt(weights.prior.diagonal()[:2]), compiled=not quick,
+        partial(problem.estimator, weights=weights, cost=redescending,
+                delay=min(round(DELAY / step), horizon), **options),
+        np.sqrt(weights.prior.diagonal()[:2]), compiled=compiled,
     )
     return {
         "EKF, Huber innovation": partial(
@@ -198,19 +202,19 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> An
     with rc_context(LIGHT):
         figure = Figure(figsize=(10.0, 5.2 * len(problems)), layout="constrained")
         panels = figure.subplots(len(problems), 2, squeeze=False, width_ratios=(1.0, 1.2))
-    for (places, errors), problem, found in zip(panels, problems, results, strict=True):
-        record = problem.records[-1]
-        shown = {
-            one.estimator: one.middle for one in found if one.weights == BY_HAND
-            and one.record == record.name and one.estimator in ("EKF", LONG_HUBER, CAUSAL, LATE)
-        }
-        tracks(record.truth, {name: path[:, :2] for name, path in shown.items()},
-               labels=("east", "north"), axes=places)
-        places.set_title(problem.title, loc="left")
-        times = np.cumsum(record.inputs[:, 2]) - record.inputs[0, 2]
-        for style, (name, path) in zip(STYLES, shown.items(), strict=False):
-            errors.plot(times, problem.error(path, record.truth), linewidth=1.2, label=name,
-                        **style)
-        errors.set(xlabel="time (s)", ylabel="error (m)", ylim=(0.0, None))
-        errors.legend()
+        for (places, errors), problem, found in zip(panels, problems, results, strict=True):
+            record = problem.records[-1]
+            shown = {
+                one.estimator: one.middle for one in found if one.weights == BY_HAND
+                and one.record == record.name and one.estimator in ("EKF", LONG_HUBER, CAUSAL, LATE)
+            }
+            tracks(record.truth, {name: path[:, :2] for name, path in shown.items()},
+                   labels=("east", "north"), axes=places)
+            places.set_title(problem.title, loc="left")
+            times = np.cumsum(record.inputs[:, 2]) - record.inputs[0, 2]
+            for style, (name, path) in zip(STYLES, shown.items(), strict=False):
+                errors.plot(times, problem.error(path, record.truth), linewidth=1.2, label=name,
+                            **style)
+            errors.set(xlabel="time (s)", ylabel="error (m)", ylim=(0.0, None))
+            errors.legend()
     return figure
