@@ -17,7 +17,6 @@ from .evidence import CertificateError, Evidence, json_ready
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
 from .regions import Region
 
-_SAMPLES, _SEED = 500, 20210829
 
 
 @dataclass(frozen=True, eq=False)

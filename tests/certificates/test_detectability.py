@@ -7,7 +7,7 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates import search as search_module
-from qpmhe.certificates.contraction import certify_detectability
+from qpmhe.certificates.contraction import certify_detectability, certify_observer
 from qpmhe.certificates.evidence import Evidence, NotCertifiedError, weakest
 from qpmhe.certificates.inequalities import Form, Matrices, definite, norms
 from qpmhe.certificates.properties import Detectability
@@ -76,14 +76,6 @@ def test_pairs_of_trajectories_keep_to_the_bound(name):
     )
     right = found.eta * norms((one - other)[:, :n], found.P) + norms(dh, found.V)
     assert np.all(norms(df, found.P) <= right * (1 + 1e-9))
-
-
-def test_default_rate_lies_between_the_smallest_and_one():
-    found = certify_detectability(qpmhe.models.pendulum()[0], PENDULUM)
-    assert found.evidence is Evidence.PROVED
-    assert 0.1 < found.eta < 0.99
-    assert found.cells > 1
-    assert any("stay in the region" in note for note in found.notes)
 
 
 def test_nonlinear_output_takes_output_injection():
@@ -156,17 +148,36 @@ def test_too_many_cells_are_sampled(monkeypatch):
     assert "given up" in found.notes[0]
 
 
-@pytest.mark.parametrize(
-    ("answer", "words"),
-    [(Answer("user_limit"), "user_limit"), *(
-        (Answer("solved", 1.0, Form(P, 0.9, 1e-3 * np.eye(1))), "no matrix that passes")
+@pytest.mark.parametrize("answer", [
+    Answer("user_limit"), *(
+        Answer("solved", 1.0, Form(P, 0.9, 1e-3 * np.eye(1)))
         for P in (np.eye(2), -np.eye(2), np.full((2, 2), np.nan))
-    )],
-)
-def test_solvers_that_lie_or_stop_early_prove_nothing(monkeypatch, answer, words):
+    ),
+])
+def test_solvers_that_lie_or_stop_early_prove_nothing(monkeypatch, answer):
     monkeypatch.setattr(Program, "solve", lambda *_, **__: answer)
+    words = "user_limit" if answer.form is None else "no matrix that passes"
     with pytest.raises(NotCertifiedError, match=words):
         certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=0.9)
+
+
+@pytest.mark.parametrize(("A", "C", "L"), [
+    ([[1.1]], [[0.5]], [[0.6]]), (np.diag([0.7, 0.5]), [[1.0, 1.0]], [[0.0], [0.0]]),
+    ([[0.9, 0.4], [-0.3, 0.8]], [[1.0, 0.0]], [[0.5], [0.1]]),
+    ([[0.9, 0.2, 0.0], [-0.1, 0.8, 0.3], [0.1, 0.0, 0.7]], [[1.0, 0.0, 0.0]],
+     [[0.4], [0.1], [0.1]]),
+])
+def test_rates_of_linear_systems_are_reproduced(A, C, L):
+    closed = np.subtract(A, np.matmul(L, C))
+    true, n = float(np.abs(np.linalg.eigvals(closed)).max()), len(closed)
+    unseen = linear(closed, 0.0 * np.array(C))
+    for ask in (
+        lambda rate: certify_observer(linear(A, C), qpmhe.Luenberger(L), unit_box(n), rho=rate),
+        lambda rate: certify_detectability(unseen, unit_box(n), eta=rate),
+    ):
+        assert ask(true * (1.0 + 1e-6)).evidence is Evidence.PROVED
+        with pytest.raises(NotCertifiedError):
+            ask(true * (1.0 - 1e-12))
 
 
 def test_assumed_constants_are_labelled():
