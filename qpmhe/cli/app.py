@@ -68,7 +68,7 @@ app.command("export-qps")(export_qps)
 
 @app.command()
 def solvers() -> None:
-    """Table of the QP backends: what is installed, and what each can do."""
+    """List the QP backends: what is installed, and what each can do."""
     table = Table(
         title="QP backends",
         title_justify="left",
@@ -103,31 +103,33 @@ def certify(
         str, typer.Argument(help="Model of the zoo, package.module:function or file.py:function.")
     ],
     box: Annotated[
-        str | None, typer.Option(help="Set of states, such as 0.1:9,-1:9; the model's own, or one "
-                                 "about a simulated record, if left out."),
+        str | None, typer.Option(help="Set of states, such as 0.1:9,-1:9; default is the "
+                                      "model's own, else a box around a simulated record."),
     ] = None,
     horizon: Annotated[
         str | None, typer.Option(help="Horizons N, between commas; the model's own if left out.")
     ] = None,
     report: Annotated[
-        Path | None, typer.Option(help="JSON file of everything; the picture goes beside it.")
+        Path | None, typer.Option(help="JSON file for all results; a picture is written beside "
+                                       "it.")
     ] = None,
     input_box: Annotated[
         str | None, typer.Option(help="Bounds on the inputs, in the form of --box.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated record.")] = 0,
     seconds: Annotated[
-        float, typer.Option(help="How long the search may take, about.")
+        float, typer.Option(help="Time limit of the search, about, in seconds.")
     ] = 60.0,
     details: Annotated[
-        bool, typer.Option("--details", help="The theorem's assumptions and constants as well.")
+        bool, typer.Option("--details", help="Show the theorem's assumptions and constants, "
+                                             "too.")
     ] = False,
     design: Annotated[
-        bool, typer.Option("--design", help="Weights, discount and horizon of a Lyapunov design, "
-                                            "ready to be pasted.")
+        bool, typer.Option("--design", help="Design weights, discount and horizon by a "
+                                            "Lyapunov function, ready to paste.")
     ] = False,
 ) -> None:
-    """What is proved of a model: the observer's error, and what the theorem guarantees."""
+    """Prove how far the observer can be from the truth, and what the theorem guarantees."""
     from .certify import certify as run
 
     certified = run(

@@ -17,9 +17,10 @@ from ..studies.grid import WORDS, Measure
 from ..studies.report import check_libraries
 from .report import show_report
 
-_JOBS = typer.Option(min=1, help="Cells at a time; all cores if left out. Times want 1.")
+_JOBS = typer.Option(min=1, help="Cells to run in parallel, default all cores; to measure "
+                                 "times, give 1.")
 _SCHEDULER = typer.Option(help="Address of a Dask scheduler whose workers run the cells.")
-_RETRY = typer.Option("--retry-failed", help="Run cells that failed before once more.")
+_RETRY = typer.Option("--retry-failed", help="Run the cells again that failed before.")
 
 
 def compare(
@@ -52,16 +53,17 @@ def compare(
                      "where no model is named."),
     ] = None,
     measure: Annotated[
-        Measure, typer.Option(help="What to measure; times alone run one cell at a time.")
+        Measure, typer.Option(help="What to measure; times alone run one cell after the other.")
     ] = "both",
     deadline: Annotated[
-        float | None, typer.Option(help="Seconds for a step; shows the share that takes longer.")
+        float | None, typer.Option(help="Deadline of a step in seconds; the report shows how "
+                                        "many steps miss it.")
     ] = None,
     covariances: Annotated[
         bool, typer.Option("--covariances", help="Compute covariances and the NEES, too.")
     ] = False,
     cell_timeout: Annotated[
-        float, typer.Option(help="Seconds after which a cell is given up.")
+        float, typer.Option(help="Seconds after which a cell is stopped.")
     ] = 60.0,
     store: Annotated[
         Path, typer.Option(help="File of the results; a run that was stopped resumes from it.")
@@ -71,7 +73,7 @@ def compare(
     scheduler: Annotated[str | None, _SCHEDULER] = None,
     retry_failed: Annotated[bool, _RETRY] = False,
 ) -> None:
-    """Which QP backend, at which cap, gives which accuracy in which time: table and report."""
+    """Compare QP backends, caps and numbers of QPs: accuracy and time, a table and a report."""
     if model is None and steps is None:
         steps = 100  # all backends at all caps are to be done within ten minutes
     what = Study(

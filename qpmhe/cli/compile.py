@@ -20,10 +20,11 @@ def compile(  # noqa: A001 - the name of the command
         typer.Argument(help="Models of the zoo, package.module:function or file.py:function."),
     ],
     horizon: Annotated[
-        int | None, typer.Option(min=1, help="N; default is each model's own.")
+        int | None, typer.Option(min=1, help="Horizon N; default is each model's own.")
     ] = None,
     initial_state: Annotated[
-        str | None, typer.Option(help="Numbers between commas; default is each model's own.")
+        str | None, typer.Option(help="Initial estimate, numbers between commas; default is "
+                                      "each model's own.")
     ] = None,
 ) -> None:
     """Compile the steps of models, so that engine="auto" finds them in the cache."""

@@ -35,7 +35,7 @@ def doctor(
                        "the zoo if left out."),
     ] = None,
 ) -> None:
-    """What this machine has, and which engine each model would run, with the reason."""
+    """Show what this machine has, and which engine each model would run, and why."""
     console = Console()
     with console.status("trying the compiler"):
         machine = _machine()

@@ -27,7 +27,7 @@ def estimate(
                        "input."),
     ],
     out: Annotated[
-        str, typer.Option(help="What to write: .csv, .parquet, or - for standard output.")
+        str, typer.Option(help="File to write, .csv or .parquet; - is standard output.")
     ] = "-",
     time: options.Time = None,
     outputs: options.Outputs = None,
@@ -39,47 +39,48 @@ def estimate(
                                 "convergence.")
     ] = None,
     max_solver_iterations: Annotated[
-        str | None, typer.Option(help="Cap on the iterations inside each QP, or: none.")
+        str | None, typer.Option(help="Cap on the solver's iterations in each QP; none removes "
+                                      "it.")
     ] = None,
     initial_state: options.InitialState = None,
     engine: options.Engine = None,
     weights: Annotated[
         Path | None,
-        typer.Option(help="File of qpmhe tune: observer, cost, horizon and parameters of the "
-                     "model from there."),
+        typer.Option(help="File that qpmhe tune wrote: take observer, cost, horizon and the "
+                          "model's parameters from it."),
     ] = None,
     covariances: Annotated[
         Literal["none", "std", "full"],
-        typer.Option(help="Standard deviations or covariances of the estimates."),
+        typer.Option(help="Write standard deviations or full covariances of the estimates."),
     ] = "none",
     step_time: Annotated[
-        bool, typer.Option(help="Whether to write the seconds of each step.")
+        bool, typer.Option(help="Write the seconds that each step took.")
     ] = True,
     bound: Annotated[
         bool,
-        typer.Option("--bound", help="Columns of the proved set around the observer, which holds "
-                     "the true state, and of the bound of the estimate's error."),
+        typer.Option("--bound", help="Write the proved set around the observer, which holds "
+                                     "the true state, and the bound of the estimate's error."),
     ] = False,
     bound_box: Annotated[
         str | None,
-        typer.Option(help="For --bound: set of states, such as 0.1:9,-1:9; as for certify if "
-                     "left out."),
+        typer.Option(help="For --bound: set of states, such as 0.1:9,-1:9; default as for "
+                          "certify."),
     ] = None,
     bound_input_box: Annotated[
         str | None, typer.Option(help="For --bound: set of inputs, in the form of --bound-box.")
     ] = None,
     initial_error: Annotated[
         str | None,
-        typer.Option(help="For --bound: most of |x - z| at the start, a length or one for each "
-                     "state; default is the scenario's."),
+        typer.Option(help="For --bound: largest |x - z| at the start, one length or a number "
+                          "for each state; default is the scenario's."),
     ] = None,
     max_disturbance: Annotated[
         str | None,
-        typer.Option(help="For --bound: most of |w|, a length or one for each state; default is "
-                     "W, or three standard deviations."),
+        typer.Option(help="For --bound: largest |w|, one length or a number for each state; "
+                          "default is W, else three standard deviations."),
     ] = None,
     max_noise: Annotated[
-        str | None, typer.Option(help="For --bound: most of |v|, likewise for outputs.")
+        str | None, typer.Option(help="For --bound: largest |v|, likewise for outputs.")
     ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an estimation that was interrupted.")
@@ -96,23 +97,25 @@ def estimate(
     ] = False,
     max_gap: Annotated[
         int | None,
-        typer.Option(min=0, help="Most samples in a row that may be missing; default 1000."),
+        typer.Option(min=0, help="Largest number of missing samples in a row; default 500."),
     ] = None,
     skip_repeated: Annotated[
-        bool, typer.Option("--skip-repeated", help="Skip lines that repeat the time before.")
+        bool, typer.Option("--skip-repeated", help="Skip lines with the same time as the line "
+                                                   "before.")
     ] = False,
     separator: Annotated[
-        str | None, typer.Option(help="Of a CSV file: a character, comma, semicolon, tab, ...")
+        str | None, typer.Option(help="Separator of a CSV file: a character, or comma, "
+                                      "semicolon, tab, bar, space.")
     ] = None,
     decimal: Annotated[Literal["auto", ".", ","], typer.Option(help="Decimal mark.")] = "auto",
-    encoding: Annotated[str, typer.Option(help="Of a CSV file.")] = "utf-8",
+    encoding: Annotated[str, typer.Option(help="Text encoding of a CSV file.")] = "utf-8",
     skip_lines: Annotated[
         int, typer.Option(min=0, help="Lines of a CSV file above its header.")
     ] = 0,
     time_format: Annotated[
         str | None,
-        typer.Option(help="Form of the dates, such as '%d/%m/%Y %H:%M:%S'; ISO dates and "
-                     "DD.MM.YYYY need none."),
+        typer.Option(help="Format of the dates, such as '%d/%m/%Y %H:%M:%S'; ISO dates and "
+                          "DD.MM.YYYY need none."),
     ] = None,
     missing: Annotated[
         list[str] | None,
@@ -120,7 +123,8 @@ def estimate(
     ] = None,
     diagnose: Annotated[
         str | None,
-        typer.Option(metavar="FILE.html", help="Look for faults, and write what was found."),
+        typer.Option(metavar="FILE.html", help="Look for faults of sensors, model and weights, "
+                                               "and write a page about them."),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
 ) -> None:

@@ -67,13 +67,13 @@ def report(
     store: Annotated[Path, typer.Argument(help="File of the results.")],
     out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("results/report"),
 ) -> None:
-    """Summary of a store on screen, and its report: one HTML page, and figures."""
+    """Summarise a store on screen, and write its report: an HTML page and figures."""
     show_report(Console(), store, out)
 
 
 def export(
     store: Annotated[Path, typer.Argument(help="File of the results.")],
-    file: Annotated[Path, typer.Argument(help="What to write: .csv or .parquet.")],
+    file: Annotated[Path, typer.Argument(help="File to write, .csv or .parquet.")],
 ) -> None:
     """Write the rows of a store into a CSV or Parquet file."""
     Console().print(f"wrote {studies.export(store, file)}", highlight=False)

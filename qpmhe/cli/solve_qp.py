@@ -192,7 +192,8 @@ def export_qps(
         Path, typer.Option(help="Folder of the test set.")
     ] = Path("results/qpbenchmark"),
     matrices: Annotated[
-        Matrices, typer.Option(help="What solvers that take both kinds are given.")
+        Matrices, typer.Option(help="Kind of matrices for solvers that take dense and sparse "
+                                    "ones.")
     ] = "sparse",
 ) -> None:
     """Write dumped QPs as a test set of qpbenchmark."""

@@ -29,14 +29,15 @@ def tune(
     record: Annotated[
         list[str], typer.Argument(help="CSV (also .gz) or Parquet files with a time column.")
     ],
-    out: Annotated[Path, typer.Option(help="What to write, a TOML file.")] = Path("weights.toml"),
+    out: Annotated[Path, typer.Option(help="TOML file to write.")] = Path("weights.toml"),
     horizon: options.Horizon = None,
     structure: Annotated[
         Literal["diagonal", "scalar", "full"],
-        typer.Option(help="What is tuned of the covariances of disturbance and noise."),
+        typer.Option(help="Which parts of the covariances of disturbance and noise to tune."),
     ] = "diagonal",
     prior: Annotated[
-        bool, typer.Option("--prior", help="Tune the prior as well; wants several records.")
+        bool, typer.Option("--prior", help="Tune the covariance of the prior, too; needs "
+                                           "several records.")
     ] = False,
     parameter: Annotated[
         list[str] | None,
@@ -45,12 +46,13 @@ def tune(
     ] = None,
     threshold: Annotated[
         float | None,
-        typer.Option(help="Huber's loss of the noise beyond so many standard deviations, for "
-                     "records with outliers."),
+        typer.Option(help="Use Huber's loss of the noise beyond this many standard deviations, "
+                          "for records with outliers."),
     ] = None,
     objective: Annotated[
         Literal["auto", "likelihood", "prediction", "truth"],
-        typer.Option(help="What is lowered after the likelihood; auto is the error, if --truth."),
+        typer.Option(help="What to minimise after the likelihood; auto is the error where "
+                          "--truth is given."),
     ] = "auto",
     truth: Annotated[
         str | None, typer.Option(help="Columns of true states: x1=COLUMN,x2=COLUMN.")
@@ -59,13 +61,14 @@ def tune(
     outputs: options.Outputs = None,
     inputs: options.Inputs = None,
     initial_state: options.InitialState = None,
-    held_out: Annotated[float, typer.Option(help="Share of the blocks that judge.")] = 0.25,
+    held_out: Annotated[float, typer.Option(help="Share of the blocks held out to judge the "
+                                                 "result.")] = 0.25,
     horizons: Annotated[
         str | None, typer.Option(help="Horizons to compare afterwards, between commas.")
     ] = None,
-    starts: Annotated[int, typer.Option(min=1, help="Starts of the search.")] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the starts.")] = 0,
-    jobs: Annotated[int, typer.Option(min=1, help="Starts at a time.")] = 1,
+    starts: Annotated[int, typer.Option(min=1, help="Starting points of the search.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the starting points.")] = 0,
+    jobs: Annotated[int, typer.Option(min=1, help="Searches to run in parallel.")] = 1,
     engine: options.Engine = None,
     dt: options.Step = None,
     time_scale: options.TimeScale = 1.0,
