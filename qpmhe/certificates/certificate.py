@@ -192,17 +192,10 @@ class Certificate:
         system = self.system
         content: dict[str, Any] = json_ready({
             "system": {"n": system.n, "p": system.p, "m": system.m},
-            "region": self.region.to_dict(),
-            "headline": self.headline,
-            "evidence": self.evidence.value,
-            "assumed": list(ASSUMED),
-            "failures": self.failures,
-            "observer_bound": self.observer_bound and self.observer_bound.to_dict(),
-            "assumptions": [each.to_dict() for each in self.assumptions],
-            "detectability": self.detectability and self.detectability.to_dict(),
-            "observer": self.stability and self.stability.to_dict(),
-            "sizes": self.sizes.to_dict(),
-            "paper": [
+            "region": self.region, "headline": self.headline, "evidence": self.evidence,
+            "assumed": ASSUMED, "failures": self.failures, "observer_bound": self.observer_bound,
+            "assumptions": self.assumptions, "detectability": self.detectability,
+            "observer": self.stability, "sizes": self.sizes, "paper": [
                 each.to_dict(self.sizes.largest, self.diameter) for each in self.constants.values()
             ],
         })

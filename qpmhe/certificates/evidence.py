@@ -74,7 +74,9 @@ class OutOfTimeError(NotCertifiedError):
 
 
 def json_ready(value: Any) -> Any:
-    """Lists for arrays and tuples, and None for numbers that are not finite."""
+    """Types that JSON knows; numbers that are not finite become None."""
+    if hasattr(value, "to_dict"):
+        value = value.to_dict()
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Evidence):

@@ -270,8 +270,8 @@ class Design:
         """Everything in types that JSON knows; infinite numbers become None."""
         content: dict[str, Any] = json_ready({
             "prior": self.prior, "disturbance": self.disturbance, "noise": self.noise,
-            "discount": self.discount, "horizon": self.horizon, "region": self.region.to_dict(),
-            "sizes": self.sizes.to_dict(), "evidence": self.evidence.value, "notes": self.notes,
+            "discount": self.discount, "horizon": self.horizon, "region": self.region,
+            "sizes": self.sizes, "evidence": self.evidence, "notes": self.notes,
             "contraction": self.contraction(),
             "least_horizon": self.least_horizon(), "limit": self.components(self.limit()),
         })

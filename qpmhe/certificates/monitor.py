@@ -244,9 +244,11 @@ class Monitor:
             )
         order = self._order(estimate.time)
         if self.lost is None:
-            reason = self._ends or order or (
-                self._again(estimate) if again else self._advance(estimate, given, dt)
-            )
+            reason = self._ends or order
+            if not reason and not again:
+                reason = self._advance(estimate, given, dt)
+            elif not reason and not np.array_equal(estimate.observer_state, self._z):
+                reason = _MOVED
             if reason:
                 self.lost, self.reason, self._radius = estimate.time, reason, math.nan
         if order or again:
@@ -288,9 +290,6 @@ class Monitor:
         if time < self._time:
             return "the estimator began again (reset, or a snapshot)"
         return f"the samples from {self._time} to {time - 1} were not shown to the monitor"
-
-    def _again(self, estimate: Estimate) -> str:
-        return "" if np.array_equal(estimate.observer_state, self._z) else _MOVED
 
     def _advance(self, estimate: Estimate, u: Array, dt: float | None) -> str:
         """Take b(t) to b(t+1); why it cannot be, or empty."""
@@ -403,27 +402,21 @@ class Monitor:
 
 def _barred(estimator: MovingHorizonEstimator) -> str:
     """Why the theorem does not cover an estimator's options; empty if it does."""
-    if estimator.settings.candidate != "observer":
-        return (
-            "the estimator's candidate comes from a reinitialized observer, which the theorem "
-            "does not cover; make it with candidate='observer'."
-        )
-    if estimator.settings.arrival != "observer":
-        return (
-            "the estimator's prior is a smoothed estimate, which the theorem does not cover; "
-            "make it with arrival='observer'."
-        )
-    if estimator.system.held:
-        return (
-            "the estimator holds parameters, a term of J that the theorem does not cover; make its "
-            "system without hold."
-        )
-    if estimator.has_changed or estimator.settings.parameters:
-        return (
-            "the estimator has parameters, or its weights or bounds were changed by set(...); "
-            "the theorem is about what stays: make the estimator with constant ones."
-        )
-    return ""
+    settings = estimator.settings
+    return next((text for bars, text in (
+        (settings.candidate != "observer",
+         "the estimator's candidate comes from a reinitialized observer, which the theorem does "
+         "not cover; make it with candidate='observer'."),
+        (settings.arrival != "observer",
+         "the estimator's prior is a smoothed estimate, which the theorem does not cover; make it "
+         "with arrival='observer'."),
+        (estimator.system.held,
+         "the estimator holds parameters, a term of J that the theorem does not cover; make its "
+         "system without hold."),
+        (estimator.has_changed or settings.parameters,
+         "the estimator has parameters, or its weights or bounds were changed by set(...); the "
+         "theorem is about what stays: make the estimator with constant ones."),
+    ) if bars), "")
 
 
 def failed_hypotheses(
@@ -432,15 +425,8 @@ def failed_hypotheses(
 ) -> tuple[str, ...]:
     """Which of the `HYPOTHESES` did not hold at one sample.
 
-    Parameters
-    ----------
-    certificate, estimate
-        Of the estimator's system, observer and cost, and what the update returned.
-    inputs : (K, m) array_like, optional
-        The inputs of the window's K samples, for a system with inputs; a `ShapeError` is raised
-        if they do not fit.
-    projected : (K,) array_like, optional
-        At which samples the observer was projected onto X in the certified metric.
+    With the inputs (K, m) of the window's K samples, and at which of these the observer was
+    projected onto X in the certified metric (K,). A `ShapeError` is raised if they do not fit.
     """
     system, region = certificate.system, certificate.region
     stages = estimate.trajectory.shape[0] - 1

@@ -176,10 +176,7 @@ class ObserverBound:
         return self.projection is not None and np.array_equal(self.projection, self.metric)
 
     def of_observer(self, observer: Observer, system: System) -> ObserverBound:
-        """The same of an observer with this gain, which may be projected in another metric.
-
-        A `MismatchError` is raised if it has another gain.
-        """
+        """The same of an observer with this gain, or a `MismatchError`; its metric may differ."""
         gain = gain_if_constant(observer, system)
         if gain is None or not np.array_equal(gain, self.gain):
             theirs = "not constant" if gain is None else str(gain.tolist())
@@ -335,14 +332,8 @@ class ObserverBound:
         value is a bound; the one for :math:`\nu = 1 + |o| / (b a_1)` is at most
         :math:`(|o| + b a_1)^2`, the triangle's.
 
-        Parameters
-        ----------
-        radius : (...) array_like
-            b.
-        offset : (..., n) array_like
-            x_hat - z.
-        observer : (..., n) array_like, optional
-            z; with it, only what is within the region counts.
+        The radius is b, the offset x_hat - z (..., n); with the observer's state z (..., n), only
+        what is within the region counts.
         """
         b, o = np.asarray(radius, np.float64), np.asarray(offset, np.float64)
         axes, directions = self._axes
@@ -426,14 +417,8 @@ class ObserverBound:
     ) -> list[tuple[int, str]]:
         """Samples after which the bound does not follow, and why: the first of each kind.
 
-        Parameters
-        ----------
-        flags : (T,) array
-            Values of the statuses.
-        observer : (T, n) array
-            z(0), ..., z(T-1).
-        inputs, steps, usual : optional
-            u (T, m), lengths of the steps (T,), and the one that is certified.
+        From values of the statuses (T,), z(0), ..., z(T-1), inputs (T, m), and lengths of the
+        steps (T,) beside the one that is certified.
         """
         low, high = self.region.lower[self.region.n :], self.region.upper[self.region.n :]
         where: list[tuple[Any, Callable[[int], str]]] = [
@@ -468,10 +453,7 @@ class ObserverBound:
 
     @property
     def settling_samples(self) -> int | None:
-        """Samples until b(t) is within 10 % of its limit, from any two states of the region.
-
-        None where the limit is zero.
-        """
+        """Samples until b(t) is within 10 % of its limit, from anywhere; None where that is 0."""
         radius, limit = self.initial(Box(-self.widths, self.widths)), self.limit()
         if not limit > 0.0:
             return None
@@ -514,11 +496,9 @@ class ObserverBound:
         """Everything in types that JSON knows."""
         limit = self.limit()
         content: dict[str, Any] = json_ready({
-            "evidence": self.evidence.value, "rate": self.rate, "metric": self.metric,
-            "gain": self.gain, "sizes": self.sizes.to_dict(), "limit": limit,
-            "condition": self.condition,
-            "invariance": self.invariance and self.invariance.to_dict(),
-            "components": self.components(limit),
+            "evidence": self.evidence, "rate": self.rate, "metric": self.metric,
+            "gain": self.gain, "sizes": self.sizes, "limit": limit, "condition": self.condition,
+            "invariance": self.invariance, "components": self.components(limit),
             "length": self.farthest(limit, np.zeros(len(self.gain))),
         })
         return content

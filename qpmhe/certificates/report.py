@@ -22,7 +22,7 @@ from ..plots.style import save
 from .certificate import Certificate, examined, horizons_of
 from .contraction import certify_observer, synthesise_gain
 from .deadline import DEFAULT_SECONDS, Deadline
-from .evidence import CertificateError, NotCertifiedError
+from .evidence import CertificateError, NotCertifiedError, json_ready
 from .lyapunov import Design
 from .monitor import Monitor, monitored_run
 from .observer_bound import Band, ObserverBound
@@ -84,8 +84,7 @@ class Report:
         return certificate.to_dict() | {
             "model": self.name, "certified": certificate.holds, "replaced": self.replaced,
             "monitor": self.monitor and self.monitor.summary(),
-            "monitored": self.monitor and self.monitor.to_dict(),
-            "design": self.design and self.design.to_dict(),
+            "monitored": json_ready(self.monitor), "design": json_ready(self.design),
             "suggestions": list(dict.fromkeys(suggestions)),
             "smallest_rates": {
                 name: getattr(certificate.errors.get(what), "smallest_rate", None)
@@ -248,17 +247,8 @@ def region_of(
 ) -> Region:
     """The set that a model is certified on, and bounds on its inputs.
 
-    Parameters
-    ----------
-    system, scenario
-        The model; the scenario is simulated where something is left out.
-    region, inputs : optional
-        What is given. Left out, the scenario's; else the system's own X if that is bounded, or a
-        box around the simulated record, and the box around its inputs.
-    record : Record, optional
-        The simulated record, where there is one already.
-    option : str
-        How an error names the region.
+    What is left out is the scenario's; else the system's own X if that is bounded, or a box around
+    the simulated record, and the box around its inputs. Errors name the region by ``option``.
     """
     given = inputs
     if record is None and scenario is not None:
