@@ -18,7 +18,6 @@ from .inequalities import Matrices, eigenvalue_bounds, norm_bound
 from .regions import Region
 
 
-
 @dataclass(frozen=True, eq=False)
 class Assumption:
     """Whether an assumption of the theorem holds, and what that rests on.

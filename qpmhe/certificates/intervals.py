@@ -100,8 +100,7 @@ class Interval:
         return _outward(self.low - other.high, self.high - other.low)
 
     def __rsub__(self, other: Any) -> Interval:
-        turned: Interval = self - other
-        return -turned
+        return Interval.of(other) - self
 
     def __mul__(self, other: Any) -> Interval:
         if other is self:
@@ -119,10 +118,6 @@ class Interval:
 
     def __truediv__(self, other: Any) -> Interval:
         quotient: Interval = self * Interval.of(other).power(-1)
-        return quotient
-
-    def __rtruediv__(self, other: Any) -> Interval:
-        quotient: Interval = self.power(-1) * other
         return quotient
 
     def power(self, exponent: int) -> Interval:
@@ -214,21 +209,16 @@ def share(x: Interval, y: Interval) -> Interval:
 
     At the origin anything between -1 and 1: the generalised derivatives of the length there.
     """
-    near, far = Interval.of(abs(y).low), Interval.of(abs(y).high)
-
-    def at(end: Array, outer: NDArray[np.bool_]) -> Interval:
+    near, far = abs(y).low, abs(y).high
+    ends = []
+    for end, outer, sign in ((x.low, x.low <= 0.0, -1.0), (x.high, x.high >= 0.0, 1.0)):
         point = Interval.of(end)
-        size = [length(point, side) for side in (near, far)]
-        with np.errstate(all="ignore"):
-            one, other = (point / each for each in size)
-        return Interval(np.where(outer, one.low, other.low), np.where(outer, one.high, other.high))
-
-    low, high = at(x.low, x.low <= 0.0).low, at(x.high, x.high >= 0.0).high
-    # Division by a length that may be zero says nothing.
-    low = np.where(np.isnan(low), np.where(x.low > 0.0, 0.0, -1.0), low)
-    high = np.where(np.isnan(high), np.where(x.high < 0.0, 0.0, 1.0), high)
-    known = x.known & y.known
-    return Interval(np.maximum(low, -1.0), np.minimum(high, 1.0)).where(known)
+        found = point / length(point, Interval.of(np.where(outer, near, far)))
+        # Division by a length that may be zero says nothing.
+        nothing = np.where(outer, sign, 0.0)
+        value = found.low if sign < 0.0 else found.high
+        ends.append(np.clip(np.where(np.isnan(value), nothing, value), -1.0, 1.0))
+    return Interval(*ends).where(x.known & y.known)
 
 
 def _truth(sure: NDArray[np.bool_], possible: NDArray[np.bool_], *operands: Interval) -> Interval:
@@ -254,14 +244,12 @@ def either(
     ))
 
 
-def maximum(s: Interval, t: Interval) -> Interval:
-    """The larger of two."""
-    return Interval(np.maximum(s.low, t.low), np.maximum(s.high, t.high))
+def _extreme(function: Callable[[Array, Array], Any]) -> Callable[[Interval, Interval], Interval]:
+    """The larger or the smaller of two."""
+    return lambda s, t: Interval(function(s.low, t.low), function(s.high, t.high))
 
 
-def minimum(s: Interval, t: Interval) -> Interval:
-    """The smaller of two."""
-    return Interval(np.minimum(s.low, t.low), np.minimum(s.high, t.high))
+maximum, minimum = _extreme(np.maximum), _extreme(np.minimum)
 
 
 def _step(function: Callable[[Array], Any]) -> Callable[[Interval], Interval]:

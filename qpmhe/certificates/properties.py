@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -24,7 +23,6 @@ class _Certified:
     notes: tuple[str, ...] = ()
     P: Array | None = None
     V: Array | None = None
-    margin: float = math.nan
     cells: int = 0
     evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
     system: System | None = field(default=None, init=False, repr=False)
@@ -73,8 +71,6 @@ class Detectability(_Certified):
         Norms of the differences of states and of disturbances, and of outputs.
     form : str
         Which inequality was shown: ``output weight``, ``output injection``, or ``assumed``.
-    margin : float
-        The smallest eigenvalue of the verified matrices with their diagonals scaled to one.
     cells : int
         In how many pieces of the region the inequality was verified; 0 if in none.
     system : System or None
@@ -135,7 +131,7 @@ class ObserverStability(_Certified):
         Norms of error and disturbance, and of noise: V is L^T P L.
     Q, R : (r, r) and (p, p) array or None
         Weights of disturbance and noise in the sum of squares.
-    evidence, region, notes, margin, cells, system
+    evidence, region, notes, cells, system
         As for `Detectability`.
     """
 

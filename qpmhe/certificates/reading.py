@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Callable
 from typing import Any
 
 from ..model.expressions import CasadiModel, import_casadi
@@ -53,11 +52,8 @@ def read(graph: Graph, function: Any) -> list[int]:
         elif code == ca.OP_OUTPUT:
             results[outputs[1]] = _settled(graph, work[inputs[0]])
         else:
-            operation = _READ.get(names[code])
-            work[outputs[0]] = (
-                graph.node("unknown", parameter=names[code].lower()) if operation is None
-                else operation(graph, *(work[one] for one in inputs))
-            )
+            nodes = [work[one] for one in inputs]
+            work[outputs[0]] = _operation(graph, names[code], nodes)
     return results
 
 
@@ -73,7 +69,7 @@ def _condition(graph: Graph, node: int) -> int:
     """What is not zero, as a condition."""
     if graph.nodes[node][0] in CONDITIONS:
         return node
-    return graph.negated(graph.of("equal", *sorted((_settled(graph, node), graph.constant(0.0)))))
+    return graph.negated(_equal(graph, _settled(graph, node), graph.constant(0.0)))
 
 
 def _pick(graph: Graph, c: int, a: int) -> int:
@@ -105,58 +101,46 @@ def _raised(graph: Graph, a: int, b: int) -> int:
     return graph.of("exp", graph.mul(b, graph.of("log", a)))
 
 
-def _same(_: Graph, a: int, *__: int) -> int:
-    return a
+def _equal(graph: Graph, a: int, b: int) -> int:
+    return graph.of("equal", *sorted((a, b)))
 
 
-def _elementary(operation: str, graph: Graph, a: int) -> int:
-    return graph.of(operation, a)
-
-
-def _of_numbers(function: Callable[..., int]) -> Callable[..., int]:
-    return lambda graph, *nodes: function(graph, *(_settled(graph, one) for one in nodes))
-
-
-def _functions(table: Mapping[str, Callable[..., int]]) -> Mapping[str, Callable[..., int]]:
-    """The table itself, all of one type."""
-    return table
-
-
-def _of_conditions(operation: str) -> Callable[..., int]:
-    return lambda graph, *nodes: graph.of(
-        operation, *(_condition(graph, one) for one in nodes)
-    )
-
-
-def _ordered(operation: str) -> Callable[..., int]:
-    return _of_numbers(lambda graph, a, b: graph.of(operation, *sorted((a, b))))
-
-
-_READ: dict[str, Callable[..., int]] = {
-    "ADD": _add, "IF_ELSE_ZERO": _pick, "AND": _of_conditions("and"), "OR": _of_conditions("or"),
-    "NOT": lambda graph, c: graph.negated(_condition(graph, c)),
-    "EQ": _ordered("equal"), "FMAX": _of_numbers(Graph.largest),
-    "FMIN": _of_numbers(Graph.least),
-    "NE": _of_numbers(lambda graph, a, b: graph.negated(graph.of("equal", *sorted((a, b))))),
-    **{name: _of_numbers(function) for name, function in _functions({
-        "SUB": Graph.sub, "MUL": Graph.mul, "NEG": Graph.neg, "DIV": _divided, "SQRT": Graph.root,
-        "POW": _raised, "CONSTPOW": _raised, "SQ": lambda graph, a: graph.power(a, 2),
-        "TWICE": lambda graph, a: graph.mul(graph.constant(2.0), a),
-        "INV": lambda graph, a: _divided(graph, graph.constant(1.0), a),
-        "ASSIGN": _same, "LIFT": _same,
-        "LT": lambda graph, a, b: graph.of("less", a, b),
-        "LE": Graph.atmost,
-        "FABS": Graph.absolute,
-        "ATAN2": lambda graph, a, b: graph.of("angle", a, b),
-        "HYPOT": lambda graph, a, b: graph.of("length", a, b),
-        "FMOD": lambda graph, a, b: graph.sub(
-            a, graph.mul(b, graph.of("trunc", _divided(graph, a, b)))),
-        "COPYSIGN": lambda graph, a, b: graph.choice(
-            graph.atmost(graph.constant(0.0), b), graph.absolute(a),
-            graph.neg(graph.absolute(a))),
-    }).items()},
-    **{name: _of_numbers(partial(_elementary, name.lower())) for name in (
-        "EXP", "LOG", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "SINH", "COSH", "TANH", "ASINH",
-        "ACOSH", "ATANH", "EXPM1", "LOG1P", "ERF", "FLOOR", "CEIL", "SIGN",
-    )},
+_Reader = Callable[..., int]
+_OF_CONDITIONS: dict[str, _Reader] = {
+    "AND": lambda graph, a, b: graph.of("and", a, b),
+    "OR": lambda graph, a, b: graph.of("or", a, b), "NOT": Graph.negated,
 }
+_OF_NUMBERS: dict[str, _Reader] = {
+    "SUB": Graph.sub, "MUL": Graph.mul, "NEG": Graph.neg, "DIV": _divided, "SQRT": Graph.root,
+    "POW": _raised, "CONSTPOW": _raised, "SQ": lambda graph, a: graph.power(a, 2),
+    "TWICE": lambda graph, a: graph.mul(graph.constant(2.0), a),
+    "INV": lambda graph, a: _divided(graph, graph.constant(1.0), a),
+    "ASSIGN": lambda _, a: a, "LIFT": lambda _, a, *__: a,
+    "LT": lambda graph, a, b: graph.of("less", a, b), "LE": Graph.atmost, "EQ": _equal,
+    "NE": lambda graph, a, b: graph.negated(_equal(graph, a, b)),
+    "FABS": Graph.absolute, "FMAX": Graph.largest, "FMIN": Graph.least,
+    "ATAN2": lambda graph, a, b: graph.of("angle", a, b),
+    "HYPOT": lambda graph, a, b: graph.of("length", a, b),
+    "FMOD": lambda graph, a, b: graph.sub(
+        a, graph.mul(b, graph.of("trunc", _divided(graph, a, b)))),
+    "COPYSIGN": lambda graph, a, b: graph.choice(
+        graph.atmost(graph.constant(0.0), b), graph.absolute(a), graph.neg(graph.absolute(a))),
+}
+_ELEMENTARY = {
+    "EXP", "LOG", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "SINH", "COSH", "TANH", "ASINH",
+    "ACOSH", "ATANH", "EXPM1", "LOG1P", "ERF", "FLOOR", "CEIL", "SIGN",
+}
+
+
+def _operation(graph: Graph, name: str, nodes: list[int]) -> int:
+    """The node of one of CasADi's operations."""
+    if name in ("ADD", "IF_ELSE_ZERO"):
+        return (_add if name == "ADD" else _pick)(graph, *nodes)
+    if name in _OF_CONDITIONS:
+        return _OF_CONDITIONS[name](graph, *(_condition(graph, one) for one in nodes))
+    nodes = [_settled(graph, one) for one in nodes]
+    if name in _ELEMENTARY:
+        return graph.of(name.lower(), nodes[0])
+    if name in _OF_NUMBERS:
+        return _OF_NUMBERS[name](graph, *nodes)
+    return graph.node("unknown", parameter=name.lower())
