@@ -72,7 +72,7 @@ def system(drive: Drive) -> qpmhe.System:
 
 
 def inputs(drive: Drive) -> Array:
-    """u of each step."""
+    """Speed, turn rate and length of each step, and where the satellites are."""
     return np.column_stack(
         (drive.odometry, drive.lengths, drive.satellites.reshape(len(drive.times), -1))
     )

@@ -12,9 +12,9 @@ from ..command import DataError
 from ..problem import Array
 
 SOURCE = (
-    "The smartLoc Dataset by Pierre Reisdorf, Tim Pfeifer and others, TU Chemnitz (CC BY-SA 4.0), is "
-    "in github.com/TUC-ProAut/libRSF, folder datasets/smartLoc: put the input and the ground truth "
-    "of a record into one folder."
+    "The smartLoc Dataset by Pierre Reisdorf, Tim Pfeifer and others, TU Chemnitz (CC BY-SA 4.0), "
+    "is in github.com/TUC-ProAut/libRSF, folder datasets/smartLoc: put the input and the ground "
+    "truth of a record into one folder."
 )
 LIGHT, EARTH = 299792458.0, 7.2921151467e-5  # m/s; rad/s
 # SBAS and QZSS keep the time of GPS.
@@ -43,7 +43,8 @@ class Drive:
     strengths : (T, P) array
         Carrier to noise density of the pseudoranges, in dBHz.
     deviation : float
-        Standard deviation that the receiver reports for the best twentieth of its pseudoranges, in m.
+        Standard deviation in m that the receiver reports for the best twentieth of its
+        pseudoranges.
     """
 
     times: Array
@@ -91,33 +92,36 @@ def read(folder: Path) -> Drive:
     if not np.all(np.diff(times) > 0):
         raise DataError("two lines of its odometry have the same time")
     origin = truth[0, 1:]
-    names, columns = np.unique(ranges[:, [7, 6]], axis=0, return_inverse=True)
     step = _nearest(times, ranges[:, 0])
     near = np.abs(times[step] - ranges[:, 0]) <= 0.5 * np.median(np.diff(times))
+    step, ranges = step[near], ranges[near]
+    if not len(ranges):
+        raise DataError("none of its pseudoranges is of the time of its odometry")
+    names, columns = np.unique(ranges[:, [7, 6]], axis=0, return_inverse=True)
+    columns = columns.ravel()
     y, strengths = np.full((2, len(times), len(names)), np.nan)
     satellites = np.full((len(times), len(names), 3), np.nan)
-    y[step[near], columns[near]] = ranges[near, 1]
-    strengths[step[near], columns[near]] = ranges[near, 9]
-    satellites[step[near], columns[near]] = local(_rotated(ranges[near, 3:6], origin), origin)
+    y[step, columns], strengths[step, columns] = ranges[:, 1], ranges[:, 9]
+    satellites[step, columns] = local(rotated(ranges[:, 3:6], origin), origin)
     at = np.column_stack([
         np.interp(times, truth[:, 0], one, left=np.nan, right=np.nan)
         for one in local(truth[:, 1:], origin).T
     ])
     return Drive(
-        times, y, _filled(satellites), _offsets(ranges[:, 7], columns), odometry[:, [1, 6]], at, strengths,
-        float(np.sqrt(np.quantile(ranges[:, 2], 0.05))),
+        times, y, _filled(satellites), _offsets(ranges[:, 7], columns), odometry[:, [1, 6]], at,
+        strengths, float(np.sqrt(np.quantile(ranges[:, 2], 0.05))),
     )
 
 
 def local(points: Array, origin: Array) -> Array:
     """East, north and up of an origin, both Earth-centred; up is away from the Earth's centre."""
-    x, y, z = origin
+    x, y, _ = origin
     east = np.array([-y, x, 0.0]) / np.hypot(x, y)
     up = origin / np.linalg.norm(origin)
     return (points - origin) @ np.stack((east, np.cross(up, east), up)).T
 
 
-def _rotated(satellites: Array, receiver: Array) -> Array:
+def rotated(satellites: Array, receiver: Array) -> Array:
     """Satellites in the Earth's axes at the time of reception: it turns while a signal travels."""
     angle = EARTH / LIGHT * np.linalg.norm(satellites - receiver, axis=1)
     cos, sin = np.cos(angle), np.sin(angle)
