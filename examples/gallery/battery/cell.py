@@ -145,9 +145,9 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> An
             top.set_title(record.name)
             spoilt.set(xlabel="time (min)", xlim=(0, minutes[-1]))
         axes[0, 0].set(ylabel="state of charge (%)", ylim=(0, 103))
-        axes[1, 0].set(ylabel="error (percentage points)", ylim=(-15, 8))
+        axes[1, 0].set(ylabel="error (percentage points)", ylim=(-3, 3))
         axes[2, 0].set(ylabel="error (percentage points),\n2 % of the voltages read 0 V",
-                       ylim=(-40, 8))
+                       ylim=(-16, 6))
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center",
                       ncols=2, frameon=False)
     return figure
