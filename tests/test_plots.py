@@ -116,7 +116,8 @@ def test_step_times_tell_how_many_are_late(case):
     deadline = float(np.median(run.times))
     panel = plots.step_times(run, deadline=deadline)
     late = (run.times > deadline).mean()
-    assert f"{late:.1%}" in panel.texts[0].get_text()
+    texts = [text.get_text() for text in panel.get_legend().get_texts()]
+    assert f"deadline ({late:.1%} late)" in texts
     steps = lines(panel)["whole step"]
     np.testing.assert_allclose(steps[:, 0], 1e6 * np.sort(run.times))
     assert steps[0, 1] == 1.0

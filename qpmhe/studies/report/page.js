@@ -43,14 +43,13 @@
 
   function draw(plot) {
     const name = plot.dataset.figure, found = figure(name), choice = wanted[name] || {};
+    // A section without data for this problem is left out.
+    plot.closest("section").hidden = !found;
     if (!found) {
       Plotly.purge(plot);
-      plot.replaceChildren(Object.assign(document.createElement("p"),
-        { className: "none", textContent: "The study holds nothing to draw here." }));
       drawn[name] = null;
       return;
     }
-    if (drawn[name] === null) { plot.replaceChildren(); }
     const traces = found.data.map((trace) => ({ ...trace, visible: shows(trace, choice) }));
     if (name === "trajectories") { follow(traces, choice.run); }
     const layout = structuredClone(found.layout);
