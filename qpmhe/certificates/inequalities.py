@@ -250,17 +250,12 @@ def definite(matrices: Matrices) -> NDArray[np.bool_]:
 
 def eigenvalue_bounds(P: Array) -> tuple[float, float]:
     r"""Numbers :math:`0 < a \le b` with :math:`a I \prec P \prec b I`, verified."""
-    values = np.linalg.eigvalsh(P)
-    eye = np.eye(P.shape[0])
+    values, eye = np.linalg.eigvalsh(P), np.eye(len(P))
     for slack in (1e-13, 1e-11, 1e-9, 1e-7):
         room = slack * float(np.abs(values).max())
         low, high = float(values[0]) - room, float(values[-1]) + room
-        if low <= 0.0:
-            break
-        pair = Matrices.exact(np.stack((P, -P))) + Matrices.exact(
-            np.stack((-low * eye, high * eye))
-        )
-        if definite(pair).all():
+        sides = np.stack((P, -P)), np.stack((-low * eye, high * eye))
+        if low > 0.0 and definite(Matrices.exact(sides[0]) + Matrices.exact(sides[1])).all():
             return low, high
     raise CertificateError(
         f"P has the eigenvalues {values.tolist()}; it could not be shown positive definite."
@@ -268,29 +263,18 @@ def eigenvalue_bounds(P: Array) -> tuple[float, float]:
 
 
 def norm_bound(matrices: Matrices) -> Array:
-    """Upper bounds on the spectral norms of the matrices in each set."""
-    middle = matrices.middle
-    spread = np.sqrt(
-        np.square(np.broadcast_to(matrices.radius, middle.shape)).sum(axis=(-2, -1))
-    ) * (1.0 + 1e-13)
-    bounds = np.full(middle.shape[0], np.inf)
-    usable = np.isfinite(middle).all(axis=(-2, -1)) & np.isfinite(spread)
-    if not usable.any():
-        return bounds
-    chosen = Matrices.exact(middle[usable])
-    found = np.linalg.norm(middle[usable], 2, axis=(-2, -1))
-    frobenius = np.sqrt(np.square(middle[usable]).sum(axis=(-2, -1))) * (1.0 + 1e-13) + _TINY
-    guess = found * (1.0 + 1e-10) + 1e-150
-    eye = np.eye(middle.shape[-1])
-    square = Matrices.exact((guess * guess * (1.0 - 1e-15))[:, None, None] * eye)
-    shown = definite(square - chosen.T @ chosen)
-    bounds[usable] = (np.where(shown, guess, frobenius) + spread[usable]) * (1.0 + 1e-15)
-    return bounds
-
-
-def rounded_up(value: float, operations: int = 8) -> float:
-    """A number no less than one that was computed by some correctly rounded operations."""
-    return math.nextafter(value * (1.0 + operations * _UNIT), math.inf)
+    """Upper bounds on the spectral norms of the matrices in each set; infinite where unknown."""
+    radius = np.broadcast_to(matrices.radius, matrices.middle.shape)
+    with np.errstate(all="ignore"):
+        spread = np.sqrt(np.square(radius).sum(axis=(-2, -1))) * (1.0 + 1e-13)
+        usable = np.isfinite(matrices.middle).all(axis=(-2, -1)) & np.isfinite(spread)
+        chosen = Matrices.exact(np.where(usable[:, None, None], matrices.middle, 0.0))
+        frobenius = np.sqrt(np.square(chosen.middle).sum(axis=(-2, -1))) * (1.0 + 1e-13) + _TINY
+        guess = np.linalg.norm(chosen.middle, 2, axis=(-2, -1)) * (1.0 + 1e-10) + 1e-150
+        eye = np.eye(chosen.middle.shape[-1])
+        square = Matrices.exact((guess * guess * (1.0 - 1e-15))[:, None, None] * eye)
+        found = np.where(definite(square - chosen.T @ chosen), guess, frobenius) + spread
+    return np.where(usable, found * (1.0 + 1e-15), np.inf)
 
 
 def euclidean_constants(P: Array, V: Array, rate: float) -> tuple[float, float, float]:
@@ -306,7 +290,8 @@ def euclidean_constants(P: Array, V: Array, rate: float) -> tuple[float, float, 
     low, high = eigenvalue_bounds(P)
     size = 2.0 * float(np.linalg.norm(V))
     # Of V, the upper bound alone is needed; shifted, it has the lower one that is verified.
-    output = eigenvalue_bounds(V + size * np.eye(V.shape[0]))[1] - size if size > 0.0 else 0.0
+    output = eigenvalue_bounds(V + size * np.eye(len(V)))[1] - size if size > 0.0 else 0.0
     output = max(output, 0.0) + 1e-15 * size
-    c_p = rounded_up(math.sqrt(high / low))
-    return c_p, rounded_up(c_p / rate), max(rounded_up(math.sqrt(output / low) / rate), 1e-300)
+    up = 1.0 + 8.0 * _UNIT
+    c_p = math.sqrt(high / low) * up
+    return c_p, c_p / rate * up, max(math.sqrt(output / low) / rate * up, 1e-300)

@@ -72,8 +72,7 @@ class Region:
             inside &= np.all(
                 (rows >= self.states.row_lower) & (rows <= self.states.row_upper), axis=-1
             )
-        found: NDArray[np.bool_] = inside
-        return found
+        return np.asarray(inside)
 
     def outside(self, lower: Array, upper: Array) -> NDArray[np.bool_]:
         """Which cells, given by corners (B, n + m), certainly have no state of the region."""
