@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from ..model.system import Function, System
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Loss = Callable[[Array], tuple[Array, Array]]
 
 # Outliers have a Cauchy distribution, as they may be anything: their share, and its width.
 _SHARE, _WIDTH = 0.02, 8.0
@@ -31,8 +33,8 @@ class Hypothesis:
         y, NaN where it is missing, and u.
     noise, disturbance : (p, p) and (n, n) array
         Covariances R, and Q of what the disturbance adds to the state.
-    start : (n,) array
-        The first estimate.
+    start, prior : (n,) and (n, n) array
+        The first estimate, and its covariance.
     step : float
         The length of each step, as a multiple of what the record says.
     outliers : bool
@@ -46,6 +48,7 @@ class Hypothesis:
     noise: Array
     disturbance: Array
     start: Array
+    prior: Array
     step: float = 1.0
     outliers: bool = False
     gains: Array | None = None
@@ -94,12 +97,18 @@ class Filtered:
 
 
 class FilterBank:
-    """Runs filters over one record, with steps (T,) or the usual one, and samples before it."""
+    """Runs filters over one record, with steps (T,) or the usual one, and samples before it.
+
+    With a `loss`, of whitened innovations to their costs and to what corrects the filter, they are
+    as `qpmhe.ExtendedKalman` is: linearised at the predictions alone; all samples are evidence.
+    """
 
     def __init__(
-        self, system: System, steps: Array | None, prior: Array, before: int = 0
+        self, system: System, steps: Array | None, before: int = 0, *, loss: Loss | None = None
     ) -> None:
-        self.system, self.before, self._prior, self._steps = system, before, prior, steps
+        self.system, self.before, self._steps, self._loss = system, before, steps, loss
+        #: The first thing that the model has raised.
+        self.error: Exception | None = None
         #: Takes the length of the step as its last input where it can.
         self.model = system if system.make_timed is None else system.timed
         self._is_timed = self.model is not system
@@ -107,14 +116,14 @@ class FilterBank:
             self._steps = np.array([float(system.dt or 1.0)])
         self._tried = False
 
-    def _try_batched(self, start: Array, inputs: Array) -> None:
+    def _try_batched(self, start: Array, prior: Array, inputs: Array) -> None:
         """Let functions that no trace has proved to take many states do so if it looks like it."""
         self._tried = True
         if "looped" not in (self.model.f.mode, self.model.h.mode):
             return
         self.model = model = self.model.copy(traced=True)
         generator, count = np.random.default_rng(0), 2 * self.system.n + 7
-        spread = 0.1 * np.sqrt(self._prior.diagonal())
+        spread = 0.1 * np.sqrt(prior.diagonal())
         x = self._bounded(start + spread * generator.standard_normal((count, self.system.n)))
         for one in (model.f, model.h, model.f_jacobian, model.h_jacobian):
             one.try_batched(x, inputs[np.arange(count) % len(inputs)])
@@ -142,18 +151,32 @@ class FilterBank:
 
     def moves(self, states: Array, inputs: Array) -> tuple[Array, Array]:
         """Expected outputs (T, p) at states (T, n), and how far they move within a step."""
-        expected = _values(self.model.h.batch, states, inputs, (self.system.p,))
-        following = _values(self.model.f.batch, states, inputs, (self.system.n,))
-        later = _values(self.model.h.batch, following, inputs, (self.system.p,))
+        expected = self._values(self.model.h.batch, states, inputs, (self.system.p,))
+        following = self._values(self.model.f.batch, states, inputs, (self.system.n,))
+        later = self._values(self.model.h.batch, following, inputs, (self.system.p,))
         return expected, self.errors(later, expected)
+
+    def _values(self, function: Function, x: Array, u: Array, shape: tuple[int, ...]) -> Array:
+        """A model function's values at all states; NaN where it raises."""
+        try:
+            return np.asarray(function(x, u))
+        except Exception:
+            found = np.full((len(x), *shape), np.nan)
+            for i in range(len(x)):
+                try:
+                    found[i] = function(x[i : i + 1], u[i : i + 1])[0]
+                except Exception as error:
+                    self.error = self.error or error
+            return found
 
     def run(self, hypotheses: Sequence[Hypothesis]) -> Filtered:
         """Filter the record under all hypotheses at once."""
         y = np.array([one.measurements for one in hypotheses])
         u = np.array([self.full_inputs(one.inputs, one.step) for one in hypotheses])
         start = np.array([one.start for one in hypotheses])
+        prior = np.array([one.prior for one in hypotheses])
         if not self._tried:
-            self._try_batched(start[0], u[0])
+            self._try_batched(start[0], prior[0], u[0])
         model, (count, total, p), n = self.model, y.shape, self.system.n
         there = np.isfinite(y)
         y = np.where(there, y, 0.0)
@@ -164,7 +187,7 @@ class FilterBank:
         unit = np.sqrt(hypotheses[0].noise.diagonal())
         noise = np.array([one.noise for one in hypotheses]) / np.multiply.outer(unit, unit)
         eye_n, eye_p = np.eye(n), np.eye(p)
-        x, covariance = start.copy(), np.tile(self._prior, (count, 1, 1))
+        x, covariance = start.copy(), prior.copy()
         alive, logs = np.ones(count, np.bool_), np.zeros((total, count))
         shapes = (n,), (n,), (p,), (p, p), (p, p), (n, n), (n, n), (p, n), (n, p)
         first = Filtered(logs, *(np.empty((total, *shape)) for shape in shapes))
@@ -172,8 +195,8 @@ class FilterBank:
         usual, any_outliers = np.log1p(-_SHARE), outliers.any()
         for t in range(total):
             now, seen = u[:, t], there[:, t]
-            c = _values(model.h_jacobian.batch, x, now, (p, n)) / unit[:, None]
-            e = self.errors(y[:, t], _values(model.h.batch, x, now, (p,))) / unit
+            c = self._values(model.h_jacobian.batch, x, now, (p, n)) / unit[:, None]
+            e = self.errors(y[:, t], self._values(model.h.batch, x, now, (p,))) / unit
             transposed = covariance @ c.transpose(0, 2, 1)
             spread = c @ transposed
             if any_outliers:
@@ -192,23 +215,31 @@ class FilterBank:
             good &= np.isfinite(spread).all(axis=(1, 2)) & np.isfinite(c).all(axis=(1, 2))
             if not good.all():
                 alive = good
-                x[~good], covariance[~good] = start[~good], self._prior
+                x[~good], covariance[~good] = start[~good], prior[~good]
                 e[~good], c[~good], spread[~good], transposed[~good] = 0.0, 0.0, eye_p, 0.0
-            inverse = _inverses(spread, alive)
+            inverse = _each(np.linalg.inv, spread, alive)
             gain = transposed @ inverse
-            logs[t] -= 0.5 * (
-                np.einsum("hi,hij,hj->h", e, inverse, e) + np.linalg.slogdet(spread)[1]
-            )
+            if self._loss is None:
+                cost = 0.5 * np.einsum("hi,hij,hj->h", e, inverse, e)
+                move = np.einsum("hij,hj->hi", gain, e)
+            else:
+                factor = _each(np.linalg.cholesky, spread, alive)
+                cost, used = self._loss(np.asarray(np.linalg.solve(factor, e[..., None]))[..., 0])
+                move = np.einsum("hij,hjk,hk->hi", gain, factor, used)
+            logs[t] -= cost + 0.5 * np.linalg.slogdet(spread)[1]
             first.states[t], first.outputs[t], first.gains[t] = x[0], c[0], gain[0]
             first.innovations[t] = np.where(seen[0], e[0], np.nan)
             first.spreads[t], first.weights[t] = spread[0], inverse[0]
-            x = self._bounded(x + np.einsum("hij,hj->hi", gain, e))
+            if self._loss is None:
+                x = self._bounded(x + move)
             closed = eye_n - gain @ c
             covariance = closed @ covariance @ closed.transpose(0, 2, 1)
             covariance += gain @ noise @ gain.transpose(0, 2, 1)
             first.corrected[t], first.covariances[t] = x[0], covariance[0]
-            a = _values(model.f_jacobian.batch, x, now, (n, n))
-            following = _values(model.f.batch, x, now, (n,))
+            a = self._values(model.f_jacobian.batch, x, now, (n, n))
+            following = self._values(model.f.batch, x, now, (n,))
+            if self._loss is not None:
+                following = self._bounded(following + np.einsum("hij,hj->hi", a, move))
             if (scale != 1.0).any():
                 following = x + scale * (following - x)
                 a = eye_n + scale[:, :, None] * (a - eye_n)
@@ -220,8 +251,9 @@ class FilterBank:
         # A shifted record lacks some samples, which must make no difference.
         counts = there.sum(axis=(1, 2))
         logs *= counts[0] / np.maximum(counts, 1)
-        recovers = _recovering(there[0].any(axis=1))
-        logs[recovers], first.innovations[recovers] = 0.0, np.nan
+        if self._loss is None:
+            recovers = _recovering(there[0].any(axis=1))
+            logs[recovers], first.innovations[recovers] = 0.0, np.nan
         logs[:, ~alive | ~np.isfinite(logs).all(axis=0)] = -np.inf
         first.innovations[...] *= unit
         first.spreads[...] *= np.multiply.outer(unit, unit)
@@ -245,26 +277,14 @@ def _recovering(seen: Mask) -> Mask:
     return found if usual else np.zeros_like(found)
 
 
-def _inverses(matrices: Array, alive: Mask) -> Array:
-    """The inverses; the filter of a singular one is dead, and has the identity."""
+def _each(function: Callable[[Array], Any], matrices: Array, alive: Mask) -> Array:
+    """The inverses or factors; the filter of a matrix without one is dead, and has the identity."""
     try:
-        return np.asarray(np.linalg.inv(matrices), np.float64)
+        return np.asarray(function(matrices), np.float64)
     except np.linalg.LinAlgError:
-        singular = np.linalg.slogdet(matrices)[0] <= 0.0
-        alive[singular] = False
-        matrices[singular] = np.eye(matrices.shape[-1])
-        return np.asarray(np.linalg.inv(matrices), np.float64)
-
-
-def _values(function: Function, x: Array, u: Array, shape: tuple[int, ...]) -> Array:
-    """A model function's values at all states; NaN where it raises."""
-    try:
-        return np.asarray(function(x, u))
-    except Exception:
-        found = np.full((len(x), *shape), np.nan)
-        for i in range(len(x)):
+        for k, one in enumerate(matrices):
             try:
-                found[i] = function(x[i : i + 1], u[i : i + 1])[0]
-            except Exception:
-                continue
-        return found
+                function(one)
+            except np.linalg.LinAlgError:
+                alive[k], matrices[k] = False, np.eye(len(one))
+        return np.asarray(function(matrices), np.float64)

@@ -110,11 +110,13 @@ class Examination:
         """Filters of the record without and with its faults; what is stuck is no measurement."""
         run, source, part = self.run, self.source, slice(self.first, len(self.run))
         steps = None if source.steps is None else source.steps[part]
-        self.bank = FilterBank(source.system, steps, self.prior, self.first)
+        self.bank = FilterBank(source.system, steps, self.first)
         start = run.states[self.first]
         start = start if np.isfinite(start).all() else run.states[0]
         y = source.measurements.copy()
-        base = Hypothesis(y[part], self.inputs[part], self.noise, disturbance, start)
+        base = Hypothesis(
+            y[part], self.inputs[part], self.noise, disturbance, start, self.prior
+        )
 
         def contradicts(repeated: Mask, sensor: int) -> bool:
             errors = self.bank.run([base]).normalised[repeated[self.first :], sensor]
@@ -137,8 +139,7 @@ class Examination:
             begin = int(np.argmax(sums[_MOST_SAMPLES:] - sums[:-_MOST_SAMPLES]))
             part = slice(begin, begin + _MOST_SAMPLES)
             bank = FilterBank(
-                source.system, None if steps is None else steps[part], self.prior,
-                self.first + begin,
+                source.system, None if steps is None else steps[part], self.first + begin
             )
             base = replace(base, measurements=base.measurements[part], inputs=base.inputs[part],
                            start=run.states[self.first + begin])
@@ -158,9 +159,7 @@ class Examination:
         """The user's own estimate, and where the model moves it until the filter begins."""
         found = [self.run.states[0], self.run.states[0]]
         steps = self.source.steps
-        before = FilterBank(
-            self.source.system, None if steps is None else steps[: self.first], self.prior
-        )
+        before = FilterBank(self.source.system, None if steps is None else steps[: self.first])
         try:
             for u in before.full_inputs(self.inputs[: self.first]):
                 found[1] = np.asarray(before.model.f(found[1], u))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from .._checks import Array
 from ..errors import QpmheError
 from ..model.expressions import import_casadi
 from ..model.system import System
+from .bank import FilterBank, Hypothesis
 from .data import Data, Mask
 from .structures import Structure
 from .weights import Weights
@@ -216,57 +216,28 @@ class _Filter:
     # In NumPy, several settings at once
 
     def _run_together(self, settings: list[Weights], one: Data) -> Array:
-        system, count, k = self._system, len(settings), self._threshold
-        model, (low, high) = system if one.dt is None else system.timed, self._clip
-        P, Q, R = map(np.array, zip(*map(self._covariances, settings), strict=True))
-        u = np.stack([one.inputs(system, each.parameters) for each in settings], axis=1)
-        if one.dt is not None:
-            lengths = np.broadcast_to(one.dt[:, None, None], (len(one), count, 1))
-            u = np.concatenate((u, lengths), axis=2)
-        z, costs = np.tile(one.start, (count, 1)), np.zeros((len(one), count))
+        bank = FilterBank(self._system, one.dt, loss=self._loss)
+        hypotheses = []
+        for each in settings:
+            prior, entering, noise = self._covariances(each)
+            u = one.inputs(self._system, each.parameters)
+            hypotheses.append(Hypothesis(one.y, u, noise, entering, one.start, prior))
         with np.errstate(all="ignore"):
-            for t, there in enumerate(one.observed):
-                A = model.f_jacobian.batch(z, u[t])
-                C = model.h_jacobian.batch(z, u[t]) * there[:, None]
-                e = one.y[t] - model.h.batch(z, u[t])
-                if system.output_residual is not None:
-                    system.output_residual.wrap(e, np.broadcast_to(one.y[t], e.shape))
-                e[:, ~there] = 0.0
-                r = R * np.outer(there, there) + np.diag(1.0 - there)
-                S = C @ P @ C.swapaxes(1, 2) + r
-                L = _cholesky(S)
-                white = np.linalg.solve(L, e[..., None])[..., 0]
-                size = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
-                costs[t] = size + _loss(white, k)
-                used = white if k is None else np.clip(white, -k, k)
-                gain = np.linalg.solve(S, C @ P @ A.swapaxes(1, 2)).swapaxes(1, 2)
-                move = gain @ (L @ used[..., None])
-                z = np.clip(model.f.batch(z, u[t]) + move[..., 0], low, high)
-                closed = A - gain @ C
-                P = closed @ P @ closed.swapaxes(1, 2) + gain @ (r @ gain.swapaxes(1, 2)) + Q
-                P = 0.5 * (P + P.swapaxes(1, 2))
-        return costs
+            logs = bank.run(hypotheses).logs
+        if bank.error is not None:
+            raise bank.error
+        # They are in units of the first noise.
+        return one.observed @ (0.5 * np.log(settings[0].noise.diagonal()))[:, None] - logs
 
-
-def _cholesky(S: Array) -> Array:
-    try:
-        return np.asarray(np.linalg.cholesky(S))
-    except np.linalg.LinAlgError:  # of one setting: the others go on
-        found = np.full_like(S, np.nan)
-        for k, one in enumerate(S):
-            with suppress(np.linalg.LinAlgError):
-                found[k] = np.linalg.cholesky(one)
-        return found
-
-
-def _loss(white: Array, threshold: float | None) -> Array:
-    """Half the square of each row, or the robust cost of its components."""
-    if threshold is None:
-        return np.asarray(0.5 * (white * white).sum(axis=-1))
-    size, k = np.abs(white), threshold
-    beyond = k * k * (0.5 + np.log(np.maximum(size, k) / k))
-    costs = np.where(size <= k, 0.5 * size * size, beyond).sum(axis=-1)
-    return np.asarray(costs / _clipped_variance(k))
+    def _loss(self, white: Array) -> tuple[Array, Array]:
+        """Half the squares of rows, or the robust cost of components; and the rows clipped."""
+        k = self._threshold
+        if k is None:
+            return 0.5 * (white * white).sum(axis=-1), white
+        size = np.abs(white)
+        beyond = k * k * (0.5 + np.log(np.maximum(size, k) / k))
+        costs = np.where(size <= k, 0.5 * size * size, beyond).sum(axis=-1)
+        return costs / _clipped_variance(k), np.clip(white, -k, k)
 
 
 def _clipped_variance(k: float) -> float:

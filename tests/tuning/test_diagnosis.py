@@ -326,9 +326,9 @@ def test_filters_are_kalman_filters():
         qpmhe.QuadraticCost.from_covariances(prior=prior, disturbance=disturbance, noise=noise),
         horizon=2, initial_state=[1.0, 0.0], max_qps=0)
     run = mhe.run(y)
-    bank, start = FilterBank(system, None, prior), np.array([1.0, 0.0])
-    base = Hypothesis(y, np.zeros((60, 0)), noise, disturbance, start)
-    other = Hypothesis(y, np.zeros((60, 0)), 9.0 * noise, disturbance, start)
+    bank, start = FilterBank(system, None), np.array([1.0, 0.0])
+    base = Hypothesis(y, np.zeros((60, 0)), noise, disturbance, start, prior)
+    other = Hypothesis(y, np.zeros((60, 0)), 9.0 * noise, disturbance, start, prior)
     found, alone = bank.run([base, other]), bank.run([other])
     assert found.states == pytest.approx(run.states[:-1], rel=1e-9, abs=1e-12)
     assert found.corrected == pytest.approx(run.filtered, rel=1e-9, abs=1e-12)
